@@ -1,0 +1,81 @@
+"""A folder in the user's cache that is made once, whole or not at all."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+
+def cache_folder() -> Path:
+    """Give the folder that holds what the tools download and build.
+
+    Returns
+    -------
+    Path
+        ``$REFINE_CACHE``, else ``$XDG_CACHE_HOME/refine-addon``, else ``~/.cache/refine-addon``.
+    """
+    if own := os.environ.get("REFINE_CACHE"):
+        return Path(own).absolute()
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base).absolute() / "refine-addon"
+
+
+def made_once(name: str, make: Callable[[Path, int], None]) -> Path:
+    """Return the cached folder ``name``, making it first where it is not there yet.
+
+    Parameters
+    ----------
+    name : str
+        The folder's name in `cache_folder`.
+    make : callable
+        Called as ``make(partial, lock)`` where there is no such folder: fills the new folder
+        ``partial``, which gets its final name once ``make`` returns. ``lock`` is the descriptor
+        of the held lock: a child process that inherits it keeps others out for as long as it
+        runs, also when this process is killed.
+
+    Returns
+    -------
+    Path
+        The complete folder.
+
+    Raises
+    ------
+    RuntimeError
+        If a killed run's half folder still has something mounted in it.
+    """
+    folder = cache_folder() / name
+    if folder.is_dir():
+        return folder
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with folder.with_name(f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        # Another run may have made it while this one waited for the lock.
+        if not folder.is_dir():
+            partial = folder.with_name(f"{name}.partial")
+            _remove(partial)
+            partial.mkdir()
+            try:
+                make(partial, lock.fileno())
+            except BaseException:
+                _remove(partial)
+                raise
+            partial.rename(folder)
+    return folder
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder, but never reach through a mount point to what is mounted there."""
+    mounts = Path("/proc/self/mountinfo")
+    if mounts.exists():
+        points = [line.split()[4] for line in mounts.read_text().splitlines()]
+        if inside := [point for point in points if Path(point).is_relative_to(folder)]:
+            message = f"{folder} is left of a killed run and has mounts: unmount {inside} first"
+            raise RuntimeError(message)
+    if folder.exists():
+        shutil.rmtree(folder)
