@@ -1,0 +1,37 @@
+"""Scoring and pruning of 3D Gaussian splats on NumPy arrays; knows nothing of Blender.
+
+file = read_ply("scene.ply")
+result = prune(file.splats(), read_cameras("cameras.json"), Budget(ratio=0.5))
+file.write("pruned.ply", result.keep)
+"""
+
+from .camera_files import read_cameras
+from .closed_form import ClosedForm
+from .errors import Cancelled, RefineError
+from .pipeline import Result, Settings, prune, prune_file, score
+from .ply import SplatFile, read_ply
+from .scores import Scores
+from .selection import Budget, rank, select
+from .splats import Splats
+from .views import View, ViewSet
+
+__all__ = [
+    "Budget",
+    "Cancelled",
+    "ClosedForm",
+    "RefineError",
+    "Result",
+    "Scores",
+    "Settings",
+    "SplatFile",
+    "Splats",
+    "View",
+    "ViewSet",
+    "prune",
+    "prune_file",
+    "rank",
+    "read_cameras",
+    "read_ply",
+    "score",
+    "select",
+]

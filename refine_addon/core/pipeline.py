@@ -1,0 +1,259 @@
+"""The one use case: views and splats in, scores and a keep mask out.
+
+The panel, the command and Python code all come through here, so that they keep the same splats.
+"""
+
+from __future__ import annotations
+
+import platform
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from . import closed_form, selection
+from .errors import RefineError
+from .files import refuse_existing
+from .ply import read_ply
+from .work import Progress, part, report, silent
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .scores import Scores
+    from .selection import Budget
+    from .splats import Splats
+    from .views import ViewSet
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to score.
+
+    Attributes
+    ----------
+    method : {"closed-form"}
+        Name of the scoring method.
+    views : int
+        Use at most this many views, spread out evenly; 0 uses all.
+    closed_form : ClosedForm
+        Settings of that method.
+    """
+
+    method: Literal["closed-form"] = "closed-form"
+    views: int = 64
+    closed_form: closed_form.ClosedForm = field(default_factory=closed_form.ClosedForm)
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises
+        ------
+        RefineError
+            If one cannot be.
+        """
+        if self.method != "closed-form":
+            msg = f"method is {self.method!r}, expected 'closed-form'"
+            raise RefineError(msg)
+        if self.views < 0:
+            msg = f"views is {self.views}, expected 0 (all) or more"
+            raise RefineError(msg)
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a prune decided.
+
+    Attributes
+    ----------
+    keep : (N,) bool
+        Which splats stay.
+    scores : Scores
+        What decided.
+    report : dict
+        Counts, settings, weights, timings and versions, ready for JSON.
+    """
+
+    keep: NDArray[np.bool_]
+    scores: Scores
+    report: dict[str, Any]
+
+
+def score(
+    splats: Splats,
+    views: ViewSet,
+    settings: Settings = Settings(),
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Scores:
+    """Score splats by how much the views would miss each.
+
+    Parameters
+    ----------
+    splats : Splats
+        In the frame of the views.
+    views : ViewSet
+    settings : Settings
+    progress : callable, optional
+        ``progress(fraction, what)``; returning ``False`` cancels.
+    threads : int, optional
+
+    Returns
+    -------
+    Scores
+
+    Raises
+    ------
+    RefineError
+        If there are no splats, or no view sees any.
+    Cancelled
+        If `progress` answers ``False``.
+    """
+    used = views.spread(settings.views)
+    return closed_form.score(splats, used, settings.closed_form, progress=progress, threads=threads)
+
+
+def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
+    splats: Splats,
+    views: ViewSet,
+    budget: Budget,
+    settings: Settings = Settings(),
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    row_bytes: float = 0.0,
+    fixed_bytes: int = 0,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Result:
+    """Score splats and decide which stay.
+
+    Parameters
+    ----------
+    splats, views, settings, progress, threads
+        See `score`.
+    budget : Budget
+        How much to remove.
+    protected : (N,) bool, optional
+        Splats never to remove.
+    row_bytes, fixed_bytes
+        See `Budget.removals`.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `score`; also if the budget would leave nothing.
+    """
+    start = time.perf_counter()
+    scores = score(splats, views, settings, progress=part(progress, 0.0, 0.95), threads=threads)
+    scored = time.perf_counter()
+    report(progress, 0.95, "selecting")
+    keep = selection.select(
+        scores, budget, protected=protected, row_bytes=row_bytes, fixed_bytes=fixed_bytes
+    )
+    timings = {"score_s": scored - start, "select_s": time.perf_counter() - scored}
+    return Result(keep, scores, make_report(scores, keep, views, budget, settings, timings))
+
+
+def prune_file(  # noqa: PLR0913 - the use case, file to file
+    source: Path | str,
+    output: Path | str | None,
+    views: ViewSet,
+    budget: Budget,
+    settings: Settings = Settings(),
+    *,
+    overwrite: bool = False,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Result:
+    """Prune a 3DGS PLY file into another.
+
+    Parameters
+    ----------
+    source : path-like
+        The file to read.
+    output : path-like or None
+        The file to make; None decides and writes nothing.
+    views, budget, settings, progress, threads
+        See `prune`.
+    overwrite : bool
+        Whether `output` may replace a file.
+
+    Returns
+    -------
+    Result
+        Its report says the files' names and sizes besides.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `prune`, `read_ply` and `SplatFile.write`; nothing is written then.
+    """
+    start = time.perf_counter()
+    target = None if output is None else Path(output).expanduser()
+    if target is not None:
+        refuse_existing(target, overwrite=overwrite)
+    file = read_ply(source)
+    opened = time.perf_counter()
+    result = prune(
+        file.splats(),
+        views,
+        budget,
+        settings,
+        row_bytes=file.row_bytes,
+        fixed_bytes=file.fixed_bytes,
+        progress=part(progress, 0.0, 0.8),
+        threads=threads,
+    )
+    decided = time.perf_counter()
+    report(progress, 0.8, "writing")
+    if target is not None:
+        file.write(target, result.keep, overwrite=overwrite)
+    timings = result.report["timings"]
+    timings["read_s"] = opened - start
+    timings["write_s"] = time.perf_counter() - decided
+    timings["total_s"] = time.perf_counter() - start
+    result.report["files"] = {
+        "input": str(file.path),
+        "output": None if target is None else str(target),
+        "input_bytes": file.size(),
+        "output_bytes": file.size(result.keep),
+    }
+    return result
+
+
+def make_report(
+    scores: Scores,
+    keep: NDArray[np.bool_],
+    views: ViewSet,
+    budget: Budget,
+    settings: Settings,
+    timings: dict[str, float],
+) -> dict[str, Any]:
+    """Return everything a pipeline wants to know about a prune, as plain JSON values."""
+    kept = int(np.count_nonzero(keep))
+    notes = [*scores.notes, *([views.note] if views.note else [])]
+    if scores.undrawable:
+        notes.append(f"{scores.undrawable} splats cannot be drawn; they rank lowest")
+    return {
+        "splats": {
+            "before": len(keep),
+            "kept": kept,
+            "removed": len(keep) - kept,
+            "undrawable": scores.undrawable,
+            "unseen": int(np.count_nonzero(scores.seen == 0)),
+        },
+        "views": {"given": len(views), "used": scores.views_used},
+        "budget": {budget.kind: getattr(budget, budget.kind)},
+        "settings": asdict(settings),
+        "weights": scores.weights,
+        "timings": timings,
+        "notes": notes,
+        "versions": {"python": platform.python_version(), "numpy": np.__version__},
+    }

@@ -1,0 +1,182 @@
+"""From scores to a keep mask: budgets, protection, stable ties."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .errors import RefineError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .scores import Scores
+
+
+@dataclass(frozen=True)
+class Budget:
+    """How much to remove: exactly one of these.
+
+    Attributes
+    ----------
+    ratio : float, optional
+        Share to remove, in [0, 1): exactly ``floor(ratio * N)`` splats go.
+    keep : int, optional
+        How many splats stay, at least 1; all of them where there are fewer.
+    max_mb : float, optional
+        Size of the file afterwards, in megabytes of 1e6 bytes.
+    threshold : float, optional
+        Splats that score below this go.
+    min_seen : float, optional
+        Splats that lie in fewer than this share of the views go, in percent.
+
+    Examples
+    --------
+    >>> Budget(ratio=0.29).removals(100)
+    29
+    """
+
+    ratio: float | None = None
+    keep: int | None = None
+    max_mb: float | None = None
+    threshold: float | None = None
+    min_seen: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check that one value is given and can be.
+
+        Raises
+        ------
+        RefineError
+            With the name of the value, what it is and what was expected.
+        """
+        given = [item.name for item in fields(self) if getattr(self, item.name) is not None]
+        if len(given) != 1:
+            msg = f"expected one of ratio, keep, max_mb, threshold, min_seen, got {given or 'none'}"
+            raise RefineError(msg)
+        value = getattr(self, given[0])
+        expected = {
+            "ratio": ("0 <= ratio < 1", 0 <= value < 1),
+            "keep": ("a whole number of at least 1", value >= 1 and value == int(value or 0)),
+            "max_mb": ("a positive number", 0 < value < math.inf),
+            "threshold": ("a number", math.isfinite(value)),
+            "min_seen": ("a percentage, 0 to 100", 0 <= value <= 100),  # noqa: PLR2004
+        }[given[0]]
+        if not expected[1]:
+            msg = f"{given[0]} is {value}, expected {expected[0]}"
+            raise RefineError(msg)
+
+    @property
+    def kind(self) -> str:
+        """Name of the value given."""
+        return next(item.name for item in fields(self) if getattr(self, item.name) is not None)
+
+    def removals(self, count: int, row_bytes: float = 0.0, fixed_bytes: int = 0) -> int | None:
+        """Return how many of `count` splats go, or None where only the scores can tell.
+
+        Parameters
+        ----------
+        count : int
+            Number of splats.
+        row_bytes, fixed_bytes : float, int
+            Size of one splat in the file, and of all else in it; for `max_mb`.
+
+        Raises
+        ------
+        RefineError
+            If not even one splat fits in `max_mb`.
+        """
+        if self.ratio is not None:
+            # The decimal that was written, not its binary neighbour: floor(.29 * 100) is 29.
+            return math.floor(Fraction(repr(float(self.ratio))) * count)
+        if self.keep is not None:
+            return max(count - self.keep, 0)
+        if self.max_mb is not None:
+            fitting = math.floor((self.max_mb * 1e6 - fixed_bytes) / row_bytes)
+            if fitting < 1:
+                msg = f"max_mb is {self.max_mb}, too small for one splat of {row_bytes:.0f} bytes"
+                raise RefineError(msg)
+            return max(count - fitting, 0)
+        return None
+
+
+def select(
+    scores: Scores,
+    budget: Budget,
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    row_bytes: float = 0.0,
+    fixed_bytes: int = 0,
+) -> NDArray[np.bool_]:
+    """Return which splats stay.
+
+    The lowest scores go; of equal ones, the first in the file. Protected splats always stay, others
+    go in their place; where the budget asks for more than there are others, only those go.
+
+    Parameters
+    ----------
+    scores : Scores
+    budget : Budget
+    protected : (N,) bool, optional
+        Splats never to remove.
+    row_bytes, fixed_bytes
+        See `Budget.removals`.
+
+    Returns
+    -------
+    (N,) bool
+    """
+    values = scores.values
+    keep = np.ones(len(values), np.bool_)
+    free = np.ones(len(values), np.bool_) if protected is None else ~protected
+    removals = budget.removals(len(values), row_bytes, fixed_bytes)
+    if budget.threshold is not None:
+        keep[free & (values < budget.threshold)] = False
+    elif budget.min_seen is not None:
+        # In whole numbers: 25 % of 64 views is 16, and 16 is not fewer.
+        least = Fraction(repr(float(budget.min_seen))) * scores.views_used / 100
+        keep[free & (scores.seen < math.ceil(least))] = False
+    elif removals:
+        _remove_lowest(keep, values, free, min(removals, int(np.count_nonzero(free))))
+    if not keep.any():
+        msg = f"{budget.kind} would remove all {len(values)} splats; nothing was removed"
+        raise RefineError(msg)
+    return keep
+
+
+def _remove_lowest(
+    keep: NDArray[np.bool_], values: NDArray[np.float32], free: NDArray[np.bool_], count: int
+) -> None:
+    """Clear `keep` for the `count` lowest of the `free` values, the first of equal ones."""
+    if not count:
+        return
+    candidates = values if free.all() else values[free]
+    edge = np.partition(candidates, count - 1)[count - 1]
+    below = free & (values < edge)
+    keep[below] = False
+    ties = np.flatnonzero(free & (values == edge))
+    keep[ties[: count - int(np.count_nonzero(below))]] = False
+
+
+def rank(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return each splat's place in the order of removal, 0 (goes first) to 1 (goes last).
+
+    Parameters
+    ----------
+    values : (N,) float32
+
+    Returns
+    -------
+    (N,) float32
+        A single splat has rank 1.
+    """
+    count = len(values)
+    if count == 1:
+        return np.ones(1, np.float32)
+    ranks = np.empty(count, np.float32)
+    ranks[np.argsort(values, kind="stable")] = np.linspace(0.0, 1.0, count, dtype=np.float32)
+    return ranks

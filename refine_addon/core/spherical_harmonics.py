@@ -1,0 +1,117 @@
+"""Real spherical harmonics with the signs and order that 3DGS files use, degrees 0 to 4."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
+    """Evaluate the harmonics.
+
+    Parameters
+    ----------
+    directions : (..., 3) floating
+        Unit vectors from the view to the splat, in the frame of the coefficients.
+    degree : int
+        0 to 4.
+
+    Returns
+    -------
+    (..., (degree + 1)^2) float64
+        In the order of the coefficients: constant first, then band by band, m = -l .. l.
+
+    Notes
+    -----
+    Real harmonics with the Condon-Shortley phase, as in the reference implementation of 3DGS: the
+    constants below are sqrt((2l + 1) / 4 pi (l - m)! / (l + m)!) times those of the polynomials.
+
+    Examples
+    --------
+    >>> basis(np.array([0.0, 0.0, 1.0]), 1).round(4).tolist()
+    [0.2821, -0.0, 0.4886, -0.0]
+    """
+    x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
+    xx, yy, zz = x * x, y * y, z * z
+    root = np.sqrt(1.0 / np.pi)
+    bands = [[np.full_like(x, 0.5 * root)]]
+    if degree >= 1:
+        c = np.sqrt(3.0) / 2 * root
+        bands.append([-c * y, c * z, -c * x])
+    if degree >= 2:  # noqa: PLR2004
+        c = np.sqrt(15.0) / 2 * root
+        bands.append(
+            [
+                c * x * y,
+                -c * y * z,
+                np.sqrt(5.0) / 4 * root * (2 * zz - xx - yy),
+                -c * x * z,
+                c / 2 * (xx - yy),
+            ]
+        )
+    if degree >= 3:  # noqa: PLR2004
+        a, b = np.sqrt(35.0 / 2) / 4 * root, np.sqrt(21.0 / 2) / 4 * root
+        c = np.sqrt(105.0) / 2 * root
+        bands.append(
+            [
+                -a * y * (3 * xx - yy),
+                c * x * y * z,
+                -b * y * (4 * zz - xx - yy),
+                np.sqrt(7.0) / 4 * root * z * (2 * zz - 3 * xx - 3 * yy),
+                -b * x * (4 * zz - xx - yy),
+                c / 2 * z * (xx - yy),
+                -a * x * (xx - 3 * yy),
+            ]
+        )
+    if degree >= 4:  # noqa: PLR2004
+        a, b = np.sqrt(35.0) * 3 / 4 * root, np.sqrt(35.0 / 2) * 3 / 4 * root
+        c, d = np.sqrt(5.0) * 3 / 4 * root, np.sqrt(5.0 / 2) * 3 / 4 * root
+        bands.append(
+            [
+                a * x * y * (xx - yy),
+                -b * y * z * (3 * xx - yy),
+                c * x * y * (7 * zz - 1),
+                -d * y * z * (7 * zz - 3),
+                3 / 16 * root * (zz * (35 * zz - 30) + 3),
+                -d * x * z * (7 * zz - 3),
+                c / 2 * (xx - yy) * (7 * zz - 1),
+                -b * x * z * (xx - 3 * yy),
+                a / 4 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
+            ]
+        )
+    return np.stack([value for band in bands for value in band], axis=-1)
+
+
+def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[Any]:
+    """Rotate coefficients so that the colour seen along ``rotation @ d`` is that once seen along d.
+
+    Parameters
+    ----------
+    sh_rest : (N, K, 3) floating
+        Coefficients above the constant, K = (degree + 1)^2 - 1.
+    rotation : (3, 3) float64
+        Orthonormal; a reflection is as good.
+
+    Returns
+    -------
+    (N, K, 3), of the type of `sh_rest`
+    """
+    degree = math.isqrt(sh_rest.shape[1] + 1) - 1
+    rotated = np.empty_like(sh_rest)
+    # Each band maps to itself: solve for the matrix from more directions than it has rows.
+    points = np.random.default_rng(0).normal(size=(64, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    here, before = basis(points, degree), basis(points @ rotation, degree)
+    for band in range(1, degree + 1):
+        own = slice(band * band, (band + 1) ** 2)
+        matrix = np.linalg.lstsq(here[:, own], before[:, own], rcond=None)[0]
+        stored = slice(own.start - 1, own.stop - 1)
+        rotated[:, stored] = np.einsum(
+            "ij,njc->nic", matrix.astype(sh_rest.dtype), sh_rest[:, stored]
+        )
+    return rotated

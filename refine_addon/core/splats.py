@@ -1,0 +1,149 @@
+"""3D Gaussian splats as stored by 3DGS files, and the one place where they are activated."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+SH_C0 = 0.28209479177387814
+"""Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """N splats with the values a 3DGS file stores: log scales, logit opacities, raw harmonics.
+
+    The arrays may be read-only strided views of a memory-mapped file in any byte order; whoever
+    computes with them converts a chunk at a time. Nothing here is ever mutated.
+
+    Attributes
+    ----------
+    means : (N, 3) floating
+        Centres, in the file's (or, once transformed, the world's) frame and unit.
+    log_scales : (N, 3) floating
+        Natural logarithm of the standard deviation along each axis of the splat.
+    quaternions : (N, 4) floating
+        Rotation from the splat's axes to the frame, w x y z, not necessarily normalised.
+    opacity_logits : (N,) floating
+        Opacity before the logistic function.
+    sh_dc : (N, 3) floating
+        Constant spherical-harmonics coefficient of red, green, blue.
+    sh_rest : (N, K, 3) floating
+        The other coefficients, K = (degree + 1)^2 - 1 of each channel.
+    """
+
+    means: NDArray[Any]
+    log_scales: NDArray[Any]
+    quaternions: NDArray[Any]
+    opacity_logits: NDArray[Any]
+    sh_dc: NDArray[Any]
+    sh_rest: NDArray[Any]
+
+    def __len__(self) -> int:
+        """Return the number of splats."""
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """Highest spherical-harmonics band present, 0 to 4."""
+        return math.isqrt(self.sh_rest.shape[1] + 1) - 1
+
+    def take(self, index: NDArray[Any] | slice) -> Splats:
+        """Return the splats at `index` (a mask, integers or a slice), in that order."""
+        return Splats(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
+
+
+def opacity(logits: NDArray[Any]) -> NDArray[np.float64]:
+    """Opacity in 0..1, the logistic function of the stored value, without overflow.
+
+    Parameters
+    ----------
+    logits : (...) floating
+        Any value, infinities included; NaN stays NaN.
+
+    Returns
+    -------
+    (...) float64
+    """
+    logits = np.asarray(logits, np.float64)
+    # Beyond 700 the smaller side is below 1e-304: taken as it is there, so that nothing underflows.
+    decay = np.exp(-np.minimum(np.abs(logits), 700.0))
+    return np.asarray(np.where(logits >= 0.0, 1.0, decay) / (1.0 + decay))
+
+
+def base_color(sh_dc: NDArray[Any]) -> NDArray[np.float64]:
+    """View-independent colour in 0..1, ``clip(SH_C0 * f_dc + 0.5, 0, 1)``.
+
+    Parameters
+    ----------
+    sh_dc : (..., 3) floating
+
+    Returns
+    -------
+    (..., 3) float64
+    """
+    return np.clip(SH_C0 * np.asarray(sh_dc, np.float64) + 0.5, 0.0, 1.0)
+
+
+def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
+    """Rotation matrices of stored quaternions.
+
+    Parameters
+    ----------
+    quaternions : (..., 4) floating
+        w x y z of any length; a zero or non-finite quaternion counts as the identity.
+
+    Returns
+    -------
+    (..., 3, 3) float64
+        Columns are the splat's axes in the frame of the means.
+    """
+    q = np.asarray(quaternions, np.float64)
+    largest = np.max(np.abs(q), axis=-1, keepdims=True)
+    usable = np.isfinite(largest) & (largest > 0.0)
+    # Divide by the largest component first: squares of 1e200 or 1e-200 would leave the range.
+    q = np.where(usable, q, [1.0, 0.0, 0.0, 0.0]) / np.where(usable, largest, 1.0)
+    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def drawable(splats: Splats) -> NDArray[np.bool_]:
+    """Which splats a renderer can draw.
+
+    Not those with a value that is NaN or infinite (other than an opacity logit, where infinity
+    means 0 or 1, and a scale of zero, a log of minus infinity), nor those that leave the range of
+    the float32 that renderers compute in: opacity 0, size 0 along every axis, a mean or scale too
+    large.
+
+    Returns
+    -------
+    (N,) bool
+    """
+    s0, s1, s2 = splats.log_scales.T
+    largest = np.maximum(np.maximum(s0, s1), s2)
+    # Comparisons with NaN are False, and maximum hands NaN on: every line also rejects NaN.
+    good = splats.opacity_logits >= _LOG_SMALLEST
+    good &= (largest <= _LOG_LARGEST) & (largest >= _LOG_SMALLEST)
+    for axis in range(3):
+        good &= np.abs(splats.means[:, axis]) <= _LARGEST
+    for values in (splats.quaternions, splats.sh_dc, splats.sh_rest):
+        finite = np.isfinite(values)
+        if not finite.all():  # seldom: row by row costs ten times as much as all at once
+            good &= finite.reshape(len(splats), -1).all(axis=1)
+    return good
+
+
+_LARGEST = float(np.finfo(np.float32).max)
+_LOG_LARGEST = float(np.log(_LARGEST))
+_LOG_SMALLEST = float(np.log(np.float64(np.finfo(np.float32).smallest_subnormal)))

@@ -1,0 +1,139 @@
+"""Splats moved by an affine matrix, such as a Blender object's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from . import spherical_harmonics
+from .errors import RefineError
+from .splats import Splats, rotation_matrices
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+UNIFORM_TOLERANCE = 1e-4
+"""Relative difference between the scales of a matrix that still counts as uniform scaling."""
+
+
+def is_uniform(matrix: NDArray[Any]) -> bool:
+    """Whether a (4, 4) or (3, 3) matrix scales all directions alike (a mirror image included)."""
+    scales = np.linalg.svd(np.asarray(matrix, np.float64)[:3, :3], compute_uv=False)
+    return bool(scales[0] - scales[2] <= UNIFORM_TOLERANCE * scales[0])
+
+
+def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True) -> Splats:
+    """Return the splats as an affine matrix places them.
+
+    Parameters
+    ----------
+    splats : Splats
+    matrix : (4, 4) floating
+        From the frame of the splats to the new one; any invertible affine matrix.
+    rotate_sh : bool
+        Whether harmonics are rotated with the splats. Without, colours are those of the old frame
+        (enough for the closed form, which looks at the constant alone) and non-uniform matrices
+        are allowed: means and covariances follow them exactly.
+
+    Returns
+    -------
+    Splats
+        Means in float64, all else in float32.
+
+    Raises
+    ------
+    RefineError
+        If the matrix is not finite, not invertible or not affine; or, with `rotate_sh`, scales
+        directions differently, for which harmonics have no answer.
+    """
+    matrix = np.asarray(matrix, np.float64)
+    linear = matrix[:3, :3]
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        msg = f"expected a finite (4, 4) matrix, got {matrix.tolist()}"
+        raise RefineError(msg)
+    scales = np.linalg.svd(linear, compute_uv=False)
+    if scales[2] <= 1e-9 * scales[0] or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        msg = (
+            f"the transform is flat or not affine (scales {scales.tolist()}): it cannot be applied"
+        )
+        raise RefineError(msg)
+    means = splats.means @ linear.T.astype(np.float64) + matrix[:3, 3]
+    if not is_uniform(matrix):
+        if rotate_sh:
+            msg = (
+                f"the transform scales directions differently ({scales.round(6).tolist()}); splat "
+                "colours cannot follow that: make the object's scale uniform first"
+            )
+            raise RefineError(msg)
+        return _stretched(splats, means, linear)
+    factor = np.cbrt(abs(np.linalg.det(linear)))
+    rotation = linear / factor
+    left, _, right = np.linalg.svd(rotation)
+    rotation = left @ right
+    # A splat is its own mirror image along each of its axes, so a reflection R turns it like -R,
+    # which is a rotation; its harmonics follow R itself.
+    proper = rotation if np.linalg.det(rotation) > 0 else -rotation
+    return replace(
+        splats,
+        means=means,
+        log_scales=(splats.log_scales + np.float32(np.log(factor))).astype(np.float32),
+        quaternions=_rotated(splats.quaternions, proper),
+        sh_rest=(
+            spherical_harmonics.rotate(splats.sh_rest, rotation).astype(np.float32)
+            if rotate_sh and splats.sh_degree
+            else splats.sh_rest
+        ),
+    )
+
+
+def _rotated(quaternions: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the quaternion of `rotation` times each of `quaternions`, lengths kept."""
+    w, x, y, z = quaternion(rotation)
+    left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    product: NDArray[np.float64] = np.asarray(quaternions, np.float64) @ left.T
+    return product.astype(np.float32)
+
+
+def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the unit quaternion w x y z of rotation matrices, (..., 3, 3) -> (..., 4).
+
+    The eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Bar-Itzhack 2000): no
+    case distinction, and as accurate at half a turn as elsewhere.
+    """
+    m = np.asarray(rotation, np.float64)
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    a, b, c = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xy, xz = m[..., 1, 0] + m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0]
+    yz = m[..., 2, 1] + m[..., 1, 2]
+    rows = [
+        [xx + yy + zz, a, b, c],
+        [a, xx - yy - zz, xy, xz],
+        [b, xy, yy - xx - zz, yz],
+        [c, xz, yz, zz - xx - yy],
+    ]
+    symmetric = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    q = np.linalg.eigh(symmetric)[1][..., -1]
+    return np.where(q[..., :1] < 0.0, -q, q)
+
+
+def _stretched(splats: Splats, means: NDArray[Any], linear: NDArray[np.float64]) -> Splats:
+    """Apply a non-uniform matrix to the Gaussians: the covariance M S M' and its axes."""
+    logs = np.empty((len(splats), 3), np.float32)
+    quaternions = np.empty((len(splats), 4), np.float32)
+    for start in range(0, len(splats), 1 << 16):
+        piece = slice(start, start + (1 << 16))
+        stored = np.asarray(splats.log_scales[piece], np.float64)
+        usable = np.isfinite(stored).all(axis=1)
+        largest = np.where(usable, stored.max(axis=1), 0.0)
+        # Relative to the longest axis, so that neither 1e30 nor 1e-30 leaves the range.
+        relative = np.exp(np.where(usable[:, None], stored - largest[:, None], 0.0).clip(-300, 0))
+        axes = linear @ (rotation_matrices(splats.quaternions[piece]) * relative[:, None, :])
+        # Singular values keep the digits that the eigenvalues of the product would square away.
+        left, sizes, _ = np.linalg.svd(axes)
+        flip = np.where(np.linalg.det(left) < 0.0, -1.0, 1.0)
+        quaternions[piece] = quaternion(left * flip[:, None, None])
+        with np.errstate(divide="ignore"):  # a flat splat: log 0 is -inf, as stored
+            logs[piece] = np.where(usable[:, None], np.log(sizes) + largest[:, None], stored)
+    return replace(splats, means=means, log_scales=logs, quaternions=quaternions)

@@ -1,0 +1,208 @@
+"""Pinhole views in the OpenCV convention, one at a time and as a set."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .errors import RefineError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """One pinhole camera: x right, y down, z forward; pixels, origin at the image's upper left.
+
+    A point ``p`` of the world lies at ``rotation @ (p - center)`` in the camera, and at
+    ``(fx x / z + cx, fy y / z + cy)`` in the image; the centre of pixel k is at k + 0.5.
+
+    Attributes
+    ----------
+    rotation : (3, 3) float64
+        World to camera, orthonormal; determinant -1 where the camera is mirrored.
+    center : (3,) float64
+        Centre of projection, world units.
+    fx, fy, cx, cy : float
+        Focal lengths and principal point, pixels.
+    width, height : int
+        Image size, pixels.
+    near, far : float
+        Clip distances along z, world units; 0 and infinity where the source knows none.
+    weight : float
+        How much this view counts among the others, >= 0.
+    name : str
+        Image or camera name, for messages.
+    """
+
+    rotation: NDArray[np.float64]
+    center: NDArray[np.float64]
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    near: float = 0.0
+    far: float = math.inf
+    weight: float = 1.0
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        """Check everything: what is wrong here would surface as a wrong picture much later.
+
+        Raises
+        ------
+        RefineError
+            With the view's name and the value that cannot be.
+        """
+        rotation = np.array(self.rotation, np.float64)
+        center = np.array(self.center, np.float64)
+        label = f"view {self.name!r}" if self.name else "view"
+        if rotation.shape != (3, 3) or center.shape != (3,):
+            msg = (
+                f"{label}: expected rotation (3, 3) and center (3,), "
+                f"got {rotation.shape} and {center.shape}"
+            )
+            raise RefineError(msg)
+        numbers = (self.fx, self.fy, self.cx, self.cy, self.near, self.weight)
+        if not (np.isfinite(rotation).all() and np.isfinite(center).all()):
+            msg = f"{label}: rotation and center must be finite numbers"
+            raise RefineError(msg)
+        if not all(math.isfinite(number) for number in numbers) or math.isnan(self.far):
+            msg = f"{label}: fx, fy, cx, cy, near and weight must be finite, got {numbers}"
+            raise RefineError(msg)
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:  # noqa: PLR2004
+            msg = f"{label}: rotation is not orthonormal"
+            raise RefineError(msg)
+        if self.fx <= 0 or self.fy <= 0 or self.width < 1 or self.height < 1:
+            msg = (
+                f"{label}: focal lengths and image size must be positive, got fx {self.fx}, "
+                f"fy {self.fy}, {self.width} x {self.height}"
+            )
+            raise RefineError(msg)
+        if self.weight < 0 or self.near < 0 or self.far <= self.near:
+            msg = (
+                f"{label}: expected weight >= 0 and 0 <= near < far, got weight {self.weight}, "
+                f"near {self.near}, far {self.far}"
+            )
+            raise RefineError(msg)
+        left, _, right = np.linalg.svd(rotation)
+        object.__setattr__(self, "rotation", left @ right)  # files round; make it exactly rigid
+        object.__setattr__(self, "center", center)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewSet:
+    """The views that decide, as arrays.
+
+    Attributes
+    ----------
+    views : tuple of View
+        At least one, at least one with a positive weight.
+    note : str
+        What the source of the views had that is not modelled (lens distortion), or "".
+    """
+
+    views: tuple[View, ...]
+    note: str = ""
+
+    def __post_init__(self) -> None:
+        """Refuse an empty set.
+
+        Raises
+        ------
+        RefineError
+            If there is no view, or none with a positive weight.
+        """
+        object.__setattr__(self, "views", tuple(self.views))
+        if not self.views:
+            msg = "no cameras: scoring needs at least one view"
+            raise RefineError(msg)
+        if not any(view.weight > 0 for view in self.views):
+            msg = f"all {len(self.views)} views have weight 0: at least one must count"
+            raise RefineError(msg)
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self.views)
+
+    def __iter__(self) -> Iterator[View]:
+        """Iterate over the views in order."""
+        return iter(self.views)
+
+    def __getitem__(self, index: int) -> View:
+        """Return one view."""
+        return self.views[index]
+
+    def take(self, indices: Sequence[int] | NDArray[Any]) -> ViewSet:
+        """Return the views at `indices`, in that order."""
+        return replace(self, views=tuple(self.views[int(index)] for index in indices))
+
+    def select(self, names: Sequence[str]) -> ViewSet:
+        """Return the views of these names, in the order of `names`.
+
+        Raises
+        ------
+        RefineError
+            If a name is not there.
+        """
+        by_name = {view.name: view for view in self.views}
+        missing = [name for name in names if name not in by_name]
+        if missing:
+            msg = f"no view named {missing[0]!r} among {len(self)} views"
+            raise RefineError(msg)
+        return replace(self, views=tuple(by_name[name] for name in names))
+
+    @property
+    def centers(self) -> NDArray[np.float64]:
+        """Centres of projection, (V, 3), world units."""
+        return np.array([view.center for view in self.views])
+
+    @property
+    def rotations(self) -> NDArray[np.float64]:
+        """World-to-camera rotations, (V, 3, 3)."""
+        return np.array([view.rotation for view in self.views])
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Weights scaled to sum to 1, (V,)."""
+        weights = np.array([view.weight for view in self.views], np.float64)
+        weights /= weights.max()  # first, so that weights of 1e308 do not sum to infinity
+        return np.asarray(weights / weights.sum())
+
+    def spread(self, count: int) -> ViewSet:
+        """Return at most `count` views that cover the set evenly, in their old order.
+
+        Farthest-point sampling over position and viewing direction, from the view farthest from
+        the middle of the set. Deterministic, and independent of the order and the unit of the set.
+
+        Parameters
+        ----------
+        count : int
+            How many to keep; 0 keeps all.
+        """
+        usable = np.array([index for index, view in enumerate(self.views) if view.weight > 0])
+        if count <= 0 or len(usable) <= count:
+            return self if len(usable) == len(self) else self.take(usable)
+        centers = self.centers[usable]
+        offset = centers - centers.mean(axis=0)
+        scale = np.sqrt(np.mean(np.sum(offset * offset, axis=1)))
+        place = np.hstack([offset / (scale or 1.0), self.rotations[usable][:, 2]])
+        # Equal distances are decided by place, never by index, so the order of views is nothing.
+        order = np.lexsort(place.T)
+        place = place[order]
+        chosen = [int(np.argmax(np.round(np.sum(place * place, axis=1), 9)))]
+        distance = np.full(len(place), np.inf)
+        while len(chosen) < count:
+            step = np.sum((place - place[chosen[-1]]) ** 2, axis=1)
+            distance = np.minimum(distance, step)
+            distance[chosen] = -1.0
+            chosen.append(int(np.argmax(np.round(distance, 9))))
+        return self.take(np.sort(usable[order[chosen]]))

@@ -1,0 +1,20 @@
+"""The version, which stands in blender_manifest.toml and nowhere else."""
+
+from __future__ import annotations
+
+import tomllib
+from importlib import metadata
+from pathlib import Path
+
+
+def _version() -> str:
+    package = Path(__file__).parent
+    # Installed as an extension, the manifest lies in the package; in the checkout, beside it.
+    for folder in (package, package.parent):
+        manifest = folder / "blender_manifest.toml"
+        if manifest.is_file():
+            return str(tomllib.loads(manifest.read_text("utf-8"))["version"])
+    return metadata.version("refine-addon")  # installed by pip
+
+
+VERSION = _version()
