@@ -367,9 +367,9 @@ def _say_result(run: _Run, label: str, report: dict[str, Any]) -> None:
     splats, views, files = report["splats"], report["views"], report["files"]
     verb = "would keep" if run.options.dry_run else "kept"
     before, after = (files[name] / 1e6 for name in ("input_bytes", "output_bytes"))
+    share = splats["removed"] / splats["before"]
     parts = [
-        f"{verb} {splats['kept']:,} of {splats['before']:,} splats "
-        f"({splats['removed'] / splats['before']:.1%} removed)",
+        f"{verb} {splats['kept']:,} of {splats['before']:,} splats ({share:.1%} removed)",
         f"{before:,.1f} -> {after:,.1f} MB",
         f"by {views['used']} of {views['given']} views",
         f"{report['timings']['total_s']:.2f} s",

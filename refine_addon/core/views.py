@@ -75,6 +75,9 @@ class View:
         if not (np.isfinite(rotation).all() and np.isfinite(center).all()):
             msg = f"{label}: rotation and center must be finite numbers"
             raise RefineError(msg)
+        if np.abs(center).max() > np.finfo(np.float32).max:
+            msg = f"{label}: center {center.tolist()} is beyond the range of float32"
+            raise RefineError(msg)
         if not all(math.isfinite(number) for number in numbers) or math.isnan(self.far):
             msg = f"{label}: fx, fy, cx, cy, near and weight must be finite, got {numbers}"
             raise RefineError(msg)

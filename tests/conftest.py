@@ -1,0 +1,9 @@
+"""Settings for all tests."""
+
+from __future__ import annotations
+
+import hypothesis
+
+# The same examples on every run: a test that fails by chance on somebody else's commit helps nobody.
+hypothesis.settings.register_profile("refine", deadline=None, derandomize=True, max_examples=50)
+hypothesis.settings.load_profile("refine")

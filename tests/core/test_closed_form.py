@@ -1,0 +1,334 @@
+"""The closed form against numbers by hand, a plain reference, and its laws."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from refine_addon.core import ClosedForm, RefineError, Splats, View, ViewSet, closed_form
+
+READINGS = [
+    ClosedForm(),
+    ClosedForm("distance"),
+    ClosedForm.published("z"),
+    ClosedForm.published("distance"),
+    ClosedForm(frustum=False),
+    ClosedForm(margin=0.0, eta=2.0),
+    ClosedForm(visibility=False),
+    ClosedForm(projection=False),
+    ClosedForm(equal_weights=True),
+    ClosedForm(visibility=False, projection=False, equal_weights=True, frustum=False),
+    ClosedForm.published("distance", projection=False),
+]
+
+
+def splats_of(means, logits, logs, dc=None) -> Splats:
+    means = np.array(means, np.float32).reshape(-1, 3)
+    count = len(means)
+    return Splats(
+        means=means,
+        log_scales=np.broadcast_to(np.array(logs, np.float32), (count, 3)).copy(),
+        quaternions=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        opacity_logits=np.broadcast_to(np.array(logits, np.float32), (count,)).copy(),
+        sh_dc=np.zeros((count, 3), np.float32) if dc is None else np.array(dc, np.float32),
+        sh_rest=np.zeros((count, 0, 3), np.float32),
+    )
+
+
+def view_at(center=(0.0, 0.0, 0.0), rotation=None, **changes) -> View:
+    values = {"fx": 50.0, "fy": 50.0, "cx": 50.0, "cy": 50.0, "width": 100, "height": 100}
+    return View(np.eye(3) if rotation is None else rotation, np.array(center), **values | changes)
+
+
+def random_scene(seed: int, count: int = 300, view_count: int = 5) -> tuple[Splats, ViewSet]:
+    rng = np.random.default_rng(seed)
+    splats = Splats(
+        means=rng.normal(size=(count, 3)).astype(np.float32) * 2,
+        log_scales=rng.normal(-3, 1.5, size=(count, 3)).astype(np.float32),
+        quaternions=rng.normal(size=(count, 4)).astype(np.float32),
+        opacity_logits=rng.normal(0, 3, size=count).astype(np.float32),
+        sh_dc=rng.normal(size=(count, 3)).astype(np.float32),
+        sh_rest=rng.normal(size=(count, 3, 3)).astype(np.float32),
+    )
+    views = [view_at([0, 0, -6])]  # sees nearly all, so that no scene is unseen
+    for index in range(1, view_count):
+        rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        views.append(
+            view_at(
+                rng.normal(size=3) * 3,
+                rotation,
+                cx=rng.uniform(20, 80),
+                fy=rng.uniform(30, 70),
+                weight=rng.uniform(0.1, 2),
+                near=rng.choice([0.0, 0.5]),
+                far=rng.choice([4.0, math.inf]),
+                name=str(index),
+            )
+        )
+    return splats, ViewSet(tuple(views))
+
+
+def reference(splats: Splats, views: ViewSet, settings: ClosedForm) -> np.ndarray:
+    """Evaluate the formulas of docs/method.md one splat and one view at a time, in float64."""
+    count = len(splats)
+    weights = [view.weight / sum(view.weight for view in views) for view in views]
+    means = splats.means.astype(float)
+    squared = [
+        sum(w * float(np.sum((p - v.center) ** 2)) for w, v in zip(weights, views, strict=True))
+        for p in means
+    ]
+    size = math.sqrt(float(np.median(squared)))
+    eta = 0.005 * size**2 if settings.eta is None else settings.eta
+    alpha = [1 / (1 + math.exp(-float(x))) for x in splats.opacity_logits]
+    colors = np.clip(0.28209479177387814 * splats.sh_dc.astype(float) + 0.5, 0, 1)
+    luma = [0.299 * r + 0.587 * g + 0.114 * b for r, g, b in colors]
+    terms = np.zeros((3, count))
+    ratios = []
+    for i in range(count):
+        s = sorted(math.exp(float(x)) for x in splats.log_scales[i])
+        if settings.anisotropy_offset is None:
+            ratios.append(min(s[2] / s[0], 1e6))
+        else:
+            ratios.append(s[2] / (s[0] + settings.anisotropy_offset))
+        weight, seen = 0.0, 0
+        for w, view in zip(weights, views, strict=True):
+            x, y, z = view.rotation @ (means[i] - view.center)
+            if settings.frustum:
+                near = view.near if view.near > 0 else 0.01 * size
+                half_x = view.width / 2 * (1 + settings.margin)
+                half_y = view.height / 2 * (1 + settings.margin)
+                if not (near <= z <= view.far):
+                    continue
+                if abs(view.fx * x / z + view.cx - view.width / 2) > half_x:
+                    continue
+                if abs(view.fy * y / z + view.cy - view.height / 2) > half_y:
+                    continue
+            seen += 1
+            d2 = z * z if settings.depth == "z" else x * x + y * y + z * z
+            weight += w / (d2 + eta) if settings.projection else w
+        if settings.frustum and not seen:
+            weight = 1e-6 / (squared[i] + eta) if settings.projection else 1e-6
+        if settings.visibility:
+            weight *= alpha[i]
+        terms[:, i] = weight * s[1] * s[2], weight * luma[i] ** 2, weight * alpha[i] ** 2
+    raw = np.array(
+        [
+            max(math.log(np.mean(ratios) + (settings.anisotropy_offset or 0.0)), 0) / 10.73,
+            100 * np.var(luma) / 56.06,
+            100 * np.mean([4 * a * (1 - a) for a in alpha]) / 100.67,
+        ]
+    )
+    lambdas = np.full(3, 1 / 3) if settings.equal_weights else raw / raw.sum()
+    return lambdas @ (terms / terms.mean(axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("settings", READINGS)
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_scores_equal_a_plain_reference_for_every_setting(seed, settings):
+    """The stored score is float32, so 1e-5 leaves room for its rounding (6e-8) and no more."""
+    splats, views = random_scene(seed)
+    expected = reference(splats, views, settings)
+
+    scores = closed_form.score(splats, views, settings)
+
+    np.testing.assert_allclose(scores.values, expected, rtol=1e-5)
+
+
+def three_splats() -> tuple[Splats, ViewSet]:
+    """Three splats on the axis of one view at depths 1, 2 and 3, opacity 1/2, black, grey, white.
+
+    Scales e^0 = 1 along each axis of the first, so that area 1; 2, 2, 1 of the second: area 4;
+    3, 1, 1 of the third: area 3. Grey is f_dc = 0; +-10 clips to white and black.
+    """
+    logs = np.log([[1, 1, 1], [2, 2, 1], [3, 1, 1]])
+    dc = [[-10] * 3, [0] * 3, [10] * 3]
+    splats = splats_of([[0, 0, 1], [0, 0, 2], [0, 0, 3]], [0.0, 0.0, 0.0], logs, dc)
+    return splats, ViewSet((view_at(),))
+
+
+@pytest.mark.parametrize(
+    ("depth", "eta", "offset"), [("z", 0.05, 0.05), ("distance", 0.5, 1e-6)], ids=["paper", "code"]
+)
+def test_both_published_readings_give_the_numbers_worked_out_by_hand(depth, eta, offset):
+    """On the axis depth and distance agree: d = 1, 2, 3 and H_i = (1/2) / (d^2 + eta).
+
+    Geometry G = 1, 4, 3; colour luma^2 = 0, 1/4, 1; opacity 1/4 each.
+    F_gem = (1/(1 + o) + 2/(1 + o) + 3/(1 + o)) / 3 = 2 / (1 + o); F_col = var(0, 1/2, 1) = 1/6;
+    mean 4 a (1 - a) = 1. So lt = ln(2 / (1 + o) + o) / 10.73, 100 / 6 / 56.06, 100 / 100.67.
+    """
+    splats, views = three_splats()
+    h1, h2, h3 = 0.5 / (1 + eta), 0.5 / (4 + eta), 0.5 / (9 + eta)
+    lt = [math.log(2 / (1 + offset) + offset) / 10.73, 100 / 6 / 56.06, 100 / 100.67]
+    gem, col, opa = (value / sum(lt) for value in lt)
+    mean_gem, mean_col = (h1 + 4 * h2 + 3 * h3) / 3, (h2 / 4 + h3) / 3
+    mean_opa = (h1 + h2 + h3) / 12
+    expected = [
+        gem * h1 / mean_gem + opa * h1 / 4 / mean_opa,
+        gem * 4 * h2 / mean_gem + col * h2 / 4 / mean_col + opa * h2 / 4 / mean_opa,
+        gem * 3 * h3 / mean_gem + col * h3 / mean_col + opa * h3 / 4 / mean_opa,
+    ]
+
+    scores = closed_form.score(splats, views, ClosedForm.published(depth))
+
+    np.testing.assert_allclose(scores.values, expected, rtol=1e-6)
+    assert scores.weights["lambda"] == pytest.approx(
+        {"geometry": gem, "color": col, "opacity": opa}
+    )
+
+
+def test_only_splats_inside_the_frustum_are_seen():
+    """A 90 degree view of margin 0.15 sees |x| <= 1.15 z; near is .01 of the size of the scene."""
+    places = [[0, 0, 2], [2.29, 0, 2], [2.31, 0, 2], [0, -2.31, 2], [0, 0, -2], [0, 0, 0.001]]
+    splats = splats_of(places, 0.0, 0.0)
+
+    scores = closed_form.score(splats, ViewSet((view_at(),)), ClosedForm(margin=0.15))
+
+    assert scores.seen.tolist() == [1, 1, 0, 0, 0, 0]
+
+
+def test_near_and_far_of_the_view_are_honoured():
+    """Depths 1 and 4 lie outside 2 .. 3; both planes belong to the inside."""
+    splats = splats_of([[0, 0, 1], [0, 0, 2], [0, 0, 3], [0, 0, 4]], 0.0, 0.0)
+    views = ViewSet((view_at(near=2.0, far=3.0),))
+
+    assert closed_form.score(splats, views).seen.tolist() == [0, 1, 1, 0]
+
+
+def test_what_no_view_sees_ranks_below_all_that_is_seen_and_nearer_above_farther():
+    """Behind the view: the prior orders by distance, a millionth of what is seen."""
+    splats = splats_of([[0, 0, -9], [0, 0, 90], [0, 0, -3]], 0.0, -3.0)
+
+    values = closed_form.score(splats, ViewSet((view_at(),))).values
+
+    assert values.argsort().tolist() == [0, 2, 1]
+
+
+def test_a_view_of_twice_the_weight_counts_as_two():
+    """The mean over views is weighted, so doubling a view and doubling its weight agree."""
+    splats, views = random_scene(3, view_count=3)
+    first = views[0]
+    double = ViewSet((replace(first, weight=2 * first.weight), *views.views[1:]))
+    twice = ViewSet((first, *views.views))
+
+    np.testing.assert_allclose(
+        closed_form.score(splats, double).values, closed_form.score(splats, twice).values, rtol=1e-6
+    )
+
+
+@given(st.integers(0, 2**32 - 1), st.randoms(use_true_random=False))
+def test_permuting_the_splats_permutes_the_scores(seed, random):
+    """Nothing depends on the order but the last bits of the sums over the scene."""
+    splats, views = random_scene(seed, count=40)
+    order = list(range(40))
+    random.shuffle(order)
+
+    expected = closed_form.score(splats, views).values[order]
+
+    values = closed_form.score(splats.take(np.array(order)), views).values
+    np.testing.assert_allclose(values, expected, rtol=1e-6)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_order_of_views_changes_nothing(seed):
+    """The mean over views is a sum in float64."""
+    splats, views = random_scene(seed, count=40)
+
+    np.testing.assert_allclose(
+        closed_form.score(splats, views.take([3, 0, 4, 1, 2])).values,
+        closed_form.score(splats, views).values,
+        rtol=1e-6,
+    )
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(-6, 6), st.booleans())
+def test_scaling_moving_and_turning_the_scene_keeps_the_scores(seed, exponent, mirrored):
+    """Score, ranking and lambda have no unit: a scene in nanometres ranks like one in kilometres.
+
+    The moved means are float64 here; float32 would move the splats themselves.
+    """
+    splats, views = random_scene(seed, count=60)
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn)) * (-1 if mirrored else 1)
+    scale = 10.0**exponent
+    shift = rng.normal(size=3) * scale * 10
+    moved = replace(
+        splats,
+        means=scale * splats.means.astype(float) @ turn.T + shift,
+        log_scales=splats.log_scales.astype(float) + math.log(scale),
+    )
+    there = ViewSet(
+        tuple(
+            replace(
+                view,
+                rotation=view.rotation @ turn.T,
+                center=scale * turn @ view.center + shift,
+                near=view.near * scale,
+                far=view.far * scale,
+            )
+            for view in views
+        )
+    )
+
+    here = closed_form.score(splats, views)
+    scores = closed_form.score(moved, there)
+
+    np.testing.assert_allclose(scores.values, here.values, rtol=2e-5)
+    assert scores.weights["lambda"] == pytest.approx(here.weights["lambda"], rel=1e-5)
+
+
+@pytest.mark.parametrize(("chunk", "threads", "block"), [(7, 1, 64), (64, 3, 2), (4096, 2, 1)])
+def test_chunks_threads_and_view_blocks_change_nothing(monkeypatch, chunk, threads, block):
+    """Only sums of float64 are split differently."""
+    splats, views = random_scene(5)
+    expected = closed_form.score(splats, views, threads=1)
+    monkeypatch.setattr(closed_form, "_CHUNK", chunk)
+    monkeypatch.setattr(closed_form, "_VIEW_BLOCK", block)
+
+    scores = closed_form.score(splats, views, threads=threads)
+
+    np.testing.assert_allclose(scores.values, expected.values, rtol=1e-6)
+    np.testing.assert_array_equal(scores.seen, expected.seen)
+
+
+def test_views_that_see_nothing_are_refused_with_a_sentence():
+    """The splat stands behind the only camera."""
+    with pytest.raises(RefineError, match="no camera sees the splats"):
+        closed_form.score(splats_of([[0, 0, -1]], 0.0, 0.0), ViewSet((view_at(),)))
+
+
+def test_no_splats_are_refused_with_a_sentence():
+    """An empty file is somebody's mistake, not a result."""
+    with pytest.raises(RefineError, match="no splats"):
+        closed_form.score(splats_of([], 0.0, 0.0), ViewSet((view_at(),)))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"depth": "x"}, {"eta": 0.0}, {"eta": math.nan}, {"anisotropy_offset": -1.0}, {"margin": -1}],
+)
+def test_settings_that_cannot_be_are_refused(changes):
+    """Each message names the setting."""
+    with pytest.raises(RefineError, match=next(iter(changes))):
+        ClosedForm(**changes)
+
+
+def test_a_callback_that_answers_false_cancels():
+    """At any of its calls."""
+    from refine_addon.core import Cancelled  # noqa: PLC0415
+
+    splats, views = random_scene(0)
+    for last in range(2):
+        calls = itertools.count()
+
+        def progress(_fraction, _what, calls=calls, last=last):
+            return next(calls) < last
+
+        with pytest.raises(Cancelled):
+            closed_form.score(splats, views, progress=progress)

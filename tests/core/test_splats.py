@@ -1,0 +1,125 @@
+"""Activations and what counts as drawable."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from refine_addon.core import Splats
+from refine_addon.core.splats import base_color, drawable, opacity, rotation_matrices
+
+
+def one(**changes) -> Splats:
+    values = {
+        "means": np.zeros((1, 3), np.float32),
+        "log_scales": np.zeros((1, 3), np.float32),
+        "quaternions": np.array([[1, 0, 0, 0]], np.float32),
+        "opacity_logits": np.zeros(1, np.float32),
+        "sh_dc": np.zeros((1, 3), np.float32),
+        "sh_rest": np.zeros((1, 15, 3), np.float32),
+    }
+    return Splats(**values | changes)
+
+
+@pytest.mark.parametrize(
+    ("logit", "expected"),
+    [
+        (0.0, 0.5),
+        (np.log(3.0), 0.75),
+        (-np.log(3.0), 0.25),
+        (np.inf, 1.0),
+        (-50.0, 1.9287498479639178e-22),  # e^-50 / (1 + e^-50)
+        (1e3, 1.0),
+    ],
+)
+def test_opacity_is_the_logistic_function(logit, expected):
+    """1 / (1 + e^-x): x = ln 3 gives 1 / (1 + 1/3) = 3/4."""
+    with np.errstate(all="raise"):
+        assert opacity(np.array(logit)) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("logit", [-1e3, -1e30, -np.inf])
+def test_opacity_underflows_silently(logit):
+    """What is below 1e-304 is returned as about that: far below the smallest float32."""
+    with np.errstate(all="raise"):
+        assert 0.0 <= opacity(np.array(logit)) < 1e-303
+
+
+def test_base_color_is_the_constant_harmonic_and_a_half():
+    """0.5 + 0.28209 f_dc: 1 reaches 0.78209, +-1e20 clip."""
+    assert base_color(np.array([1.0, 1e20, -1e20])) == pytest.approx([0.7820947917738781, 1, 0])
+
+
+@pytest.mark.parametrize("length", [1e-300, 1.0, 3.7, 1e300])
+def test_a_quaternion_of_any_length_is_a_rotation(length):
+    """(1, 0, 0, 1) turns a quarter about z: x goes to y."""
+    with np.errstate(all="raise"):
+        matrix = rotation_matrices(length * np.array([1.0, 0.0, 0.0, 1.0]))
+
+    np.testing.assert_allclose(matrix, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
+
+
+@pytest.mark.parametrize("broken", [[0, 0, 0, 0], [np.nan, 0, 0, 0], [np.inf, 1, 0, 0]])
+def test_a_quaternion_that_says_nothing_counts_as_the_identity(broken):
+    """Zero has no direction."""
+    with np.errstate(all="raise"):
+        np.testing.assert_array_equal(rotation_matrices(np.array(broken, float)), np.eye(3))
+
+
+NAMES = ["means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_value_that_is_not_finite_makes_a_splat_undrawable(name, value):
+    """Except opacity 1 (logit +inf) and a flat splat (one log scale -inf)."""
+    values = getattr(one(), name).copy()
+    values.flat[-1] = value
+    fine = (name == "opacity_logits" and value == np.inf) or (
+        name == "log_scales" and value == -np.inf
+    )
+
+    with np.errstate(all="raise"):
+        assert drawable(one(**{name: values})).tolist() == [fine]
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, True),
+        ({"opacity_logits": [-103.0]}, True),  # 1.9e-45, the smallest float32 is 1.4e-45
+        ({"opacity_logits": [-104.0]}, False),
+        ({"log_scales": [[88.7, 0, 0]]}, True),  # 3.3e38, the largest float32 is 3.4e38
+        ({"log_scales": [[88.8, 0, 0]]}, False),
+        ({"log_scales": [[-104, -104, -104]]}, False),
+        ({"log_scales": [[-104, -104, 0]]}, True),
+        ({"log_scales": [[-np.inf, -np.inf, -np.inf]]}, False),
+        ({"means": [[1e39, 0, 0]]}, False),
+    ],
+)
+def test_what_leaves_the_range_of_float32_cannot_be_drawn(changes, expected):
+    """Renderers compute in float32; doubles in a file may hold more."""
+    arrays = {name: np.array(value, float) for name, value in changes.items()}
+
+    with np.errstate(all="raise"):
+        assert drawable(replace(one(), **arrays)).tolist() == [expected]
+
+
+def test_take_keeps_the_order_of_the_index():
+    """Integers, masks and slices, on every array."""
+    splats = one(
+        means=np.arange(9.0).reshape(3, 3),
+        **{name: np.repeat(getattr(one(), name), 3, axis=0) for name in NAMES[1:]},
+    )
+
+    assert splats.take(np.array([2, 0])).means[:, 0].tolist() == [6.0, 0.0]
+    assert splats.take(np.array([True, False, True])).means[:, 0].tolist() == [0.0, 6.0]
+    assert len(splats.take(slice(0, 2)).sh_rest) == 2
+
+
+@pytest.mark.parametrize(("count", "degree"), [(0, 0), (3, 1), (8, 2), (15, 3), (24, 4)])
+def test_the_degree_follows_from_the_number_of_coefficients(count, degree):
+    """(degree + 1)^2 - 1 above the constant."""
+    assert one(sh_rest=np.zeros((1, count, 3))).sh_degree == degree

@@ -1,0 +1,142 @@
+"""Views, view sets and their even subsets."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from refine_addon.core import RefineError, View, ViewSet
+
+
+def view(center=(0.0, 0.0, 0.0), **changes) -> View:
+    values = {"fx": 50.0, "fy": 50.0, "cx": 50.0, "cy": 50.0, "width": 100, "height": 100}
+    rotation = changes.pop("rotation", np.eye(3))
+    return View(rotation, np.array(center, float), **values | changes)
+
+
+def ring(count: int) -> ViewSet:
+    angles = np.arange(count) * 2 * np.pi / count
+    views = []
+    for index, angle in enumerate(angles):
+        c, s = np.cos(angle), np.sin(angle)
+        rotation = np.array([[-s, c, 0], [0, 0, -1], [-c, -s, 0]])  # looks inwards
+        views.append(view([3 * c, 3 * s, 0], rotation=rotation, name=str(index)))
+    return ViewSet(tuple(views))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fx": 0.0}, "focal lengths and image size must be positive"),
+        ({"width": 0}, "focal lengths and image size must be positive"),
+        ({"cx": np.nan}, "must be finite"),
+        ({"near": 2.0, "far": 1.0}, "0 <= near < far"),
+        ({"weight": -1.0}, "weight >= 0"),
+        ({"rotation": np.ones((3, 3))}, "not orthonormal"),
+        ({"rotation": np.full((3, 3), np.inf)}, "must be finite"),
+        ({"rotation": np.eye(2)}, r"expected rotation \(3, 3\)"),
+        ({"center": (np.nan, 0, 0)}, "must be finite"),
+        ({"center": (1e39, 0, 0)}, "float32"),
+    ],
+)
+def test_a_view_that_cannot_be_is_refused_by_name(changes, message):
+    """Every message starts with the view's name."""
+    with pytest.raises(RefineError, match=rf"view 'left'.*{message}"):
+        view(name="left", **changes)
+
+
+def test_a_rotation_rounded_by_a_file_becomes_exactly_orthonormal():
+    """Four decimals are what a text file may leave."""
+    rounded = np.round(ring(7)[1].rotation, 4)
+
+    rotation = view(rotation=rounded).rotation
+
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(rotation, rounded, atol=1e-4)
+
+
+def test_a_mirrored_camera_stays_mirrored():
+    """A determinant of -1 is a flipped picture, not an error."""
+    assert np.linalg.det(view(rotation=np.diag([-1.0, 1, 1])).rotation) == pytest.approx(-1)
+
+
+def test_a_set_needs_a_view_that_counts():
+    """No views, or none with a weight, cannot decide anything."""
+    with pytest.raises(RefineError, match="no cameras"):
+        ViewSet(())
+    with pytest.raises(RefineError, match="weight 0"):
+        ViewSet((view(weight=0.0),))
+
+
+def test_weights_sum_to_one_even_when_their_sum_overflows():
+    """Three of 1e308 are a third each."""
+    with np.errstate(all="raise"):
+        weights = ViewSet(tuple(view(weight=1e308) for _ in range(3))).weights
+
+    np.testing.assert_allclose(weights, [1 / 3] * 3)
+
+
+def test_views_are_found_by_name():
+    """In the order asked for; an unknown name is named."""
+    views = ring(4)
+
+    assert [v.name for v in views.select(["2", "0"])] == ["2", "0"]
+    with pytest.raises(RefineError, match="no view named 'x' among 4 views"):
+        views.select(["x"])
+
+
+def test_a_subset_of_a_ring_is_a_ring():
+    """Farthest-point sampling takes every second of 8 views, or every fourth."""
+    chosen = sorted(int(v.name) for v in ring(8).spread(4))
+    opposite = sorted(int(v.name) for v in ring(8).spread(2))
+
+    assert chosen in ([0, 2, 4, 6], [1, 3, 5, 7])
+    assert opposite[1] - opposite[0] == 4
+
+
+def test_the_subset_does_not_depend_on_order_or_unit():
+    """The same cameras are chosen from a shuffled set and from one a thousand times as large."""
+    rng = np.random.default_rng(3)
+    views = ViewSet(
+        tuple(
+            view(rng.normal(size=3), rotation=np.linalg.qr(rng.normal(size=(3, 3)))[0], name=str(i))
+            for i in range(40)
+        )
+    )
+    expected = {v.name for v in views.spread(9)}
+
+    shuffled = {v.name for v in views.take(rng.permutation(40)).spread(9)}
+    large = ViewSet(tuple(replace(v, center=v.center * 1e3) for v in views))
+
+    assert shuffled == expected
+    assert {v.name for v in large.spread(9)} == expected
+
+
+def test_subsets_are_nested_so_that_more_views_only_add():
+    """The sampling is greedy from one start."""
+    views = ring(12)
+
+    assert {v.name for v in views.spread(3)} < {v.name for v in views.spread(6)}
+
+
+@pytest.mark.parametrize("count", [0, 5, 9])
+def test_all_views_stay_where_all_are_asked_for(count):
+    """0 means all; so does any number not below the size of the set."""
+    assert len(ring(5).spread(count)) == 5
+
+
+def test_views_of_weight_zero_are_never_used():
+    """They would cost time and change nothing."""
+    views = ViewSet((view(weight=0.0, name="off"), view([1, 0, 0], name="on")))
+
+    assert [v.name for v in views.spread(0)] == ["on"]
+
+
+def test_cameras_in_one_place_are_spread_by_direction():
+    """A panorama's cameras share their centre."""
+    rotations = [np.eye(3), np.diag([1.0, -1, -1]), np.eye(3)]
+    views = ViewSet(tuple(view(rotation=r, name=str(i)) for i, r in enumerate(rotations)))
+
+    assert len({tuple(v.rotation[2]) for v in views.spread(2)}) == 2
