@@ -1,0 +1,87 @@
+"""Camera models that files name, and what is told about those that are no pinholes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+
+@dataclass(frozen=True)
+class Model:
+    """A camera model: first its focal lengths, then cx, cy, then what is not modelled here.
+
+    Attributes
+    ----------
+    name : str
+        As in ``cameras.txt``.
+    focals : int
+        1 if fx = fy; 0 if there is none: a panorama.
+    count : int
+        Number of parameters.
+    fisheye : bool
+        Whether the angle, not its tangent, grows with the distance from the centre.
+    """
+
+    name: str
+    focals: int
+    count: int
+    fisheye: bool = False
+
+
+MODELS = {
+    0: Model("SIMPLE_PINHOLE", 1, 3),
+    1: Model("PINHOLE", 2, 4),
+    2: Model("SIMPLE_RADIAL", 1, 4),
+    3: Model("RADIAL", 1, 5),
+    4: Model("OPENCV", 2, 8),
+    5: Model("OPENCV_FISHEYE", 2, 8, fisheye=True),
+    6: Model("FULL_OPENCV", 2, 12),
+    7: Model("FOV", 2, 5),
+    8: Model("SIMPLE_RADIAL_FISHEYE", 1, 4, fisheye=True),
+    9: Model("RADIAL_FISHEYE", 1, 5, fisheye=True),
+    10: Model("THIN_PRISM_FISHEYE", 2, 12, fisheye=True),
+    11: Model("RAD_TAN_THIN_PRISM_FISHEYE", 2, 16, fisheye=True),
+    12: Model("SIMPLE_DIVISION", 1, 4),
+    13: Model("DIVISION", 2, 5),
+    14: Model("SIMPLE_FISHEYE", 1, 3, fisheye=True),
+    15: Model("FISHEYE", 2, 4, fisheye=True),
+    16: Model("EUCM", 2, 6),
+    17: Model("EQUIRECTANGULAR", 0, 2),
+}
+"""COLMAP's camera models by their number in ``cameras.bin``."""
+
+MODELS_BY_NAME = {model.name: model for model in MODELS.values()}
+
+
+FISHEYE624 = Model("FISHEYE624", 1, 15, fisheye=True)
+"""nerfstudio's name for Project Aria's lenses; COLMAP has no number for it."""
+
+PANORAMAS = {
+    *("EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R"),
+    *("VR180_L", "VR180_R", "ORTHOPHOTO"),
+}
+"""Models of nerfstudio and COLMAP that no pinhole comes near."""
+
+
+def lens_note(counts: Mapping[Model, int], thing: str) -> str:
+    """Return what to tell about lenses that are no pinholes, or "".
+
+    Parameters
+    ----------
+    counts : mapping of Model to int
+        How many there are of each model.
+    thing : str
+        Of what, in the singular.
+    """
+    notes = []
+    for model, count in counts.items():
+        things = f"{count} {thing}{'s' if count > 1 else ''}"
+        if model.fisheye:
+            note = f"{things} (fisheye, {model.name}) taken as pinhole: wrong away from the centre"
+        else:
+            note = f"distortion of {things} ignored (model {model.name})"
+        notes.append(note)
+    return "; ".join(notes)

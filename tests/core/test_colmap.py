@@ -1,0 +1,496 @@
+"""COLMAP models, text and binary."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from refine_addon.core import RefineError, read_cameras
+
+POSE = (0.5, 0.5, 0.5, -0.5, -2, 3, 1)
+"""The camera of `test_camera_files.test_every_format_gives_the_same_view`."""
+
+POINT = np.array([-1.0, 2.5, 2.75])
+
+MODELS = [
+    ("SIMPLE_PINHOLE", 0, "f cx cy"),
+    ("PINHOLE", 1, "fx fy cx cy"),
+    ("SIMPLE_RADIAL", 2, "f cx cy k"),
+    ("RADIAL", 3, "f cx cy k k"),
+    ("OPENCV", 4, "fx fy cx cy k k p p"),
+    ("OPENCV_FISHEYE", 5, "fx fy cx cy k k k k"),
+    ("FULL_OPENCV", 6, "fx fy cx cy k k p p k k k k"),
+    ("FOV", 7, "fx fy cx cy omega"),
+    ("SIMPLE_RADIAL_FISHEYE", 8, "f cx cy k"),
+    ("RADIAL_FISHEYE", 9, "f cx cy k k"),
+    ("THIN_PRISM_FISHEYE", 10, "fx fy cx cy k k p p k k s s"),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 11, "fx fy cx cy k k k k k k p p s s s s"),
+    ("SIMPLE_DIVISION", 12, "f cx cy k"),
+    ("DIVISION", 13, "fx fy cx cy k"),
+    ("SIMPLE_FISHEYE", 14, "f cx cy"),
+    ("FISHEYE", 15, "fx fy cx cy"),
+    ("EUCM", 16, "fx fy cx cy alpha beta"),
+]
+"""Name, number and parameters, as COLMAP's ``src/colmap/sensor/models`` lists them."""
+
+VALUES = {"f": 100, "fx": 100, "fy": 120, "cx": 30.5, "cy": 24}
+
+PINHOLE = (1, 1, 64, 48, (100, 120, 32, 24))
+IMAGE = (1, POSE, 1, "a.png", 0)
+
+
+@pytest.fixture(autouse=True)
+def _loud_numpy():
+    with np.errstate(all="raise"):
+        yield
+
+
+# Tiny writers: cameras as (id, model, width, height, parameters), images as
+# (id, pose, camera id, name, number of points) -------------------------------------------------
+
+
+def binary_cameras(cameras):
+    data = struct.pack("<Q", len(cameras))
+    for camera_id, model, width, height, values in cameras:
+        data += struct.pack("<IiQQ", camera_id, model, width, height)
+        data += struct.pack(f"<{len(values)}d", *values)
+    return data
+
+
+def binary_images(images):
+    data = struct.pack("<Q", len(images))
+    for image_id, pose, camera_id, name, points in images:
+        data += struct.pack("<I7dI", image_id, *pose, camera_id)
+        data += name.encode() + b"\0" + struct.pack("<Q", points)
+        data += struct.pack("<ddQ", 1.5, 2.5, 2**64 - 1) * points
+    return data
+
+
+def text_cameras(cameras):
+    names = {number: name for name, number, _ in MODELS}
+    lines = ["# Camera list with one line of data per camera:"]
+    for camera_id, model, width, height, values in cameras:
+        lines.append(f"{camera_id} {names[model]} {width} {height} {' '.join(map(repr, values))}")
+    return ("\n".join(lines) + "\n").encode()
+
+
+def text_images(images):
+    lines = ["# Image list with two lines of data per image:", "#   POINTS2D[] as (X, Y, ID)"]
+    for image_id, pose, camera_id, name, points in images:
+        lines += [f"{image_id} {' '.join(map(repr, pose))} {camera_id} {name}"]
+        lines += [" ".join(["1.5 2.5 -1"] * points)]
+    return ("\n".join(lines) + "\n").encode()
+
+
+WRITERS = {".bin": (binary_cameras, binary_images), ".txt": (text_cameras, text_images)}
+
+
+def write(folder, suffix, cameras=(PINHOLE,), images=(IMAGE,)):
+    """Write a model; `cameras` and `images` may also be the bytes of the file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for stem, things, writer in zip(
+        ("cameras", "images"), (cameras, images), WRITERS[suffix], strict=True
+    ):
+        data = things if isinstance(things, bytes) else writer(things)
+        (folder / f"{stem}{suffix}").write_bytes(data)
+    return folder
+
+
+def refused(folder, file):
+    """Return the message, which names the file."""
+    with pytest.raises(RefineError) as caught:
+        read_cameras(folder)
+    message = str(caught.value)
+
+    assert message.startswith(f"{folder / file}: ")
+
+    return message
+
+
+def project(view, point):
+    x, y, z = view.rotation @ (point - view.center)
+    return [view.fx * x / z + view.cx, view.fy * y / z + view.cy]
+
+
+both = pytest.mark.parametrize("suffix", [".bin", ".txt"])
+
+
+# What is read ----------------------------------------------------------------------------------
+
+
+@both
+def test_a_point_lands_on_the_pixel_derived_by_hand(tmp_path, suffix):
+    """(57, 39), by the docstring of `test_every_format_gives_the_same_view`."""
+    (view,) = read_cameras(write(tmp_path, suffix))
+
+    assert project(view, POINT) == pytest.approx([57, 39], abs=1e-12)
+
+
+@both
+def test_the_upper_left_corner_of_the_image_is_the_origin(tmp_path, suffix):
+    """COLMAP's centre of a 64 x 48 image is (32, 24) as is ours, so it is not shifted by 0.5."""
+    (view,) = read_cameras(write(tmp_path, suffix))
+
+    assert (view.cx, view.cy) == (view.width / 2, view.height / 2)
+
+
+@both
+@pytest.mark.parametrize(("name", "number", "layout"), MODELS)
+def test_every_camera_model_gives_its_pinhole(tmp_path, suffix, name, number, layout):
+    """A second camera follows, which is found only if the number of parameters is right."""
+    values = [VALUES.get(key, 0) for key in layout.split()]
+    cameras = [(5, number, 64, 48, values), PINHOLE]
+    images = [(1, POSE, 5, "a", 3), (2, POSE, 1, "b", 0)]
+
+    views = read_cameras(write(tmp_path, suffix, cameras, images))
+
+    assert (views[0].fx, views[0].fy) == (100, 120 if "fy" in layout else 100)
+    assert (views[0].cx, views[0].cy) == (30.5, 24)
+    assert (views[1].cx, views[1].cy) == (32, 24)
+    fisheye = f"1 camera (fisheye, {name}) taken as pinhole: wrong away from the centre"
+    assert views.note == (fisheye if "FISHEYE" in name else "")
+
+
+@both
+@pytest.mark.parametrize(("name", "number", "layout"), MODELS[2:])
+def test_distortion_is_ignored_and_noted(tmp_path, suffix, name, number, layout):
+    """Only cameras that an image uses count: here two of three."""
+    values = [VALUES.get(key, 0.01) for key in layout.split()]
+    cameras = [(index, number, 64, 48, values) for index in (1, 2, 3)]
+    images = [(index, POSE, 1 + index % 2, f"{index}", 0) for index in range(5)]
+
+    views = read_cameras(write(tmp_path, suffix, cameras, images))
+
+    fisheye = f"2 cameras (fisheye, {name}) taken as pinhole: wrong away from the centre"
+    distorted = f"distortion of 2 cameras ignored (model {name})"
+    assert views.note == (fisheye if "FISHEYE" in name else distorted)
+
+
+@both
+def test_several_models_are_noted_one_by_one(tmp_path, suffix):
+    cameras = [(1, 2, 64, 48, [9, 32, 24, 0.1]), (2, 4, 64, 48, [9, 9, 32, 24, 0, 0, 0, 1])]
+    images = [(1, POSE, 1, "a", 0), (2, POSE, 2, "b", 0)]
+
+    assert read_cameras(write(tmp_path, suffix, cameras, images)).note == (
+        "distortion of 1 camera ignored (model SIMPLE_RADIAL); "
+        "distortion of 1 camera ignored (model OPENCV)"
+    )
+
+
+@both
+def test_views_are_sorted_by_name_whatever_the_order_of_the_file(tmp_path, suffix):
+    images = [(3, POSE, 1, "b/2.png", 1), (1, POSE, 1, "c 3.png", 0), (2, POSE, 1, "a.png", 2)]
+
+    views = read_cameras(write(tmp_path, suffix, [PINHOLE], images))
+
+    assert [view.name for view in views] == ["a.png", "b/2.png", "c 3.png"]
+
+
+@both
+def test_images_of_one_name_stand_in_the_order_of_their_ids(tmp_path, suffix):
+    images = [(9, (*POSE[:6], 9), 1, "a", 0), (4, (*POSE[:6], 4), 1, "a", 0)]
+
+    views = read_cameras(write(tmp_path, suffix, [PINHOLE], images))
+
+    assert [(view.rotation @ -view.center)[2] for view in views] == pytest.approx([4, 9])
+
+
+@both
+def test_a_quaternion_of_any_length_and_sign_is_the_same_rotation(tmp_path, suffix):
+    poses = [tuple(factor * value for value in POSE[:4]) + POSE[4:] for factor in (1, -3, 1e-8)]
+    images = [(index, pose, 1, "a", 0) for index, pose in enumerate(poses)]
+
+    for view in read_cameras(write(tmp_path, suffix, [PINHOLE], images)):
+        assert project(view, POINT) == pytest.approx([57, 39], abs=1e-9)
+
+
+@both
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(
+    quaternion=st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: max(map(abs, q)) > 1e-3),
+    center=st.tuples(*[st.floats(-1e6, 1e6)] * 3),
+)
+def test_any_pose_survives_a_round_trip(tmp_path, suffix, quaternion, center):
+    """Rotating the basis by q v q* (the definition) gives the columns of R; t = -R c."""
+    w, *axis = np.where(np.abs(quaternion) < 1e-9, 0, quaternion) / np.linalg.norm(quaternion)
+    basis = np.eye(3)
+    # q v q* = v + 2 w (a x v) + 2 a x (a x v)
+    once = np.cross(axis, basis)
+    rotation = (basis + 2 * w * once + 2 * np.cross(axis, once)).T
+    center = np.where(np.abs(center) < 1e-9, 0, center)
+    pose = [float(value) for value in (w, *axis, *(-rotation @ center))]
+
+    (view,) = read_cameras(write(tmp_path, suffix, [PINHOLE], [(1, pose, 1, "a", 0)]))
+
+    np.testing.assert_allclose(view.rotation, rotation, atol=1e-12)
+    np.testing.assert_allclose(view.center, center, atol=1e-8)
+
+
+def test_binary_is_preferred_to_text_as_by_colmap_itself(tmp_path):
+    write(tmp_path, ".bin", images=[(1, POSE, 1, "binary", 0)])
+    write(tmp_path, ".txt", images=[(1, POSE, 1, "text", 0)])
+
+    assert read_cameras(tmp_path)[0].name == "binary"
+    assert read_cameras(tmp_path / "images.txt")[0].name == "text"
+
+
+@both
+@pytest.mark.parametrize("stem", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_any_file_of_the_model_leads_to_it(tmp_path, suffix, stem):
+    """Rigs and frames of newer models lie beside; the poses are in images all the same."""
+    write(tmp_path, suffix)
+    (tmp_path / f"{stem}{suffix}").touch()
+
+    assert read_cameras(tmp_path / f"{stem}{suffix}")[0].name == "a.png"
+
+
+@pytest.mark.parametrize(
+    "images",
+    [
+        b"1 0.5 0.5 0.5 -0.5 -2 3 1 1 a.png",
+        b"1 0.5 0.5 0.5 -0.5 -2 3 1 1 a.png\n",
+        b"\n\n1 0.5 0.5 0.5 -0.5 -2 3 1 1 a.png\r\n\r\n\r\n",
+        b"\xef\xbb\xbf# Images\n1  0.5 0.5 0.5\t-0.5 -2 3 1 1 a.png \n1 2 -1 3 4 5\n",
+    ],
+)
+def test_the_line_of_points_may_be_empty_or_absent(tmp_path, images):
+    (view,) = read_cameras(write(tmp_path, ".txt", images=images))
+
+    assert project(view, POINT) == pytest.approx([57, 39], abs=1e-12)
+    assert view.name == "a.png"
+
+
+def test_an_image_without_points_does_not_swallow_the_next(tmp_path):
+    images = [(1, POSE, 1, "a", 0), (2, POSE, 1, "b", 0), (3, POSE, 1, "c", 40)]
+
+    assert len(read_cameras(write(tmp_path, ".txt", [PINHOLE], images))) == 3
+
+
+# What is refused -------------------------------------------------------------------------------
+
+
+@both
+@pytest.mark.parametrize("file", ["cameras", "images"])
+def test_an_empty_file_is_refused(tmp_path, suffix, file):
+    write(tmp_path, suffix, **{file: b""})
+
+    assert "the file is empty, expected a COLMAP model" in refused(tmp_path, f"{file}{suffix}")
+
+
+@both
+@pytest.mark.parametrize("file", ["cameras", "images"])
+def test_a_missing_half_is_named(tmp_path, suffix, file):
+    write(tmp_path, suffix)
+    (tmp_path / f"{file}{suffix}").unlink()
+    (tmp_path / f"points3D{suffix}").touch()
+
+    with pytest.raises(RefineError) as caught:
+        read_cameras(tmp_path / f"points3D{suffix}")
+
+    assert str(caught.value).startswith(f"{tmp_path / file}{suffix}: cannot be read (")
+
+
+@both
+@pytest.mark.parametrize(
+    ("key", "value", "problem"),
+    [
+        (0, float("nan"), "QW: expected a finite number up to 1e18, got NaN"),
+        (4, float("inf"), "TX: expected a finite number up to 1e18, got Infinity"),
+        (6, -1e300, "TZ: expected a finite number up to 1e18, got -1e+300"),
+    ],
+)
+def test_a_wrong_pose_is_named_with_the_image(tmp_path, suffix, key, value, problem):
+    pose = [*POSE[:key], value, *POSE[key + 1 :]]
+    write(tmp_path, suffix, images=[IMAGE, (2, pose, 1, "b", 0)])
+
+    message = refused(tmp_path, f"images{suffix}")
+
+    assert "image row 1 " in message
+    assert problem in message
+
+
+@both
+def test_a_zero_quaternion_is_no_rotation(tmp_path, suffix):
+    write(tmp_path, suffix, images=[(1, (0, 0, 0, 0, 1, 2, 3), 1, "a", 0)])
+
+    assert "image row 0" in refused(tmp_path, f"images{suffix}")
+    assert "expected a quaternion (w, x, y, z)" in refused(tmp_path, f"images{suffix}")
+
+
+@both
+def test_an_image_of_an_unknown_camera_is_named(tmp_path, suffix):
+    write(tmp_path, suffix, images=[IMAGE, (2, POSE, 7, "b", 0)])
+
+    message = refused(tmp_path, f"images{suffix}")
+
+    assert "image row 1" in message
+    assert f"refers to camera 7, expected one of the 1 in cameras{suffix}" in message
+
+
+@both
+def test_a_camera_that_is_there_twice_is_refused(tmp_path, suffix):
+    write(tmp_path, suffix, [PINHOLE, PINHOLE])
+
+    assert "camera 1 is there twice" in refused(tmp_path, f"cameras{suffix}")
+
+
+@both
+@pytest.mark.parametrize(
+    ("camera", "problem"),
+    [
+        ((1, 1, 0, 48, (100, 120, 32, 24)), "width: expected a whole number of pixels"),
+        ((1, 1, 64, 2**64 - 1, (100, 120, 32, 24)), "height: expected a finite number up to 1e18"),
+        ((1, 1, 64, 48, (100, 0.0, 32, 24)), "focal length: expected a positive focal length"),
+        ((1, 1, 64, 48, (100, 120, float("nan"), 24)), "parameter 2: expected a finite number"),
+        ((1, 2, 64, 48, (100, 32, 24, float("inf"))), "parameter 3: expected a finite number"),
+    ],
+)
+def test_a_wrong_camera_is_named_with_its_place(tmp_path, suffix, camera, problem):
+    write(tmp_path, suffix, [(9, *PINHOLE[1:]), camera])
+
+    message = refused(tmp_path, f"cameras{suffix}")
+
+    assert ("line 3" if suffix == ".txt" else "camera row 1 at byte 64") in message
+    assert problem in message
+
+
+def test_panoramas_are_refused(tmp_path):
+    write(tmp_path, ".bin", [(1, 17, 64, 48, (64, 48))] * 2)
+
+    assert "EQUIRECTANGULAR is a panorama" in refused(tmp_path, "cameras.bin")
+
+
+@pytest.mark.parametrize("number", [-1, 18, 2**31 - 1])
+def test_an_unknown_model_number_is_named(tmp_path, number):
+    """Its parameters cannot be counted, so nothing behind it can be read either."""
+    write(tmp_path, ".bin", [PINHOLE, (2, number, 64, 48, (1, 2, 3, 4))])
+
+    message = refused(tmp_path, "cameras.bin")
+
+    assert f"camera row 1 at byte 64: unknown camera model {number}, expected 0 to 17" in message
+
+
+@both
+def test_no_image_at_all_is_refused(tmp_path, suffix):
+    write(tmp_path, suffix, images=[])
+
+    assert "no registered image, expected at least one" in refused(tmp_path, f"images{suffix}")
+
+
+@pytest.mark.parametrize("file", ["cameras", "images"])
+def test_a_binary_cut_off_at_any_byte_is_refused(tmp_path, file):
+    """The message tells the byte where the missing part should have started."""
+    write(tmp_path, ".bin", [PINHOLE, (2, 0, 8, 8, (1, 2, 3))], [IMAGE, (2, POSE, 2, "b", 2)])
+    whole = (tmp_path / f"{file}.bin").read_bytes()
+    for length in range(1, len(whole)):
+        (tmp_path / f"{file}.bin").write_bytes(whole[:length])
+
+        message = refused(tmp_path, f"{file}.bin")
+
+        assert "truncated: " in message
+        assert int(message.split(": byte ")[1].split(":")[0]) <= length
+
+
+@pytest.mark.parametrize("count", [2, 2**32, 2**63, 2**64 - 1])
+@pytest.mark.parametrize("file", ["cameras", "images"])
+def test_a_count_that_the_file_does_not_back_allocates_nothing(tmp_path, file, count):
+    write(tmp_path, ".bin")
+    path = tmp_path / f"{file}.bin"
+    path.write_bytes(struct.pack("<Q", count) + path.read_bytes()[8:])
+
+    message = refused(tmp_path, path.name)
+
+    assert f"truncated: number of {file}: {count} of at least " in message
+
+
+@pytest.mark.parametrize("count", [1, 2**32, 2**63, 2**64 - 1])
+def test_a_count_of_points_that_the_file_does_not_back_is_refused(tmp_path, count):
+    data = binary_images([IMAGE])
+    write(tmp_path, ".bin", images=data[:-8] + struct.pack("<Q", count))
+
+    assert f"truncated: {count} points of image row 0" in refused(tmp_path, "images.bin")
+
+
+def test_a_name_without_end_is_refused(tmp_path):
+    data = binary_images([IMAGE])
+    write(tmp_path, ".bin", images=data[: 8 + 64] + b"x" * 100)
+
+    message = refused(tmp_path, "images.bin")
+
+    assert "byte 72: truncated: name of image row 0: expected a zero byte" in message
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        ("1", "unknown camera model '', expected SIMPLE_PINHOLE, "),
+        ("1 LENS 64 48 1 2 3", "unknown camera model 'LENS'"),
+        ("1 PINHOLE 64 48 100 120 32", "4 parameters of PINHOLE, got 5 numbers"),
+        ("1 PINHOLE 64 48 100 120 32 24 0", "4 parameters of PINHOLE, got 7 numbers"),
+        ("1 PINHOLE 64 48 100 120 32 x", "expected a number, got 'x'"),
+        ("1.5 PINHOLE 64 48 100 120 32 24", "CAMERA_ID: expected a whole number, got '1.5'"),
+        (f"{'9' * 5000} PINHOLE 64 48 100 120 32 24", "CAMERA_ID: expected a whole number"),
+        ("1 PINHOLE 64.5 48 100 120 32 24", "width: expected a whole number of pixels"),
+        ("\xff", "unknown camera model ''"),
+    ],
+)
+def test_a_wrong_line_of_cameras_is_named(tmp_path, line, problem):
+    write(tmp_path, ".txt", cameras=f"# comment\n\n{line}\n".encode("latin-1"))
+
+    message = refused(tmp_path, "cameras.txt")
+
+    assert "cameras.txt: line 3" in message
+    assert problem in message
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        ("1 1 0 0 0 0 0 0 1", "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"),
+        ("a 1 0 0 0 0 0 0 1 a.png", "IMAGE_ID: expected a whole number, got 'a'"),
+        ("1 1 0 0 0 0 0 0 a a.png", "CAMERA_ID: expected a whole number, got 'a'"),
+        ("1 1 0 0 zero 0 0 0 1 a.png", "expected a number, got 'zero'"),
+    ],
+)
+def test_a_wrong_line_of_images_is_named(tmp_path, line, problem):
+    write(tmp_path, ".txt", images=f"1 1 0 0 0 0 0 0 1 a\n\n{line}\n".encode())
+
+    message = refused(tmp_path, "images.txt")
+
+    assert "images.txt: line 3 image row 1: " in message
+    assert problem in message
+
+
+def test_images_without_their_lines_of_points_are_told(tmp_path):
+    """Else every second image would be taken for the points of the one before, and vanish."""
+    line = b"1 1 0 0 0 0 0 0 1 a\n"
+    write(tmp_path, ".txt", images=line * 4)
+
+    message = refused(tmp_path, "images.txt")
+
+    assert "images.txt: line 2: expected the points of image row 0" in message
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(data=st.data())
+def test_any_damage_gives_views_or_a_located_error(tmp_path, data):
+    """Bytes are replaced, removed or inserted anywhere; there is no other exception."""
+    suffix = data.draw(st.sampled_from([".bin", ".txt"]))
+    stem = data.draw(st.sampled_from(["cameras", "images"]))
+    write(tmp_path, suffix, [PINHOLE, (2, 0, 8, 8, (1, 2, 3))], [IMAGE, (2, POSE, 2, "b", 2)])
+    path = tmp_path / f"{stem}{suffix}"
+    content = path.read_bytes()
+    start = data.draw(st.integers(0, len(content)))
+    end = data.draw(st.integers(start, min(start + 12, len(content))))
+    path.write_bytes(content[:start] + data.draw(st.binary(max_size=12)) + content[end:])
+    try:
+        views = read_cameras(tmp_path)
+    except RefineError as error:
+        assert str(error).startswith(str(tmp_path))  # noqa: PT017
+    else:
+        assert np.isfinite(views.rotations).all()
+        assert np.isfinite(views.centers).all()
