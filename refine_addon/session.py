@@ -1,0 +1,342 @@
+"""What the panel and the command do to an object: score, store, plan, apply, export.
+
+Every function either does all it says or raises `RefineError` and leaves the scene as it was.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import numpy as np
+
+from . import mesh_adapter, mesh_edit
+from .camera_objects import world_matrix
+from .core import pipeline
+from .core.errors import RefineError
+from .core.files import refuse_existing
+from .core.pipeline import Settings
+from .core.ply import columns_from_splats
+from .core.selection import select
+from .core.transform import transformed
+from .core.work import Progress, part, silent
+from .mesh_layout import check
+from .score_attributes import RECORD, store, stored_scores
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .core.ply import SplatFile
+    from .core.scores import Scores
+    from .core.selection import Budget
+    from .core.splats import Splats
+    from .core.views import ViewSet
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a budget would do to an object.
+
+    Attributes
+    ----------
+    kept, removed : int
+        Splats that stay and go.
+    bytes_before, bytes_after : int
+        Size of the exported file.
+    """
+
+    kept: int
+    removed: int
+    bytes_before: int
+    bytes_after: int
+
+
+def gather(obj: bpy.types.Object) -> Splats:
+    """Return an object's splats as they stand in the world, for scoring.
+
+    Modifiers are not looked at: what is scored is what is exported.
+
+    Raises
+    ------
+    RefineError
+        If the object holds no splats, or its matrix cannot be applied.
+    """
+    check(obj)
+    matrix = world_matrix(obj, bpy.context.evaluated_depsgraph_get())
+    splats = mesh_adapter.splats_from_object(obj, sh_rest=False)
+    if np.array_equal(matrix, np.eye(4)):
+        return splats
+    return transformed(splats, matrix, rotate_sh=False)
+
+
+def score_object(
+    obj: bpy.types.Object,
+    views: ViewSet,
+    settings: Settings | None = None,
+    progress: Progress = silent,
+) -> Scores:
+    """Score an object's splats and store the result on its mesh.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+    views : ViewSet
+        In the world's frame.
+    settings : Settings, optional
+    progress : callable, optional
+
+    Returns
+    -------
+    Scores
+
+    Raises
+    ------
+    RefineError
+        If the object holds no splats or cannot be written to, or no view sees any of them.
+    Cancelled
+        If `progress` answers ``False``.
+    """
+    settings = settings or Settings()
+    mesh_edit.check_writable(obj)
+    scores = pipeline.score(gather(obj), views, settings, progress=progress)
+    store(obj, scores, views, settings)
+    return scores
+
+
+def keep_mask(obj: bpy.types.Object, budget: Budget, protect: str = "") -> NDArray[np.bool_]:
+    """Return which splats of a scored object stay.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+    budget : Budget
+    protect : str
+        Name of a boolean point attribute or a vertex group: what is in it stays.
+
+    Raises
+    ------
+    RefineError
+        If the object was not scored, has nothing named `protect`, or nothing would stay.
+    """
+    row_bytes, fixed_bytes = mesh_adapter.file_size(obj)
+    return select(
+        stored_scores(obj),
+        budget,
+        protected=mesh_edit.protected_mask(obj, protect) if protect else None,
+        row_bytes=row_bytes,
+        fixed_bytes=fixed_bytes,
+    )
+
+
+def plan(obj: bpy.types.Object, budget: Budget, protect: str = "") -> Plan:
+    """Return what `apply_object` would do, and mark the splats that would go."""
+    keep = keep_mask(obj, budget, protect)
+    mesh_edit.check_writable(obj)
+    mesh_adapter.write_attribute(obj.data, mesh_edit.REMOVE, "BOOLEAN", ~keep)
+    obj.data.update()
+    return _plan(obj, keep)
+
+
+def apply_object(obj: bpy.types.Object, budget: Budget, protect: str = "") -> Plan:
+    """Delete the splats that a budget does not keep, by the scores that the object holds.
+
+    Everything else of the object and its mesh stays: attributes, vertex groups, custom properties,
+    materials, modifiers. The scores stay to be looked at, but the next apply asks for new ones.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+    budget : Budget
+    protect : str
+        See `keep_mask`.
+
+    Returns
+    -------
+    Plan
+        What was done.
+
+    Raises
+    ------
+    RefineError
+        See `keep_mask` and `mesh_edit.check_deletable`.
+    """
+    mesh_edit.check_deletable(obj)
+    keep = keep_mask(obj, budget, protect)
+    done = _plan(obj, keep)
+    mesh_edit.delete_vertices(obj, ~keep)
+    del obj.data[RECORD]
+    return done
+
+
+def export_object(
+    obj: bpy.types.Object,
+    path: Path | str,
+    *,
+    keep: NDArray[np.bool_] | None = None,
+    apply_transform: bool = False,
+    overwrite: bool = False,
+) -> SplatFile:
+    """Write an object as a 3DGS PLY, in the layout of the file it was imported from.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+    path : path-like
+    keep : (N,) bool, optional
+        Which splats to write; all by default.
+    apply_transform : bool
+        Whether to write the splats as they stand in the world, harmonics turned with them.
+    overwrite : bool
+        Whether `path` may be replaced.
+
+    Returns
+    -------
+    SplatFile
+        What was written, all rows.
+
+    Raises
+    ------
+    RefineError
+        If the object holds no splats, its scale is uneven and is to be applied, or the file cannot
+        be written; nothing is written then.
+    """
+    target = Path(path).expanduser()
+    check(obj)
+    refuse_existing(target, overwrite=overwrite)
+    file = mesh_adapter.file_from_object(obj, _world_columns(obj) if apply_transform else None)
+    file.write(target, keep, overwrite=overwrite)
+    return file
+
+
+def prune_object(  # noqa: PLR0913 - the command's options
+    name: str,
+    views: ViewSet,
+    budget: Budget,
+    settings: Settings,
+    *,
+    output: Path | None = None,
+    save: bool = False,
+    dry_run: bool = False,
+    overwrite: bool = False,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Prune an object of the open scene, export what stays, save the .blend.
+
+    Parameters
+    ----------
+    name : str
+        Of the object.
+    views, budget, settings, progress
+        See `refine_addon.core.pipeline.prune`.
+    output : Path, optional
+        The PLY file to make.
+    save : bool
+        Whether to delete the splats from the object and save the .blend.
+    dry_run : bool
+        Whether to decide only.
+    overwrite : bool
+        Whether `output` may be replaced.
+
+    Returns
+    -------
+    dict
+        The report, as of `refine_addon.core.pipeline.prune_file`.
+
+    Raises
+    ------
+    RefineError
+        See `score_object`, `apply_object` and `export_object`; also if there is no such object, or
+        the .blend cannot be saved.
+    """
+    start = time.perf_counter()
+    obj = _find(name)
+    target = None if output is None or dry_run else Path(output).expanduser()
+    if target is not None:
+        refuse_existing(target, overwrite=overwrite)
+    if save and not dry_run:
+        _check_savable(obj)
+    row_bytes, fixed_bytes = mesh_adapter.file_size(obj)
+    splats = gather(obj)
+    read = time.perf_counter()
+    result = pipeline.prune(
+        splats,
+        views,
+        budget,
+        settings,
+        row_bytes=row_bytes,
+        fixed_bytes=fixed_bytes,
+        progress=part(progress, 0.0, 0.8),
+    )
+    decided = time.perf_counter()
+    sizes = _plan(obj, result.keep)
+    if target is not None:
+        export_object(obj, target, keep=result.keep, overwrite=overwrite)
+    if save and not dry_run:
+        store(obj, result.scores, views, settings)
+        mesh_edit.delete_vertices(obj, ~result.keep)
+        del obj.data[RECORD]
+        _save()
+    timings = result.report["timings"]
+    timings["read_s"] = read - start
+    timings["write_s"] = time.perf_counter() - decided
+    timings["total_s"] = time.perf_counter() - start
+    result.report["files"] = {
+        "input": f"{bpy.data.filepath}#{name}",
+        "output": None if target is None else str(target),
+        "input_bytes": sizes.bytes_before,
+        "output_bytes": sizes.bytes_after,
+    }
+    return result.report
+
+
+def _plan(obj: bpy.types.Object, keep: NDArray[np.bool_]) -> Plan:
+    row_bytes, fixed_bytes = mesh_adapter.file_size(obj)
+    kept = int(np.count_nonzero(keep))
+    # The header says how many splats follow, in as many digits as that takes.
+    shorter = len(str(len(keep))) - len(str(kept))
+    sizes = (fixed_bytes + row_bytes * len(keep), fixed_bytes - shorter + row_bytes * kept)
+    return Plan(kept, len(keep) - kept, *sizes)
+
+
+def _world_columns(obj: bpy.types.Object) -> dict[str, NDArray[Any]]:
+    """Return the columns that the object's matrix changes, as they are in the world."""
+    matrix = world_matrix(obj, bpy.context.evaluated_depsgraph_get())
+    if np.array_equal(matrix, np.eye(4)):
+        return {}
+    moved = transformed(mesh_adapter.splats_from_object(obj), matrix)
+    columns: dict[str, NDArray[Any]] = dict(columns_from_splats(moved))
+    layout = check(obj)
+    if {"nx", "ny", "nz"} <= {column.name for column in layout.columns}:
+        normals = mesh_adapter.normals(obj, layout) @ np.linalg.inv(matrix[:3, :3])
+        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+        normals = normals / np.where(lengths > 0.0, lengths, 1.0)  # most files store zeros
+        columns.update(zip(("nx", "ny", "nz"), normals.T, strict=True))
+    return columns
+
+
+def _find(name: str) -> bpy.types.Object:
+    obj = bpy.context.scene.objects.get(name)
+    if obj is None:
+        names = [o.name for o in bpy.context.scene.objects if mesh_adapter.looks_like_splats(o)]
+        there = ", ".join(names[:8]) or "none"
+        msg = f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {there})"
+        raise RefineError(msg)
+    return obj
+
+
+def _check_savable(obj: bpy.types.Object) -> None:
+    mesh_edit.check_deletable(obj)
+    if not bpy.data.filepath:
+        msg = "the scene is not saved in a .blend file yet: --save has nowhere to save to"
+        raise RefineError(msg)
+
+
+def _save() -> None:
+    try:
+        bpy.ops.wm.save_mainfile()
+    except RuntimeError as error:
+        msg = f"{bpy.data.filepath}: cannot be saved ({str(error).strip()})"
+        raise RefineError(msg) from error
