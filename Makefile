@@ -1,0 +1,56 @@
+# Every way to run things. `make demo` and `make test` set up all they need.
+
+PY := .venv/bin/python
+# What decides what .venv holds; `touch`ed markers say that it holds it.
+DEV := .venv/.dev
+BENCH := .venv/.bench
+
+.PHONY: demo test test-core test-numpy test-e2e check build bench bench-trade fuzz mutants clean
+
+demo: $(DEV)          ## the main job: the committed room, its cameras, half of it pruned, into out/
+	$(PY) docs/demo.py
+
+test: $(DEV)          ## core and add-on tests
+	$(PY) -m pytest
+
+test-core: $(DEV)     ## without Blender, seconds
+	$(PY) -m pytest tests/core
+
+test-numpy: $(DEV)    ## core on the oldest and the newest NumPy that a supported Blender carries
+	$(PY) .ci/numpy_ends.py
+
+test-e2e: $(DEV) build ## the installed zip in real Blenders; skips, with the reason, those not to be had
+	$(PY) -m pytest tests/e2e
+
+check: $(DEV)         ## lint, format, types
+	.venv/bin/ruff check && .venv/bin/ruff format --check && .venv/bin/mypy
+
+build: $(DEV)         ## the extension's zip, validated, into build/
+	$(PY) tools/build_extension.py
+
+bench: $(BENCH)       ## speed and memory, with medians
+	$(PY) -m benchmarks.speed
+
+bench-trade: $(BENCH) ## quality over time: docs/trade.md; SCENES="folder ..." measures others
+	$(PY) -m benchmarks.trade $(SCENES)
+
+fuzz: $(DEV)          ## hostile files, for SECONDS
+	$(PY) tools/fuzz.py --seconds $(or $(SECONDS),300)
+
+mutants: $(DEV)       ## deliberate faults in core, each to be caught by the tests
+	$(PY) tests/mutants.py
+
+clean:                ## all that was made
+	rm -rf .venv .venv-* build out .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+
+.venv/bin/python:
+	sh .ci/make_venv .venv
+
+$(DEV): pyproject.toml | .venv/bin/python
+	$(PY) -m pip install --quiet --editable '.[dev]'
+	$(PY) .ci/check_libraries.py
+	touch $@
+
+$(BENCH): $(DEV)
+	$(PY) -m pip install --quiet --editable '.[dev,bench]'
+	touch $@

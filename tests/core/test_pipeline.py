@@ -1,0 +1,156 @@
+"""The one use case, on the committed room."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from refine_addon.core import (
+    Budget,
+    Cancelled,
+    ClosedForm,
+    RefineError,
+    Settings,
+    prune,
+    prune_file,
+    read_cameras,
+    read_ply,
+)
+from refine_addon.core.selection import rank
+
+ROOM = Path(__file__).parents[1] / "data/room_small"
+PLY = ROOM / "point_cloud.ply"
+
+
+@pytest.fixture(scope="module")
+def file():
+    return read_ply(PLY)
+
+
+@pytest.fixture(scope="module")
+def views():
+    names = json.loads((ROOM / "split.json").read_text())["train"]
+    return read_cameras(ROOM / "cameras.json").select(names)
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.1, 0.29, 0.5, 0.9, 0.9999])
+def test_a_ratio_removes_exactly_its_floor(file, views, ratio):
+    """floor(ratio * 39755), of the decimal as written."""
+    expected = {0.0: 0, 0.1: 3975, 0.29: 11528, 0.5: 19877, 0.9: 35779, 0.9999: 39751}[ratio]
+
+    result = prune(file.splats(), views, Budget(ratio=ratio))
+
+    assert np.count_nonzero(~result.keep) == expected
+    assert result.report["splats"]["removed"] == expected
+
+
+def test_what_survives_half_survives_a_third(file, views):
+    """Budgets are nested, since all select from one ranking."""
+    masks = [prune(file.splats(), views, Budget(ratio=r)).keep for r in (0.1, 0.3, 0.5, 0.7, 0.9)]
+
+    for more, less in zip(masks, masks[1:], strict=False):
+        assert not (less & ~more).any()
+
+
+def test_the_ranking_says_what_a_budget_removes(file, views):
+    """The k lowest ranks go: rank is the place in the order of removal."""
+    result = prune(file.splats(), views, Budget(keep=1000))
+
+    order = np.argsort(rank(result.scores.values), kind="stable")
+
+    assert sorted(np.flatnonzero(result.keep)) == sorted(order[-1000:])
+
+
+def test_protected_splats_stay_and_others_go_in_their_place(file, views):
+    """The thousand lowest are protected, so the next thousand go."""
+    lowest = np.argsort(prune(file.splats(), views, Budget(keep=1)).scores.values, kind="stable")
+    protected = np.zeros(len(file), np.bool_)
+    protected[lowest[:1000]] = True
+
+    keep = prune(file.splats(), views, Budget(keep=len(file) - 1000), protected=protected).keep
+
+    assert sorted(np.flatnonzero(~keep)) == sorted(lowest[1000:2000])
+
+
+def test_a_size_in_megabytes_is_kept_to_the_row(file, views, tmp_path):
+    """The file fits in 2 MB, and one row of 248 bytes more would not."""
+    result = prune_file(PLY, tmp_path / "out.ply", views, Budget(max_mb=2.0))
+
+    size = (tmp_path / "out.ply").stat().st_size
+
+    assert 2e6 - 248 - 2 < size <= 2e6
+    assert result.report["files"]["output_bytes"] == size
+
+
+def test_the_pruned_file_holds_the_kept_rows_and_the_report_is_json(file, views, tmp_path):
+    """Rows bit for bit, in order; every number of the report is finite."""
+    result = prune_file(PLY, tmp_path / "out.ply", views, Budget(ratio=0.5))
+
+    assert read_ply(tmp_path / "out.ply").rows.tobytes() == file.rows[result.keep].tobytes()
+    assert json.loads(json.dumps(result.report, allow_nan=False))["splats"]["before"] == 39755
+
+
+def test_no_output_writes_nothing(views, tmp_path):
+    """A dry run decides and reports."""
+    result = prune_file(PLY, None, views, Budget(ratio=0.5))
+
+    assert result.report["files"]["output"] is None
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_fewer_views_are_used_when_asked_for(file, views):
+    """Eight of the 63, spread out."""
+    report = prune(file.splats(), views, Budget(ratio=0.5), Settings(views=8)).report
+
+    assert report["views"] == {"given": 63, "used": 8}
+
+
+@pytest.mark.parametrize("last", range(4))
+def test_cancelling_leaves_nothing(views, tmp_path, last):
+    """At the first calls and after, no output appears."""
+    calls = iter(range(10_000))
+
+    with pytest.raises(Cancelled):
+        prune_file(
+            PLY, tmp_path / "out.ply", views, Budget(ratio=0.5),
+            progress=lambda _fraction, _what: next(calls) < last,
+        )  # fmt: skip
+
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_settings_that_cannot_be_are_refused():
+    """The message names the setting and what it is."""
+    with pytest.raises(RefineError, match="method is 'guess'"):
+        Settings(method="guess")
+    with pytest.raises(RefineError, match="views is -1"):
+        Settings(views=-1)
+
+
+@pytest.mark.parametrize("settings", [ClosedForm(), ClosedForm.published("distance")])
+def test_float32_positions_keep_the_splats_that_float64_keeps(file, views, settings):
+    """The file's float32 values, widened first or not, are the same numbers."""
+    from dataclasses import replace  # noqa: PLC0415
+
+    splats = file.splats()
+    wide = replace(splats, means=splats.means.astype(np.float64))
+    for ratio in (0.1, 0.5, 0.9):
+        one = prune(splats, views, Budget(ratio=ratio), Settings(closed_form=settings)).keep
+        two = prune(wide, views, Budget(ratio=ratio), Settings(closed_form=settings)).keep
+        assert np.count_nonzero(one & two) / np.count_nonzero(one | two) >= 0.9999
+
+
+def test_core_imports_where_there_is_no_blender():
+    """`sys.modules["bpy"] = None` makes any import of it fail."""
+    code = (
+        "import sys\n"
+        "for name in ('bpy', 'bmesh', 'mathutils', 'gpu'): sys.modules[name] = None\n"
+        "import refine_addon.core, refine_addon.command\n"
+    )
+
+    subprocess.run([sys.executable, "-c", code], check=True)
