@@ -1,0 +1,176 @@
+"""The Blenders that the tests run: real binaries in a Debian root, and `bpy` modules.
+
+Both run a step, one file of `inside/`, in a process of their own and give back what its `main`
+returned. Nothing of the person's own Blender is seen or touched: home, preferences and extensions
+are folders of the test.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import blender_root
+import bpy_venv
+
+PROJECT = Path(__file__).resolve().parents[2]
+DRIVER = Path(__file__).parent / "inside" / "run_step.py"
+
+MODULES = ("bpy-4.2.23", "bpy-4.5.15", "bpy-5.0.1")
+BINARIES = ("trixie", "sid")
+
+# Seconds; a window starts in a few, and the slowest step takes about twenty.
+PATIENCE = 120
+
+
+class StepError(AssertionError):
+    """A step inside Blender failed; the message is all that it printed."""
+
+
+@functools.cache
+def provide(name: str) -> tuple[Path | None, str]:
+    """Make sure of one of `MODULES` or `BINARIES`.
+
+    Returns
+    -------
+    Path or None
+        The interpreter or the root; None where it cannot be had on this machine.
+    str
+        Why not.
+    """
+    try:
+        if name in BINARIES:
+            return blender_root.provide(name), ""
+        return bpy_venv.provide(name.removeprefix("bpy-")), ""
+    except (blender_root.UnavailableError, bpy_venv.UnavailableError) as error:
+        return None, f"{name} cannot be had here: {error}"
+
+
+@dataclass(frozen=True)
+class Blender:
+    """One Blender and the folders it may write to.
+
+    Attributes
+    ----------
+    name : str
+        One of `MODULES` or `BINARIES`.
+    path : Path
+        What `provide` gave for it.
+    work : Path
+        Where its files go.
+    resources : Path
+        Its preferences and extensions (``BLENDER_USER_RESOURCES``).
+    """
+
+    name: str
+    path: Path
+    work: Path
+    resources: Path
+
+    def environment(self) -> dict[str, str]:
+        """Return the variables that keep Blender to the test's folders."""
+        return {
+            "HOME": os.fspath(self.work),
+            "BLENDER_USER_RESOURCES": os.fspath(self.resources),
+            "LC_ALL": "C.UTF-8",
+        }
+
+    def python(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """Run Blender with this script and its arguments, in the background."""
+        raise NotImplementedError
+
+    def step(self, name: str, /, **arguments: Any) -> Any:
+        """Run ``main(**arguments)`` of `inside/NAME.py` in Blender.
+
+        Parameters
+        ----------
+        name : str
+            The file's name.
+        **arguments
+            JSON values, or paths.
+
+        Returns
+        -------
+        object
+            What `main` returned, by way of JSON.
+
+        Raises
+        ------
+        StepError
+            If it raised, or Blender ended before it returned.
+        """
+        return self._result(name, arguments, self.python)
+
+    def _result(self, name: str, arguments: dict[str, Any], run: Any) -> Any:
+        __tracebackhide__ = True  # a report that ends with Blender's output, not with this
+        answer = self.work / f"{name}.json"
+        answer.unlink(missing_ok=True)
+        done = run(os.fspath(DRIVER), "--", name, json.dumps(arguments, default=str), str(answer))
+        if done.returncode != 0 or not answer.exists():
+            message = f"{self.name}, step {name}, exit code {done.returncode}:\n"
+            raise StepError(message + done.stdout + done.stderr)
+        return json.loads(answer.read_text(encoding="utf-8"))
+
+
+class Module(Blender):
+    """`bpy` in a virtual environment."""
+
+    def python(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """Run a script with the environment's interpreter."""
+        environment = {"PATH": "/usr/bin:/bin", **self.environment()}
+        return _run([self.path, *words], env=environment, cwd=self.work)
+
+
+class Binary(Blender):
+    """A real Blender in a Debian root, with a command line and, under Xvfb, a window."""
+
+    def run(self, *words: str | Path) -> subprocess.CompletedProcess[str]:
+        """Run a command in the root, offline; it can write to the test's folders alone."""
+        enter = blender_root.enter(
+            self.path,
+            read_only=[PROJECT],
+            writable=[self.work, self.resources],
+            environment=self.environment(),
+        )
+        return _run([*enter, "--chdir", self.work, *words])
+
+    def blender(self, *words: str | Path) -> subprocess.CompletedProcess[str]:
+        """Run Blender in the background, with the preferences that the test has saved."""
+        return self.run("blender", "--background", *words)
+
+    def python(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """Run a script in Blender as it is fresh from the factory."""
+        return self.blender("--factory-startup", "--python-exit-code", "1", "--python", *words)
+
+    def window_step(self, name: str, blend: Path, /, **arguments: Any) -> Any:
+        """Run a step on an open file, in a window of 1600 x 1000 pixels.
+
+        The step's `main` is a generator; each value it yields is how many seconds to leave
+        Blender to itself. See `step` for the other parameters, the result and the error.
+        """
+
+        def window(*words: str) -> subprocess.CompletedProcess[str]:
+            xvfb = ("xvfb-run", "--auto-servernum", "--server-args=-screen 0 1600x1000x24")
+            size = ("--enable-event-simulate", "--window-geometry", "0", "0", "1600", "1000")
+            return self.run(
+                *(*xvfb, "blender", "--factory-startup", *size, blend, "--python", *words)
+            )
+
+        return self._result(name, arguments, window)
+
+
+def _run(words: list[Any], **options: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        words,
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+        timeout=PATIENCE,
+        check=False,
+        **options,
+    )

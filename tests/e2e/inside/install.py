@@ -1,0 +1,24 @@
+"""Install the extension from its zip and keep it enabled in the preferences."""
+
+from __future__ import annotations
+
+import bpy
+from extension import MODULE, is_enabled
+
+
+def main(archive: str) -> None:
+    """Install ``archive`` into the user's repository.
+
+    Raises
+    ------
+    RuntimeError
+        If the extension is not enabled afterwards.
+    """
+    # FINISHED says nothing: it is the result for a missing file, too.
+    bpy.ops.extensions.package_install_files(
+        repo="user_default", filepath=archive, enable_on_install=True, overwrite=True
+    )
+    if not is_enabled():
+        message = f"{archive} was installed, but {MODULE} is not enabled"
+        raise RuntimeError(message)
+    bpy.ops.wm.save_userpref()

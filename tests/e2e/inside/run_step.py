@@ -1,0 +1,56 @@
+"""Run one step inside Blender: ``run_step.py -- NAME ARGUMENTS ANSWER``.
+
+Calls ``main(**ARGUMENTS)`` of `NAME.py` beside this file and writes what it returns to the file
+ANSWER, both as JSON. If `main` is a generator, it runs in steps between which Blender draws and
+handles events; then Blender is closed.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import os
+import sys
+import traceback
+from pathlib import Path
+
+import bpy
+
+
+def answer_with(answer: str, value: object) -> None:
+    """Write the step's result."""
+    Path(answer).write_text(json.dumps(value), encoding="utf-8")
+
+
+def drive(steps, answer: str) -> None:
+    """Let a generator run between Blender's own work; each value is a pause in seconds."""
+
+    def advance() -> float | None:
+        try:
+            return next(steps)
+        except StopIteration as end:
+            answer_with(answer, end.value)
+        except Exception:  # noqa: BLE001 - whatever it is, Blender has to end
+            traceback.print_exc()
+            sys.stderr.flush()
+            os._exit(1)
+        bpy.ops.wm.quit_blender()
+        return None
+
+    # Persistent: a step may open another file.
+    bpy.app.timers.register(advance, first_interval=1.0, persistent=True)
+
+
+def run() -> None:
+    """Run the step that the command line names."""
+    name, arguments, answer = sys.argv[sys.argv.index("--") + 1 :]
+    sys.path.insert(0, str(Path(__file__).parent))
+    value = importlib.import_module(name).main(**json.loads(arguments))
+    if inspect.isgenerator(value):
+        drive(value, answer)
+    else:
+        answer_with(answer, value)
+
+
+run()

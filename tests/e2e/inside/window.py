@@ -1,0 +1,174 @@
+"""Use the panel as a person does: open its tab, click *Score*, click *Apply*, undo with Ctrl+Z."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import extension
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Generator
+
+TAB = "REFINE"
+
+# Seconds: for Blender to take in an event and draw, and for an operator to end.
+A_MOMENT = 0.05
+PATIENCE = 60.0
+
+# A button is 20 pixels high or more, so no button is missed.
+STEP = 8
+
+
+def main(name: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
+    """Prune the open scene by hand; return what was there before, between and after.
+
+    Parameters
+    ----------
+    name
+        The active object, splats.
+    pictures
+        Folder for a picture of the whole screen after each stage.
+
+    Yields
+    ------
+    float
+        Seconds to wait.
+    """
+    extension.enable()
+    yield 1.0
+    hand = Hand()
+    yield from hand.press("ESC")  # the splash screen
+    yield from hand.open_tab()
+    yield from picture(pictures, "1-opened")
+    found = {"opened": state(name)}
+
+    yield from hand.click("refine.score")
+    yield from until(lambda: state(name)["scored"], "there are scores")
+    yield from picture(pictures, "2-scored")
+    found["scored"] = state(name)
+
+    yield from hand.click("refine.apply")
+    yield from until(lambda: state(name) != found["scored"], "splats are removed")
+    yield from picture(pictures, "3-applied")
+    found["applied"] = state(name)
+
+    yield from hand.undo()
+    yield from until(lambda: state(name) != found["applied"], "they are back")
+    yield from picture(pictures, "4-undone")
+    found["undone"] = state(name)
+    return found
+
+
+def state(name: str) -> dict[str, Any]:
+    """Return what the panel's buttons are to change; by name, as undo replaces the object."""
+    mesh = bpy.data.objects[name].data
+    return {"vertices": len(mesh.vertices), "scored": "refine_score" in mesh.attributes}
+
+
+def picture(folder: str, name: str) -> Generator[float, None, None]:
+    """Save what the X server shows; Blender's own screenshot is black with this driver."""
+    yield 0.5
+    target = Path(folder) / f"{name}.png"
+    subprocess.run(["import", "-window", "root", target], check=True)
+
+
+def until(is_so: Callable[[], bool], what: str) -> Generator[float, None, None]:
+    """Wait for something to become so.
+
+    Raises
+    ------
+    TimeoutError
+        If it does not within `PATIENCE`.
+    """
+    for _ in range(int(PATIENCE / A_MOMENT)):
+        if is_so():
+            return
+        yield A_MOMENT
+    message = f"after {PATIENCE} s it is still not so that {what}"
+    raise TimeoutError(message)
+
+
+class Hand:
+    """Mouse and keyboard over the sidebar of the window's 3D view."""
+
+    def __init__(self) -> None:
+        self.window = bpy.context.window_manager.windows[0]
+        areas = self.window.screen.areas
+        self.area = next(area for area in areas if area.type == "VIEW_3D")
+        self.area.spaces.active.show_region_ui = True
+        self.at = {"x": 0, "y": 0}
+
+    @property
+    def sidebar(self) -> bpy.types.Region:
+        """The sidebar, as it is now."""
+        return next(region for region in self.area.regions if region.type == "UI")
+
+    def press(self, key: str, **modifiers: bool) -> Generator[float, None, None]:
+        """Press and release a key or a button of the mouse."""
+        for value in ("PRESS", "RELEASE"):
+            self.window.event_simulate(type=key, value=value, **self.at, **modifiers)
+            yield A_MOMENT
+
+    def move(self, x: int, y: int) -> Generator[float, None, None]:
+        """Bring the mouse to a pixel of the window, y from the bottom."""
+        # A button notices the mouse by its moving on it, not by its being there.
+        for near in (1, 0):
+            self.at = {"x": x + near, "y": y}
+            self.window.event_simulate(type="MOUSEMOVE", value="NOTHING", **self.at)
+            yield A_MOMENT
+
+    def open_tab(self) -> Generator[float, None, None]:
+        """Click down the sidebar's column of tabs until ours is open.
+
+        Raises
+        ------
+        LookupError
+            If there is no such tab.
+        """
+        yield 0.5
+        region = self.sidebar
+        for y in range(region.y + region.height - STEP, region.y, -2 * STEP):
+            yield from self.move(region.x + region.width - 12, y)
+            yield from self.press("LEFTMOUSE")
+            if region.active_panel_category == TAB:
+                yield 0.5
+                return
+        message = f"the sidebar of the 3D view has no tab {TAB}"
+        raise LookupError(message)
+
+    def click(self, operator: str) -> Generator[float, None, None]:
+        """Click the button of an operator, found by asking each place in the sidebar for its.
+
+        Raises
+        ------
+        LookupError
+            If the sidebar shows no such button.
+        """
+        region = self.sidebar
+        # Buttons side by side leave the middle free.
+        for share in (0.5, 0.25, 0.75):
+            x = region.x + int(share * (region.width - 24))
+            for y in range(region.y + region.height - STEP, region.y, -STEP):
+                yield from self.move(x, y)
+                if f"bpy.ops.{operator}(" in self.button():
+                    yield from self.press("LEFTMOUSE")
+                    return
+        message = f"the tab {TAB} has no button for {operator}"
+        raise LookupError(message)
+
+    def button(self) -> str:
+        """Return the Python call of the button under the mouse, empty where there is none."""
+        manager = bpy.context.window_manager
+        manager.clipboard = ""
+        with bpy.context.temp_override(window=self.window, area=self.area, region=self.sidebar):
+            if bpy.ops.ui.copy_python_command_button.poll():
+                bpy.ops.ui.copy_python_command_button()
+        return manager.clipboard
+
+    def undo(self) -> Generator[float, None, None]:
+        """Press Ctrl+Z over the 3D view."""
+        yield from self.move(self.area.x + self.area.width // 2, self.area.y + 100)
+        yield from self.press("Z", ctrl=True)

@@ -1,0 +1,33 @@
+"""The panel in a real window, used with mouse and keyboard."""
+
+from __future__ import annotations
+
+import shutil
+from typing import TYPE_CHECKING
+
+from blenders import PROJECT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from blenders import Binary
+
+PICTURES = PROJECT / "build" / "e2e"
+
+
+def test_score_apply_and_undo_by_hand(binary: Binary, blend: Path):
+    """39,755 splats; *Score* keeps all, *Apply* leaves 19,878, one Ctrl+Z brings all back.
+
+    Pictures of the stages stay in build/e2e, for a person to look at.
+    """
+    try:
+        found = binary.window_step("window", blend, name="Splats", pictures=binary.work)
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+
+    assert found["opened"] == {"vertices": 39_755, "scored": False}
+    assert found["scored"] == {"vertices": 39_755, "scored": True}
+    assert found["applied"] == {"vertices": 19_878, "scored": True}
+    assert found["undone"] == found["scored"]
