@@ -4,6 +4,6 @@ from __future__ import annotations
 
 import hypothesis
 
-# The same examples on every run: a test that fails by chance on somebody else's commit helps nobody.
+# The same examples on every run: a test that fails by chance on another's commit helps nobody.
 hypothesis.settings.register_profile("refine", deadline=None, derandomize=True, max_examples=50)
 hypothesis.settings.load_profile("refine")

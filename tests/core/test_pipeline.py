@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import sys
@@ -53,7 +54,7 @@ def test_what_survives_half_survives_a_third(file, views):
     """Budgets are nested, since all select from one ranking."""
     masks = [prune(file.splats(), views, Budget(ratio=r)).keep for r in (0.1, 0.3, 0.5, 0.7, 0.9)]
 
-    for more, less in zip(masks, masks[1:], strict=False):
+    for more, less in itertools.pairwise(masks):
         assert not (less & ~more).any()
 
 
@@ -77,7 +78,7 @@ def test_protected_splats_stay_and_others_go_in_their_place(file, views):
     assert sorted(np.flatnonzero(~keep)) == sorted(lowest[1000:2000])
 
 
-def test_a_size_in_megabytes_is_kept_to_the_row(file, views, tmp_path):
+def test_a_size_in_megabytes_is_kept_to_the_row(views, tmp_path):
     """The file fits in 2 MB, and one row of 248 bytes more would not."""
     result = prune_file(PLY, tmp_path / "out.ply", views, Budget(max_mb=2.0))
 

@@ -89,7 +89,7 @@ def test_rotated_harmonics_show_the_old_colour_along_the_rotated_direction(matri
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 250.0])
 @pytest.mark.parametrize("sign", [1, -1], ids=["turned", "mirrored"])
 def test_a_uniform_transform_moves_means_covariances_and_colours(scale, sign):
-    """mean' = M mean + t, covariance' = M covariance M', with M = scale times a rotation."""
+    """M mean + t and M covariance M', with M = scale times a rotation."""
     splats = some()
     matrix = affine(sign * scale * ROTATION, [1, -2, 3])
     linear = matrix[:3, :3]
@@ -104,9 +104,7 @@ def test_a_uniform_transform_moves_means_covariances_and_colours(scale, sign):
     where = directions()
     before = np.einsum("dk,nkc->ndc", basis(where, 3)[:, 1:], splats.sh_rest)
     turned = basis(sign * where @ ROTATION.T, 3)[:, 1:]
-    np.testing.assert_allclose(
-        np.einsum("dk,nkc->ndc", turned, moved.sh_rest), before, atol=1e-5
-    )
+    np.testing.assert_allclose(np.einsum("dk,nkc->ndc", turned, moved.sh_rest), before, atol=1e-5)
 
 
 def test_a_stretch_is_exact_for_the_shape_and_refused_for_the_colours():
