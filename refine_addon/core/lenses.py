@@ -66,6 +66,11 @@ PANORAMAS = {
 """Models of nerfstudio and COLMAP that no pinhole comes near."""
 
 
+def counted(count: int, thing: str) -> str:
+    """Return a count and what is counted, in the plural where there are several."""
+    return f"{count} {thing}" if count == 1 else f"{count} {thing}s"
+
+
 def lens_note(counts: Mapping[Model, int], thing: str) -> str:
     """Return what to tell about lenses that are no pinholes, or "".
 
@@ -78,7 +83,7 @@ def lens_note(counts: Mapping[Model, int], thing: str) -> str:
     """
     notes = []
     for model, count in counts.items():
-        things = f"{count} {thing}{'s' if count > 1 else ''}"
+        things = counted(count, thing)
         if model.fisheye:
             note = f"{things} (fisheye, {model.name}) taken as pinhole: wrong away from the centre"
         else:

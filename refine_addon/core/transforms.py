@@ -24,7 +24,7 @@ import numpy as np
 
 from .camera_checks import ORTHONORMAL_TOLERANCE, Place, described, read_json
 from .image_size import image_size
-from .lenses import FISHEYE624, MODELS_BY_NAME, PANORAMAS, Model, lens_note
+from .lenses import FISHEYE624, MODELS_BY_NAME, PANORAMAS, Model, counted, lens_note
 from .views import View, ViewSet
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def read_transforms(path: Path, data: object) -> ViewSet:
         views.append(frame.view(world))
         lenses.update(frame.lens())
         poses.update(frame.remarks)
-    notes += [f"{text} of {count} frames" for text, count in poses.items()]
+    notes += [f"{text} of {counted(count, 'frame')}" for text, count in poses.items()]
     return ViewSet(tuple(views), "; ".join(filter(None, (lens_note(lenses, "frame"), *notes))))
 
 

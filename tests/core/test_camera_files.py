@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from refine_addon.core import RefineError, ViewSet, read_cameras, read_ply
+from refine_addon.core.camera_checks import Place
 
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 
@@ -309,6 +310,25 @@ def test_an_unknown_home_is_no_crash():
         read_cameras("~no-such-user-of-this-machine/cameras.json")
 
 
+def test_a_file_that_may_not_be_read_says_why(tmp_path, monkeypatch):
+    path = write(tmp_path / "cameras.json", [INRIA])
+
+    def refuse(*_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)
+
+    with pytest.raises(RefineError, match=r"cameras\.json: cannot be read \(Permission denied\)"):
+        read_cameras(path)
+
+
+def test_what_a_view_refuses_is_refused_with_the_place():
+    place = Place(Path("cameras.json"), "camera 3")
+
+    with pytest.raises(RefineError, match=r"^cameras\.json: camera 3: view 'a': focal lengths"):
+        place.view("a", np.eye(3), np.zeros(3), (-1, 1), (0, 0), (1, 1))
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 def test_a_named_pipe_is_refused_rather_than_waited_for(tmp_path):
     os.mkfifo(tmp_path / "cameras.json")
@@ -391,6 +411,32 @@ def test_dataparser_transforms_beside_it_lead_to_the_splats_of_ns_export(tmp_pat
     assert views.note == "dataparser_transforms.json applied"
 
 
+def test_an_applied_scale_is_undone_as_well(tmp_path):
+    """The stored scale is 0.5 (nerfstudio's own) times 4 (applied): (1, 2, 3) goes to half."""
+    write(
+        tmp_path / "dataparser_transforms.json", {"transform": np.eye(4)[:3].tolist(), "scale": 2}
+    )
+
+    (view,) = read(tmp_path, {**TRANSFORMS, "applied_scale": 4})
+
+    np.testing.assert_allclose(view.center, [0.5, 1, 1.5], atol=1e-15)
+
+
+def test_older_colmap_projects_of_nerfstudio_have_a_transform_of_their_own(tmp_path):
+    """Where none is named but colmap/sparse/0 is there, A is (x, y, z) -> (y, x, -z).
+
+    With A itself stored, nerfstudio's own part is nothing and the camera stays.
+    """
+    (tmp_path / "colmap" / "sparse" / "0").mkdir(parents=True)
+    stored = {"transform": [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]], "scale": 1}
+    write(tmp_path / "dataparser_transforms.json", stored)
+
+    (view,) = read(tmp_path, TRANSFORMS)
+
+    np.testing.assert_allclose(view.center, [1, 2, 3], atol=1e-15)
+    assert pixel(view, POINT) == pytest.approx([57, 39], abs=1e-12)
+
+
 @pytest.mark.parametrize(
     ("data", "problem"),
     [
@@ -417,7 +463,7 @@ def test_a_uniform_scale_is_taken_out_and_noted(tmp_path):
     views = read(tmp_path, with_frame(transform_matrix=scaled))
 
     assert pixel(views[1], POINT) == pytest.approx([57, 39], abs=1e-9)
-    assert views.note == "uniform scale taken out of 1 frames"
+    assert views.note == "uniform scale taken out of 1 frame"
 
 
 def test_a_mirrored_pose_is_kept_and_noted(tmp_path):
@@ -427,7 +473,7 @@ def test_a_mirrored_pose_is_kept_and_noted(tmp_path):
     views = read(tmp_path, with_frame(transform_matrix=mirrored))
 
     assert pixel(views[1], POINT) == pytest.approx([7, 39], abs=1e-9)
-    assert views.note == "mirrored pose (determinant -1) of 1 frames"
+    assert views.note == "mirrored pose (determinant -1) of 1 frame"
 
 
 def test_a_matrix_of_three_rows_will_do(tmp_path):

@@ -216,7 +216,8 @@ def test_a_quaternion_of_any_length_and_sign_is_the_same_rotation(tmp_path, suff
 )
 def test_any_pose_survives_a_round_trip(tmp_path, suffix, quaternion, center):
     """Rotating the basis by q v q* (the definition) gives the columns of R; t = -R c."""
-    w, *axis = np.where(np.abs(quaternion) < 1e-9, 0, quaternion) / np.linalg.norm(quaternion)
+    tame = np.where(np.abs(quaternion) < 1e-9, 0, quaternion)
+    w, *axis = tame / np.linalg.norm(tame)
     basis = np.eye(3)
     # q v q* = v + 2 w (a x v) + 2 a x (a x v)
     once = np.cross(axis, basis)
@@ -319,6 +320,15 @@ def test_a_zero_quaternion_is_no_rotation(tmp_path, suffix):
 
     assert "image row 0" in refused(tmp_path, f"images{suffix}")
     assert "expected a quaternion (w, x, y, z)" in refused(tmp_path, f"images{suffix}")
+
+
+@both
+def test_a_centre_too_far_to_square_is_refused(tmp_path, suffix):
+    """Turned by 45 degrees about z, t = (9e17, -9e17, 0) is sqrt(2) * 9e17 along one axis."""
+    pose = (0.9238795325112867, 0, 0, 0.3826834323650898, 9e17, -9e17, 0)
+    write(tmp_path, suffix, images=[(1, pose, 1, "a", 0)])
+
+    assert "the camera's centre is farther than 1e18" in refused(tmp_path, f"images{suffix}")
 
 
 @both
