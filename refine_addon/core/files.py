@@ -6,13 +6,31 @@ import contextlib
 import errno
 import os
 import secrets
+from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from .errors import RefineError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
+
+REPLACES_MAPPED = os.name != "nt"
+"""Whether the system lets go of a file's name while a program still maps it; Windows does not."""
+
+
+def expanded(path: Path | str) -> Path:
+    """Return `path` with ``~`` replaced by the home folder.
+
+    Raises
+    ------
+    RefineError
+        If there is no such user.
+    """
+    try:
+        return Path(path).expanduser()
+    except RuntimeError as error:
+        msg = f"{path}: cannot be found ({error})"
+        raise RefineError(msg) from error
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:
@@ -20,15 +38,34 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
 
     Called before the long work starts, so that a mistyped output costs nothing.
     """
-    if path.is_dir():
-        msg = f"{path}: is a folder, expected a file name to write to"
-        raise RefineError(msg)
-    if path.exists() and not overwrite:
-        msg = f"{path}: exists already; choose another name or ask to overwrite it"
-        raise RefineError(msg)
-    if not path.parent.is_dir():
-        msg = f"{path}: cannot be written, there is no folder {path.parent}"
-        raise RefineError(msg)
+    try:
+        if path.is_dir():
+            msg = f"{path}: is a folder, expected a file name to write to"
+            raise RefineError(msg)
+        if path.exists() and not path.is_file():
+            msg = f"{path}: is a device, expected the name of a file"
+            raise RefineError(msg)
+        if path.exists() and not overwrite:
+            msg = f"{path}: exists already; choose another name or ask to overwrite it"
+            raise RefineError(msg)
+        if not path.parent.is_dir():
+            msg = f"{path}: cannot be written, there is no folder {path.parent}"
+            raise RefineError(msg)
+    except OSError as error:  # a name too long, a folder that may not be looked into
+        raise RefineError(_explain(path, error)) from error
+
+
+def refuse_mapped(path: Path, source: Path) -> None:
+    """Raise `RefineError` where `path` is the mapped file `source` and cannot be replaced."""
+    if REPLACES_MAPPED:
+        return
+    with contextlib.suppress(OSError):
+        if path.samefile(source):
+            msg = (
+                f"{path}: is the file being read, which this system cannot replace; "
+                "write to another name"
+            )
+            raise RefineError(msg)
 
 
 @contextlib.contextmanager
@@ -55,8 +92,13 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
         If the file exists and may not be replaced, or the system cannot write it.
     """
     refuse_existing(path, overwrite=overwrite)
-    target = path.resolve()
-    temporary = target.with_name(f".{target.name[:100]}.{secrets.token_hex(6)}.tmp")
+    try:
+        target = path.resolve()
+    except (OSError, RuntimeError, ValueError) as error:  # links in a circle; a zero byte
+        msg = f"{path}: cannot be written ({error}); nothing was changed"
+        raise RefineError(msg) from error
+    # Of its own name, not the target's: that one may be as long as a name can be.
+    temporary = target.with_name(f".refine-{secrets.token_hex(8)}.tmp")
     try:
         # Not tempfile: its files are readable by their owner alone, and the name would keep that.
         with temporary.open("xb") as stream:
@@ -80,16 +122,17 @@ def _publish_new(temporary: Path, target: Path) -> None:
         os.link(temporary, target)
     except FileExistsError:
         raise
-    except OSError:  # a file system without hard links: the check and the rename are two steps
+    except OSError:
+        # No hard links here: two steps, the second of which refuses by itself on Windows.
         if target.exists():
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from None
-        temporary.replace(target)
+        temporary.rename(target)
 
 
 def _explain(path: Path, error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return f"{path}: no space left on the disk; nothing was written"
+        return f"{path}: no space left on the disk; nothing was changed"
     if isinstance(error, FileExistsError):
-        return f"{path}: was made by somebody else in the meantime; nothing was written"
+        return f"{path}: was made by somebody else in the meantime; it was left as it is"
     reason = error.strerror or type(error).__name__
     return f"{path}: cannot be written ({reason}); nothing was changed"
