@@ -30,12 +30,11 @@ UNAVAILABLE = 69  # EX_UNAVAILABLE of sysexits.h
 PACKAGES = (
     "blender",
     "python3-numpy",
-    # A window without a graphics card, a mouse for it, and a picture of it.
+    # A window without a graphics card, and a picture of it.
     "libegl1",
     "libgl1-mesa-dri",
     "xvfb",
     "xauth",
-    "xdotool",
     "imagemagick",
 )
 
