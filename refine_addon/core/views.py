@@ -15,6 +15,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+ORTHONORMAL = 1e-3
+"""How far from orthonormal a rotation may be: what four decimals in a text file leave."""
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -62,43 +65,53 @@ class View:
         RefineError
             With the view's name and the value that cannot be.
         """
-        rotation = np.array(self.rotation, np.float64)
-        center = np.array(self.center, np.float64)
-        label = f"view {self.name!r}" if self.name else "view"
-        if rotation.shape != (3, 3) or center.shape != (3,):
-            msg = (
-                f"{label}: expected rotation (3, 3) and center (3,), "
-                f"got {rotation.shape} and {center.shape}"
-            )
-            raise RefineError(msg)
-        numbers = (self.fx, self.fy, self.cx, self.cy, self.near, self.weight)
-        if not (np.isfinite(rotation).all() and np.isfinite(center).all()):
-            msg = f"{label}: rotation and center must be finite numbers"
-            raise RefineError(msg)
-        if np.abs(center).max() > np.finfo(np.float32).max:
-            msg = f"{label}: center {center.tolist()} is beyond the range of float32"
-            raise RefineError(msg)
-        if not all(math.isfinite(number) for number in numbers) or math.isnan(self.far):
-            msg = f"{label}: fx, fy, cx, cy, near and weight must be finite, got {numbers}"
-            raise RefineError(msg)
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:  # noqa: PLR2004
-            msg = f"{label}: rotation is not orthonormal"
-            raise RefineError(msg)
-        if self.fx <= 0 or self.fy <= 0 or self.width < 1 or self.height < 1:
-            msg = (
-                f"{label}: focal lengths and image size must be positive, got fx {self.fx}, "
-                f"fy {self.fy}, {self.width} x {self.height}"
-            )
-            raise RefineError(msg)
-        if self.weight < 0 or self.near < 0 or self.far <= self.near:
-            msg = (
-                f"{label}: expected weight >= 0 and 0 <= near < far, got weight {self.weight}, "
-                f"near {self.near}, far {self.far}"
-            )
-            raise RefineError(msg)
+        try:
+            rotation = np.array(self.rotation, np.float64)
+            center = np.array(self.center, np.float64)
+            _check_pose(rotation, center)
+            self._check_image()
+        except (TypeError, ValueError) as error:
+            msg = f"view {self.name!r}: {error}"
+            raise RefineError(msg) from error
         left, _, right = np.linalg.svd(rotation)
         object.__setattr__(self, "rotation", left @ right)  # files round; make it exactly rigid
         object.__setattr__(self, "center", center)
+
+    def _check_image(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy, self.near, self.weight)
+        if not all(math.isfinite(number) for number in numbers) or math.isnan(self.far):
+            msg = f"fx, fy, cx, cy, near and weight must be finite, got {numbers}"
+            raise ValueError(msg)
+        size = (self.width, self.height)
+        if self.fx <= 0 or self.fy <= 0 or min(size) < 1 or size != tuple(map(int, size)):
+            msg = (
+                "expected positive focal lengths and whole numbers of pixels, got "
+                f"fx {self.fx}, fy {self.fy}, {self.width} x {self.height}"
+            )
+            raise ValueError(msg)
+        if self.weight < 0 or self.near < 0 or self.far <= self.near:
+            msg = (
+                f"expected weight >= 0 and 0 <= near < far, got weight {self.weight}, "
+                f"near {self.near}, far {self.far}"
+            )
+            raise ValueError(msg)
+
+
+def _check_pose(rotation: NDArray[np.float64], center: NDArray[np.float64]) -> None:
+    if rotation.shape != (3, 3) or center.shape != (3,):
+        msg = f"expected rotation (3, 3) and center (3,), got {rotation.shape} and {center.shape}"
+        raise ValueError(msg)
+    if not (np.isfinite(rotation).all() and np.isfinite(center).all()):
+        msg = "rotation and center must be finite numbers"
+        raise ValueError(msg)
+    if np.abs(center).max() > np.finfo(np.float32).max:
+        msg = f"center {center.tolist()} is beyond the range of float32"
+        raise ValueError(msg)
+    # Entries first: those of a rotation are at most 1, and squares of others might overflow.
+    largest = np.abs(rotation).max()
+    if largest > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > ORTHONORMAL:  # noqa: PLR2004
+        msg = f"rotation is not orthonormal: {rotation.tolist()}"
+        raise ValueError(msg)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +162,7 @@ class ViewSet:
         return replace(self, views=tuple(self.views[int(index)] for index in indices))
 
     def select(self, names: Sequence[str]) -> ViewSet:
-        """Return the views of these names, in the order of `names`.
+        """Return the views of these names, in the order of `names`; of equal names, the last.
 
         Raises
         ------
@@ -177,8 +190,9 @@ class ViewSet:
     def weights(self) -> NDArray[np.float64]:
         """Weights scaled to sum to 1, (V,)."""
         weights = np.array([view.weight for view in self.views], np.float64)
-        weights /= weights.max()  # first, so that weights of 1e308 do not sum to infinity
-        return np.asarray(weights / weights.sum())
+        with np.errstate(under="ignore"):  # a weight of 1e-300 beside one of 1e300 is none
+            weights /= weights.max()  # first, so that weights of 1e308 do not sum to infinity
+            return np.asarray(weights / weights.sum())
 
     def spread(self, count: int) -> ViewSet:
         """Return at most `count` views that cover the set evenly, in their old order.

@@ -29,8 +29,9 @@ def ring(count: int) -> ViewSet:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"fx": 0.0}, "focal lengths and image size must be positive"),
-        ({"width": 0}, "focal lengths and image size must be positive"),
+        ({"fx": 0.0}, "positive focal lengths"),
+        ({"width": 1.5}, "whole numbers"),
+        ({"width": 0}, "positive focal lengths"),
         ({"cx": np.nan}, "must be finite"),
         ({"near": 2.0, "far": 1.0}, "0 <= near < far"),
         ({"weight": -1.0}, "weight >= 0"),
@@ -140,3 +141,13 @@ def test_cameras_in_one_place_are_spread_by_direction():
     views = ViewSet(tuple(view(rotation=r, name=str(i)) for i, r in enumerate(rotations)))
 
     assert len({tuple(v.rotation[2]) for v in views.spread(2)}) == 2
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"fx": "wide"}, {"rotation": [[1, 0], [0]]}, {"rotation": np.full((3, 3), 1e200)}],
+)
+def test_values_that_are_no_numbers_or_far_beyond_are_refused_too(changes):
+    """A program's mistake gets a sentence as a file's does."""
+    with np.errstate(all="raise"), pytest.raises(RefineError, match="view 'left'"):
+        view(name="left", **changes)
