@@ -142,7 +142,8 @@ class SplatFile:
         declared = declarations(self.path, self.rows, columns)
         if declared:
             header = with_properties(header, declared)
-        refuse_mapped(path, self.path)
+        if self.lines is None and not self.rows.flags.writeable:
+            refuse_mapped(path, self.path)
         with whole_file(path, overwrite=overwrite) as stream:
             stream.write(header)
             stream.write(self.before.data)

@@ -13,7 +13,7 @@ from .errors import RefineError
 from .ply_header import TEXT, Header
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -189,21 +189,57 @@ def read_text(
 
 def _numbers(header: Header, element: Any, lines: Sequence[bytes]) -> NDArray[Any]:  # noqa: ANN401
     dtype = element.dtype(TEXT)
+    try:
+        return _parsed(lines, dtype)
+    except _WRONG:
+        row = _first_wrong(lines, dtype)
+    words = lines[row].split()
+    if len(words) != len(dtype):
+        problem = f"expected {len(dtype)} numbers, got {len(words)}"
+    else:
+        index = next(i for i, word in enumerate(words) if not _is_number(word, dtype[i]))
+        problem = (
+            f"property '{dtype.names[index]}': expected a number of type {dtype[index]}, "
+            f"got {words[index][:40].decode('ascii', 'backslashreplace')!r}"
+        )
+    msg = f"{header.path}: vertex row {row}: {problem}"
+    raise RefineError(msg)
+
+
+_WRONG = (ValueError, DeprecationWarning)
+"""What NumPy raises of text that is no number of the type."""
+
+
+def _parsed(lines: Sequence[bytes], dtype: Any) -> NDArray[Any]:  # noqa: ANN401
     if not lines:
         return np.empty(0, dtype)
+    if not all(map(bytes.strip, lines)):
+        msg = "a line without words, which NumPy would skip"
+        raise ValueError(msg)
+    with warnings.catch_warnings():
+        # 1.5 where a whole number belongs is deprecated.
+        warnings.simplefilter("error", DeprecationWarning)
+        text = (line.decode("ascii") for line in lines)
+        return np.loadtxt(text, dtype, comments=None, ndmin=1)
+
+
+def _is_number(word: bytes, dtype: Any) -> bool:  # noqa: ANN401
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", DeprecationWarning)  # 1.5 where a whole number belongs
-            return np.loadtxt(_checked(header, lines), dtype, comments=None, ndmin=1)
-    except (ValueError, DeprecationWarning) as error:
-        msg = f"{header.path}: element 'vertex': {error}"
-        raise RefineError(msg) from error
+        _parsed([word], dtype)
+    except _WRONG:
+        return False
+    return True
 
 
-def _checked(header: Header, lines: Sequence[bytes]) -> Iterator[str]:
-    """Yield the lines as text; refuse those that NumPy would skip, and so count differently."""
-    for row, line in enumerate(lines):
-        if not line.isascii() or not line.strip():
-            msg = f"{header.path}: vertex row {row}: expected numbers, got {line[:40]!r}"
-            raise RefineError(msg)
-        yield line.decode("ascii")
+def _first_wrong(lines: Sequence[bytes], dtype: Any) -> int:  # noqa: ANN401
+    """Return the index of the first line that is not of that type, where one is not."""
+    first, beyond = 0, len(lines)
+    while beyond - first > 1:  # one of first..beyond is wrong, and none before them
+        middle = (first + beyond) // 2
+        try:
+            _parsed(lines[first:middle], dtype)
+        except _WRONG:
+            beyond = middle
+        else:
+            first = middle
+    return first

@@ -72,9 +72,10 @@ def columns_from_splats(splats: Splats) -> dict[str, NDArray[np.float32]]:
         (["scale_0", "scale_1", "scale_2"], splats.log_scales),
         (["rot_0", "rot_1", "rot_2", "rot_3"], splats.quaternions),
     ]
-    for names, values in groups:
-        for index, name in enumerate(names):
-            columns[name] = np.ascontiguousarray(values[:, index], np.float32)
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # of double into float
+        for names, values in groups:
+            for index, name in enumerate(names):
+                columns[name] = np.ascontiguousarray(values[:, index], np.float32)
     return columns
 
 
@@ -91,6 +92,7 @@ def _stack(columns: Any, names: Sequence[str]) -> NDArray[Any]:  # noqa: ANN401
             )
     kind = np.result_type(*(columns[name].dtype for name in names), np.float32)
     stacked = np.empty((len(first), len(names)), kind)
-    for index, name in enumerate(names):
-        stacked[:, index] = columns[name]
+    with np.errstate(invalid="ignore"):  # of signalling NaN put among doubles
+        for index, name in enumerate(names):
+            stacked[:, index] = columns[name]
     return stacked

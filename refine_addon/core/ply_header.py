@@ -157,8 +157,8 @@ def _plain(path: Path, raw: bytes) -> tuple[bytes, list[int]]:
             words[2] = b"0"
         elif keyword == b"property":
             _refuse_double(path, number, words[-1], names)
-        lines.append(b" ".join(words))
-    return b"\n".join(lines), counts
+        lines.append(b" ".join(words) or b" ")  # plyfile takes an empty line for the end
+    return b"\n".join([*lines[:-1], b""]), counts
 
 
 def _count(path: Path, number: int, word: bytes) -> int:

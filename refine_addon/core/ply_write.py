@@ -104,8 +104,7 @@ def _with_cells(
         width = kinds[name].itemsize
         at = fields[name][1] if name in fields else size
         size += 0 if name in fields else width
-        with np.errstate(over="ignore", under="ignore"):  # of double put into float
-            stored = values.astype(kinds[name])
+        stored = _cast(values, kinds[name])
         grown[:, at : at + width] = stored.view(np.uint8).reshape(-1, width)
     return grown
 
@@ -123,8 +122,7 @@ def write_lines(
         stream.writelines(lines[index] for index in kept)
         return
     names = dtype.names or ()
-    with np.errstate(over="ignore", under="ignore"):  # of double put into float
-        cells = {n: v.astype(_stored(dtype, n, v.dtype)) for n, v in columns.items()}
+    cells = {n: _cast(v, _stored(dtype, n, v.dtype)) for n, v in columns.items()}
     places = {names.index(name): values for name, values in cells.items() if name in names}
     added = [values for name, values in cells.items() if name not in names]
     # str of a NumPy number is the shortest text that reads back as the same number.
@@ -193,3 +191,9 @@ def _stored(dtype: np.dtype[Any], name: str, kind: np.dtype[Any]) -> np.dtype[An
         return dtype[name]
     # That of the positions: single bytes, which the first property may be, have none.
     return kind.newbyteorder(dtype["x"].byteorder)  # type: ignore[arg-type]
+
+
+def _cast(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:
+    # A double may be too large or too small for a float; a signalling NaN turns quiet.
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        return values.astype(kind)
