@@ -144,6 +144,8 @@ def drawable(splats: Splats) -> NDArray[np.bool_]:
     return good
 
 
-_LARGEST = float(np.finfo(np.float32).max)
-_LOG_LARGEST = float(np.log(_LARGEST))
+# A float32 itself: a Python float of this size would make NumPy 1 widen the column, which warns of
+# signalling NaN and costs time.
+_LARGEST = np.finfo(np.float32).max
+_LOG_LARGEST = float(np.log(np.float64(_LARGEST)))
 _LOG_SMALLEST = float(np.log(np.float64(np.finfo(np.float32).smallest_subnormal)))
