@@ -1,8 +1,10 @@
 """Scoring and pruning of 3D Gaussian splats on NumPy arrays; knows nothing of Blender.
 
-file = read_ply("scene.ply")
-result = prune(file.splats(), read_cameras("cameras.json"), Budget(ratio=0.5))
-file.write("pruned.ply", result.keep)
+In short::
+
+    file = read_ply("scene.ply")
+    result = prune(file.splats(), read_cameras("cameras.json"), Budget(ratio=0.5))
+    file.write("pruned.ply", result.keep)
 """
 
 from .camera_files import read_cameras
