@@ -59,15 +59,16 @@ class Budget:
             msg = f"expected one of ratio, keep, max_mb, threshold, min_seen, got {given or 'none'}"
             raise RefineError(msg)
         value = getattr(self, given[0])
-        expected = {
-            "ratio": ("0 <= ratio < 1", 0 <= value < 1),
-            "keep": ("a whole number of at least 1", value >= 1 and value == int(value or 0)),
-            "max_mb": ("a positive number", 0 < value < math.inf),
-            "threshold": ("a number", math.isfinite(value)),
-            "min_seen": ("a percentage, 0 to 100", 0 <= value <= 100),  # noqa: PLR2004
+        # Each is asked of its own value alone: what can be no number of splats can be a size.
+        expected, holds = {
+            "ratio": ("0 <= ratio < 1", lambda: 0 <= value < 1),
+            "keep": ("a whole number of at least 1", lambda: value >= 1 and value % 1 == 0),
+            "max_mb": ("a positive number", lambda: 0 < value < math.inf),
+            "threshold": ("a number", lambda: -math.inf < value < math.inf),
+            "min_seen": ("a percentage, 0 to 100", lambda: 0 <= value <= 100),  # noqa: PLR2004
         }[given[0]]
-        if not expected[1]:
-            msg = f"{given[0]} is {value}, expected {expected[0]}"
+        if not holds():
+            msg = f"{given[0]} is {value}, expected {expected}"
             raise RefineError(msg)
 
     @property
@@ -94,9 +95,13 @@ class Budget:
             # The decimal that was written, not its binary neighbour: floor(.29 * 100) is 29.
             return math.floor(Fraction(repr(float(self.ratio))) * count)
         if self.keep is not None:
-            return max(count - self.keep, 0)
+            return max(count - int(self.keep), 0)
         if self.max_mb is not None:
-            fitting = math.floor((self.max_mb * 1e6 - fixed_bytes) / row_bytes)
+            if not row_bytes:
+                msg = "max_mb needs to know how many bytes a splat takes in the file"
+                raise RefineError(msg)
+            size = Fraction(repr(float(self.max_mb))) * 10**6  # the decimal, as above
+            fitting = math.floor((size - fixed_bytes) / Fraction(row_bytes))
             if fitting < 1:
                 msg = f"max_mb is {self.max_mb}, too small for one splat of {row_bytes:.0f} bytes"
                 raise RefineError(msg)
