@@ -8,18 +8,19 @@ from __future__ import annotations
 import platform
 import time
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from . import closed_form, selection
 from .errors import RefineError
-from .files import refuse_existing
+from .files import expanded, refuse_existing
 from .ply import read_ply
 from .work import Progress, part, report, silent
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from .scores import Scores
@@ -196,7 +197,7 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
         See `prune`, `read_ply` and `SplatFile.write`; nothing is written then.
     """
     start = time.perf_counter()
-    target = None if output is None else Path(output).expanduser()
+    target = None if output is None else expanded(output)
     if target is not None:
         refuse_existing(target, overwrite=overwrite)
     file = read_ply(source)
