@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 import time
 from dataclasses import dataclass, field
@@ -27,7 +28,7 @@ from .core import (
     read_ply,
     score,
 )
-from .core.files import refuse_existing, whole_file
+from .core.files import expanded, refuse_existing, whole_file
 from .core.splats import drawable
 from .version import VERSION
 
@@ -97,9 +98,9 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "--object", metavar="NAME", help="prune this splat object of the open .blend"
     )
     prune.add_argument("--save", action="store_true", help="save the .blend, with --object")
-    prune.add_argument("-o", "--output", type=Path, metavar="OUT.ply", help="for a single input")
+    prune.add_argument("-o", "--output", type=_path, metavar="OUT.ply", help="for a single input")
     prune.add_argument(
-        "--output-dir", type=Path, metavar="DIR", help="for many inputs; made if it is not there"
+        "--output-dir", type=_path, metavar="DIR", help="for many inputs; made if it is not there"
     )
     budget = prune.add_mutually_exclusive_group()
     budget.add_argument(
@@ -123,7 +124,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
 def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     scoring = commands.add_parser("score", help="write the file with a float property refine_score")
     scoring.add_argument("inputs", nargs=1, type=Path, metavar="INPUT")
-    scoring.add_argument("-o", "--output", type=Path, metavar="OUT.ply", required=True)
+    scoring.add_argument("-o", "--output", type=_path, metavar="OUT.ply", required=True)
     _add_scoring(scoring)
     _add_common(scoring)
     scoring.set_defaults(run=_run_score)
@@ -156,13 +157,21 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--report", type=Path, metavar="FILE.json", help="write a report as JSON")
+    parser.add_argument("--report", type=_path, metavar="FILE.json", help="write a report as JSON")
     parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
     parser.add_argument("--quiet", action="store_true", help="print errors only")
 
 
+def _path(text: str) -> Path:
+    try:
+        return expanded(text)
+    except RefineError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
 def _check_usage(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Refuse combinations that argparse cannot; leaves through ``parser.error``, code 2."""
+    _check_report(parser, options)
     if options.run is _run_info:
         return
     try:
@@ -175,6 +184,20 @@ def _check_usage(parser: argparse.ArgumentParser, options: argparse.Namespace) -
         parser.error("no cameras: give --cameras, or open a .blend that has some")
     if options.run is _run_prune:
         _check_prune(parser, options)
+
+
+def _check_report(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Refuse a report that would replace what is read or written, even with --overwrite."""
+    if options.report is None:
+        return
+    others = [*options.inputs, getattr(options, "output", None), getattr(options, "cameras", None)]
+    if getattr(options, "output_dir", None):
+        others += [options.output_dir / path.name for path in options.inputs]
+    report = os.path.realpath(options.report)
+    for other in filter(None, others):
+        # Unlike pathlib's, these two never fail, whatever the name.
+        if os.path.realpath(os.path.expanduser(other)) == report:  # noqa: PTH111
+            parser.error(f"--report {options.report} is {other}, expected a file of its own")
 
 
 def _check_prune(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
@@ -251,8 +274,12 @@ class _Run:
     started: float = field(default_factory=time.perf_counter)
 
     def say(self, text: str) -> None:
-        if not self.options.quiet:
+        if self.options.quiet:
+            return
+        try:
             print(text, flush=True)
+        except UnicodeEncodeError:  # a name that this terminal's encoding cannot show
+            print(text.encode("ascii", "backslashreplace").decode(), flush=True)
 
     def progress(self, label: str) -> Callable[[float, str], None]:
         """Return a callback that draws on a terminal and is silent elsewhere."""
@@ -270,9 +297,12 @@ class _Run:
             self.entries.append({"status": "done", **work()})
         except RefineError as error:
             self.failed = True
-            self.entries.append({"status": "failed", "input": label, "error": str(error)})
+            message = str(error)
+            if Path(label).name not in message:  # what is wrong with splats does not know the file
+                message = f"{label}: {message}"
+            self.entries.append({"status": "failed", "input": label, "error": message})
             self.clear_line()
-            _complain(str(error))
+            _complain(message)
 
     def clear_line(self) -> None:
         if not self.options.quiet and sys.stderr.isatty():
@@ -288,7 +318,7 @@ class _Run:
                 "seconds": time.perf_counter() - self.started,
                 "results": self.entries,
             }
-            path = self.options.report.expanduser()
+            path = self.options.report
             with whole_file(path, overwrite=self.options.overwrite) as stream:
                 stream.write(json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
         return FAILED if self.failed else DONE
@@ -296,7 +326,7 @@ class _Run:
 
 def _start(options: argparse.Namespace) -> _Run:
     if options.report is not None:
-        refuse_existing(options.report.expanduser(), overwrite=options.overwrite)
+        refuse_existing(options.report, overwrite=options.overwrite)
     return _Run(options)
 
 
@@ -310,7 +340,7 @@ def _run_prune(options: argparse.Namespace) -> int:
     if options.object:
         run.attempt(options.object, lambda: _prune_object(run, views))
     elif options.output_dir and not options.dry_run:
-        _make_folder(options.output_dir.expanduser())
+        _make_folder(options.output_dir)
     for source in options.inputs:
         run.attempt(str(source), lambda source=source: _prune_one(run, source, views))
     return run.finish()
@@ -390,7 +420,7 @@ def _run_score(options: argparse.Namespace) -> int:
 
 def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     options = run.options
-    output = options.output.expanduser()
+    output = options.output
     refuse_existing(output, overwrite=options.overwrite)
     file = read_ply(source)
     scores = score(file.splats(), views, _settings(options), progress=run.progress(source.name))
