@@ -11,6 +11,7 @@ import functools
 import json
 import os
 import subprocess
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -162,6 +163,11 @@ class Binary(Blender):
             )
 
         return self._result(name, arguments, window)
+
+
+def without_blender(*words: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run the extension's command of this checkout, in this Python and without Blender."""
+    return _run([sys.executable, "-m", "refine_addon", *words], cwd=PROJECT)
 
 
 def _run(words: list[Any], **options: Any) -> subprocess.CompletedProcess[str]:

@@ -18,7 +18,16 @@ import pytest
 # The harness and the tools it stands on are modules of the tests, not of the package.
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2] / "tools")]
 
-from blenders import BINARIES, MODULES, PROJECT, Binary, Blender, Module, provide  # noqa: E402
+from blenders import (  # noqa: E402
+    BINARIES,
+    MODULES,
+    PROJECT,
+    Binary,
+    Blender,
+    Module,
+    provide,
+    without_blender,
+)
 
 SCENE = PROJECT / "tests" / "data" / "room_small"
 
@@ -102,6 +111,16 @@ def cloud() -> Path:
 def cameras() -> Path:
     """Give the small room's 72 cameras."""
     return SCENE / "cameras.json"
+
+
+@pytest.fixture(scope="session")
+def pruned(cloud: Path, cameras: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Give what ``python -m refine_addon`` makes of the small room: half of its splats."""
+    output = tmp_path_factory.mktemp("python") / "pruned.ply"
+    done = without_blender("prune", cloud, "--cameras", cameras, "--ratio", "0.5", "-o", output)
+    if done.returncode != 0:
+        pytest.fail(done.stdout + done.stderr, pytrace=False)
+    return output
 
 
 @pytest.fixture

@@ -2,29 +2,18 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from typing import TYPE_CHECKING
 
 import numpy as np
-import plyfile
 import pytest
-from blenders import PROJECT
+from blenders import without_blender
+from splat_rows import rows, rows_in
 
 if TYPE_CHECKING:
+    import subprocess
     from pathlib import Path
 
     from blenders import Binary, Blender
-
-
-def rows(path: Path) -> np.ndarray:
-    """Read the splats of a PLY file, a structured array with a field for each property."""
-    return plyfile.PlyData.read(path)["vertex"].data
-
-
-def rows_in(some: np.ndarray, all_of_them: np.ndarray) -> np.ndarray:
-    """Find the rows that stand in another array; (N,) bool for ``all_of_them``, by their bytes."""
-    return np.isin(all_of_them.view(f"V{all_of_them.itemsize}"), some.view(f"V{some.itemsize}"))
 
 
 def refine(binary: Binary, *words: str | Path) -> subprocess.CompletedProcess[str]:
@@ -32,14 +21,13 @@ def refine(binary: Binary, *words: str | Path) -> subprocess.CompletedProcess[st
     return binary.blender("--command", "refine", *words)
 
 
-def without_blender(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run the same command of the checkout, in this Python."""
-    command = [sys.executable, "-m", "refine_addon", *words]
-    return subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=False)
+def test_prune_removes_exactly_half_and_changes_no_row(
+    binary: Binary, cloud: Path, cameras: Path, pruned: Path
+):
+    """floor(39,755 / 2) = 19,877 go; the rest stand in their old order, bit for bit.
 
-
-def test_prune_removes_exactly_half_and_changes_no_row(binary: Binary, cloud: Path, cameras: Path):
-    """floor(39,755 / 2) = 19,877 go; the rest stand in their old order, bit for bit."""
+    The file is the one that ``python -m refine_addon`` writes without Blender.
+    """
     output = binary.work / "pruned.ply"
 
     done = refine(binary, "prune", cloud, "--cameras", cameras, "-o", output, "--ratio", "0.5")
@@ -49,31 +37,23 @@ def test_prune_removes_exactly_half_and_changes_no_row(binary: Binary, cloud: Pa
     assert (len(before), len(after)) == (39_755, 39_755 - 19_877)
     assert after.dtype == before.dtype
     assert after.tobytes() == before[rows_in(after, before)].tobytes()
+    assert output.read_bytes() == pruned.read_bytes()
 
 
-def test_prune_writes_the_same_file_without_blender(binary: Binary, cloud: Path, cameras: Path):
-    """Blender's Python and numpy are others than this one's; the file must not tell."""
-    ours, theirs = binary.work / "python.ply", binary.work / "blender.ply"
-    words = ("prune", cloud, "--cameras", cameras, "--ratio", "0.5", "-o")
+def test_every_blender_writes_the_same_file(
+    blender: Blender, cloud: Path, cameras: Path, pruned: Path
+):
+    """Blender's Python and NumPy are others than this one's; the file must not tell.
 
-    in_blender = refine(binary, *words, theirs)
-    in_python = without_blender(*words, ours)
+    The `bpy` wheels have no `--command`, so the step calls the function behind it.
+    """
+    output = blender.work / "pruned.ply"
+    words = ["prune", cloud, "--cameras", cameras, "--ratio", "0.5", "-o", output]
 
-    assert in_blender.returncode == 0, in_blender.stdout + in_blender.stderr
-    assert in_python.returncode == 0, in_python.stdout + in_python.stderr
-    assert theirs.read_bytes() == ours.read_bytes()
+    code = blender.step("command", arguments=words)
 
-
-def test_modules_command_writes_the_same_file(blender: Blender, cloud: Path, cameras: Path):
-    """The `bpy` wheels have no `--command`; their Python runs the same function."""
-    ours, theirs = blender.work / "python.ply", blender.work / "blender.ply"
-    words = [*map(str, ("prune", cloud, "--cameras", cameras, "--ratio", 0.5, "-o"))]
-
-    code = blender.step("command", arguments=[*words, str(theirs)])
-    in_python = without_blender(*words, ours)
-
-    assert (code, in_python.returncode) == (0, 0), in_python.stderr
-    assert theirs.read_bytes() == ours.read_bytes()
+    assert code == 0
+    assert output.read_bytes() == pruned.read_bytes()
 
 
 def test_failure_is_exit_code_1_and_one_line(binary: Binary, cameras: Path):
