@@ -298,7 +298,9 @@ class _Run:
         except RefineError as error:
             self.failed = True
             message = str(error)
-            if Path(label).name not in message:  # what is wrong with splats does not know the file
+            # What is wrong with the splats is said without the file.
+            files = (Path(label), getattr(self.options, "output", None))
+            if not any(file and file.name in message for file in files):
                 message = f"{label}: {message}"
             self.entries.append({"status": "failed", "input": label, "error": message})
             self.clear_line()
