@@ -12,6 +12,8 @@ import numpy as np
 from .errors import RefineError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from .scores import Scores
@@ -60,13 +62,14 @@ class Budget:
             raise RefineError(msg)
         value = getattr(self, given[0])
         # Each is asked of its own value alone: what can be no number of splats can be a size.
-        expected, holds = {
+        checks: dict[str, tuple[str, Callable[[], bool]]] = {
             "ratio": ("0 <= ratio < 1", lambda: 0 <= value < 1),
             "keep": ("a whole number of at least 1", lambda: value >= 1 and value % 1 == 0),
             "max_mb": ("a positive number", lambda: 0 < value < math.inf),
             "threshold": ("a number", lambda: -math.inf < value < math.inf),
             "min_seen": ("a percentage, 0 to 100", lambda: 0 <= value <= 100),  # noqa: PLR2004
-        }[given[0]]
+        }
+        expected, holds = checks[given[0]]
         if not holds():
             msg = f"{given[0]} is {value}, expected {expected}"
             raise RefineError(msg)

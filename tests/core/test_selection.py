@@ -1,0 +1,217 @@
+"""Budgets and what they select, against a slow reference that anybody can read."""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from refine_addon.core import Budget, RefineError, Scores, rank, select
+from tests.strategies import masks, scores
+
+
+def scored(values, seen=None, views: int = 64) -> Scores:
+    values = np.asarray(values, np.float32)
+    seen = np.zeros(len(values), np.int32) if seen is None else np.asarray(seen, np.int32)
+    return Scores(values, seen, views, 0)
+
+
+def slow_keep(values, count: int, protected) -> list[bool]:
+    """Remove one after the other: the lowest that may go, of equal ones the first."""
+    keep = [True] * len(values)
+    for _ in range(count):
+        left = [i for i in range(len(values)) if keep[i] and not protected[i]]
+        if left:
+            keep[min(left, key=lambda i: (values[i], i))] = False
+    return keep
+
+
+@given(values=scores(), data=st.data())
+def test_the_lowest_scores_go_and_the_first_of_equal_ones(values, data):
+    """As if one went after the other, with any of them protected."""
+    count = len(values)
+    protected = data.draw(st.one_of(st.none(), masks(count)))
+    stay = data.draw(st.integers(1, count + 3))
+    shield = np.zeros(count, np.bool_) if protected is None else protected
+
+    keep = select(scored(values), Budget(keep=stay), protected=protected)
+
+    assert slow_keep(values, max(count - stay, 0), shield) == keep.tolist()
+    assert np.bool_ == keep.dtype
+
+
+@given(values=scores(least=2), data=st.data())
+def test_budgets_are_nested(values, data):
+    """What survives a harsher budget survives a milder one."""
+    low, high = sorted(data.draw(st.tuples(*[st.floats(0, 1, exclude_max=True)] * 2)))
+    mild, harsh = (select(scored(values), Budget(ratio=ratio)) for ratio in (low, high))
+
+    assert not (harsh & ~mild).any()
+
+
+@given(values=scores(), order=st.randoms(use_true_random=False))
+def test_where_no_scores_are_equal_the_order_in_the_file_is_nothing(values, order):
+    """The kept set of shuffled splats is the shuffled kept set."""
+    values = np.unique(values)
+    shuffle = np.array(order.sample(range(len(values)), len(values)))
+    budget = Budget(ratio=0.5)
+
+    expected = select(scored(values), budget)[shuffle]
+
+    np.testing.assert_array_equal(expected, select(scored(values[shuffle]), budget))
+
+
+@pytest.mark.parametrize(
+    ("ratio", "count", "expected"),
+    [
+        (0.0, 10, 0),
+        (0.29, 100, 29),  # as binary floating point, .29 * 100 is 28.999999999999996
+        (0.57, 100, 57),  # 56.99999999999999
+        (0.1, 39755, 3975),
+        (0.999999, 10, 9),
+        (1e-300, 10, 0),
+        (0.5, 1, 0),
+    ],
+)
+def test_a_ratio_is_the_decimal_that_was_written(ratio, count, expected):
+    """floor(ratio N) of the decimal; a ratio below 1 always leaves one."""
+    assert expected == Budget(ratio=ratio).removals(count)
+    assert expected == np.count_nonzero(~select(scored(np.arange(count)), Budget(ratio=ratio)))
+
+
+@given(
+    megabytes=st.floats(1e-4, 1e3),
+    row=st.integers(1, 1000),
+    fixed=st.integers(0, 2000),
+    count=st.integers(1, 10**6),
+)
+def test_a_size_is_met_by_as_many_splats_as_fit(megabytes, row, fixed, count):
+    """In whole numbers: fixed + kept * row <= size < fixed + (kept + 1) * row, or all stay."""
+    size = Fraction(repr(megabytes)) * 10**6
+    budget = Budget(max_mb=megabytes)
+    if fixed + row > size:
+        with pytest.raises(RefineError, match="too small for one splat"):
+            budget.removals(count, row, fixed)
+        return
+
+    kept = count - budget.removals(count, row, fixed)
+
+    assert fixed + kept * row <= size
+    assert kept == count or fixed + (kept + 1) * row > size
+
+
+@pytest.mark.parametrize("megabytes", [1e303, 1.7e308])
+def test_a_size_beyond_all_files_keeps_every_splat(megabytes):
+    """In bytes it is beyond what floating point holds."""
+    assert Budget(max_mb=megabytes).removals(10, 248, 1000) == 0
+
+
+def test_a_size_without_the_size_of_a_splat_is_refused():
+    """From Python, where `select` is not told."""
+    with pytest.raises(RefineError, match="max_mb needs to know how many bytes"):
+        select(scored([1, 2]), Budget(max_mb=1.0))
+
+
+def test_a_threshold_removes_what_scores_below_it():
+    """Equal to it stays; what is protected stays; none may be left over."""
+    values = scored([0.0, 0.5, 1.0, 2.0])
+    protected = np.array([True, False, False, False])
+
+    assert select(values, Budget(threshold=1.0)).tolist() == [False, False, True, True]
+    assert (select(values, Budget(threshold=1.0), protected=protected).tolist()) == [
+        True,
+        False,
+        True,
+        True,
+    ]
+    assert select(values, Budget(threshold=-1.0)).tolist() == [True] * 4
+    with pytest.raises(RefineError, match="threshold would remove all 4 splats; nothing was"):
+        select(values, Budget(threshold=2.5))
+
+
+@pytest.mark.parametrize(
+    ("percent", "views", "least"),
+    [
+        (25, 64, 16),  # 16 of 64 is not fewer than a quarter
+        (0, 64, 0),
+        (1, 64, 1),  # .64 views, and no splat lies in part of a view
+        (0.1, 1000, 1),  # of binary floating point, a little more than 1
+        (100, 7, 7),
+        (28.999999999999996, 100, 29),
+    ],
+)
+def test_splats_in_too_few_views_go(percent, views, least):
+    """Fewer than that share: the least number that stays is its ceiling."""
+    seen = np.arange(views + 1)
+
+    keep = select(scored(np.ones(views + 1), seen, views), Budget(min_seen=percent))
+
+    assert least == int(np.argmax(keep))
+    assert keep[least:].all()
+
+
+def test_protected_splats_stay_whatever_the_budget():
+    """Two of four are protected; of three to go, only the two others can."""
+    protected = np.array([True, False, True, False])
+
+    keep = select(scored([0, 1, 0, 1]), Budget(keep=1), protected=protected)
+
+    assert protected.tolist() == keep.tolist()
+    assert (
+        select(scored([0, 1, 0, 1]), Budget(keep=1), protected=~keep | keep).tolist() == [True] * 4
+    )
+
+
+def test_a_budget_is_exactly_one_number():
+    """None, or two, are refused with what was given."""
+    with pytest.raises(RefineError, match="expected one of ratio, keep, max_mb, threshold, min_"):
+        Budget()
+    with pytest.raises(RefineError, match=re.escape("got ['ratio', 'keep']")):
+        Budget(ratio=0.5, keep=3)
+
+
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "expected"),
+    [
+        ("ratio", (-0.1, 1, 1.5, NAN, INF, -INF, 10**400), "expected 0 <= ratio < 1"),
+        ("keep", (0, -1, 1.5, NAN, INF), "expected a whole number of at least 1"),
+        ("max_mb", (0, -1, NAN, INF), "expected a positive number"),
+        ("threshold", (NAN, INF, -INF), "expected a number"),
+        ("min_seen", (-1, 100.5, NAN, INF), "expected a percentage, 0 to 100"),
+    ],
+)
+def test_a_number_that_cannot_be_is_refused_with_its_name(name, values, expected):
+    """Each says what it is and what was expected."""
+    for value in values:
+        with pytest.raises(RefineError, match=re.escape(f"{name} is {value}, {expected}")):
+            Budget(**{name: value})
+
+
+def test_whole_numbers_of_any_kind_are_taken():
+    """3, 3.0 and NumPy's 3 keep three; more than there are keeps all."""
+    for keep in (3, 3.0, np.int64(3), np.float32(3)):
+        assert np.count_nonzero(select(scored(np.arange(5)), Budget(keep=keep))) == 3
+    for keep in (5, 10**400):
+        assert select(scored(np.arange(5)), Budget(keep=keep)).all()
+
+
+@given(values=scores())
+def test_the_rank_is_the_place_in_the_order_of_removal(values):
+    """0 goes first, 1 last, evenly; equal scores by their place in the file."""
+    order = sorted(range(len(values)), key=lambda i: (values[i], i))
+
+    ranks = rank(values)
+
+    assert np.float32 == ranks.dtype
+    assert order == np.argsort(ranks, kind="stable").tolist()
+    assert ranks.max() == 1.0
+    assert (0.0 if len(values) > 1 else 1.0) == ranks.min()
+    expected = np.linspace(0, 1, len(values)) if len(values) > 1 else np.ones(1)
+    np.testing.assert_allclose(ranks[order], expected, atol=1e-6)
