@@ -1,0 +1,126 @@
+"""How long a prune takes from file to file, against copying the file, and what memory it needs.
+
+    python -m benchmarks.file_to_file [--splats 3000000] [--runs 5]
+
+The input is the committed room's rows, repeated, each copy a little elsewhere: 744 MB for 3 million
+splats of degree 3. Both commands are processes of their own, interpreter start included; they run
+in turn, one not counted, with the input in the page cache and nothing at the output's place.
+
+Memory is sampled from ``/proc``: the pages that belong to the process alone (RssAnon). What it maps
+of the input is the page cache's, which the system takes back when others need it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from refine_addon.core import read_ply
+from refine_addon.core.ply_header import with_count
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+ROOT = Path(__file__).parents[1]
+ROOM = ROOT / "tests/data/room_small"
+
+TARGET_RATIO = 3.0
+"""A prune takes at most this many times as long as a copy."""
+
+TARGET_MEMORY = 400.0
+"""Megabytes that a prune may hold beyond the page cache."""
+
+
+def make_input(path: Path, count: int) -> None:
+    """Write a file of `count` splats: the room's again and again, moved by 2 cm of noise."""
+    file = read_ply(ROOM / "point_cloud.ply")
+    random = np.random.default_rng(0)
+    with path.open("wb") as stream:
+        stream.write(with_count(file.header, count))
+        for start in range(0, count, len(file)):
+            rows = file.rows[: count - start].copy()
+            for axis in "xyz":
+                rows[axis] += random.normal(scale=0.02, size=len(rows)).astype(np.float32)
+            stream.write(rows.data)
+
+
+def run(command: Sequence[str | Path]) -> tuple[float, float]:
+    """Run a command from the checkout; return its seconds and its peak of megabytes alone."""
+    peak = 0.0
+    start = time.perf_counter()
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+        status = Path(f"/proc/{process.pid}/status")
+        while process.poll() is None:
+            peak = max(peak, _anonymous(status))
+            time.sleep(0.002)
+        seconds = time.perf_counter() - start
+    if process.returncode:
+        sys.exit(process.returncode)
+    return seconds, peak
+
+
+def _anonymous(status: Path) -> float:
+    try:
+        lines = status.read_text().splitlines()
+    except OSError:  # it ended in between, or this is no Linux
+        return 0.0
+    return sum(int(line.split()[1]) / 1000 for line in lines if line.startswith("RssAnon:"))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print medians, their ratio, the peak of memory and where the time goes."""
+    parser = argparse.ArgumentParser(description="Time a prune against a copy.")
+    parser.add_argument("--splats", type=int, default=3_000_000)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--ratio", default="0.5")
+    parser.add_argument("--folder", type=Path, help="on the disk to measure; default the system's")
+    options = parser.parse_args(arguments)
+    with tempfile.TemporaryDirectory(dir=options.folder) as made:
+        source, copy, output, report = (
+            Path(made) / name for name in ("in.ply", "copy.ply", "out.ply", "report.json")
+        )
+        make_input(source, options.splats)
+        print(f"{options.splats:,} splats, {source.stat().st_size / 1e6:.0f} MB, {made}")
+        commands = {
+            "copy": ["cp", source, copy],
+            "start": [sys.executable, "-m", "refine_addon", "--version"],
+            "prune": [
+                *(sys.executable, "-m", "refine_addon", "prune", source, "-o", output),
+                *("--cameras", ROOM / "cameras.json", "--ratio", options.ratio),
+                *("--report", report, "--overwrite"),
+            ],
+        }
+        seconds: dict[str, list[float]] = {name: [] for name in commands}
+        peaks: dict[str, float] = dict.fromkeys(commands, 0.0)
+        parts: list[dict[str, float]] = []
+        for turn in range(options.runs + 1):
+            for name, command in commands.items():
+                took, peak = run(command)
+                if turn:
+                    seconds[name].append(took)
+                    peaks[name] = max(peaks[name], peak)
+            parts.append(json.loads(report.read_text())["results"][0]["timings"])
+            copy.unlink()
+            output.unlink()
+    medians = {name: statistics.median(values) for name, values in seconds.items()}
+    for name, values in seconds.items():
+        every = " ".join(f"{value:.2f}" for value in values)
+        print(f"{name:6} {medians[name]:6.2f} s   ({every})   peak {peaks[name]:.0f} MB of its own")
+    for name in parts[0]:
+        print(f"    {name:9} {statistics.median(part[name] for part in parts[1:]):6.2f}")
+    ratio = medians["prune"] / medians["copy"]
+    print(f"prune / copy: {ratio:.2f}, target at most {TARGET_RATIO:g}")
+    print(f"memory: {peaks['prune']:.0f} MB, target at most {TARGET_MEMORY:g}")
+
+
+if __name__ == "__main__":
+    main()

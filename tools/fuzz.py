@@ -1,0 +1,444 @@
+"""Feed broken files to every reader, for as long as there is time.
+
+    python tools/fuzz.py [--seconds 300] [--seed N] [--only ply]
+
+Good files of every format are broken by chance: bytes, words, numbers, lines, JSON values. Each
+must end in a `RefineError` that names the file, or in a result that holds together: a PLY must be
+rewritten byte for byte, cameras must be usable for scoring. Anything else, a warning of NumPy's, a
+memory beyond the file's and a run of seconds among it, is a crash: the input is kept and the exit
+code is 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import random
+import re
+import struct
+import sys
+import tempfile
+import time
+import traceback
+import tracemalloc
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+from refine_addon.command import describe  # noqa: E402 - from this checkout, installed or not
+from refine_addon.core import RefineError, read_cameras, read_ply, score  # noqa: E402
+from refine_addon.core.ply import splats_from_columns  # noqa: E402
+
+MEMORY = 40_000_000
+"""Bytes that any of these small inputs may cost; NumPy and JSON need some of their own."""
+
+SECONDS = 5.0
+"""An input that takes longer is a crash too."""
+
+REQUIRED = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
+
+WORDS = (
+    *(b"element vertex 3", b"element face 2", b"property float x", b"property list uchar int i"),
+    *(b"property list float double d", b"end_header\n", b"comment \xff", b"obj_info", b"format"),
+    *(b"ascii 1.0", b"binary_big_endian 1.0", b"ply\r\n", b"\r", b"\n", b"\0", b" ", b"\t", b"#"),
+    *(
+        b"[",
+        b"]",
+        b"{",
+        b"}",
+        b'"',
+        b"\\ud800",
+        b",",
+        b":",
+        b"null",
+        b"NaN",
+        b"-Infinity",
+        b"1e999",
+    ),
+)
+NUMBERS = (
+    *("0", "-1", "1", "255", "256", "65536", "2147483648", "4294967295", "9223372036854775808"),
+    *("18446744073709551616", "9" * 400, "1e400", "-1e-400", "nan", "inf", "1_0", "0x10", "1.5"),
+)
+VALUES = (
+    *(None, True, False, "", "x" * 500, "\ud800", [], {}, [[]], {"a": 1}, 0, -1, 1, 0.5, 1e-320),
+    *(1e18, 1e19, 1e300, float("nan"), float("inf"), -float("inf"), 10**18, 10**400, -(10**30)),
+)
+"""What a number, a list or a name in a JSON file is replaced with."""
+
+Files = dict[str, bytes]
+"""A file, or several that belong together, by name."""
+
+
+# Good files.
+
+
+def ply_seeds() -> list[Files]:
+    """Return PLY files in every encoding, with lists, text, doubles and comments."""
+    names = REQUIRED.split()
+    values = np.linspace(-1.0, 1.0, 3 * len(names)).reshape(3, -1)
+    plain = "".join(f"property float {name}\n" for name in names)
+    rest = "".join(f"property double f_rest_{index}\n" for index in range(9))
+    seeds = []
+    for form, order in (("binary_little_endian", "<"), ("binary_big_endian", ">")):
+        head = f"ply\nformat {form} 1.0\ncomment made\nobj_info here\n"
+        rows = values.astype(f"{order}f4").tobytes()
+        seeds.append(f"{head}element vertex 3\n{plain}end_header\n".encode() + rows)
+        face = struct.pack(f"{order}B2iB1i", 2, 5, 6, 1, 7)
+        lists = "element face 2\nproperty list uchar int corners\n"
+        lead = f"{head}{lists}element vertex 3\n{plain}end_header\n".replace("\n", "\r\n")
+        seeds.append(lead.encode() + face + rows)
+        trail = f"{head}element vertex 3\n{plain}{lists}end_header\n"
+        seeds.append(trail.encode() + rows + face)
+        wide = np.zeros((3, 14 * 4 + 9 * 8), np.uint8)
+        wide[:, :56] = np.frombuffer(rows, np.uint8).reshape(3, 56)
+        header = f"{head}element vertex 3\n{plain}{rest}end_header\n"
+        seeds.append(header.encode() + wide.tobytes() + b"trailing")
+    lines = "".join(" ".join(f"{value:g}" for value in row) + " 7\n" for row in values)
+    text = f"ply\nformat ascii 1.0\nelement vertex 3\n{plain}property uchar tag\n"
+    seeds.append(
+        (text + "element face 1\nproperty list uchar int i\nend_header\n" + lines).encode()
+    )
+    seeds[-1] += b"3 0 1 2\n"
+    seeds.append((text + "end_header\n" + lines).replace("\n", "\r").encode().rstrip())
+    return [{"in.ply": seed} for seed in seeds]
+
+
+def inria_seeds() -> list[Files]:
+    """Return ``cameras.json`` as the reference implementation writes it."""
+    cameras = [
+        {
+            "id": index,
+            "img_name": f"{index:03}",
+            "width": 640,
+            "height": 480,
+            "position": [0.1 * index, 0.0, -4.0],
+            "rotation": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+            "fx": 500.0,
+            "fy": 500.0,
+        }
+        for index in range(2)
+    ]
+    return [{"cameras.json": json.dumps(cameras).encode()}]
+
+
+def transforms_seeds() -> list[Files]:
+    """Return ``transforms.json`` of nerfstudio and of instant-ngp, and what lies beside it."""
+    pose = [[1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, -4.0], [0, 0, 0, 1]]
+    frames = [{"file_path": "a.png", "transform_matrix": pose}]
+    studio = {
+        "w": 640,
+        "h": 480,
+        "fl_x": 500.0,
+        "fl_y": 500.0,
+        "cx": 320.0,
+        "cy": 240.0,
+        "k1": 0.1,
+        "camera_model": "OPENCV",
+        "applied_transform": pose[:3],
+        "frames": frames,
+    }
+    ngp = {
+        "camera_angle_x": 0.8,
+        "w": 640.0,
+        "h": 480.0,
+        "aabb_scale": 4,
+        "scale": 0.3,
+        "frames": [{**frames[0], "fl_x": 400.0, "w": 320, "h": 200}],
+    }
+    beside = {"transform": pose[:3], "scale": 0.5}
+    return [
+        {"transforms.json": json.dumps(studio).encode()},
+        {"transforms.json": json.dumps(ngp).encode()},
+        {
+            "transforms.json": json.dumps(studio).encode(),
+            "dataparser_transforms.json": json.dumps(beside).encode(),
+        },
+    ]
+
+
+def colmap_text_seeds() -> list[Files]:
+    """Return a text model of two cameras and two images."""
+    cameras = (
+        "# Camera list\n1 PINHOLE 640 480 500 500 320 240\n2 SIMPLE_RADIAL 64 48 50 32 24 .1\n"
+    )
+    images = (
+        "# Image list\n1 1 0 0 0 0.0 0.0 4.0 1 a.png\n1.5 2.5 -1 3.5 4.5 7\n"
+        "2 0.9 0.1 0 0 0.1 0.0 4.0 2 b.png\n\n"
+    )
+    return [{"cameras.txt": cameras.encode(), "images.txt": images.encode()}]
+
+
+def colmap_binary_seeds() -> list[Files]:
+    """Return a binary model of two cameras and two images."""
+    cameras = struct.pack("<Q", 2)
+    cameras += struct.pack("<IiQQ4d", 1, 1, 640, 480, 500.0, 500.0, 320.0, 240.0)
+    cameras += struct.pack("<IiQQ4d", 2, 2, 64, 48, 50.0, 32.0, 24.0, 0.1)
+    images = struct.pack("<Q", 2)
+    for index, points in ((1, 2), (2, 0)):
+        images += struct.pack("<I7dI", index, 1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 4.0, index)
+        images += b"%d.png\0" % index + struct.pack("<Q", points) + bytes(24 * points)
+    return [{"cameras.bin": cameras, "images.bin": images}]
+
+
+# Broken files.
+
+
+def broken(files: Files, others: list[Files], chance: random.Random) -> Files:
+    """Return the files with one of them broken in one to five ways."""
+    name = chance.choice(sorted(files))
+    data = files[name]
+    for _ in range(chance.choice((1, 1, 1, 2, 3, 5))):
+        if name.endswith(".json") and chance.random() < 0.6:  # noqa: PLR2004
+            data = _other_value(data, chance)
+        else:
+            other = chance.choice(others).get(name, data)
+            data = chance.choice(_WAYS)(data, other, chance)
+    return {**files, name: data[:200_000]}
+
+
+def _cut(data: bytes, _: bytes, chance: random.Random) -> bytes:
+    return data[: chance.randint(0, len(data))]
+
+
+def _drop(data: bytes, _: bytes, chance: random.Random) -> bytes:
+    start = chance.randint(0, len(data))
+    return data[:start] + data[start + chance.choice((1, 1, 4, 8, 60)) :]
+
+
+def _repeat(data: bytes, _: bytes, chance: random.Random) -> bytes:
+    start = chance.randint(0, len(data))
+    piece = data[start : start + chance.choice((1, 8, 60, 200))]
+    return data[:start] + piece * chance.choice((2, 3, 100)) + data[start:]
+
+
+def _flip(data: bytes, _: bytes, chance: random.Random) -> bytes:
+    changed = bytearray(data)
+    for _ in range(chance.choice((1, 1, 4, 30)) if data else 0):
+        where = chance.randrange(len(changed))
+        changed[where] = chance.choice((0, 255, 10, 13, 32, chance.randrange(256)))
+    return bytes(changed)
+
+
+def _word(data: bytes, _: bytes, chance: random.Random) -> bytes:
+    start = chance.randint(0, len(data))
+    return data[:start] + chance.choice(WORDS) + data[start + chance.choice((0, 0, 4)) :]
+
+
+def _number(data: bytes, _: bytes, chance: random.Random) -> bytes:
+    found = list(re.finditer(rb"-?[0-9.]+", data[:5000]))
+    if not found:
+        return data
+    place = chance.choice(found)
+    return data[: place.start()] + chance.choice(NUMBERS).encode() + data[place.end() :]
+
+
+def _machine_number(data: bytes, _: bytes, chance: random.Random) -> bytes:
+    value = chance.choice((0, 1, 255, 2**31, 2**32 - 1, 2**63, 2**64 - 1, 0x7FF4000000000001))
+    start = chance.randint(0, max(len(data) - 8, 0))
+    kind = chance.choice(["<Q", ">Q", "<I", ">I", "<B"])
+    packed = struct.pack(kind, value & (1 << 8 * struct.calcsize(kind)) - 1)
+    return data[:start] + packed + data[start + len(packed) :]
+
+
+def _line(data: bytes, other: bytes, chance: random.Random) -> bytes:
+    lines, more = data.split(b"\n"), other.split(b"\n")
+    start = chance.randrange(len(lines))
+    lines[start : start + chance.randint(0, 2)] = chance.sample(more, min(len(more), 1))
+    return b"\n".join(lines)
+
+
+def _splice(data: bytes, other: bytes, chance: random.Random) -> bytes:
+    return data[: chance.randint(0, len(data))] + other[chance.randint(0, len(other)) :]
+
+
+_WAYS = (_cut, _drop, _repeat, _flip, _word, _number, _machine_number, _line, _splice)
+
+
+def _other_value(data: bytes, chance: random.Random) -> bytes:
+    """Replace, drop or nest one value of a JSON file."""
+    try:
+        content = json.loads(data)
+    except (ValueError, RecursionError):
+        return data
+    places: list[tuple[dict | list, str | int]] = []
+    left = [content]
+    while left:
+        node = left.pop()
+        if isinstance(node, dict | list):
+            keys = list(node) if isinstance(node, dict) else range(len(node))
+            places += [(node, key) for key in keys]
+            left += [node[key] for key in keys]
+    if not places:
+        return data
+    node, key = chance.choice(places)
+    way = chance.random()
+    if way < 0.7:  # noqa: PLR2004
+        node[key] = chance.choice(VALUES)
+    elif way < 0.8:  # noqa: PLR2004
+        del node[key]
+    elif way < 0.9:  # noqa: PLR2004
+        node[key] = [node[key]] * chance.choice((1, 2, 1000))
+    else:
+        text = json.dumps(node[key])
+        node[key] = "\0here\0"
+        deep = chance.choice((3, 5000))
+        return (
+            json.dumps(content)
+            .replace('"\\u0000here\\u0000"', "[" * deep + text + "]" * deep)
+            .encode()
+        )
+    return json.dumps(content).encode()
+
+
+# What must hold of them.
+
+
+def use_ply(folder: Path) -> None:
+    """Read, describe, convert and rewrite a PLY file."""
+    path, again = folder / "in.ply", folder / "out.ply"
+    file = read_ply(path)
+    file.splats()
+    describe(file)
+    file.write(again, overwrite=True)
+    if path.read_bytes() != again.read_bytes():
+        msg = "rewritten with nothing pruned it is another file"
+        raise AssertionError(msg)
+    keep = np.arange(len(file)) % 2 == 0
+    file.write(again, keep, columns={"mine": np.ones(len(file), np.float32)}, overwrite=True)
+    if len(read_ply(again)) != int(keep.sum()):
+        msg = "pruned it holds another number of splats"
+        raise AssertionError(msg)
+
+
+def use_cameras(folder: Path) -> None:
+    """Read cameras, and score a few splats by them."""
+    files = sorted(path for path in folder.iterdir() if path.name != "dataparser_transforms.json")
+    views = read_cameras(files[0])
+    values = np.random.default_rng(0).normal(size=(20, 14)).astype(np.float32)
+    columns = dict(zip(REQUIRED.split(), values.T, strict=True))
+    try:
+        scores = score(splats_from_columns(columns), views)
+    except RefineError as error:
+        if "no camera sees the splats" in str(error):
+            return
+        raise
+    if not np.isfinite(scores.values).all():
+        msg = "scores are not finite"
+        raise AssertionError(msg)
+
+
+Target = tuple[Callable[[], list[Files]], Callable[[Path], None]]
+TARGETS: dict[str, Target] = {
+    "ply": (ply_seeds, use_ply),
+    "cameras.json": (inria_seeds, use_cameras),
+    "transforms.json": (transforms_seeds, use_cameras),
+    "colmap text": (colmap_text_seeds, use_cameras),
+    "colmap binary": (colmap_binary_seeds, use_cameras),
+}
+
+
+class Crash(Exception):  # noqa: N818 - what fuzzers call it
+    """Something other than a result or an error for the user, and the files that led to it."""
+
+    def __init__(self, files: Files, why: str) -> None:
+        super().__init__(why)
+        self.files = files
+
+
+def attempt(files: Files, use: Callable[[Path], None], folder: Path) -> bool:
+    """Use files that may be broken; return whether they were taken.
+
+    Raises
+    ------
+    Crash
+        If the answer is neither a result nor an error that names the file.
+    """
+    for old in folder.iterdir():
+        old.unlink()
+    for name, data in files.items():
+        (folder / name).write_bytes(data)
+    start = time.perf_counter()
+    tracemalloc.reset_peak()
+    try:
+        with np.errstate(all="raise"):
+            use(folder)
+        taken = True
+    except RefineError as error:
+        taken = False
+        message = str(error)
+        if not message.startswith(str(folder)):
+            raise Crash(files, f"the error names no file: {message}") from error
+        if len(message) > 2000 or not message.isprintable():  # noqa: PLR2004
+            raise Crash(files, f"the error is no sentence: {message[:300]!r}") from error
+    except Exception as error:
+        raise Crash(files, traceback.format_exc()) from error
+    if time.perf_counter() - start > SECONDS:
+        raise Crash(files, f"took {time.perf_counter() - start:.1f} s")
+    if tracemalloc.is_tracing() and tracemalloc.get_traced_memory()[1] > MEMORY:
+        raise Crash(files, f"took {tracemalloc.get_traced_memory()[1]} bytes of memory")
+    return taken
+
+
+def fuzz(name: str, chance: random.Random, going: Callable[[int], bool]) -> tuple[int, int]:
+    """Try broken files of one format as long as `going`, asked with their number, says so.
+
+    Returns
+    -------
+    tuple of int
+        How many were tried, and how many of them were taken.
+    """
+    make, use = TARGETS[name]
+    seeds = make()
+    tried = taken = 0
+    with tempfile.TemporaryDirectory() as made, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        folder = Path(made)
+        for seed in seeds:
+            if not attempt(seed, use, folder):
+                raise Crash(seed, "a good file is refused")
+        while going(tried):
+            tried += 1
+            taken += attempt(broken(chance.choice(seeds), seeds, chance), use, folder)
+    return tried, taken
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Fuzz every reader in turn; return the exit code."""
+    parser = argparse.ArgumentParser(description="Feed broken files to every reader.")
+    parser.add_argument("--seconds", type=float, default=300.0, help="for all formats together")
+    parser.add_argument("--seed", type=int, default=None, help="the same inputs again")
+    parser.add_argument("--only", choices=sorted(TARGETS), help="one format alone")
+    parser.add_argument("--keep", type=Path, default=ROOT / "build/fuzz", help="for what crashes")
+    options = parser.parse_args(arguments)
+    seed = random.SystemRandom().randrange(2**32) if options.seed is None else options.seed
+    names = [options.only] if options.only else list(TARGETS)
+    print(f"seed {seed}, {options.seconds:g} s")
+    total = crashes = 0
+    tracemalloc.start()
+    for name in names:
+        end = time.monotonic() + options.seconds / len(names)
+        try:
+            chance = random.Random(f"{seed} {name}")  # noqa: S311 - no secret
+            tried, taken = fuzz(name, chance, lambda _, end=end: time.monotonic() < end)
+        except Crash as crash:
+            crashes += 1
+            where = options.keep / name.replace(" ", "_")
+            where.mkdir(parents=True, exist_ok=True)
+            for file, data in crash.files.items():
+                (where / file).write_bytes(data)
+            print(f"{name}: CRASH, input kept in {where}\n{crash}")
+            continue
+        total += tried
+        print(f"{name}: {tried} inputs tried, {taken} taken, {tried - taken} refused, no crash")
+    print(f"{total} inputs tried, {crashes} crashes")
+    return 1 if crashes else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
