@@ -5,6 +5,7 @@
 The input is the committed room's rows, repeated, each copy a little elsewhere: 744 MB for 3 million
 splats of degree 3. Both commands are processes of their own, interpreter start included; they run
 in turn, one not counted, with the input in the page cache and nothing at the output's place.
+Seconds of the processor, of all cores together, tell what a busy machine hides.
 
 Memory is sampled from ``/proc``: the pages that belong to the process alone (RssAnon). What it maps
 of the input is the page cache's, which the system takes back when others need it.
@@ -14,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import resource
 import statistics
 import subprocess
 import sys
@@ -53,9 +55,10 @@ def make_input(path: Path, count: int) -> None:
             stream.write(rows.data)
 
 
-def run(command: Sequence[str | Path]) -> tuple[float, float]:
-    """Run a command from the checkout; return its seconds and its peak of megabytes alone."""
+def run(command: Sequence[str | Path]) -> tuple[float, float, float]:
+    """Run a command from the checkout; return its seconds, the processor's, and peak megabytes."""
     peak = 0.0
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start = time.perf_counter()
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
         status = Path(f"/proc/{process.pid}/status")
@@ -65,7 +68,9 @@ def run(command: Sequence[str | Path]) -> tuple[float, float]:
         seconds = time.perf_counter() - start
     if process.returncode:
         sys.exit(process.returncode)
-    return seconds, peak
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    busy = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    return seconds, busy, peak
 
 
 def _anonymous(status: Path) -> float:
@@ -100,13 +105,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
             ],
         }
         seconds: dict[str, list[float]] = {name: [] for name in commands}
+        busy: dict[str, list[float]] = {name: [] for name in commands}
         peaks: dict[str, float] = dict.fromkeys(commands, 0.0)
         parts: list[dict[str, float]] = []
         for turn in range(options.runs + 1):
             for name, command in commands.items():
-                took, peak = run(command)
+                took, worked, peak = run(command)
                 if turn:
                     seconds[name].append(took)
+                    busy[name].append(worked)
                     peaks[name] = max(peaks[name], peak)
             parts.append(json.loads(report.read_text())["results"][0]["timings"])
             copy.unlink()
@@ -114,7 +121,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     medians = {name: statistics.median(values) for name, values in seconds.items()}
     for name, values in seconds.items():
         every = " ".join(f"{value:.2f}" for value in values)
-        print(f"{name:6} {medians[name]:6.2f} s   ({every})   peak {peaks[name]:.0f} MB of its own")
+        print(
+            f"{name:6} {medians[name]:6.2f} s ({every}), {statistics.median(busy[name]):.2f} s of "
+            f"the processor, peak {peaks[name]:.0f} MB of its own"
+        )
     for name in parts[0]:
         print(f"    {name:9} {statistics.median(part[name] for part in parts[1:]):6.2f}")
     ratio = medians["prune"] / medians["copy"]
