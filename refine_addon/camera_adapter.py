@@ -150,6 +150,7 @@ def _cameras(
     context: bpy.types.Context, source: str, collection: bpy.types.Collection | None
 ) -> Iterator[bpy.types.Object]:
     layer = context.view_layer
+    layer.update()  # or the list holds gaps where objects were just removed
     if source == "ACTIVE":
         yield _active_camera(context.scene)
         return

@@ -9,6 +9,7 @@ import numpy as np
 
 from . import mesh_adapter
 from .core.errors import RefineError
+from .node_trees import chain, named_attribute, new_tree
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -143,39 +144,8 @@ def _group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
         bpy.data.node_groups.remove(tree)
 
 
-def new_tree(name: str) -> bpy.types.NodeTree:
-    """Return a geometry node group with a geometry in and out, and nothing between."""
-    tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
-    for direction in ("INPUT", "OUTPUT"):
-        tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
-    tree.nodes.new("NodeGroupInput")
-    tree.nodes.new("NodeGroupOutput").location.x = 600
-    return tree
-
-
-def named_attribute(tree: bpy.types.NodeTree, name: str, data_type: str) -> bpy.types.NodeSocket:
-    """Add a node that reads an attribute, and return its value."""
-    node = tree.nodes.new("GeometryNodeInputNamedAttribute")
-    node.data_type = data_type
-    node.inputs["Name"].default_value = name
-    node.location.y = -200
-    return next(socket for socket in node.outputs if socket.name == "Attribute" and socket.enabled)
-
-
-def chain(tree: bpy.types.NodeTree, nodes: list[bpy.types.Node]) -> None:
-    """Link the geometry from the group's input through `nodes` to its output."""
-    start = next(node for node in tree.nodes if node.bl_idname == "NodeGroupInput")
-    end = next(node for node in tree.nodes if node.bl_idname == "NodeGroupOutput")
-    socket = start.outputs[0]
-    for index, node in enumerate(nodes):
-        node.location.x = 200 * (index + 1)
-        tree.links.new(socket, node.inputs[0])
-        socket = node.outputs[0]
-    tree.links.new(socket, end.inputs[0])
-
-
 def add_delete(tree: bpy.types.NodeTree) -> bpy.types.Node:
-    """Add a node that deletes the points marked by `REMOVE`; none where nothing is marked."""
+    """Add a node that deletes the points marked by `REMOVE`, or none where nothing is marked."""
     node = tree.nodes.new("GeometryNodeDeleteGeometry")
     node.domain = "POINT"
     tree.links.new(named_attribute(tree, REMOVE, "BOOLEAN"), node.inputs["Selection"])

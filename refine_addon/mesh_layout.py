@@ -175,7 +175,7 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
         header = re.sub(_COUNT, count, noted["header"].encode("latin-1"), count=1)
         layout = Layout(columns, header)
         described = layout.row_dtype.itemsize > 0
-    except (KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError, ValueError):
         # Somebody else may have written there: what does not describe a file is no layout.
         return None
     return layout if described else None

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from . import mesh_adapter, mesh_edit
+from . import mesh_adapter, mesh_edit, mesh_layout
 from .camera_objects import world_matrix
 from .core import pipeline
 from .core.errors import RefineError
@@ -72,6 +72,12 @@ def gather(obj: bpy.types.Object) -> Splats:
     return transformed(splats, matrix, rotate_sh=False)
 
 
+def check_scorable(obj: bpy.types.Object) -> None:
+    """Raise `RefineError` if scores could not be stored on an object, before they are computed."""
+    check(obj)
+    mesh_edit.check_writable(obj)
+
+
 def score_object(
     obj: bpy.types.Object,
     views: ViewSet,
@@ -100,7 +106,7 @@ def score_object(
         If `progress` answers ``False``.
     """
     settings = settings or Settings()
-    mesh_edit.check_writable(obj)
+    check_scorable(obj)
     scores = pipeline.score(gather(obj), views, settings, progress=progress)
     store(obj, scores, views, settings)
     return scores
@@ -252,7 +258,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
         the .blend cannot be saved.
     """
     start = time.perf_counter()
-    obj = _find(name)
+    obj = find(name)
     target = None if output is None or dry_run else Path(output).expanduser()
     if target is not None:
         refuse_existing(target, overwrite=overwrite)
@@ -317,10 +323,11 @@ def _world_columns(obj: bpy.types.Object) -> dict[str, NDArray[Any]]:
     return columns
 
 
-def _find(name: str) -> bpy.types.Object:
+def find(name: str) -> bpy.types.Object:
+    """Return the object of that name, or raise `RefineError` with those that hold splats."""
     obj = bpy.context.scene.objects.get(name)
     if obj is None:
-        names = [o.name for o in bpy.context.scene.objects if mesh_adapter.looks_like_splats(o)]
+        names = [o.name for o in bpy.context.scene.objects if mesh_layout.looks_like_splats(o)]
         there = ", ".join(names[:8]) or "none"
         msg = f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {there})"
         raise RefineError(msg)

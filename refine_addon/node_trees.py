@@ -1,0 +1,75 @@
+"""Building node trees: what geometry nodes and materials of ours have in common."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import bpy
+
+
+def new_tree(name: str) -> bpy.types.NodeTree:
+    """Return a geometry node group with a geometry in and out, and nothing between."""
+    tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    for direction in ("INPUT", "OUTPUT"):
+        tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
+    tree.nodes.new("NodeGroupInput")
+    tree.nodes.new("NodeGroupOutput").location.x = 600
+    return tree
+
+
+def named_attribute(tree: bpy.types.NodeTree, name: str, data_type: str) -> bpy.types.NodeSocket:
+    """Add a node that reads an attribute, and return its value."""
+    node = tree.nodes.new("GeometryNodeInputNamedAttribute")
+    node.data_type = data_type
+    node.inputs["Name"].default_value = name
+    node.location.y = -200
+    return next(socket for socket in node.outputs if socket.name == "Attribute" and socket.enabled)
+
+
+def chain(tree: bpy.types.NodeTree, nodes: list[bpy.types.Node]) -> None:
+    """Link the geometry from the group's input through `nodes` to its output."""
+    start = next(node for node in tree.nodes if node.bl_idname == "NodeGroupInput")
+    end = next(node for node in tree.nodes if node.bl_idname == "NodeGroupOutput")
+    socket = start.outputs[0]
+    for index, node in enumerate(nodes):
+        node.location.x = 200 * (index + 1)
+        tree.links.new(socket, node.inputs[0])
+        socket = node.outputs[0]
+    tree.links.new(socket, end.inputs[0])
+
+
+def add(tree: bpy.types.NodeTree, kind: str, **settings: Any) -> bpy.types.Node:  # noqa: ANN401
+    """Add a node of a type and set its properties."""
+    node = tree.nodes.new(kind)
+    for name, value in settings.items():
+        setattr(node, name, value)
+    return node
+
+
+def math(
+    tree: bpy.types.NodeTree, operation: str, *inputs: bpy.types.NodeSocket | float
+) -> bpy.types.NodeSocket:
+    """Add a math node with numbers or sockets as its inputs, and return its value."""
+    node = add(tree, "ShaderNodeMath", operation=operation)
+    for socket, value in zip(node.inputs, inputs, strict=False):
+        if isinstance(value, bpy.types.NodeSocket):
+            tree.links.new(value, socket)
+        else:
+            socket.default_value = value
+    return node.outputs[0]
+
+
+def vector_math(
+    tree: bpy.types.NodeTree, operation: str, *inputs: bpy.types.NodeSocket
+) -> bpy.types.NodeSocket:
+    """Add a vector math node, and return its result: a number for a dot product."""
+    node = add(tree, "ShaderNodeVectorMath", operation=operation)
+    for socket, value in zip(node.inputs, inputs, strict=False):
+        tree.links.new(value, socket)
+    return node.outputs["Value" if operation == "DOT_PRODUCT" else "Vector"]
+
+
+def logistic(tree: bpy.types.NodeTree, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+    """Add nodes that turn a logit into 0..1."""
+    decay = math(tree, "EXPONENT", math(tree, "MULTIPLY", value, -1.0))
+    return math(tree, "DIVIDE", 1.0, math(tree, "ADD", 1.0, decay))

@@ -1,0 +1,283 @@
+"""Operators on splat objects: each reads what the user chose and makes one call."""
+
+# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, StringProperty
+from bpy_extras.io_utils import ExportHelper
+
+from . import mesh_layout, plans, preview, score_attributes, session
+from .camera_adapter import views_from_scene
+from .core.errors import Cancelled, RefineError
+from .score_worker import ScoreWorker
+
+if TYPE_CHECKING:
+    from .core.scores import Scores
+    from .core.views import ViewSet
+
+Answer = set[str]
+
+
+def fail(operator: bpy.types.Operator, error: Exception) -> Answer:
+    """Report an error to the user, and return that nothing was done."""
+    operator.report({"ERROR"}, str(error))
+    return {"CANCELLED"}
+
+
+class _OnSplats:
+    """An operator on the active object, which must hold splats."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run, and if not, why."""
+        obj = context.object
+        if not mesh_layout.looks_like_splats(obj):
+            cls.poll_message_set("Select an object that holds splats: import a 3DGS PLY file")
+            return False
+        if obj.mode == "EDIT":
+            cls.poll_message_set("Leave edit mode first")
+            return False
+        return True
+
+
+class _OnScored(_OnSplats):
+    """An operator on the active object, which must be scored."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run, and if not, why."""
+        if not super().poll(context):
+            return False
+        if score_attributes.record(context.object.data) is None:
+            cls.poll_message_set("Score the splats first")
+            return False
+        return True
+
+
+class REFINE_OT_score(_OnSplats, bpy.types.Operator):
+    """Score each splat by how much the cameras would miss it (Esc cancels)"""
+
+    bl_idname = "refine.score"
+    bl_label = "Score"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Score at once."""
+        try:
+            obj, settings = context.object, context.scene.refine.to_settings()
+            views = self._views(context)
+            scores = session.score_object(obj, views, settings)
+        except RefineError as error:
+            return fail(self, error)
+        return self._done(context, scores, views)
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
+        """Score on a thread, with a bar to watch and a key to cancel."""
+        if bpy.app.background or context.window is None:
+            return self.execute(context)
+        try:
+            self._settings = context.scene.refine.to_settings()
+            self._gathered = self._views(context)
+            session.check_scorable(context.object)
+            splats = session.gather(context.object)
+        except RefineError as error:
+            return fail(self, error)
+        # By name: the object itself may not be the same one after an undo.
+        self._name = context.object.name
+        self._worker = ScoreWorker(splats, self._gathered, self._settings)
+        manager = context.window_manager
+        self._timer = manager.event_timer_add(0.05, window=context.window)
+        manager.modal_handler_add(self)
+        self._show(context, 0.0)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+        """Wait for the thread, and write what it found."""
+        if event.type == "ESC":
+            self._worker.cancel()
+        if event.type != "TIMER":
+            return {"RUNNING_MODAL"}
+        if self._worker.running():
+            self._show(context, self._worker.fraction)
+            return {"RUNNING_MODAL"}
+        self._clean_up(context)
+        try:
+            scores = self._worker.result()
+            obj = session.find(self._name)
+            score_attributes.store(obj, scores, self._gathered, self._settings)
+        except Cancelled:
+            self.report({"INFO"}, "Scoring cancelled; nothing was changed")
+            return {"CANCELLED"}
+        except RefineError as error:
+            return fail(self, error)
+        return self._done(context, scores, self._gathered)
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Stop the thread where Blender ends the operator."""
+        self._worker.cancel()
+        self._clean_up(context)
+
+    def _views(self, context: bpy.types.Context) -> ViewSet:
+        settings = context.scene.refine
+        return views_from_scene(
+            context,
+            settings.source,
+            collection=settings.collection,
+            frames=settings.to_frames(context.scene),
+            splats=context.object,
+        )
+
+    def _done(self, context: bpy.types.Context, scores: Scores, views: ViewSet) -> Answer:
+        plans.refresh(context)
+        unseen = int((scores.seen == 0).sum())
+        self.report(
+            {"INFO"},
+            f"Scored {len(scores.values):,} splats by {scores.views_used} of {len(views)} views; "
+            f"{unseen:,} lie in none",
+        )
+        for note in (*scores.notes, *([views.note] if views.note else [])):
+            self.report({"WARNING"}, note)
+        return {"FINISHED"}
+
+    def _show(self, context: bpy.types.Context, fraction: float) -> None:
+        context.window_manager.refine_progress = fraction
+        context.workspace.status_text_set(f"Scoring splats: {fraction:.0%} (Esc cancels)")
+        for area in context.window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
+
+    def _clean_up(self, context: bpy.types.Context) -> None:
+        context.window_manager.event_timer_remove(self._timer)
+        self._show(context, -1.0)
+        context.workspace.status_text_set(None)
+
+
+class REFINE_OT_plan(_OnScored, bpy.types.Operator):
+    """Work out again how many splats stay and go"""
+
+    bl_idname = "refine.plan"
+    bl_label = "Update"
+    bl_options = {"INTERNAL"}
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Work it out."""
+        plans.refresh(context)
+        return {"FINISHED"}
+
+
+class REFINE_OT_apply(_OnScored, bpy.types.Operator):
+    """Delete the splats that the budget does not keep, lowest scores first"""
+
+    bl_idname = "refine.apply"
+    bl_label = "Apply"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Delete them."""
+        settings = context.scene.refine
+        try:
+            done = session.apply_object(context.object, settings.to_budget(), settings.protect)
+        except RefineError as error:
+            return fail(self, error)
+        plans.forget(context.object.data)
+        self.report(
+            {"INFO"},
+            f"Kept {done.kept:,} splats, removed {done.removed:,}: "
+            f"{done.bytes_before / 1e6:,.1f} -> {done.bytes_after / 1e6:,.1f} MB",
+        )
+        return {"FINISHED"}
+
+
+class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
+    """Show the splats as points, without changing them"""
+
+    bl_idname = "refine.preview"
+    bl_label = "Preview"
+    bl_options = {"REGISTER", "UNDO"}
+
+    mode: EnumProperty(
+        name="Show",
+        description="What the points show",
+        items=(
+            ("HEAT", "Heat Map", "Rank of each splat: dark goes first, yellow last"),
+            ("COLOR", "Colour", "The splat's own colour"),
+            ("OFF", "Off", "Show the plain mesh again"),
+        ),
+    )
+    hide_removed: BoolProperty(
+        name="Hide What Goes", description="Hide the splats that the budget removes"
+    )
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: Any) -> str:  # noqa: ANN401
+        """Return the tooltip of a button."""
+        if properties.mode == "OFF":
+            return "Show the plain mesh again"
+        if properties.hide_removed:
+            return "Hide the splats that would be removed; nothing is deleted"
+        return {
+            "HEAT": "Colour each splat by its rank: dark goes first, yellow goes last",
+            "COLOR": "Show each splat in its own colour",
+        }[properties.mode]
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Add, change or remove the preview."""
+        obj = context.object
+        try:
+            if self.mode == "OFF":
+                preview.hide(obj)
+            else:
+                preview.show(obj, self.mode, hide_removed=self.hide_removed)
+        except RefineError as error:
+            return fail(self, error)
+        shading = getattr(context.space_data, "shading", None)
+        # Solid mode draws every point in one grey.
+        if self.mode != "OFF" and shading and shading.type in {"SOLID", "WIREFRAME"}:
+            shading.type = "MATERIAL"
+        return {"FINISHED"}
+
+
+class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
+    """Write the active object's splats to a 3DGS PLY file"""
+
+    bl_idname = "refine.export_ply"
+    bl_label = "Export Splats"
+    bl_options = {"REGISTER"}
+
+    filename_ext = ".ply"
+    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+    apply_transform: BoolProperty(
+        name="Apply Transform",
+        description="Write the splats as they stand in the world: positions, rotations, scales "
+        "and view-dependent colour follow the object",
+    )
+    overwrite: BoolProperty(
+        name="Overwrite",
+        description="Replace the file if it exists",
+        options={"SKIP_SAVE"},
+    )
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+        """Ask for the file; whoever picks an existing one in the browser means to replace it."""
+        if not self.filepath:
+            self.filepath = f"{context.object.name}.ply"
+        self.overwrite = True
+        return super().invoke(context, event)
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Write the file."""
+        obj = context.object
+        try:
+            file = session.export_object(
+                obj,
+                bpy.path.abspath(self.filepath),
+                apply_transform=self.apply_transform,
+                overwrite=self.overwrite,
+            )
+        except RefineError as error:
+            return fail(self, error)
+        self.report({"INFO"}, f"Wrote {len(file):,} splats to {self.filepath}")
+        return {"FINISHED"}

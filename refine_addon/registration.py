@@ -1,0 +1,79 @@
+"""What Blender is told about, and in which order; `unregister` takes it back in reverse."""
+
+from __future__ import annotations
+
+import bpy
+from bpy.props import FloatProperty, PointerProperty
+
+from . import command
+from .import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
+from .operators import (
+    REFINE_OT_apply,
+    REFINE_OT_export_ply,
+    REFINE_OT_plan,
+    REFINE_OT_preview,
+    REFINE_OT_score,
+)
+from .panel import (
+    REFINE_PT_advanced,
+    REFINE_PT_apply,
+    REFINE_PT_cameras,
+    REFINE_PT_export,
+    REFINE_PT_preview,
+    REFINE_PT_score,
+    REFINE_PT_splats,
+)
+from .properties import RefineSettings
+
+CLASSES = (
+    RefineSettings,
+    REFINE_OT_import_ply,
+    REFINE_OT_import_cameras,
+    REFINE_OT_score,
+    REFINE_OT_plan,
+    REFINE_OT_apply,
+    REFINE_OT_preview,
+    REFINE_OT_export_ply,
+    REFINE_FH_ply,
+    REFINE_PT_splats,
+    REFINE_PT_cameras,
+    REFINE_PT_score,
+    REFINE_PT_advanced,
+    REFINE_PT_preview,
+    REFINE_PT_apply,
+    REFINE_PT_export,
+)
+
+_commands: list[object] = []
+"""Handle of the command, which Blender wants back."""
+
+
+def register() -> None:
+    """Register classes, properties, menu entries and the command ``refine``."""
+    for cls in CLASSES:
+        bpy.utils.register_class(cls)
+    bpy.types.Scene.refine = PointerProperty(type=RefineSettings)
+    bpy.types.WindowManager.refine_progress = FloatProperty(default=-1.0, options={"SKIP_SAVE"})
+    bpy.types.TOPBAR_MT_file_import.append(_draw_import)
+    bpy.types.TOPBAR_MT_file_export.append(_draw_export)
+    _commands.append(bpy.utils.register_cli_command("refine", command.main))
+
+
+def unregister() -> None:
+    """Undo `register`, in reverse."""
+    bpy.utils.unregister_cli_command(_commands.pop())
+    bpy.types.TOPBAR_MT_file_export.remove(_draw_export)
+    bpy.types.TOPBAR_MT_file_import.remove(_draw_import)
+    del bpy.types.WindowManager.refine_progress
+    del bpy.types.Scene.refine
+    for cls in reversed(CLASSES):
+        bpy.utils.unregister_class(cls)
+
+
+def _draw_import(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
+    menu.layout.operator("refine.import_ply", text="Gaussian Splats (.ply)")
+    menu.layout.operator("refine.import_cameras", text="Splat Cameras (.json, COLMAP)")
+
+
+def _draw_export(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
+    menu.layout.operator("refine.export_ply", text="Gaussian Splats (.ply)")

@@ -1,0 +1,151 @@
+"""Blender as a module, with the source tree enabled as an extension, and a small scene."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+# Before the first `import bpy`: Blender reads it once, and the user's own settings stay theirs.
+os.environ["BLENDER_USER_RESOURCES"] = tempfile.mkdtemp(prefix="refine-blender-")
+
+import bpy  # noqa: I001
+import addon_utils
+
+ROOT = Path(__file__).parents[2]
+ROOM = ROOT / "tests" / "data" / "room_small"
+MODULE = "bl_ext.dev.refine_addon"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def extension(tmp_path_factory):
+    """Enable the source tree as an extension: the package under the name it has installed."""
+    repository = tmp_path_factory.mktemp("extensions")
+    package = repository / "refine_addon"
+    package.mkdir()
+    for path in (ROOT / "refine_addon").iterdir():
+        if path.name != "__pycache__":
+            (package / path.name).symlink_to(path)
+    (package / "blender_manifest.toml").symlink_to(ROOT / "blender_manifest.toml")
+    bpy.context.preferences.extensions.repos.new(
+        name="Dev", module="dev", custom_directory=str(repository), source="USER"
+    )
+    failures = []
+    addon_utils.enable(MODULE, default_set=True, handle_error=failures.append)
+    assert not failures, failures
+    yield importlib.import_module(MODULE)
+    addon_utils.disable(MODULE, default_set=True)
+
+
+@pytest.fixture(scope="session")
+def addon(extension):
+    """Return the package with its modules as attributes: ``addon.session``."""
+    for path in (ROOT / "refine_addon").glob("*.py"):
+        if not path.stem.startswith("__"):
+            importlib.import_module(f"{MODULE}.{path.stem}")
+    return extension
+
+
+@pytest.fixture
+def core(addon):
+    """Give access to the core that the package carries."""
+    return addon.core
+
+
+@pytest.fixture(autouse=True)
+def empty_scene():
+    """Start from an empty file, with the extension enabled."""
+    bpy.ops.wm.read_homefile(use_empty=True)
+    scene = bpy.context.scene
+    scene.render.resolution_x, scene.render.resolution_y = 240, 160
+    return scene
+
+
+@pytest.fixture
+def room(addon, empty_scene):
+    """Import the small trained room."""
+    file = addon.core.read_ply(ROOM / "point_cloud.ply")
+    mesh = addon.mesh_adapter.mesh_from_file(file)
+    obj = bpy.data.objects.new("room", mesh)
+    empty_scene.collection.objects.link(obj)
+    bpy.context.view_layer.objects.active = obj
+    obj.select_set(True)
+    return obj
+
+
+@pytest.fixture
+def room_views(addon):
+    """Read the room's camera file."""
+    return addon.core.read_cameras(ROOM / "cameras.json")
+
+
+@pytest.fixture
+def room_cameras(addon, empty_scene, room_views):
+    """Import the room's cameras as objects, in a collection."""
+    collection = bpy.data.collections.new("cameras")
+    empty_scene.collection.children.link(collection)
+    addon.camera_adapter.create_cameras(room_views, collection)
+    empty_scene.refine.collection = collection
+    empty_scene.refine.source = "COLLECTION"
+    return collection
+
+
+def snapshot():
+    """Return what an operator must leave alone where it fails, as plain values."""
+    facts = {
+        kind: sorted(item.name for item in getattr(bpy.data, kind))
+        for kind in ("objects", "meshes", "cameras", "collections", "node_groups", "materials")
+    }
+    for mesh in bpy.data.meshes:
+        facts[f"mesh {mesh.name}"] = (
+            len(mesh.vertices),
+            sorted((a.name, a.data_type, a.domain) for a in mesh.attributes),
+            sorted(mesh.keys()),
+        )
+    for obj in bpy.data.objects:
+        facts[f"object {obj.name}"] = (
+            obj.data.name if obj.data else "",
+            [modifier.name for modifier in obj.modifiers],
+            [list(row) for row in obj.matrix_world],
+        )
+    scene = bpy.context.scene
+    facts["scene"] = (scene.frame_current, scene.camera.name if scene.camera else "")
+    return facts
+
+
+@pytest.fixture
+def unchanged():
+    """Return a function that checks that the scene is what it was when the test asked for it."""
+    state = {}
+
+    def remember():
+        state.update(snapshot())
+
+    def check():
+        assert snapshot() == state
+
+    check.start = remember
+    return check
+
+
+@pytest.fixture
+def make_splats():
+    """Return a function that makes columns of random splats."""
+    return _make_splats
+
+
+def _make_splats(count=8, *, degree=0, seed=0):
+    """Return named float32 columns in the order of the reference files."""
+    rng = np.random.default_rng(seed)
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+    names += [f"f_rest_{index}" for index in range(rest)]
+    names += ["opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+    columns = {name: rng.normal(size=count).astype(np.float32) for name in names}
+    for index in range(3):
+        columns[f"scale_{index}"] -= 3.0
+    return columns

@@ -1,0 +1,436 @@
+"""A view taken from a Blender camera sees what Blender sees."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import bpy
+import mathutils
+import numpy as np
+import pytest
+from bpy_extras.object_utils import world_to_camera_view
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+
+def _camera(name="camera", location=(0.0, 0.0, 0.0), rotation=(0.0, 0.0, 0.0)):
+    obj = bpy.data.objects.new(name, bpy.data.cameras.new(name))
+    obj.location, obj.rotation_euler = location, rotation
+    bpy.context.scene.collection.objects.link(obj)
+    return obj
+
+
+def _set(target, values):
+    for name, value in values.items():
+        setattr(target, name, value)
+
+
+def _view(addon, obj):
+    return addon.camera_objects.view_from_camera(
+        obj, bpy.context.scene, bpy.context.evaluated_depsgraph_get()
+    )
+
+
+def _project(view, points):
+    """Return image coordinates as Blender counts them: 0..1 from the lower left, and depth."""
+    local = (points - view.center) @ view.rotation.T
+    x = view.fx * local[:, 0] / local[:, 2] + view.cx
+    y = view.fy * local[:, 1] / local[:, 2] + view.cy
+    return np.stack([x / view.width, 1 - y / view.height, local[:, 2]], axis=-1)
+
+
+def _agree(addon, camera, local_points):
+    """Compare with `world_to_camera_view` at points given in the camera's own frame."""
+    bpy.context.view_layer.update()
+    rigid = camera.matrix_world.normalized()
+    points = [rigid @ mathutils.Vector(p) for p in local_points]
+    expected = [world_to_camera_view(bpy.context.scene, camera, p) for p in points]
+    got = _project(_view(addon, camera), np.array(points, np.float64))
+
+    assert np.allclose(got, np.array(expected), rtol=2e-5, atol=2e-4)
+
+
+_lenses = st.fixed_dictionaries(
+    {
+        "lens": st.floats(8.0, 200.0),
+        "sensor_fit": st.sampled_from(["AUTO", "HORIZONTAL", "VERTICAL"]),
+        "sensor_width": st.floats(10.0, 60.0),
+        "sensor_height": st.floats(8.0, 50.0),
+        "shift_x": st.floats(-0.6, 0.6),
+        "shift_y": st.floats(-0.6, 0.6),
+    }
+)
+_renders = st.fixed_dictionaries(
+    {
+        "resolution_x": st.integers(10, 4000),
+        "resolution_y": st.integers(10, 4000),
+        "pixel_aspect_x": st.floats(1.0, 4.0),
+        "pixel_aspect_y": st.floats(1.0, 4.0),
+    }
+)
+_vectors = st.tuples(*[st.floats(-5.0, 5.0)] * 3)
+_sizes = st.one_of(st.floats(-4.0, -0.2), st.floats(0.2, 4.0))
+_placements = st.fixed_dictionaries(
+    {"location": _vectors, "rotation_euler": _vectors, "scale": st.tuples(*[_sizes] * 3)}
+)
+_even_placements = st.fixed_dictionaries(
+    {
+        "location": _vectors,
+        "rotation_euler": _vectors,
+        "scale": st.floats(0.2, 4.0).map(lambda size: (size,) * 3),
+    }
+)
+_points = st.lists(
+    st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0), st.floats(-20.0, -0.5)),
+    min_size=4,
+    max_size=8,
+)
+_in_one_scene = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@_in_one_scene
+@given(_lenses, _renders, _placements, _points)
+def test_any_lens_frame_and_placement_agrees_with_blender(addon, lens, render, placement, points):
+    """Lens, fit, sensor, shift, resolution, pixel aspect; moved, turned, scaled, mirrored."""
+    camera = bpy.data.objects.get("camera") or _camera()
+    _set(camera.data, lens)
+    _set(bpy.context.scene.render, render)
+    _set(camera, placement)
+
+    _agree(addon, camera, points)
+
+
+@_in_one_scene
+@given(_even_placements, _placements, _points)
+def test_parented_cameras_agree_with_blender(addon, parent_placement, placement, points):
+    """Under a parent that is moved, turned and evenly scaled, with a parent inverse."""
+    camera = bpy.data.objects.get("camera") or _camera()
+    parent = bpy.data.objects.get("parent")
+    if parent is None:
+        parent = bpy.data.objects.new("parent", None)
+        bpy.context.scene.collection.objects.link(parent)
+        camera.parent = parent
+        camera.matrix_parent_inverse = mathutils.Matrix.Translation((1.0, 2.0, 3.0))
+    _set(parent, parent_placement)
+    _set(camera, placement)
+
+    _agree(addon, camera, points)
+
+
+def test_a_plain_camera_sees_what_can_be_worked_out_by_hand(addon):
+    """50 mm on 36 mm over 240 px: f = 50 / 36 * 240 = 333.3; the centre is the image's.
+
+    At the origin Blender looks along -z with y up: a point at (0, 1, -2) lies above the centre,
+    at y = 80 - 333.3 / 2 in pixels that count downward.
+    """
+    view = _view(addon, _camera())
+    x, y, depth = _project(view, np.array([[0.0, 1.0, -2.0]]))[0]
+
+    assert math.isclose(view.fx, 50 / 36 * 240)
+    assert (view.cx, view.cy, view.width, view.height) == (120, 80, 240, 160)
+    assert math.isclose(x, 0.5)
+    assert math.isclose(1 - y, (80 - view.fy / 2) / 160)
+    assert depth == 2.0
+
+
+def test_the_percentage_scales_the_image_and_cuts_the_fraction(addon):
+    """241 x 161 at 50 % is 120 x 80."""
+    render = bpy.context.scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = 241, 161, 50
+    view = _view(addon, _camera())
+
+    assert (view.width, view.height) == (120, 80)
+
+
+def test_clip_distances_are_the_near_and_far_planes(addon):
+    """What Blender clips, the camera does not see."""
+    camera = _camera()
+    camera.data.clip_start, camera.data.clip_end = 0.5, 8.0
+    view = _view(addon, camera)
+
+    assert (view.near, view.far) == (0.5, 8.0)
+
+
+def test_constraints_and_drivers_are_followed(addon):
+    """The evaluated camera counts: a constraint moves it to x = 3, a driver sets the lens to 85."""
+    camera = _camera()
+    target = bpy.data.objects.new("target", None)
+    target.location.x = 3.0
+    bpy.context.scene.collection.objects.link(target)
+    camera.constraints.new("COPY_LOCATION").target = target
+    camera.data.driver_add("lens").driver.expression = "85.0"
+    view = _view(addon, camera)
+
+    assert view.center.tolist() == [3.0, 0.0, 0.0]
+    assert math.isclose(view.fx, 85 / 36 * 240)
+
+
+@pytest.mark.parametrize(("kind", "word"), [("ORTHO", "orthographic"), ("PANO", "panoramic")])
+def test_cameras_without_perspective_are_named_and_refused(addon, kind, word):
+    """The message says which camera, and what to do."""
+    camera = _camera("wide")
+    camera.data.type = kind
+
+    with pytest.raises(addon.core.RefineError, match=f"'wide' is {word}, expected a perspective"):
+        _view(addon, camera)
+
+
+def test_a_sheared_camera_is_refused(addon):
+    """A turned camera under an unevenly scaled parent has axes that are not at right angles."""
+    camera = _camera("skewed", rotation=(0.3, 0.4, 0.5))
+    parent = bpy.data.objects.new("parent", None)
+    parent.scale = (1.0, 3.0, 1.0)
+    bpy.context.scene.collection.objects.link(parent)
+    camera.parent = parent
+
+    with pytest.raises(addon.core.RefineError, match="'skewed' is sheared"):
+        _view(addon, camera)
+
+
+def test_the_weight_is_a_custom_property(addon):
+    """A number of at least 0; anything else is said by name."""
+    camera = _camera()
+    assert _view(addon, camera).weight == 1.0
+    camera["refine_weight"] = 2.5
+    assert _view(addon, camera).weight == 2.5
+    camera["refine_weight"] = 3
+    assert _view(addon, camera).weight == 3.0
+    for bad in ("2", -1.0, math.nan, math.inf, [1.0], True):
+        camera["refine_weight"] = bad
+        with pytest.raises(addon.core.RefineError, match=r"'camera'.*refine_weight is"):
+            _view(addon, camera)
+
+
+def test_a_disabled_camera_is_read_if_it_can_be(addon):
+    """Blender does not evaluate it: placed by hand or by a parent it is clear, constrained not."""
+    camera = _camera(location=(1.0, 2.0, 3.0))
+    parent = bpy.data.objects.new("parent", None)
+    parent.location.x = 10.0
+    bpy.context.scene.collection.objects.link(parent)
+    camera.parent = parent
+    camera.hide_viewport = True
+
+    assert _view(addon, camera).center.tolist() == [11.0, 2.0, 3.0]
+    camera.constraints.new("COPY_LOCATION")
+    with pytest.raises(addon.core.RefineError, match="disabled in viewports"):
+        _view(addon, camera)
+
+
+def _names(addon, source, **options):
+    views = addon.camera_adapter.views_from_scene(bpy.context, source, **options)
+    return [view.name for view in views]
+
+
+def test_each_source_gives_its_cameras(addon):
+    """Active, selected, visible, and a collection with those below it, hidden ones too."""
+    scene = bpy.context.scene
+    first, second, third = (_camera(name) for name in ("first", "second", "third"))
+    outer, inner = (bpy.data.collections.new(name) for name in ("outer", "inner"))
+    scene.collection.children.link(outer)
+    outer.children.link(inner)
+    outer.objects.link(second)
+    inner.objects.link(third)
+    scene.camera = first
+    for camera in (first, second, third):
+        camera.select_set(camera is second)
+    third.hide_set(True)
+
+    assert _names(addon, "ACTIVE") == ["first"]
+    assert _names(addon, "SELECTED") == ["second"]
+    assert sorted(_names(addon, "VISIBLE")) == ["first", "second"]
+    assert sorted(_names(addon, "COLLECTION", collection=outer)) == ["second", "third"]
+    assert addon.camera_adapter.visible_views(scene).views[0].name in ("first", "second")
+
+
+def _animate(obj, path, values, index=-1):
+    for frame, value in values.items():
+        if index < 0:
+            setattr(obj, path, value)
+        else:
+            getattr(obj, path)[index] = value
+        obj.keyframe_insert(path, index=index, frame=frame)
+
+
+def test_a_shot_is_a_view_set_and_the_frame_is_put_back(addon):
+    """X is 1 at frame 1 and 5 at frame 5; every second frame sees 1, 3 (eased, half way) and 5."""
+    scene = bpy.context.scene
+    scene.camera = _camera()
+    _animate(scene.camera, "location", {1: 1.0, 5: 5.0}, index=0)
+    _animate(scene.camera.data, "lens", {1: 50.0, 5: 100.0})
+    scene.frame_set(4, subframe=0.25)
+    views = addon.camera_adapter.views_from_frames(bpy.context, range(1, 6, 2))
+
+    assert [round(view.center[0], 5) for view in views] == [1.0, 3.0, 5.0]
+    assert math.isclose(views[2].fx, 2 * views[0].fx)
+    assert (scene.frame_current, scene.frame_subframe) == (4, 0.25)
+    assert [view.name for view in views] == [f"camera, frame {frame}" for frame in (1, 3, 5)]
+
+
+def test_cameras_bound_to_markers_take_over(addon):
+    """Marker at frame 1 binds one camera, at frame 3 another; the active one is put back."""
+    scene = bpy.context.scene
+    first, second, other = (_camera(name) for name in ("first", "second", "other"))
+    for frame, camera in ((1, first), (3, second)):
+        scene.timeline_markers.new(camera.name, frame=frame).camera = camera
+    scene.camera = other
+    views = addon.camera_adapter.views_from_frames(bpy.context, range(1, 5))
+
+    assert [view.name.split(",")[0] for view in views] == ["first", "first", "second", "second"]
+    assert scene.camera is other
+
+
+def test_an_error_in_the_midst_of_a_shot_puts_the_frame_back(addon):
+    """At frame 3 a marker hands over to an orthographic camera."""
+    scene = bpy.context.scene
+    first, flat = _camera("first"), _camera("flat")
+    flat.data.type = "ORTHO"
+    scene.camera = first
+    for frame, camera in ((1, first), (3, flat)):
+        scene.timeline_markers.new(camera.name, frame=frame).camera = camera
+    scene.frame_set(2)
+
+    with pytest.raises(addon.core.RefineError, match="'flat' is orthographic"):
+        addon.camera_adapter.views_from_frames(bpy.context, range(1, 5))
+    assert scene.frame_current == 2
+    assert scene.camera is first
+
+
+def test_an_empty_range_of_frames_is_refused(addon):
+    """From 5 to 4."""
+    with pytest.raises(addon.core.RefineError, match="starts at 5 and ends at 4"):
+        addon.camera_adapter.views_from_frames(bpy.context, range(5, 5))
+
+
+def test_a_turntable_is_seen_from_all_sides(addon, room):
+    """The object turns a quarter before a still camera at (4, 0, 0): it sees a side of it.
+
+    Turned by +90 degrees about z, the object has the camera where, had it stayed, the camera
+    would be turned by -90: at (0, -4, 0).
+    """
+    scene = bpy.context.scene
+    scene.camera = _camera(location=(4.0, 0.0, 0.0))
+    _animate(room, "rotation_euler", {1: 0.0, 2: math.pi / 2}, index=2)
+    scene.frame_set(1)
+    views = addon.camera_adapter.views_from_frames(bpy.context, range(1, 3), room)
+
+    assert np.allclose(views[0].center, [4, 0, 0])
+    assert np.allclose(views[1].center, [0, -4, 0], atol=1e-6)
+
+
+def test_an_animated_scale_of_the_splats_is_refused(addon, room):
+    """Views of different scales have no common distance."""
+    scene = bpy.context.scene
+    scene.camera = _camera(location=(4.0, 0.0, 0.0))
+    _animate(room, "scale", {1: 1.0, 2: 2.0}, index=0)
+    _animate(room, "scale", {1: 1.0, 2: 2.0}, index=1)
+    _animate(room, "scale", {1: 1.0, 2: 2.0}, index=2)
+
+    with pytest.raises(addon.core.RefineError, match="scale is animated"):
+        addon.camera_adapter.views_from_frames(bpy.context, range(1, 3), room)
+
+
+def _close(got, expected):
+    assert np.allclose(got.rotation, expected.rotation, atol=1e-12)
+    assert np.array_equal(got.center, expected.center)
+    for name in ("fx", "fy", "cx", "cy", "width", "height", "near", "far", "weight"):
+        assert getattr(got, name) == getattr(expected, name), name
+
+
+def test_imported_cameras_give_back_the_views_of_their_file(addon, room_cameras, room_views):
+    """To the last digit, though Blender's matrices are float32 and the render size is another."""
+    bpy.context.scene.render.resolution_x = 999
+    views = addon.camera_adapter.views_from_scene(
+        bpy.context, "COLLECTION", collection=room_cameras
+    )
+
+    assert len(views) == 72
+    for got, expected in zip(views, room_views, strict=True):
+        _close(got, expected)
+
+
+def test_blender_shows_what_the_imported_camera_saw(addon, room_cameras, room_views):
+    """Without the note: at the file's resolution pose and frame agree to float32."""
+    for camera in room_cameras.objects:
+        del camera["refine_view"]
+    views = addon.camera_adapter.views_from_scene(
+        bpy.context, "COLLECTION", collection=room_cameras
+    )
+
+    for got, expected in zip(views, room_views, strict=True):
+        assert np.allclose(got.rotation, expected.rotation, atol=1e-6)
+        assert np.allclose(got.center, expected.center, atol=1e-6)
+        assert np.allclose(
+            [got.fx, got.fy, got.cx, got.cy],
+            [expected.fx, expected.fy, expected.cx, expected.cy],
+            rtol=1e-6,
+        )
+
+
+def test_the_kept_rows_do_not_hang_on_the_note(addon, core, room, room_cameras, room_views):
+    """Float32 moves scores in the seventh digit; on this scene no row changes sides."""
+    expected = core.prune(addon.session.gather(room), room_views, core.Budget(ratio=0.5)).keep
+    for camera in room_cameras.objects:
+        del camera["refine_view"]
+    views = addon.camera_adapter.visible_views(bpy.context.scene)
+    got = core.prune(addon.session.gather(room), views, core.Budget(ratio=0.5)).keep
+
+    assert np.count_nonzero(got != expected) == 0
+
+
+def test_an_imported_camera_that_was_moved_or_changed_is_taken_as_it_is(addon, room_cameras):
+    """Only what was touched: pose, lens and clip distances each for itself; the size stays."""
+    moved, zoomed, clipped = room_cameras.objects[:3]
+    moved.location.x += 1.0
+    zoomed.data.lens *= 2.0
+    clipped.data.clip_end = 5.0
+    before = {c.name: json.loads(c["refine_view"]) for c in room_cameras.objects}
+    views = {c.name: _view(addon, c) for c in (moved, zoomed, clipped)}
+
+    assert math.isclose(
+        views[moved.name].center[0], before[moved.name]["center"][0] + 1.0, rel_tol=1e-6
+    )
+    assert views[moved.name].fx == before[moved.name]["fx"]
+    assert math.isclose(views[zoomed.name].fx, 2 * before[zoomed.name]["fx"], rel_tol=1e-6)
+    assert views[zoomed.name].width == 240
+    assert views[zoomed.name].center.tolist() == before[zoomed.name]["center"]
+    assert views[clipped.name].far == 5.0
+
+
+@_in_one_scene
+@given(
+    _vectors,
+    st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(lambda q: np.dot(q, q) > 0.1),
+    st.booleans(),
+    st.floats(50.0, 2000.0),
+    st.tuples(st.floats(0.2, 0.8), st.floats(0.2, 0.8)),
+)
+def test_any_view_becomes_a_camera_that_blender_frames_alike(
+    addon, center, quaternion, mirrored, focal, middle
+):
+    """Position, any rotation, mirrored or not, focal length, principal point off the centre."""
+    core = addon.core
+    rotation = core.splats.rotation_matrices(np.array(quaternion))
+    if mirrored:
+        rotation = rotation * np.array([-1.0, 1.0, 1.0])
+    cx, cy = middle[0] * 240, middle[1] * 160
+    expected = core.View(rotation, np.array(center), focal, focal, cx, cy, 240, 160)
+    camera = addon.camera_objects.camera_from_view(expected)
+    bpy.context.scene.collection.objects.link(camera)
+    del camera["refine_view"]
+    got = _view(addon, camera)
+    bpy.data.objects.remove(camera)
+
+    assert np.allclose(got.rotation, rotation, atol=2e-6)
+    assert np.allclose(got.center, center, atol=1e-6)
+    assert np.allclose([got.fx, got.fy], focal, rtol=1e-5)
+    assert np.allclose([got.cx, got.cy], [cx, cy], atol=1e-3)
+
+
+def test_a_damaged_note_is_said_by_name(addon, room_cameras):
+    """Better than scoring by something else than what the user believes."""
+    camera = room_cameras.objects[0]
+    for text in ("", "{}", "[1]", "null"):
+        camera["refine_view"] = text
+        with pytest.raises(addon.core.RefineError, match="refine_view is damaged"):
+            _view(addon, camera)
