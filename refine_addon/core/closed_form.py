@@ -18,6 +18,7 @@ import numpy as np
 
 from . import adaptive
 from .errors import RefineError
+from .frustum import Frustums
 from .scores import Scores
 from .splats import base_color, drawable, opacity
 from .work import Progress, for_chunks, part, silent
@@ -43,7 +44,6 @@ them by distance, practically below all that is seen."""
 
 _CHUNK = 4096
 _VIEW_BLOCK = 64
-_STACK = 16  # rows of one product: small enough that BLAS starts no threads beside ours
 _SMALLEST_AREA = -300.0
 
 
@@ -141,100 +141,64 @@ def score(
     if not len(splats):
         msg = "there are no splats to score"
         raise RefineError(msg)
-    good, squared = _measure(splats, views, part(progress, 0.0, 0.2), threads)
-    terms = _Terms(splats, views, settings, good, squared)
+    scene = _Scene(splats, views, settings)
     for_chunks(
-        terms.fill, len(splats), _CHUNK,
+        scene.read, len(splats), 4 * _CHUNK,
+        progress=part(progress, 0.0, 0.2), what="reading", threads=threads,
+    )  # fmt: skip
+    if not scene.good.any():
+        msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
+        raise RefineError(msg)
+    scene.measure()
+    for_chunks(
+        scene.weigh, len(splats), _CHUNK,
         progress=part(progress, 0.2, 0.95), what="scoring", threads=threads,
     )  # fmt: skip
-    if settings.frustum and not terms.seen.any():
+    if settings.frustum and not scene.seen.any():
         msg = (
             f"no camera sees the splats: none of {len(splats)} lies in the frustum of any of "
             f"{len(views)} views; check that cameras and splats share their frame and unit"
         )
         raise RefineError(msg)
-    return terms.scores()
+    return scene.scores()
 
 
-def _measure(
-    splats: Splats, views: ViewSet, progress: Progress, threads: int | None
-) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Return which splats are drawable, and the mean over views of their squared distance."""
-    good = np.empty(len(splats), np.bool_)
-    squared = np.empty(len(splats), np.float64)
-    centers, weights = views.centers, views.weights
-    origin = weights @ centers
-    spread = float(weights @ np.sum((centers - origin) ** 2, axis=1))
+class _Scene:
+    """What the formula needs of N splats, filled chunk by chunk.
 
-    def measure(piece: slice) -> None:
-        chunk = splats.take(piece)
-        good[piece] = drawable(chunk)
-        offset = np.where(good[piece, None], chunk.means, origin) - origin
-        squared[piece] = np.einsum("ij,ij->i", offset, offset) + spread
+    The splats are read once, since they may be a file larger than memory: 57 bytes of each stay.
+    """
 
-    for_chunks(
-        measure, len(splats), 16 * _CHUNK, progress=progress, what="reading", threads=threads
-    )
-    if not good.any():
-        msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
-        raise RefineError(msg)
-    return good, squared
-
-
-class _Terms:
-    """The three terms of every splat, filled chunk by chunk."""
-
-    def __init__(
-        self,
-        splats: Splats,
-        views: ViewSet,
-        settings: ClosedForm,
-        good: NDArray[np.bool_],
-        squared: NDArray[np.float64],
-    ) -> None:
-        self.splats, self.settings, self.good, self.squared = splats, settings, good, squared
-        # The median over splats follows the scene's unit, and not its origin, order or outliers.
-        size = float(np.sqrt(np.median(squared if good.all() else squared[good]))) or 1.0
-        self.count = len(views)
-        self.origin = views.centers.mean(axis=0)
-        self.centers = views.centers - self.origin
-        self.weights = views.weights
-        self.eta = ETA_RELATIVE * size * size if settings.eta is None else settings.eta
-        self.rows = _frustum_rows(views, self.centers, settings.margin)
-        near = np.array([view.near for view in views])
-        self.near = np.where(near > 0.0, near, NEAR_RELATIVE * size)[:, None]
-        self.far = np.array([view.far for view in views])[:, None]
+    def __init__(self, splats: Splats, views: ViewSet, settings: ClosedForm) -> None:
+        self.splats, self.views, self.settings = splats, views, settings
+        self.origin = views.weights @ views.centers
+        offsets = views.centers - self.origin
+        self.spread = float(views.weights @ np.einsum("ij,ij->i", offsets, offsets))
         count = len(splats)
+        self.good = np.empty(count, np.bool_)
+        self.means = np.empty((count, 3), splats.means.dtype.newbyteorder("="))
+        self.squared, self.alpha, self.luma, self.area, self.ratio, self.weight = (
+            np.empty(count) for _ in range(6)
+        )
         self.seen = np.zeros(count, np.int32)
-        self.alpha = np.zeros(count, np.float64)
-        self.luma = np.zeros(count, np.float64)
-        self.ratio = np.zeros(count, np.float64)
-        self.terms = np.zeros((3, count), np.float64)
 
-    def fill(self, piece: slice) -> None:
-        """Compute the terms ``H G^k`` of one slice of splats."""
-        chunk, good = self.splats.take(piece), self.good[piece]
-        # Where T underflows to 0 it is 0 beside everything that counts.
+    def read(self, piece: slice) -> None:
+        """Activate one slice of splats."""
+        chunk = self.splats.take(piece)
+        good = self.good[piece] = drawable(chunk)
+        means = self.means[piece] = np.where(good[:, None], chunk.means, 0.0)
+        offset = means - self.origin
+        # What underflows to 0 is 0 beside everything that counts.
         with np.errstate(under="ignore"):
-            alpha = opacity(np.where(good, chunk.opacity_logits, -np.inf))
+            self.squared[piece] = np.einsum("ij,ij->i", offset, offset) + self.spread
+            self.alpha[piece] = opacity(np.where(good, chunk.opacity_logits, -np.inf))
             red, green, blue = base_color(np.where(good[:, None], chunk.sh_dc, 0.0)).T
-            luma = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
-            area, self.ratio[piece] = self._axes(chunk, good)
-            offset = np.where(good[:, None], chunk.means, self.origin) - self.origin
-            weight = self._weight(offset, piece)
-            if self.settings.visibility:
-                weight *= alpha
-            weight *= good
-            self.alpha[piece], self.luma[piece] = alpha, luma
-            self.terms[0, piece] = weight * area
-            self.terms[1, piece] = weight * (luma * luma)
-            self.terms[2, piece] = weight * (alpha * alpha)
+            self.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
+            logs = np.where(good[:, None], chunk.log_scales, 0.0).astype(np.float64)
+            self.area[piece], self.ratio[piece] = self._axes(logs)
 
-    def _axes(
-        self, chunk: Splats, good: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _axes(self, logs: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the product of the two largest scales, and longest over shortest."""
-        logs = np.where(good[:, None], chunk.log_scales, 0.0).astype(np.float64)
         a, b, c = logs.T
         low, high = np.minimum(a, b), np.maximum(a, b)
         largest, smallest = np.maximum(high, c), np.minimum(low, c)
@@ -246,69 +210,65 @@ class _Terms:
             return area, np.exp(np.minimum(largest - np.maximum(smallest, -1e300), limit))
         return area, np.exp(largest) / (np.exp(smallest) + offset)
 
-    def _weight(self, offset: NDArray[np.float64], piece: slice) -> NDArray[np.float64]:
-        """Return the mean over views of ``inside / (d^2 + eta)`` and note `seen`."""
-        homogeneous = np.vstack([offset.T, np.ones(len(offset))])
-        total = np.zeros(len(offset))
-        for start in range(0, self.count, _VIEW_BLOCK):
-            block = slice(start, start + _VIEW_BLOCK)
-            x, y, z = self._project(homogeneous, block)
-            inside = self._inside(x, y, z, block)
-            self.seen[piece] += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.int32)
-            if self.settings.projection:
-                squared = self._squared(offset, z, block)
-                squared += self.eta
-                inside = np.divide(inside, squared, out=squared)
-            total += np.einsum("v,vn->n", self.weights[block], inside)
-        unseen = self.seen[piece] == 0
-        if unseen.any():
-            near = self.squared[piece] + self.eta
-            prior = UNSEEN / near if self.settings.projection else UNSEEN
-            total = np.where(unseen, prior, total)
-        return total
+    def measure(self) -> None:
+        """Derive from the size of the scene what is relative to it.
 
-    def _project(
-        self, homogeneous: NDArray[np.float64], block: slice
-    ) -> tuple[NDArray[np.float64], ...]:
-        """Return x', y' and z, each (V, n), of points in the views of `block`."""
-        rows = self.rows[:, block].reshape(-1, 4)
-        stack = np.zeros((-(-len(rows) // _STACK), _STACK, 4))
-        stack.reshape(-1, 4)[: len(rows)] = rows
-        product = (stack @ homogeneous).reshape(-1, homogeneous.shape[1])
-        return tuple(np.split(product[: len(rows)], 3))
+        The median over splats of their squared distance follows the scene's unit, and not its
+        origin, order or outliers.
+        """
+        good = self.good
+        size = float(np.sqrt(np.median(self.squared if good.all() else self.squared[good]))) or 1.0
+        eta = self.settings.eta
+        self.eta = ETA_RELATIVE * size * size if eta is None else eta
+        self.frustums = Frustums(
+            self.views, self.origin, NEAR_RELATIVE * size, self.settings.margin
+        )
 
-    def _inside(
-        self,
-        x: NDArray[np.float64],
-        y: NDArray[np.float64],
-        z: NDArray[np.float64],
-        block: slice,
-    ) -> NDArray[np.bool_]:
-        """Return which splats lie in which frustum; `x` and `y` are used up."""
-        if not self.settings.frustum:
-            return np.ones(z.shape, np.bool_)
-        np.maximum(np.abs(x, out=x), np.abs(y, out=y), out=x)
-        inside = np.less_equal(np.maximum(x, self.near[block], out=x), z)
-        if np.isfinite(self.far[block]).any():
-            inside &= z <= self.far[block]
-        return inside
+    def weigh(self, piece: slice) -> None:
+        """Compute H of one slice of splats, and in how many views it lies."""
+        points = np.ones((4, piece.stop - piece.start))
+        points[:3] = (self.means[piece] - self.origin).T
+        total = np.zeros(points.shape[1])
+        seen = np.zeros(points.shape[1], np.int32)
+        weights = self.views.weights
+        with np.errstate(under="ignore"):
+            for start in range(0, len(weights), _VIEW_BLOCK):
+                block = slice(start, start + _VIEW_BLOCK)
+                depth, inside = self.frustums.project(points, block)
+                if not self.settings.frustum:
+                    inside[:] = True
+                # A block has fewer views than a byte counts.
+                seen += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.uint8)
+                share = inside
+                if self.settings.projection:
+                    squared = self._squared(points, depth, block)
+                    squared += self.eta
+                    share = np.divide(inside, squared, out=squared)
+                total += np.einsum("v,vn->n", weights[block], share)
+            if not seen.all():
+                near = self.squared[piece] + self.eta if self.settings.projection else 1.0
+                total = np.where(seen == 0, UNSEEN / near, total)
+            if self.settings.visibility:
+                total *= self.alpha[piece]
+        self.weight[piece] = total * self.good[piece]
+        self.seen[piece] = seen * self.good[piece]
 
     def _squared(
-        self, offset: NDArray[np.float64], z: NDArray[np.float64], block: slice
+        self, points: NDArray[np.float64], depth: NDArray[np.float64], block: slice
     ) -> NDArray[np.float64]:
-        """Return d^2, (V, n), in the memory of `z`."""
+        """Return d^2, (V, n), in the memory of `depth`."""
         if self.settings.depth == "z":
-            return np.multiply(z, z, out=z)
-        z[:] = 0.0
+            return np.multiply(depth, depth, out=depth)
+        depth[:] = 0.0
         for axis in range(3):
-            step = offset[:, axis] - self.centers[block, axis, None]
-            z += np.multiply(step, step, out=step)
-        return z
+            step = points[axis] - self.frustums.centers[block, axis, None]
+            depth += np.multiply(step, step, out=step)
+        return depth
 
     def scores(self) -> Scores:
-        """Weigh the terms and return their sum."""
+        """Weigh the three terms and return their sum."""
         good = self.good
-        alpha, luma = (values[good] for values in (self.alpha, self.luma))
+        alpha, luma = self.alpha[good], self.luma[good]
         statistics = adaptive.Statistics(
             anisotropy=float(np.mean(self.ratio[good])),
             luma_variance=float(np.var(luma)),
@@ -319,7 +279,9 @@ class _Terms:
             lambdas = adaptive.weights(statistics, offset=self.settings.anisotropy_offset or 0.0)
         values = np.zeros(len(good))
         with np.errstate(under="ignore"):
-            for weight, term in zip(lambdas, self.terms, strict=True):
+            contents = (self.area, self.luma * self.luma, self.alpha * self.alpha)
+            for weight, content in zip(lambdas, contents, strict=True):
+                term = self.weight * content
                 mean = np.mean(term)
                 if mean > 0.0:
                     values += weight * (term / mean)
@@ -328,34 +290,11 @@ class _Terms:
         stored[good] = np.maximum(stored[good], np.finfo(np.float32).tiny)
         return Scores(
             values=stored,
-            seen=np.where(good, self.seen, 0).astype(np.int32),
-            views_used=self.count,
+            seen=self.seen,
+            views_used=len(self.views),
             undrawable=int(np.count_nonzero(~good)),
             weights={
                 "lambda": dict(zip(adaptive.TERMS, lambdas, strict=True)),
                 "statistics": vars(statistics).copy(),
             },
         )
-
-
-def _frustum_rows(
-    views: ViewSet, centers: NDArray[np.float64], margin: float
-) -> NDArray[np.float64]:
-    """Return rows whose products with ``(p, 1)`` are x', y' and z of every view.
-
-    A point lies between the image's edges, widened by `margin`, where ``|x'| <= z`` and
-    ``|y'| <= z``: the principal point and the half image size are in the rows.
-
-    Returns
-    -------
-    (3, V, 4) float64
-    """
-    rows = np.empty((3, len(views), 4))
-    for index, (view, center) in enumerate(zip(views, centers, strict=True)):
-        right, down, forward = np.column_stack([view.rotation, -view.rotation @ center])
-        half_width = view.width / 2 * (1 + margin)
-        half_height = view.height / 2 * (1 + margin)
-        rows[0, index] = (view.fx * right + (view.cx - view.width / 2) * forward) / half_width
-        rows[1, index] = (view.fy * down + (view.cy - view.height / 2) * forward) / half_height
-        rows[2, index] = forward
-    return rows

@@ -1,0 +1,106 @@
+"""The main job on the committed room, in background Blender: ``make demo``.
+
+Imports the splats and the 63 cameras that trained them as objects, scores, prunes half, exports, all
+by the operators behind the panel's buttons. Leaves in ``out/``: the pruned PLY, a report, and what
+one of the cameras sees before, after, and as a heat map; ``docs/demo.py 200`` for larger pictures.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+PROJECT = Path(__file__).resolve().parent.parent
+ROOM = PROJECT / "tests/data/room_small"
+OUT = PROJECT / "out"
+CAMERA = "018"
+PERCENTAGE = int(sys.argv[1]) if len(sys.argv) > 1 else 125
+"""Size of the pictures; those of the README are 200 % of what the cameras saw."""
+
+# Before bpy is imported, so that nobody's own Blender settings are read or written.
+RESOURCES = tempfile.mkdtemp(prefix="refine-demo-")
+os.environ["BLENDER_USER_RESOURCES"] = RESOURCES
+sys.path.insert(0, str(PROJECT))
+
+import bpy  # noqa: E402
+
+import refine_addon  # noqa: E402
+from refine_addon import preview, score_attributes  # noqa: E402
+
+
+def training_cameras(path: Path) -> int:
+    """Write the cameras that trained the room to `path`; return how many."""
+    names = json.loads((ROOM / "split.json").read_text())["train"]
+    cameras = json.loads((ROOM / "cameras.json").read_text())
+    chosen = [camera for camera in cameras if camera["img_name"] in names]
+    path.write_text(json.dumps(chosen))
+    return len(chosen)
+
+
+def picture(name: str, mode: str) -> Path:
+    """Render what the camera sees of the splats into ``out/``; return the file."""
+    scene, obj = bpy.context.scene, bpy.context.object
+    preview.show(obj, mode, style="SPLATS")
+    scene.render.filepath = str(OUT / name)
+    bpy.ops.render.render(write_still=True)
+    preview.hide(obj)
+    return OUT / name
+
+
+def main() -> None:
+    """Run the demo and say what happened."""
+    start = time.perf_counter()
+    OUT.mkdir(exist_ok=True)
+    cameras = OUT / "training_cameras.json"
+    number = training_cameras(cameras)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.refine.import_ply(filepath=str(ROOM / "point_cloud.ply"))
+    splats = bpy.context.object
+    before = len(splats.data.vertices)
+    print(f"imported {before:,} splats and {number} cameras into Blender {bpy.app.version_string}")
+    bpy.ops.refine.import_cameras(filepath=str(cameras), set_resolution=True)
+    scene = bpy.context.scene
+    scene.camera = bpy.data.objects[CAMERA]
+    scene.render.resolution_percentage = PERCENTAGE
+    preview.set_up_render(scene)
+
+    scored = time.perf_counter()
+    bpy.ops.refine.score()
+    scored = time.perf_counter() - scored
+    record = score_attributes.record(splats.data)
+    print(f"scored by {record['views_used']} views in {scored:.2f} s")
+    pictures = [picture("before.png", "COLOR"), picture("heat_map.png", "HEAT")]
+
+    scene.refine.ratio = 0.5
+    bpy.ops.refine.apply()
+    after = len(splats.data.vertices)
+    pictures.append(picture("after.png", "COLOR"))
+    bpy.ops.refine.export_ply(filepath=str(OUT / "room_half.ply"), overwrite=True)
+    sizes = [path.stat().st_size for path in (ROOM / "point_cloud.ply", OUT / "room_half.ply")]
+    print(f"kept {after:,} of {before:,} splats: {sizes[0] / 1e6:.1f} -> {sizes[1] / 1e6:.1f} MB")
+
+    report = {
+        "blender": bpy.app.version_string,
+        "splats": {"before": before, "kept": after, "removed": before - after},
+        "bytes": {"before": sizes[0], "after": sizes[1]},
+        "scores": record,
+        "seconds": {"score": scored, "all": time.perf_counter() - start},
+        "pictures": [path.name for path in pictures],
+    }
+    (OUT / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+    print(f"all of it took {report['seconds']['all']:.1f} s; see {OUT}:")
+    print("  " + ", ".join(sorted(path.name for path in OUT.iterdir())))
+
+
+if __name__ == "__main__":
+    refine_addon.register()
+    try:
+        main()
+    finally:
+        refine_addon.unregister()
+        shutil.rmtree(RESOURCES, ignore_errors=True)
