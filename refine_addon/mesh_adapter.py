@@ -221,11 +221,13 @@ def _fill(mesh: bpy.types.Mesh, rows: NDArray[Any], columns: Iterable[Column]) -
         for name, plane in zip(names, _planes(rows, names), strict=True):
             column = places[name]
             if column.attribute == "position":
-                position[:, column.component] = plane
+                with np.errstate(over="ignore"):
+                    position[:, column.component] = plane
                 continue
             kind = KINDS[column.kind]
             values = plane.view(np.int32) if plane.dtype == np.uint32 else plane
-            values = np.ascontiguousarray(values, kind.dtype)
+            with np.errstate(over="ignore"):  # doubles beyond the range become infinite, as noted
+                values = np.ascontiguousarray(values, kind.dtype)
             mesh.attributes[column.attribute].data.foreach_set(kind.field, values)
     mesh.attributes["position"].data.foreach_set("vector", position.ravel())
 

@@ -61,7 +61,10 @@ NORMAL_PLACES = {"nx": ("normal", 0), "ny": ("normal", 1), "nz": ("normal", 2)}
 """Where Blender's own PLY importer puts a file's normals."""
 
 _COUNT = rb"([\r\n]element[ \t]+vertex[ \t]+)[0-9]+"
-_TAKEN = {"position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"}
+_TAKEN = {
+    *("position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"),
+    *("refine_seen", "refine_heat", "refine_color", "refine_remove"),
+}
 
 
 @dataclass(frozen=True)
@@ -160,6 +163,14 @@ def sh_degree(mesh: bpy.types.Mesh) -> int:
     return REST_COUNTS.get(rest_count(mesh), 0)
 
 
+def stored_bytes(mesh: bpy.types.Mesh) -> int:
+    """Return about how large the exported file is; cheap enough to draw, and without checks."""
+    layout = _remembered(mesh)
+    # Without a file behind it: position, degree 0 and the harmonics, as floats.
+    row = layout.row_dtype.itemsize if layout else 4 * (14 + rest_count(mesh))
+    return row * len(mesh.vertices)
+
+
 def rest_count(mesh: bpy.types.Mesh) -> int:
     """Return how many ``f_rest_*`` attributes a mesh has."""
     return sum(f"f_rest_{index}" in mesh.attributes for index in range(max(REST_COUNTS)))
@@ -256,7 +267,7 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
         if name in PLACES:
             columns.append(Column(name, kind, *PLACES[name]))
             continue
-        # Blender keeps some names for itself, and none of more than 63 bytes.
+        # Blender keeps some names for itself, we others, and none has more than 63 bytes.
         plain = name not in _TAKEN and len(name.encode()) < 64 and name[0] != "."  # noqa: PLR2004
         place = name if plain else f"ply_{index}"
         attribute = mesh.attributes.new(place, STORAGE[kind[1:]], "POINT")

@@ -22,7 +22,7 @@ def key(settings: Any) -> str:  # noqa: ANN401 - RefineSettings, which imports t
 
 def refresh(context: bpy.types.Context) -> None:
     """Work out the plan for the active object if it has scores, and store it on its mesh."""
-    obj = context.object
+    obj = getattr(context, "object", None)  # not in every editor
     if not mesh_layout.looks_like_splats(obj) or score_attributes.record(obj.data) is None:
         return
     if obj.mode == "EDIT" or obj.data.library or obj.library:

@@ -1,0 +1,126 @@
+"""The preview shows splats, and leaves the mesh as it was."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+
+
+def _evaluated(obj):
+    """Return the points that a preview draws."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    return [
+        instance.object.data
+        for instance in depsgraph.object_instances
+        if instance.parent == obj.evaluated_get(depsgraph) or instance.object.original == obj
+    ]
+
+
+def _point_count(obj):
+    clouds = [data for data in _evaluated(obj) if isinstance(data, bpy.types.PointCloud)]
+    return sum(len(cloud.points) for cloud in clouds)
+
+
+def test_points_show_every_splat_or_only_those_that_stay(addon, room, room_cameras):  # noqa: ARG001
+    """39755 points; at 75 % removed, 9939; the slider is followed at once."""
+    settings = bpy.context.scene.refine
+    bpy.ops.refine.score()
+    bpy.ops.refine.preview(mode="HEAT")
+    every = _point_count(room)
+    settings.ratio = 0.75
+    bpy.ops.refine.preview(mode="HEAT", hide_removed=True)
+    some = _point_count(room)
+    settings.ratio = 0.9
+    fewer = _point_count(room)
+
+    assert every == len(room.data.vertices) == 39755
+    assert some == 39755 - 39755 * 3 // 4
+    assert fewer == 39755 - 39755 * 9 // 10
+
+
+def test_turning_it_off_leaves_nothing_behind(addon, room, unchanged):
+    """No modifier, no attribute, no node group, no material."""
+    unchanged.start()
+    bpy.ops.refine.preview(mode="COLOR")
+    shown = addon.preview.shown(room)
+    bpy.ops.refine.preview(mode="OFF")
+
+    assert shown == ("COLOR", False)
+    unchanged()
+
+
+def test_a_heat_map_needs_scores(room, unchanged):  # noqa: ARG001
+    """The message says what to do first."""
+    unchanged.start()
+    with pytest.raises(RuntimeError, match="score it first"):
+        bpy.ops.refine.preview(mode="HEAT")
+    unchanged()
+
+
+def test_two_objects_share_one_preview_and_lose_it_one_by_one(addon, room):
+    """The node group goes with its last user."""
+    other = bpy.data.objects.new("other", room.data.copy())
+    bpy.context.scene.collection.objects.link(other)
+    for obj in (room, other):
+        addon.preview.show(obj, "COLOR")
+    groups = [len(bpy.data.node_groups)]
+    addon.preview.hide(room)
+    groups.append(len(bpy.data.node_groups))
+    addon.preview.hide(other)
+    groups.append(len(bpy.data.node_groups))
+
+    assert groups == [1, 1, 0]
+
+
+def test_the_preview_outlives_an_apply(addon, room, room_cameras):  # noqa: ARG001
+    """What is left is shown, none of it hidden."""
+    bpy.ops.refine.score()
+    bpy.ops.refine.preview(mode="HEAT", hide_removed=True)
+    bpy.ops.refine.apply()
+
+    assert addon.preview.shown(room) == ("HEAT", True)
+    assert _point_count(room) == len(room.data.vertices) == 19878
+
+
+def _render(path):
+    scene = bpy.context.scene
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(str(path))
+    image.colorspace_settings.name = "Non-Color"  # the file's own numbers, 0..1
+    pixels = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(pixels)
+    return pixels.reshape(image.size[1], image.size[0], 4)[::-1]
+
+
+def test_a_rendered_splat_is_a_gaussian(addon, core, tmp_path):
+    """One round white splat of standard deviation .5 at 4 m before a 240 px camera of f 333.3.
+
+    A ray ``p`` pixels off the axis passes the centre at ``4 sin(atan(p / 333.3))`` metres. Opacity
+    is .8 in the middle, at 42 px (.5 m, one standard deviation) .8 exp(-.5) = .485, and in the
+    corner, at 140 px (1.55 m, 3.1 of them), .8 exp(-4.8) = .0066: as white light on black and in
+    sRGB 231, 185 and 20 of 255.
+    """
+    rest = {name: np.zeros(1, np.float32) for name in ("x", "y", "rot_1", "rot_2", "rot_3")}
+    columns = {
+        **rest,
+        "z": np.full(1, -4.0, np.float32),
+        **{f"f_dc_{i}": np.full(1, 0.5 / core.splats.SH_C0, np.float32) for i in range(3)},
+        "opacity": np.full(1, np.log(4.0), np.float32),
+        **{f"scale_{i}": np.full(1, np.log(0.5), np.float32) for i in range(3)},
+        "rot_0": np.ones(1, np.float32),
+    }
+    core.ply.write_columns(tmp_path / "one.ply", columns)
+    bpy.ops.refine.import_ply(filepath=str(tmp_path / "one.ply"))
+    scene = bpy.context.scene
+    scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(scene.camera)
+    addon.preview.show(bpy.context.object, "COLOR", style="SPLATS")
+    addon.preview.set_up_render(scene)
+    image = _render(tmp_path / "one.png")
+
+    assert abs(image[80, 120, 0] - 231 / 255) < 0.02
+    assert abs(image[80, 120 + 42, 0] - 185 / 255) < 0.03
+    assert abs(image[80 - 42, 120, 0] - 185 / 255) < 0.03
+    assert abs(image[2, 2, 0] - 20 / 255) < 0.02
