@@ -20,7 +20,7 @@ MUTANTS = [
     ("frustum.py", "out=x), depth)", "out=x), np.abs(depth))", "behind counts as inside"),
     ("frustum.py", "inside &= depth <= far", "inside &= depth < far", "far plane excluded"),
     (
-        "closed_form.py",
+        "frustum.py",
         "(view.cx - view.width / 2)",
         "(view.width / 2 - view.cx)",
         "shift mirrored",
