@@ -2,7 +2,8 @@
 
 Imports the splats and the 63 cameras that trained them as objects, scores, prunes half, exports,
 all by the operators behind the panel's buttons. Leaves in ``out/``: the pruned PLY, a report, and
-what one of the cameras sees before, after, and as a heat map; ``docs/demo.py 200`` for larger pictures.
+what one of the cameras sees before, after, and as a heat map. ``docs/demo.py 200`` makes larger
+pictures.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import numpy as np
 
 from . import closed_form, selection
 from .errors import RefineError
-from .files import expanded, refuse_existing
+from .files import expanded, refuse_existing, refuse_mapped
 from .ply import read_ply
 from .work import Progress, part, report, silent
 
@@ -200,6 +200,7 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
     target = None if output is None else expanded(output)
     if target is not None:
         refuse_existing(target, overwrite=overwrite)
+        refuse_mapped(target, expanded(source))
     file = read_ply(source)
     opened = time.perf_counter()
     result = prune(
