@@ -30,7 +30,7 @@ PATIENCE = 120
 
 
 class StepError(AssertionError):
-    """A step inside Blender failed; the message is all that it printed."""
+    """A step inside Blender failed; the message is the end of what it printed."""
 
 
 @functools.cache
@@ -103,7 +103,7 @@ class Blender:
         Raises
         ------
         StepError
-            If it raised, or Blender ended before it returned.
+            If it raised, Blender ended before it returned, or the extension raised meanwhile.
         """
         return self._result(name, arguments, self.python)
 
@@ -112,9 +112,11 @@ class Blender:
         answer = self.work / f"{name}.json"
         answer.unlink(missing_ok=True)
         done = run(os.fspath(DRIVER), "--", name, json.dumps(arguments, default=str), str(answer))
-        if done.returncode != 0 or not answer.exists():
+        printed = done.stdout + done.stderr
+        # Blender goes on after an exception in a panel, a poll or a handler; a test must not.
+        if done.returncode != 0 or not answer.exists() or "Traceback" in printed:
             message = f"{self.name}, step {name}, exit code {done.returncode}:\n"
-            raise StepError(message + done.stdout + done.stderr)
+            raise StepError(message + "\n".join(printed.splitlines()[-80:]))
         return json.loads(answer.read_text(encoding="utf-8"))
 
 

@@ -1,4 +1,4 @@
-"""Use the panel as a person does: open its tab, click *Score*, click *Apply*, undo with Ctrl+Z."""
+"""Use the panel as a person does: its tab, *Score*, *Heat Map*, *Apply*, Ctrl+Z."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ TAB = "REFINE"
 A_MOMENT = 0.05
 PATIENCE = 60.0
 
-# A button is 20 pixels high or more, so no button is missed.
+# Pixels. A button is 20 high or more: the mouse comes to it, and then moves on it.
 STEP = 8
 
 
@@ -45,19 +45,24 @@ def main(name: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
     yield from picture(pictures, "1-opened")
     found = {"opened": state(name)}
 
-    yield from hand.click("refine.score")
+    yield from hand.click("refine.score(")
     yield from until(lambda: state(name)["scored"], "there are scores")
     yield from picture(pictures, "2-scored")
     found["scored"] = state(name)
 
-    yield from hand.click("refine.apply")
+    yield from hand.click("refine.preview(mode='HEAT'")
+    yield from until(lambda: bpy.data.objects[name].modifiers, "there is a preview")
+    yield from picture(pictures, "3-heat", settle=10.0)  # EEVEE compiles its shaders
+    found["previewed"] = state(name)
+
+    yield from hand.click("refine.apply(")
     yield from until(lambda: state(name) != found["scored"], "splats are removed")
-    yield from picture(pictures, "3-applied")
+    yield from picture(pictures, "4-applied")
     found["applied"] = state(name)
 
     yield from hand.undo()
     yield from until(lambda: state(name) != found["applied"], "they are back")
-    yield from picture(pictures, "4-undone")
+    yield from picture(pictures, "5-undone")
     found["undone"] = state(name)
     return found
 
@@ -68,9 +73,13 @@ def state(name: str) -> dict[str, Any]:
     return {"vertices": len(mesh.vertices), "scored": "refine_score" in mesh.attributes}
 
 
-def picture(folder: str, name: str) -> Generator[float, None, None]:
-    """Save what the X server shows; Blender's own screenshot is black with this driver."""
-    yield 0.5
+def picture(folder: str, name: str, settle: float = 2.0) -> Generator[float, None, None]:
+    """Save what the X server shows; Blender's own screenshot is black with this driver.
+
+    Before it, wait for ``settle`` seconds: panels glide to their places, slowly where the
+    processor draws.
+    """
+    yield settle
     target = Path(folder) / f"{name}.png"
     subprocess.run(["import", "-window", "root", target], check=True)
 
@@ -114,11 +123,9 @@ class Hand:
 
     def move(self, x: int, y: int) -> Generator[float, None, None]:
         """Bring the mouse to a pixel of the window, y from the bottom."""
-        # A button notices the mouse by its moving on it, not by its being there.
-        for near in (1, 0):
-            self.at = {"x": x + near, "y": y}
-            self.window.event_simulate(type="MOUSEMOVE", value="NOTHING", **self.at)
-            yield A_MOMENT
+        self.at = {"x": x, "y": y}
+        self.window.event_simulate(type="MOUSEMOVE", value="NOTHING", **self.at)
+        yield A_MOMENT
 
     def open_tab(self) -> Generator[float, None, None]:
         """Click down the sidebar's column of tabs until ours is open.
@@ -139,8 +146,8 @@ class Hand:
         message = f"the sidebar of the 3D view has no tab {TAB}"
         raise LookupError(message)
 
-    def click(self, operator: str) -> Generator[float, None, None]:
-        """Click the button of an operator, found by asking each place in the sidebar for its.
+    def click(self, call: str) -> Generator[float, None, None]:
+        """Click the button whose Python call begins like this, found by asking everywhere.
 
         Raises
         ------
@@ -153,10 +160,10 @@ class Hand:
             x = region.x + int(share * (region.width - 24))
             for y in range(region.y + region.height - STEP, region.y, -STEP):
                 yield from self.move(x, y)
-                if f"bpy.ops.{operator}(" in self.button():
+                if self.button().startswith(f"bpy.ops.{call}"):
                     yield from self.press("LEFTMOUSE")
                     return
-        message = f"the tab {TAB} has no button for {operator}"
+        message = f"the tab {TAB} has no button for {call}"
         raise LookupError(message)
 
     def button(self) -> str:
