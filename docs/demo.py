@@ -29,6 +29,7 @@ os.environ["BLENDER_USER_RESOURCES"] = RESOURCES
 sys.path.insert(0, str(PROJECT))
 
 import bpy  # noqa: E402
+import numpy as np  # noqa: E402
 
 import refine_addon  # noqa: E402
 from refine_addon import preview, score_attributes  # noqa: E402
@@ -51,6 +52,23 @@ def picture(name: str, mode: str) -> Path:
     bpy.ops.render.render(write_still=True)
     preview.hide(obj)
     return OUT / name
+
+
+def side_by_side(pictures: list[Path], target: Path) -> None:
+    """Join pictures of one size from left to right: the README's picture."""
+    pixels = []
+    for path in pictures:
+        image = bpy.data.images.load(str(path))
+        width, height = image.size
+        values = np.empty(width * height * 4, np.float32)
+        image.pixels.foreach_get(values)
+        pixels.append(values.reshape(height, width, 4))
+    joined = np.hstack(pixels)
+    image = bpy.data.images.new("joined", joined.shape[1], joined.shape[0])
+    image.pixels.foreach_set(joined.ravel())
+    image.file_format = "JPEG"
+    image.filepath_raw = str(target)
+    image.save(quality=85)
 
 
 def main() -> None:
@@ -82,6 +100,8 @@ def main() -> None:
     after = len(splats.data.vertices)
     pictures.append(picture("after.png", "COLOR"))
     bpy.ops.refine.export_ply(filepath=str(OUT / "room_half.ply"), overwrite=True)
+    before_after = [pictures[0], pictures[2], pictures[1]]
+    side_by_side(before_after, OUT / "demo.jpg")
     sizes = [path.stat().st_size for path in (ROOM / "point_cloud.ply", OUT / "room_half.ply")]
     print(f"kept {after:,} of {before:,} splats: {sizes[0] / 1e6:.1f} -> {sizes[1] / 1e6:.1f} MB")
 
