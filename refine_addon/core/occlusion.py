@@ -1,0 +1,275 @@
+"""Scores that know what hides what, without a renderer: the froxel tier.
+
+    contribution_i = sum over views of  integral of alpha_i  x  mean T        MesonGS, LightGaussian
+    contrast_i     = sum over views of  integral of alpha_i^2  x  mean of T^2 |c_i - B_i|^2
+    score_i        = contrast_i  sqrt(contribution_i)
+
+T, the transmittance in front of a splat, and B, the colour behind it, come from `froxels`. The
+contrast is the squared error of the picture without the splat, what REFINE's Hessian stands for;
+it is true for one splat removed among many that stay. The contribution also knows what the splat
+hides once its neighbours are gone; the product is the better order from half removed on.
+
+Splats are not independent, so the order of removal is found in rounds: part of the budget goes,
+the scores of the survivors are computed anew, and so on to the last tenth. Budgets stay nested.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from . import closed_form, froxels, projection
+from .errors import RefineError
+from .scores import Scores
+from .work import Progress, for_chunks, part, silent
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .projection import Frame, Gaussians
+    from .splats import Splats
+    from .views import View, ViewSet
+
+LEAST = 0.1
+"""Share of the splats that is left when scores are computed for the last time."""
+
+PRIOR = closed_form.ClosedForm("distance", frustum=False)
+"""What orders splats that no view shows: without a frustum, for they lie in none."""
+
+_BLOCKS = 8  # of views; sums are added up block by block, so that threads do not matter
+
+
+@dataclass(frozen=True)
+class Occlusion:
+    """Settings of the occlusion method; the default ranks the same whatever the scene's unit.
+
+    Attributes
+    ----------
+    cell : float
+        Side of a cell, pixels; more where an image has more than 65,535 of them.
+    density : float
+        How finely a splat is sampled: points per standard deviation that is as long as a cell.
+    rounds : int
+        How often scores are computed: once, or anew after each part of the removal.
+    """
+
+    cell: float = 4.0
+    density: float = 3.2
+    rounds: int = 8
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises
+        ------
+        RefineError
+            If one cannot be.
+        """
+        for name in ("cell", "density"):
+            value = getattr(self, name)
+            if not 0.0 < value < np.inf:
+                msg = f"{name} is {value}, expected a positive number"
+                raise RefineError(msg)
+        if self.rounds < 1:
+            msg = f"rounds is {self.rounds}, expected 1 or more"
+            raise RefineError(msg)
+
+
+def score(
+    splats: Splats,
+    views: ViewSet,
+    settings: Occlusion = Occlusion(),
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Scores:
+    """Score splats by what the views would miss, given what hides them.
+
+    Parameters
+    ----------
+    splats : Splats
+        In the frame and unit of the views.
+    views : ViewSet
+        All of them are used.
+    settings : Occlusion
+    progress : callable, optional
+        See `refine_addon.core.work.Progress`.
+    threads : int, optional
+
+    Returns
+    -------
+    Scores
+        ``values`` is the share of the splats that have gone once this one goes, in (0, 1].
+
+    Raises
+    ------
+    RefineError
+        If there is no splat, none can be drawn, or no view sees any.
+    Cancelled
+        If `progress` answers ``False``.
+
+    Notes
+    -----
+    Memory: about 130 bytes a splat, and for each thread 100 bytes a point of one view, of which
+    there are at most 4 million (`froxels.MAX_POINTS`).
+    """
+    if not len(splats):
+        msg = "there are no splats to score"
+        raise RefineError(msg)
+    gaussians, frame, good = projection.prepare(
+        splats, views, progress=part(progress, 0.0, 0.05), threads=threads
+    )
+    if not good.any():
+        msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
+        raise RefineError(msg)
+    run = _Run(gaussians, frame, views, settings, threads)
+    prior = closed_form.score(
+        splats, views, PRIOR, progress=part(progress, 0.05, 0.1), threads=threads
+    )
+    values, seen = run.rank(prior.values, part(progress, 0.1, 1.0))
+    if not run.shown:
+        msg = (
+            f"no camera sees the splats: none of {len(splats)} reaches into the image of any of "
+            f"{len(views)} views; check that cameras and splats share their frame and unit"
+        )
+        raise RefineError(msg)
+    values[~good] = 0.0
+    return Scores(values, seen, len(views), int(np.count_nonzero(~good)))
+
+
+class _Run:
+    """One scoring: the scene as Gaussians, and what is left of it."""
+
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        frame: Frame,
+        views: ViewSet,
+        settings: Occlusion,
+        threads: int | None,
+    ) -> None:
+        self.gaussians, self.frame, self.settings, self.threads = (
+            gaussians,
+            frame,
+            settings,
+            threads,
+        )
+        self.shown = False  # whether any view sees anything
+        self.views = [
+            (view, weight) for view, weight in zip(views, views.weights, strict=True) if weight > 0
+        ]
+
+    def rank(
+        self, prior: NDArray[np.float32], progress: Progress
+    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """Return the values and `seen` of all splats; `prior` decides where the views do not."""
+        count, rounds, left = len(prior), self.settings.rounds, self.gaussians
+        values, seen = np.zeros(count, np.float32), np.zeros(count, np.int32)
+        hopeless = np.ones(count, np.bool_)
+        hopeless[left.index] = False
+        going = np.flatnonzero(hopeless)
+        going = going[np.argsort(prior[going], kind="stable")]
+        gone, start = 0, 0.0
+        for number in range(rounds):
+            values[going] = np.arange(gone + 1, gone + len(going) + 1) / count
+            gone += len(going)
+            # Each round has the views times what is left to do; all of them about thrice the first.
+            end = start + (1.0 - start) * max(1.0 / (rounds - number), 0.25)
+            measured = self.measure(left, part(progress, start, end))
+            start = end
+            if number == 0:
+                seen[left.index] = measured.seen
+                self.shown = bool(measured.contribution.any())
+            order = np.lexsort((prior[left.index], combined(measured)))
+            last = number == rounds - 1
+            stay = 0 if last else round(count * LEAST ** ((number + 1) / (rounds - 1)))
+            go = max(len(left) - stay, 0)
+            going = left.index[order[:go]]
+            left = left.take(np.sort(order[go:]))
+        values[going] = np.arange(gone + 1, gone + len(going) + 1) / count
+        return values, seen
+
+    def measure(self, gaussians: Gaussians, progress: Progress) -> Measured:
+        """Sum contribution and contrast of the Gaussians over all views."""
+        size = -(-len(self.views) // _BLOCKS)
+
+        def block(piece: slice) -> Measured:
+            total = Measured.zero(len(gaussians))
+            for view, weight in self.views[piece]:
+                measure_view(gaussians, self.frame, view, weight, self.settings, total)
+            return total
+
+        totals = for_chunks(
+            block, len(self.views), size, progress=progress, what="scoring", threads=self.threads
+        )
+        result = totals[0]
+        for other in totals[1:]:
+            result.add(other)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Sums over views, for M Gaussians.
+
+    Attributes
+    ----------
+    contribution, contrast : (M,) float64
+        See the module; px^2, weighted by the views' weights.
+    seen : (M,) int32
+        In how many views the centre lies.
+    """
+
+    contribution: NDArray[np.float64]
+    contrast: NDArray[np.float64]
+    seen: NDArray[np.int32]
+
+    @classmethod
+    def zero(cls, count: int) -> Measured:
+        """Return sums of no views."""
+        return cls(np.zeros(count), np.zeros(count), np.zeros(count, np.int32))
+
+    def add(self, other: Measured) -> None:
+        """Add the sums of other views."""
+        self.contribution[:] += other.contribution
+        self.contrast[:] += other.contrast
+        self.seen[:] += other.seen
+
+
+def combined(measured: Measured) -> NDArray[np.float64]:
+    """Return contrast times the root of contribution."""
+    return np.asarray(measured.contrast * np.sqrt(measured.contribution))
+
+
+def measure_view(
+    gaussians: Gaussians,
+    frame: Frame,
+    view: View,
+    weight: float,
+    settings: Occlusion,
+    total: Measured,
+) -> None:
+    """Add what one view says to `total`."""
+    with np.errstate(under="ignore"):
+        total.seen[:] += projection.seen_in(gaussians, frame, view)
+        footprints = projection.project(gaussians, frame, view)
+        count = len(footprints.index)
+        if not count:
+            return
+        side = froxels.cell_size(footprints, view, settings.cell, settings.density)
+        points = froxels.scatter(footprints, view, side, settings.density)
+        alphas = gaussians.alphas[footprints.index]
+        mass, mass_squared = froxels.masses(footprints, alphas)
+        thick = froxels.thickness(points, alphas, mass)
+        front = froxels.in_front(points, thick)
+        light = froxels.light(front)
+        colors = gaussians.colors[footprints.index][points.owners]
+        contrast = froxels.contrast(points, front, thick, colors)
+        contrast *= light
+        contrast *= light
+        shown = froxels.per_splat(points, light, count)
+        errors = froxels.per_splat(points, contrast, count)
+        total.contribution[footprints.index] += weight * (mass * shown)
+        total.contrast[footprints.index] += weight * (mass_squared * errors)
