@@ -92,7 +92,7 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
         obj = bpy.data.objects.new(mesh.name, mesh)
         if self.upright:
             obj.matrix_world = mathutils.Matrix(UPRIGHT.tolist())
-        context.collection.objects.link(obj)
+        _target(context).objects.link(obj)
         for note in mesh_adapter.import_notes(file):
             self.report({"WARNING"}, note)
         return obj
@@ -133,7 +133,7 @@ class REFINE_OT_import_cameras(_InObjectMode, bpy.types.Operator, ImportHelper):
             return fail(self, error)
         scene = context.scene
         collection = bpy.data.collections.new(f"Cameras {path.stem}")
-        context.collection.children.link(collection)
+        _target(context).children.link(collection)
         cameras = create_cameras(views, collection, upright=self.upright)
         scene.refine.collection = collection
         scene.refine.source = "COLLECTION"
@@ -160,6 +160,12 @@ class REFINE_FH_ply(bpy.types.FileHandler):
     def poll_drop(cls, context: bpy.types.Context) -> bool:
         """Tell whether files can be dropped here."""
         return context.area is not None and context.area.type == "VIEW_3D"
+
+
+def _target(context: bpy.types.Context) -> bpy.types.Collection:
+    """Return the active collection, or the scene's where that one belongs to a library."""
+    active = context.collection
+    return context.scene.collection if active is None or active.library else active
 
 
 def _model_folder(path: Path) -> Path:

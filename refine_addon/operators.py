@@ -68,6 +68,7 @@ class REFINE_OT_score(_OnSplats, bpy.types.Operator):
         """Score at once."""
         try:
             obj, settings = context.object, context.scene.refine.to_settings()
+            self._name = obj.name
             views = self._views(context)
             scores = session.score_object(obj, views, settings)
         except RefineError as error:
@@ -138,7 +139,8 @@ class REFINE_OT_score(_OnSplats, bpy.types.Operator):
             f"Scored {len(scores.values):,} splats by {scores.views_used} of {len(views)} views; "
             f"{unseen:,} lie in none",
         )
-        for note in (*scores.notes, *([views.note] if views.note else [])):
+        notes = [*scores.notes, *([views.note] if views.note else [])]
+        for note in (*notes, *session.modifier_notes(session.find(self._name))):
             self.report({"WARNING"}, note)
         return {"FINISHED"}
 

@@ -72,6 +72,19 @@ def gather(obj: bpy.types.Object) -> Splats:
     return transformed(splats, matrix, rotate_sh=False)
 
 
+def modifier_notes(obj: bpy.types.Object) -> list[str]:
+    """Return a sentence if modifiers show the object otherwise than it is scored and exported."""
+    ours = ("REFINE", "KIRI")  # they draw splats, and move none
+    names = [m.name for m in obj.modifiers if m.show_viewport and not m.name.startswith(ours)]
+    if not names:
+        return []
+    note = (
+        f"object '{obj.name}': scored as without its modifiers ({', '.join(names)}); apply them "
+        "first if they move splats"
+    )
+    return [note]
+
+
 def check_scorable(obj: bpy.types.Object) -> None:
     """Raise `RefineError` if scores could not be stored on an object, before they are computed."""
     check(obj)
@@ -289,6 +302,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     timings["read_s"] = read - start
     timings["write_s"] = time.perf_counter() - decided
     timings["total_s"] = time.perf_counter() - start
+    result.report["notes"] += modifier_notes(obj)
     result.report["files"] = {
         "input": f"{bpy.data.filepath}#{name}",
         "output": None if target is None else str(target),

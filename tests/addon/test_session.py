@@ -208,3 +208,14 @@ def test_a_pruned_object_is_imported_and_pruned_again(addon, room, room_cameras,
     addon.session.export_object(room, tmp_path / "out.ply")
 
     assert len(addon.core.read_ply(tmp_path / "out.ply")) == 39755 - 19877 - 9939
+
+
+def test_modifiers_that_could_move_splats_are_mentioned(addon, room):
+    """What is scored and exported is the mesh itself; our preview and KIRI's drawing move none."""
+    addon.preview.show(room, "COLOR")
+    room.modifiers.new("KIRI_3DGS_Render_GN", "NODES")
+    quiet = addon.session.modifier_notes(room)
+    room.modifiers.new("Wave", "WAVE")
+
+    assert quiet == []
+    assert "without its modifiers (Wave)" in addon.session.modifier_notes(room)[0]

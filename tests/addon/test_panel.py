@@ -1,0 +1,126 @@
+"""The panel draws in every state, and computes nothing while it does."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import bpy
+import pytest
+
+
+class Layout:
+    """Stands in for Blender's layout: notes what is drawn, in order."""
+
+    def __init__(self, drawn):
+        self.__dict__["drawn"] = drawn
+
+    def __setattr__(self, name, value):
+        """Take any setting."""
+
+    def row(self, **_options):
+        """Return itself, as a part of the layout."""
+        return self
+
+    column = row
+
+    def operator(self, name, **_options):
+        """Note a button, and return something to set its properties on."""
+        assert bpy.ops.refine.__getattr__(name.split(".")[1]).get_rna_type()
+        self.drawn.append(name)
+        return SimpleNamespace()
+
+    def prop(self, data, name, **_options):
+        """Note a property; it must exist."""
+        assert name in data.bl_rna.properties
+        self.drawn.append(name)
+
+    def label(self, *, text="", **_options):
+        """Note a text."""
+        self.drawn.append(text)
+
+    def progress(self, *, text, **_options):
+        """Note a bar."""
+        self.drawn.append(text)
+
+
+@pytest.fixture
+def draw(addon, monkeypatch):
+    """Return a function that draws all panels and returns what they draw."""
+
+    def never(*_arguments, **_options):
+        msg = "computed while drawing"
+        raise AssertionError(msg)
+
+    def draw():
+        drawn = []
+        with monkeypatch.context() as patch:
+            for name in ("plan", "keep_mask", "stored_scores", "gather", "apply_object"):
+                patch.setattr(addon.session, name, never)
+            patch.setattr(addon.mesh_adapter, "read_attribute", never)
+            patch.setattr(addon.mesh_adapter, "write_attribute", never)
+            for cls in addon.registration.CLASSES:
+                if issubclass(cls, bpy.types.Panel):
+                    cls.draw(SimpleNamespace(layout=Layout(drawn)), bpy.context)
+        return drawn
+
+    return draw
+
+
+def test_an_empty_scene_says_what_to_do_first(draw):
+    """All six steps are there from the start."""
+    drawn = draw()
+
+    buttons = ["import_ply", "import_cameras", "score", "preview", "apply", "export_ply"]
+    assert [b for b in buttons if f"refine.{b}" in drawn] == buttons
+    assert "Select an object that holds splats" in drawn
+
+
+def test_each_step_shows_what_came_of_it(draw, room, room_cameras):  # noqa: ARG001
+    """Counts and sizes of the room: 39755 splats of 248 bytes, 9.9 MB; half go."""
+    imported = draw()
+    bpy.ops.refine.score()
+    scored = draw()
+    bpy.ops.refine.preview(mode="HEAT")
+    draw()
+    bpy.ops.refine.apply()
+    applied = draw()
+
+    assert "39,755 splats, SH degree 3" in imported
+    assert "9.9 MB" in imported
+    assert "72 cameras" in imported
+    assert "Scored by 64 of 72 views" in scored
+    assert "Stay: 19,878 splats, 4.9 MB" in scored
+    assert "Go: 19,877 splats, 4.9 MB" in scored
+    assert "19,878 splats, SH degree 3" in applied
+    assert not [text for text in applied if text.startswith(("Stay", "Go", "Scored"))]
+
+
+def test_a_plan_that_no_longer_holds_is_replaced_by_a_button(draw, room, room_cameras):  # noqa: ARG001
+    """The budget changed while another object was active."""
+    bpy.ops.refine.score()
+    bpy.context.view_layer.objects.active = None
+    bpy.context.scene.refine.ratio = 0.9
+    bpy.context.view_layer.objects.active = room
+
+    assert "refine.plan" in draw()
+
+
+def test_while_scoring_a_bar_takes_the_place_of_the_button(draw, room):  # noqa: ARG001
+    """The bar says how to cancel."""
+    manager = bpy.context.window_manager
+    manager.refine_progress = 0.43
+    drawn = draw()
+    manager.refine_progress = -1.0
+
+    assert "Scoring 43% (Esc cancels)" in drawn
+    assert "refine.score" not in drawn
+
+
+@pytest.mark.parametrize("source", ["VISIBLE", "ACTIVE", "SELECTED", "COLLECTION", "FRAMES"])
+def test_every_source_of_cameras_is_drawn(draw, source):
+    """A shot of 250 frames, every tenth: 25."""
+    bpy.context.scene.refine.source = source
+    drawn = draw()
+
+    assert ("25 frames" in drawn) == (source == "FRAMES")
+    assert ("collection" in drawn) == (source == "COLLECTION")
