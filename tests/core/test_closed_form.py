@@ -65,6 +65,8 @@ def random_scene(seed: int, count: int = 300, view_count: int = 5) -> tuple[Spla
                 rotation,
                 cx=rng.uniform(20, 80),
                 fy=rng.uniform(30, 70),
+                cy=rng.uniform(10, 50),
+                height=60,
                 weight=rng.uniform(0.1, 2),
                 near=rng.choice([0.0, 0.5]),
                 far=rng.choice([4.0, math.inf]),
