@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .core import (
+    METHODS,
     Budget,
     Cancelled,
     ClosedForm,
@@ -137,7 +138,12 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
         metavar="FILE_OR_FOLDER",
         help="cameras.json, transforms.json or a COLMAP model; default: the open scene's cameras",
     )
-    parser.add_argument("--method", choices=["closed-form"], default="closed-form")
+    parser.add_argument(
+        "--method",
+        choices=METHODS,
+        default=METHODS[0],
+        help="default: closed-form; occlusion knows what hides what, and takes longer",
+    )
     parser.add_argument(
         "--depth", choices=["z", "distance"], default="z", help="along the view's axis, or from it"
     )

@@ -24,7 +24,10 @@ from .core.selection import Budget
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-METHODS = (("closed-form", "Closed Form", "REFINE's closed form: fast; takes nothing as hidden"),)
+METHODS = (
+    ("closed-form", "Closed Form", "REFINE's closed form: fast; takes nothing as hidden"),
+    ("occlusion", "Occlusion", "Knows what hides what: better, and takes longer"),
+)
 """Methods of scoring, by the names that core gives them."""
 
 BUDGETS = (

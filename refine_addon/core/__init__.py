@@ -10,7 +10,8 @@ In short::
 from .camera_files import read_cameras
 from .closed_form import ClosedForm
 from .errors import Cancelled, RefineError
-from .pipeline import Result, Settings, prune, prune_file, score
+from .occlusion import Occlusion
+from .pipeline import METHODS, Result, Settings, prune, prune_file, score
 from .ply import SplatFile, read_ply
 from .scores import Scores
 from .selection import Budget, rank, select
@@ -18,9 +19,11 @@ from .splats import Splats
 from .views import View, ViewSet
 
 __all__ = [
+    "METHODS",
     "Budget",
     "Cancelled",
     "ClosedForm",
+    "Occlusion",
     "RefineError",
     "Result",
     "Scores",

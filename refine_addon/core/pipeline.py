@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from . import closed_form, selection
+from . import closed_form, occlusion, selection
 from .errors import RefineError
 from .files import expanded, refuse_existing, refuse_mapped
 from .ply import read_ply
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from .splats import Splats
     from .views import ViewSet
 
+METHODS = ("closed-form", "occlusion")
+
 
 @dataclass(frozen=True)
 class Settings:
@@ -35,17 +37,19 @@ class Settings:
 
     Attributes
     ----------
-    method : {"closed-form"}
-        Name of the scoring method.
+    method : {"closed-form", "occlusion"}
+        Name of the scoring method: as if nothing hid anything, or with what hides what.
     views : int
         Use at most this many views, spread out evenly; 0 uses all.
     closed_form : ClosedForm
-        Settings of that method.
+    occlusion : Occlusion
+        Settings of the methods of those names.
     """
 
-    method: Literal["closed-form"] = "closed-form"
+    method: Literal["closed-form", "occlusion"] = "closed-form"
     views: int = 64
     closed_form: closed_form.ClosedForm = field(default_factory=closed_form.ClosedForm)
+    occlusion: occlusion.Occlusion = field(default_factory=occlusion.Occlusion)
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -55,8 +59,8 @@ class Settings:
         RefineError
             If one cannot be.
         """
-        if self.method != "closed-form":
-            msg = f"method is {self.method!r}, expected 'closed-form'"
+        if self.method not in METHODS:
+            msg = f"method is {self.method!r}, expected one of {', '.join(METHODS)}"
             raise RefineError(msg)
         if self.views < 0:
             msg = f"views is {self.views}, expected 0 (all) or more"
@@ -114,6 +118,8 @@ def score(
         If `progress` answers ``False``.
     """
     used = views.spread(settings.views)
+    if settings.method == "occlusion":
+        return occlusion.score(splats, used, settings.occlusion, progress=progress, threads=threads)
     return closed_form.score(splats, used, settings.closed_form, progress=progress, threads=threads)
 
 
