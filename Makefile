@@ -30,6 +30,8 @@ build: $(DEV)         ## the extension's zip, validated, into build/
 
 bench: $(BENCH)       ## speed and memory, with medians
 	$(PY) -m benchmarks.speed
+	$(PY) -m benchmarks.file_to_file
+	$(PY) -m benchmarks.in_blender
 
 bench-trade: $(BENCH) ## quality over time: docs/trade.md; SCENES="folder ..." measures others
 	$(PY) -m benchmarks.trade $(SCENES)
