@@ -45,66 +45,57 @@ COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 FLAT = 16
 """Points along either side of the image for a splat that the whole image lies in."""
 
+Line = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
+"""Points and their weights."""
+
 _EXTENT, _WIDE_EXTENT, _WIDE = 2.4, 3.0, 8  # standard deviations; the latter from 8 points on
 _GROWTH = 2.0**0.25
+_OUTSIDE = MAX_CELLS  # the number of no cell
+_BLOCK = 1 << 14  # points worked on at a time: what they need fits the cache of one core
 
 
 @dataclass(frozen=True, eq=False)
-class Lattices:
-    """Lattices of points for the standard normal distribution, one after the other.
+class Lattice:
+    """Points that stand for the standard normal distribution in two dimensions.
 
     Attributes
     ----------
-    starts, counts : (L, L) int64
-        First point, and number of points, of the lattice with ``COUNTS[i]`` points along the
-        major and ``COUNTS[j]`` along the minor axis.
-    points : (2, P) float32
-        In standard deviations.
-    weights : (P,) float32
-        Share of the mass; sums to 1 in every lattice.
-
-    The last ``FLAT * FLAT`` points are a lattice over an image, from -1 to 1.
+    points : (2, k) float32
+        In standard deviations along the major and the minor axis.
+    weights : (k,) float32
+        Share of the mass; sums to 1.
     """
 
-    starts: NDArray[np.int64]
-    counts: NDArray[np.int64]
     points: NDArray[np.float32]
     weights: NDArray[np.float32]
 
 
 @functools.cache
-def lattices() -> Lattices:
-    """Return the lattices (made once)."""
+def lattices() -> tuple[Lattice, ...]:
+    """Return the lattice of every kind: ``COUNTS[i]`` by ``COUNTS[j]`` points are number i L + j.
+
+    After those comes one of `FLAT` by `FLAT` points over an image, from -1 to 1.
+    """
     lines = [_line(count) for count in COUNTS]
-    starts = np.zeros((len(COUNTS), len(COUNTS)), np.int64)
-    counts = np.zeros_like(starts)
-    points: list[NDArray[np.float64]] = []
-    weights: list[NDArray[np.float64]] = []
-    for i, (x, x_weight) in enumerate(lines):
-        for j, (y, y_weight) in enumerate(lines):
-            weight = np.outer(x_weight, y_weight)
-            radius = np.hypot(x[:, None], y)
-            extent = _WIDE_EXTENT if COUNTS[max(i, j)] >= _WIDE else _EXTENT
-            keep = (radius <= extent + 0.1) | (weight.size <= 4)  # noqa: PLR2004 - 2 x 2 is whole
-            starts[i, j] = sum(map(len, weights))
-            counts[i, j] = np.count_nonzero(keep)
-            share = weight[keep] / weight[keep].sum()
-            place = np.stack([axis[keep] for axis in np.broadcast_arrays(x[:, None], y)])
-            variance = (place * place) @ share  # the corners are gone: back to 1
-            points.append(place / np.sqrt(np.where(variance > 0.0, variance, 1.0))[:, None])
-            weights.append(share)
-    flat = (np.arange(FLAT) + 0.5) / FLAT * 2.0 - 1.0
-    points.append(np.stack([axis.ravel() for axis in np.meshgrid(flat, flat)]))
-    weights.append(np.full(FLAT * FLAT, 1.0 / FLAT**2))
-    return Lattices(
-        starts,
-        counts,
-        np.concatenate(points, axis=1).astype(np.float32),
-        np.concatenate(weights).astype(np.float32),
-    )
+    made = [_lattice(major, minor) for major in lines for minor in lines]
+    line = (np.arange(FLAT) + 0.5) / FLAT * 2.0 - 1.0
+    flat = np.stack([axis.ravel() for axis in np.meshgrid(line, line)]).astype(np.float32)
+    return (*made, Lattice(flat, np.full(FLAT**2, 1.0 / FLAT**2, np.float32)))
 
 
-def _line(count: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _lattice(major: Line, minor: Line) -> Lattice:
+    weight = np.outer(major[1], minor[1])
+    place = np.broadcast_arrays(major[0][:, None], minor[0])
+    extent = _WIDE_EXTENT if max(weight.shape) >= _WIDE else _EXTENT
+    keep = (np.hypot(*place) <= extent + 0.1) | (weight.size <= 4)  # noqa: PLR2004 - 2 x 2 is whole
+    weights = weight[keep] / weight[keep].sum()
+    points = np.stack([axis[keep] for axis in place])
+    variance = (points * points) @ weights  # the corners are gone: back to 1
+    points /= np.sqrt(np.where(variance > 0.0, variance, 1.0))[:, None]
+    return Lattice(points.astype(np.float32), weights.astype(np.float32))
+
+
+def _line(count: int) -> Line:
     """Return points and weights on a line: equal bins, each at its mean, with variance 1."""
     if count == 1:
         return np.zeros(1), np.ones(1)
@@ -170,59 +161,83 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
         Points per standard deviation for cells of that size.
     """
     table = lattices()
-    index = _lattice_index(footprints.sigmas, density / side)
-    counts, firsts = table.counts[index[0], index[1]], table.starts[index[0], index[1]]
+    kinds = _kinds(footprints, view, density / side)
+    counts = np.array([len(lattice.weights) for lattice in table])[kinds]
+    first = np.cumsum(counts) - counts
+    cells = np.empty(int(counts.sum()), np.uint16)
+    weights = np.empty(len(cells), np.float32)
+    rows = np.argsort(kinds, kind="stable")
+    end = 0
+    for kind, number in enumerate(np.bincount(kinds)):
+        lattice, start, end = table[kind], end, end + int(number)
+        step = max(_BLOCK // len(lattice.weights), 1)
+        for begin in range(start, end, step):
+            row = rows[begin : min(begin + step, end)]
+            at = first[row][:, None] + np.arange(len(lattice.weights))
+            if kind == len(table) - 1:
+                cells[at], weights[at] = _flat(footprints, row, lattice, view, side)
+            else:
+                place = _place(footprints, row, lattice)
+                cells[at], weights[at] = _cells(place, view, side), lattice.weights
+    return _merged(cells, np.repeat(np.arange(len(counts)), counts), weights, side * side)
+
+
+def _kinds(footprints: Footprints, view: View, scale: float) -> NDArray[np.uint8]:
+    """Return which of `lattices` suits each footprint."""
+    table = np.searchsorted(COUNTS, np.arange(COUNTS[-1] + 1)).astype(np.uint8)
+    wanted = np.ceil((footprints.sigmas * np.float32(scale)).clip(1.0, COUNTS[-1]))
+    index = table[wanted.astype(np.int64)]
     # Of a splat much larger than the image no point of its own lattice may fall there.
-    vast = footprints.sigmas[0] * (2 * _WIDE_EXTENT / COUNTS[-1]) > max(view.width, view.height) / 8
-    counts = np.where(vast, FLAT * FLAT, counts)
-    firsts = np.where(vast, len(table.weights) - FLAT * FLAT, firsts)
-    owners = np.repeat(np.arange(len(counts)), counts)
-    which = np.arange(len(owners)) + np.repeat(firsts - (np.cumsum(counts) - counts), counts)
-    x, y = table.points[0, which], table.points[1, which]
-    across = math.ceil(view.width / side)
-    inside = np.ones(len(owners), np.bool_)
+    spacing = footprints.sigmas[0] * (2.0 * _WIDE_EXTENT / COUNTS[-1])
+    vast = spacing > max(view.width, view.height) / 8
+    kinds = index[0] * np.uint8(len(COUNTS)) + index[1]
+    return np.where(vast, np.uint8(len(COUNTS) ** 2), kinds)
+
+
+def _place(
+    footprints: Footprints, row: NDArray[np.int64], lattice: Lattice
+) -> list[NDArray[np.float32]]:
+    """Return column and row, pixels, of every point of some footprints, each (n, k)."""
     place = []
-    for axis, size in enumerate((view.width, view.height)):
-        half = np.float32(size / 2)
-        spans = [half, half * (axis == 0), half * (axis == 1)]
-        values = footprints.centers[axis], footprints.major[axis], footprints.minor[axis]
-        middle, major, minor = (
-            np.repeat(np.where(vast, flat, own), counts)
-            for flat, own in zip(spans, values, strict=True)
-        )
-        where = middle + major * x
-        where += minor * y
-        inside &= (where >= 0.0) & (where < size)
+    for axis in range(2):
+        where = footprints.major[axis, row][:, None] * lattice.points[0]
+        where += footprints.minor[axis, row][:, None] * lattice.points[1]
+        where += footprints.centers[axis, row][:, None]
         place.append(where)
-    weights = table.weights[which]
-    if vast.any():
-        flat = np.flatnonzero(vast[owners])
-        weights[flat] = _flat_weights(footprints, owners[flat], [w[flat] for w in place], view)
-    if not inside.all():
-        owners, weights = owners[inside], weights[inside]
-        place = [where[inside] for where in place]
-    column, row = ((where * np.float32(1.0 / side)).astype(np.int32) for where in place)
-    # Rounding may put the last pixel one cell beyond the last.
-    row = np.minimum(row, math.ceil(view.height / side) - 1) * np.int32(across)
-    cells = (row + np.minimum(column, across - 1)).astype(np.uint16)
-    return _merged(cells, owners, weights, side * side)
+    return place
 
 
-def _flat_weights(
-    footprints: Footprints,
-    owners: NDArray[np.int64],
-    place: list[NDArray[np.float32]],
-    view: View,
-) -> NDArray[np.float32]:
-    """Share of a splat's mass around points of the lattice over the image, (m,)."""
-    squared = np.zeros(len(owners), np.float32)
-    offset = [where - footprints.centers[axis, owners] for axis, where in enumerate(place)]
+def _cells(place: list[NDArray[np.float32]], view: View, side: float) -> NDArray[np.int32]:
+    """Return the number of the cell that each point lies in, or `_OUTSIDE`."""
+    across, down = math.ceil(view.width / side), math.ceil(view.height / side)
+    u, v = place
+    inside = (u >= 0.0) & (u < view.width)
+    inside &= (v >= 0.0) & (v < view.height)
+    # Clipped before rounding: far outside they would not fit the integers, and rounding may put
+    # the last pixel one cell beyond the last.
+    column = (u * np.float32(1.0 / side)).clip(0.0, across - 1).astype(np.int32)
+    number = (v * np.float32(1.0 / side)).clip(0.0, down - 1).astype(np.int32)
+    number *= across
+    number += column
+    return np.where(inside, number, np.int32(_OUTSIDE))
+
+
+def _flat(
+    footprints: Footprints, row: NDArray[np.int64], lattice: Lattice, view: View, side: float
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Return cells and weights of points all over the image, for splats larger than it."""
+    u = np.float32(view.width / 2) * (lattice.points[0] + 1)
+    v = np.float32(view.height / 2) * (lattice.points[1] + 1)
+    squared = np.zeros((len(row), len(u)), np.float32)
+    dx = u - footprints.centers[0, row][:, None]
+    dy = v - footprints.centers[1, row][:, None]
     for half, sigma in zip((footprints.major, footprints.minor), footprints.sigmas, strict=True):
-        along = (offset[0] * half[0, owners] + offset[1] * half[1, owners]) / sigma[owners] ** 2
+        unit = half[:, row] / sigma[row] ** 2
+        along = (dx * unit[0][:, None] + dy * unit[1][:, None]).clip(-15.0, 15.0)
         squared += along * along
-    area = view.width * view.height / FLAT**2
-    mass = np.float32(2.0 * math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
-    return np.asarray(np.exp(squared.clip(0.0, 100.0) / -2.0) * (area / mass[owners]))
+    mass = np.float32(2.0 * math.pi) * footprints.sigmas[0, row] * footprints.sigmas[1, row]
+    share = np.float32(view.width * view.height / FLAT**2) / mass
+    return _cells([u, v], view, side), np.exp(squared / -2.0) * share[:, None]
 
 
 def _merged(
@@ -232,12 +247,13 @@ def _merged(
     area: float,
 ) -> Points:
     """Sort points into the cells and merge those of one splat in one cell."""
-    if not len(cells):
-        return Points(owners, weights, np.empty(0, np.int64), area)
-    order = np.argsort(cells, kind="stable")  # footprints came front to back, so cells stay so
-    owners = owners[order]
-    filled = np.bincount(cells)
+    filled = np.bincount(cells, minlength=_OUTSIDE)[:_OUTSIDE]
     filled = filled[filled > 0]
+    # Footprints came front to back, so cells stay so; what is outside comes last.
+    order = np.argsort(cells, kind="stable")[: filled.sum()]
+    if not len(order):
+        return Points(order, weights[:0], order, area)
+    owners = owners[order]
     tops = np.cumsum(filled) - filled
     new = np.empty(len(owners), np.bool_)
     np.not_equal(owners[1:], owners[:-1], out=new[1:])

@@ -253,11 +253,11 @@ def measure_view(
 ) -> None:
     """Add what one view says to `total`."""
     with np.errstate(under="ignore"):
-        total.seen[:] += projection.seen_in(gaussians, frame, view)
         footprints = projection.project(gaussians, frame, view)
         count = len(footprints.index)
         if not count:
             return
+        total.seen[footprints.index[footprints.inside(view)]] += 1
         side = froxels.cell_size(footprints, view, settings.cell, settings.density)
         points = froxels.scatter(footprints, view, side, settings.density)
         alphas = gaussians.alphas[footprints.index]

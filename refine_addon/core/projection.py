@@ -114,6 +114,11 @@ class Footprints:
     minor: NDArray[np.float32]
     sigmas: NDArray[np.float32]
 
+    def inside(self, view: View) -> NDArray[np.bool_]:
+        """Which centres lie in the image, (n,)."""
+        u, v = self.centers
+        return np.asarray((u >= 0.0) & (u <= view.width) & (v >= 0.0) & (v <= view.height))
+
 
 def prepare(
     splats: Splats, views: ViewSet, *, progress: Progress = silent, threads: int | None = None
@@ -208,16 +213,6 @@ def _morton(means: NDArray[np.float64]) -> NDArray[np.int64]:
     return code
 
 
-def seen_in(gaussians: Gaussians, frame: Frame, view: View) -> NDArray[np.bool_]:
-    """Which centres lie in the image of a view and between its clip planes, (M,)."""
-    x, y, z = _local(gaussians.means, frame, view)
-    near, far = clip_planes(frame, view)
-    inside: NDArray[np.bool_] = (z > near) & (z <= far)
-    for coordinate, focal, middle, size in _sides(view, x, y):
-        inside &= np.abs(focal * coordinate + middle * z) <= size / 2 * z
-    return inside
-
-
 def project(gaussians: Gaussians, frame: Frame, view: View) -> Footprints:
     """Project what may touch the image of a view.
 
@@ -225,21 +220,22 @@ def project(gaussians: Gaussians, frame: Frame, view: View) -> Footprints:
     splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean.
     """
     near, far = clip_planes(frame, view)
+    rotation = _rotation6(view)
     pieces: list[tuple[NDArray[Any], ...]] = []
     for start in range(0, len(gaussians), _CHUNK):
         piece = slice(start, start + _CHUNK)
         local = _local(gaussians.means[:, piece], frame, view)
         touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, (near, far)))
         if len(touching):
-            local = local[:, touching]
-            shape = _rotation6(view) @ gaussians.covariances[:, piece][:, touching]
+            local = np.take(local, touching, axis=1)
+            shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)
             pieces.append((touching + start, local[2], *_ellipses(local, shape, view)))
     if not pieces:
         empty = np.empty((2, 0), np.float32)
         return Footprints(np.empty(0, np.int64), empty, empty, empty, empty)
     index, depth, *rest = (np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True))
     order = _by_depth(depth)
-    return Footprints(index[order], *(values[:, order] for values in rest))
+    return Footprints(index[order], *(np.take(values, order, axis=1) for values in rest))
 
 
 def clip_planes(frame: Frame, view: View) -> tuple[float, float]:
