@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 PICTURES = PROJECT / "build" / "e2e"
 
 
-def test_score_preview_apply_and_undo_by_hand(binary: Binary, blend: Path):
-    """39,755 splats; *Score* and *Heat Map* keep all, *Apply* leaves 19,878, Ctrl+Z brings all back.
+def test_score_apply_undo_and_preview_by_hand(binary: Binary, blend: Path):
+    """39,755 splats; *Apply* leaves 19,878 of them, Ctrl+Z and *Heat Map* all.
 
     Pictures of the stages stay in build/e2e, for a person to look at.
     """
@@ -29,6 +29,6 @@ def test_score_preview_apply_and_undo_by_hand(binary: Binary, blend: Path):
 
     assert found["opened"] == {"vertices": 39_755, "scored": False}
     assert found["scored"] == {"vertices": 39_755, "scored": True}
-    assert found["previewed"] == found["scored"]
     assert found["applied"] == {"vertices": 19_878, "scored": True}
     assert found["undone"] == found["scored"]
+    assert found["previewed"] == found["scored"]
