@@ -1,0 +1,404 @@
+"""Merging and absorbing: the moments by hand, the laws, and what must not happen."""
+
+import numpy as np
+import pytest
+
+from refine_addon.core import merging
+from refine_addon.core.absorb import absorb, patience
+from refine_addon.core.errors import Cancelled
+from refine_addon.core.merge_graph import MergeGraph
+from refine_addon.core.merging import Field, Seen
+from refine_addon.core.splats import Splats, opacity, rotation_matrices
+from refine_addon.core.transform import transformed
+from refine_addon.core.views import View, ViewSet
+
+FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
+
+
+def flat(opacities, means, variances, *, colors=None, error=None):
+    """Splats without a low-pass, seen along z; contribution is opacity times area."""
+    means, variances = np.array(means, float), np.array(variances, float)
+    count = len(means)
+    opacities = np.array(opacities, float)
+    covariances = np.zeros((count, 6))
+    covariances[:, [0, 3, 5]] = variances
+    contribution = opacities * np.sqrt(variances[:, 0] * variances[:, 1])
+    return Field(
+        means,
+        covariances,
+        opacities,
+        contribution,
+        contribution * opacities / 2 if error is None else np.array(error, float),
+        np.tile([0.0, 0.0, 1.0], (count, 1)),
+        np.full((count, 3), 0.5) if colors is None else np.array(colors, float),
+        np.zeros(count),
+    )
+
+
+def merged_of(field, first=0, second=1):
+    one, two = np.array([first]), np.array([second])
+    pairs = merging.price(field, one, two)
+    return pairs, merging.merge(field, one, two, pairs)
+
+
+def cloud(count, seed=0, degree=1, spread=1.0):
+    rng = np.random.default_rng(seed)
+    return Splats(
+        rng.normal(size=(count, 3)) * spread,
+        rng.normal(-2.0, 0.5, size=(count, 3)).astype(np.float32),
+        rng.normal(size=(count, 4)).astype(np.float32),
+        rng.normal(0.0, 2.0, size=count).astype(np.float32),
+        rng.normal(0.0, 0.5, size=(count, 3)).astype(np.float32),
+        rng.normal(0.0, 0.1, size=(count, (degree + 1) ** 2 - 1, 3)).astype(np.float32),
+    )
+
+
+def around(count=4, distance=6.0, matrix=None):
+    """Look from a circle towards the origin, or from where a similarity takes it."""
+    views = []
+    for angle in np.linspace(0, 2 * np.pi, count, endpoint=False):
+        forward = -np.array([np.cos(angle), np.sin(angle), 0.0])
+        right = np.array([-np.sin(angle), np.cos(angle), 0.0])
+        rotation, center = np.stack([right, np.cross(forward, right), forward]), -distance * forward
+        if matrix is not None:
+            scale = np.cbrt(abs(np.linalg.det(matrix[:3, :3])))
+            rotation = rotation @ (matrix[:3, :3] / scale).T
+            center = matrix[:3, :3] @ center + matrix[:3, 3]
+        views.append(View(rotation, center, 200.0, 200.0, 160.0, 120.0, 320, 240))
+    return ViewSet(tuple(views))
+
+
+def measure(splats, _progress=None):
+    """Stand in for what renders: alpha times the geometric-mean area, no occlusion, one contrast.
+
+    Of no unit: the pixels of the views do not change with the scene's scale.
+    """
+    logs = np.asarray(splats.log_scales, np.float64)
+    size = np.exp(2 / 3 * np.sum(logs - np.median(logs), axis=1))
+    alpha = opacity(splats.opacity_logits)
+    return Seen(alpha * size, 0.05 * alpha**2 * size)
+
+
+def same(one, other):
+    for name in FIELDS:
+        np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
+
+
+# Two splats
+
+
+def test_two_equal_faint_splats_merge_to_one_of_twice_the_opacity():
+    """Equal moments stay; A_m = 2 A - <f, f>, and <f, f> = alpha A / 2: alpha' = 2a - a^2 / 2."""
+    field = flat([0.1, 0.1], [[1.0, 2, 3]] * 2, [[0.04, 0.09, 0.01]] * 2)
+
+    pairs, merged = merged_of(field)
+
+    np.testing.assert_allclose(merged.means, [[1, 2, 3]], atol=1e-15)
+    np.testing.assert_allclose(merged.covariances, field.covariances[:1], rtol=1e-14)
+    np.testing.assert_allclose(merged.opacity, 0.2 - 0.005, rtol=1e-12)
+    np.testing.assert_allclose(merged.color, field.color[:1])
+    # Only the overlap is lost: cost = tau |s|^2 (2 f - f_m)^2 = (alpha / 4)^2 of what f costs.
+    assert pairs.cost[0] <= (0.1 / 4) ** 2 * 4 * field.error[0] * (1 + 1e-9)
+
+
+def test_two_splats_apart_have_the_moments_of_their_mixture():
+    """Masses 1 : 3, a step of 4 along x: mean 3/4 of the way; variance 1 + 3/16 16 = 4 along x."""
+    field = flat([0.1, 0.3], [[0.0, 0, 0], [4, 0, 0]], [[1.0, 1, 1]] * 2)
+
+    pairs, merged = merged_of(field)
+
+    np.testing.assert_allclose(pairs.position, [0.25])
+    np.testing.assert_allclose(merged.means, [[3, 0, 0]])
+    np.testing.assert_allclose(merged.covariances, [[4, 0, 0, 1, 0, 1]])
+    # <f_i, f_j> / 2 pi = .1 .3 exp(-16 / 4) / 2; the area is 2.
+    np.testing.assert_allclose(merged.opacity, (0.4 - 0.03 * np.exp(-4) / 2) / 2, rtol=1e-12)
+
+
+def test_moments_are_associative():
+    """(i + j) + k is i + (j + k), but for the overlap, which faint splats hardly have."""
+    rng = np.random.default_rng(0)
+    field = flat([1e-9, 2e-9, 4e-9], rng.normal(size=(3, 3)), rng.uniform(0.5, 2, size=(3, 3)))
+    results = []
+    for order in ([0, 1, 2], [1, 2, 0], [2, 0, 1]):
+        own = field.take(np.array(order))
+        _, once = merged_of(own)
+        own.put(np.array([0]), once)
+        results.append(merged_of(own, 0, 2)[1])
+
+    for other in results[1:]:
+        np.testing.assert_allclose(other.means, results[0].means, rtol=1e-7)
+        np.testing.assert_allclose(other.covariances, results[0].covariances, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(other.color, results[0].color, rtol=1e-7)
+
+
+def test_the_cost_is_the_squared_error_of_the_pictures():
+    """The closed form against the three footprints summed on a fine grid, colour by colour."""
+    rng = np.random.default_rng(1)
+    background = np.array([0.2, 0.5, 0.3])
+    colors = rng.uniform(size=(2, 3))
+    alphas, means = np.array([0.3, 0.6]), np.array([[0.0, 0, 0], [0.8, 0.5, 0.3]])
+    variances = np.array([[0.5, 1.0, 0.1], [1.2, 0.3, 0.2]])
+    x, y = np.meshgrid(np.arange(-9, 9, 0.05), np.arange(-9, 9, 0.05))
+
+    def footprint(alpha, mean, xx, xy, yy):
+        dx, dy = x - mean[0], y - mean[1]
+        det = xx * yy - xy * xy
+        return alpha * np.exp(-0.5 * (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / det)
+
+    shapes = [
+        footprint(a, m, v[0], 0, v[1]) for a, m, v in zip(alphas, means, variances, strict=True)
+    ]
+    contribution = [f.sum() * 0.05**2 / (2 * np.pi) for f in shapes]
+    error = [
+        (f**2).sum() * 0.05**2 / (2 * np.pi) * np.sum((c - background) ** 2)
+        for f, c in zip(shapes, colors, strict=True)
+    ]
+    field = flat(alphas, means, variances, colors=colors, error=error)
+    np.testing.assert_allclose(field.contribution, contribution, rtol=1e-9)
+
+    pairs, merged = merged_of(field)
+
+    c = merged.covariances[0]
+    after = footprint(merged.opacity[0], merged.means[0], c[0], c[1], c[3])
+    change = sum(f[..., None] * (k - background) for f, k in zip(shapes, colors, strict=True))
+    change = change - after[..., None] * (merged.color[0] - background)
+    expected = (change**2).sum() * 0.05**2 / (2 * np.pi)
+    np.testing.assert_allclose(pairs.cost[0], expected, rtol=1e-9)
+    np.testing.assert_allclose(
+        pairs.error[0],
+        (after**2).sum() * 0.05**2 / (2 * np.pi) * np.sum((merged.color[0] - background) ** 2),
+        rtol=1e-9,
+    )
+
+
+def test_no_mass_is_created_and_none_is_lost_but_the_overlap():
+    rng = np.random.default_rng(2)
+    count = 2000
+    field = flat(
+        rng.uniform(0, 1, count), rng.normal(size=(count, 3)), np.exp(rng.normal(0, 2, (count, 3)))
+    )
+    first, second = np.arange(0, count, 2), np.arange(1, count, 2)
+    pairs = merging.price(field, first, second)
+    merged = merging.merge(field, first, second, pairs)
+
+    def mass(of):
+        c = of.covariances
+        return of.opacity * np.sqrt(c[:, 0] * c[:, 3] - c[:, 1] ** 2)
+
+    whole = mass(field)
+    after, before = mass(merged), whole[first] + whole[second]
+    assert (after <= before * (1 + 1e-9)).all()
+    assert (after >= np.maximum(whole[first], whole[second]) * (1 - 1e-9)).all()
+    assert merged.opacity.max() <= merging.OPACITY_MAX * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1e-3, 1e-9, 0.0])
+def test_covariances_become_axes_and_back(ratio):
+    """Down to a flat disc; scales and rotation reproduce the matrix, and no axis is lost."""
+    rng = np.random.default_rng(3)
+    turn = rotation_matrices(rng.normal(size=(500, 4)))
+    sizes = np.array([1.0, 0.3, 0.3 * ratio]) * np.exp(rng.normal(size=(500, 1)))
+    full = (turn * sizes[:, None] ** 2) @ np.swapaxes(turn, 1, 2)
+    rows, columns = np.triu_indices(3)
+
+    logs, quaternions = merging.axes(full[:, rows, columns])
+
+    axes = rotation_matrices(quaternions) * np.exp(logs)[:, None]
+    np.testing.assert_allclose(axes @ np.swapaxes(axes, 1, 2), full, atol=1e-9 * sizes.max() ** 2)
+    assert np.isfinite(logs).all()
+
+
+# Many
+
+
+def test_exactly_as_many_survive_as_asked():
+    splats = cloud(500)
+
+    for keep_count in (499, 350, 50, 1):
+        result = absorb(splats, around(), measure, keep_count)
+
+        assert len(result.splats) == keep_count == result.keep.sum() == len(result.changed)
+        assert result.merged + result.deleted == 500 - keep_count
+
+
+def test_survivors_that_absorbed_nothing_are_the_same_to_the_bit():
+    splats = cloud(800)
+
+    result = absorb(splats, around(), measure, 500)
+
+    assert 0 < result.changed.sum() < 500
+    assert result.merged >= result.changed.sum()
+    same(result.splats.take(~result.changed), splats.take(result.keep).take(~result.changed))
+
+
+def test_nothing_happens_where_nothing_must_go():
+    splats = cloud(50)
+
+    result = absorb(splats, around(), measure, 50)
+
+    same(result.splats, splats)
+    assert not result.changed.any()
+    assert absorb(splats, around(), measure, 80).keep.all()
+    assert len(absorb(splats.take(slice(0, 0)), around(), measure, 0).splats) == 0
+
+
+def test_protected_splats_neither_vanish_nor_change():
+    splats = cloud(600)
+    protected = np.random.default_rng(4).random(600) < 0.3
+
+    result = absorb(splats, around(), measure, 300, protected=protected)
+
+    assert len(result.splats) == 300
+    assert result.keep[protected].all()
+    assert not result.changed[protected[result.keep]].any()
+
+
+def test_more_survive_where_more_are_protected():
+    splats = cloud(100)
+
+    result = absorb(splats, around(), measure, 10, protected=np.arange(100) < 30)
+
+    np.testing.assert_array_equal(result.keep, np.arange(100) < 30)
+    same(result.splats, splats.take(slice(0, 30)))
+
+
+def test_where_nothing_is_seen_absorbing_is_deleting_the_lowest_errors():
+    splats = cloud(200)
+    error = np.random.default_rng(5).permutation(200).astype(float)
+    table = {tuple(mean): value for mean, value in zip(splats.means, error, strict=True)}
+
+    def unseen(left, _progress):
+        return Seen(np.zeros(len(left)), np.array([table[tuple(mean)] for mean in left.means]))
+
+    result = absorb(splats, around(), unseen, 120)
+
+    np.testing.assert_array_equal(result.keep, error >= 80)
+    same(result.splats, splats.take(result.keep))
+
+
+def test_black_and_white_on_grey_are_not_merged():
+    """|s|^2 = 3/4 each; grey has no contrast, so the merge loses both: it costs E_i + E_j."""
+    field = flat(
+        [0.5, 0.5], [[0.0, 0, 0], [8, 0, 0]], [[1.0, 1, 1]] * 2, colors=[[0.0] * 3, [1.0] * 3]
+    )
+    field.error *= 0.75
+
+    pairs, _ = merged_of(field)
+    graph = MergeGraph(field, 1.0)
+    graph.reduce(1)
+
+    np.testing.assert_allclose(pairs.cost, field.error.sum(), rtol=1e-6)
+    assert (len(graph.merges[0][0]), graph.deleted) == (0, 1)
+
+
+def test_no_merge_is_carried_out_that_costs_more_than_deleting():
+    """Every pair merged in the first round was cheaper than either of its splats."""
+    splats, views = cloud(2000), around()
+    graph = MergeGraph(merging.field(splats, views, measure(splats)), 2.0)
+    before = graph.field.take(np.arange(2000))
+
+    graph.reduce(1950)
+
+    (into, gone, _), *_ = graph.merges
+    assert len(into)
+    costs = 2.0 * merging.price(before, into, gone).cost
+    assert (costs < np.minimum(before.error[into], before.error[gone])).all()
+
+
+def test_undrawable_splats_go_first():
+    splats = cloud(100)
+    splats.means[7] = np.nan
+    splats.log_scales[11] = np.inf
+
+    def careful(left, _progress):
+        seen = measure(left)
+        return Seen(*(np.nan_to_num(values, nan=0.0, posinf=0.0) for values in seen))
+
+    assert not absorb(splats, around(), careful, 98).keep[[7, 11]].any()
+    assert absorb(splats, around(), careful, 99).keep.sum() == 99
+
+
+def test_inputs_are_not_changed():
+    splats = cloud(200)
+    before = splats.take(np.arange(200))
+    for name in FIELDS:
+        getattr(splats, name).flags.writeable = False
+
+    absorb(splats, around(), measure, 60)
+
+    same(splats, before)
+
+
+def test_the_order_of_the_file_does_not_matter():
+    splats = cloud(400)
+    order = np.random.default_rng(6).permutation(400)
+
+    one = absorb(splats, around(), measure, 150)
+    other = absorb(splats.take(order), around(), measure, 150)
+
+    np.testing.assert_array_equal(one.keep[order], other.keep)
+    place = np.argsort(order[other.keep])
+    np.testing.assert_allclose(other.splats.means[place], one.splats.means, atol=1e-9)
+
+
+def test_threads_change_nothing():
+    splats = cloud(3000)
+
+    same(
+        absorb(splats, around(), measure, 900, threads=1).splats,
+        absorb(splats, around(), measure, 900, threads=2).splats,
+    )
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_moved_turned_and_scaled_scenes_absorb_alike(unit):
+    """Splats and views under one similarity: the same survivors, moved likewise."""
+    splats = cloud(400, degree=0)
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation_matrices(np.array([0.3, -0.5, 0.7, 0.2])) * unit
+    matrix[:3, 3] = np.array([10.0, -20.0, 5.0]) * unit
+
+    here = absorb(splats, around(), measure, 200)
+    there = absorb(transformed(splats, matrix), around(matrix=matrix), measure, 200)
+
+    assert np.mean(here.keep == there.keep) > 0.98
+    both = (here.keep & there.keep)[here.keep], (here.keep & there.keep)[there.keep]
+    moved = transformed(here.splats.take(both[0]), matrix)
+    apart = np.abs(moved.means - there.splats.means[both[1]]).max(axis=1)
+    assert np.mean(apart < 1e-4 * unit) > 0.95
+
+
+def test_extreme_splats_raise_no_warning_and_stay_drawable():
+    """Needles, dust, walls, opacity 0 and 1, all at one place or far away."""
+    rng = np.random.default_rng(7)
+    splats = cloud(600)
+    splats.log_scales[:] = rng.choice([-100.0, -20.0, -5.0, 0.0, 5.0, 20.0], size=(600, 3))
+    splats.opacity_logits[:] = rng.choice([-100.0, -10.0, 0.0, 10.0, 100.0, np.inf], size=600)
+    splats.means[:100] = 0.0
+    splats.means[100:110] = 1e15
+    splats.quaternions[::7] = 0.0
+
+    def wild(left, _progress):
+        return Seen(
+            np.exp(np.linspace(-300, 300, len(left))), np.exp(np.linspace(300, -300, len(left)))
+        )
+
+    with np.errstate(all="raise"):
+        for seen in (wild, lambda left, _: Seen(np.ones(len(left)), np.ones(len(left)))):
+            result = absorb(splats, around(), seen, 150)
+
+            changed = result.splats.take(result.changed)
+            assert all(np.isfinite(getattr(changed, name)).all() for name in FIELDS)
+            assert (opacity(changed.opacity_logits) < 1.0).all()
+
+
+def test_patience_falls_with_the_share_that_goes():
+    values = [patience(share) for share in (0.0, 0.1, 0.5, 0.9, 1.0)]
+
+    assert values == sorted(values, reverse=True)
+    assert np.isfinite(values).all()
+
+
+def test_absorbing_can_be_cancelled():
+    with pytest.raises(Cancelled):
+        absorb(cloud(100), around(), measure, 50, progress=lambda fraction, _: fraction < 0.5)
