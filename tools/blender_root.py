@@ -103,9 +103,11 @@ def make_root(release: str, root: Path, lock: int) -> None:
             command, stdout=log, stderr=subprocess.STDOUT, pass_fds=(lock,), check=False
         )
         log.seek(0)
-        tail = "".join(log.readlines()[-15:])
+        errors = [line for line in log if line.startswith(("E:", "Err:", "dpkg: error"))]
     if done.returncode != 0:
-        message = f"mmdebstrap {release} failed with exit code {done.returncode}:\n{tail}"
+        # Of a chain of errors the first ones name the cause.
+        reason = "".join(errors[:3]).strip()
+        message = f"mmdebstrap {release} failed with exit code {done.returncode}:\n{reason}"
         raise UnavailableError(message)
     check_blender(root)
 

@@ -81,7 +81,9 @@ def make_environment(version: str, folder: Path, lock: int) -> None:
             check=False,
         )
         if done.returncode != 0:
-            message = f"{' '.join(command)} failed:\n{done.stdout[-2000:]}"
+            # pip says last what could not be had, after all its attempts.
+            reason = "\n".join(done.stdout.strip().splitlines()[-2:])
+            message = f"{' '.join(command)} failed:\n{reason}"
             raise UnavailableError(message)
 
 

@@ -63,7 +63,7 @@ def main(name: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
     # Last, since every frame is slow from here on: the view now draws materials.
     yield from hand.click("refine.preview(mode='HEAT'")
     yield from until(lambda: bpy.data.objects[name].modifiers, "there is a preview")
-    yield from picture(pictures, "5-heat", settle=10.0)  # EEVEE compiles its shaders
+    yield from picture(pictures, "5-heat", settle=20.0)  # EEVEE compiles its shaders
     found["previewed"] = state(name)
     return found
 
