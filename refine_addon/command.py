@@ -142,7 +142,16 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=METHODS,
         default=METHODS[0],
-        help="default: closed-form; occlusion knows what hides what, and takes longer",
+        help="default: closed-form; occlusion knows what hides what, and takes longer; auto takes "
+        "the cheapest that agrees with it",
+    )
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        default=Settings.tolerance,
+        metavar="T",
+        help="with --method auto: share of the kept splats that may differ from the full model's "
+        f"(default {Settings.tolerance})",
     )
     parser.add_argument(
         "--depth", choices=["z", "distance"], default="z", help="along the view's axis, or from it"
@@ -239,7 +248,7 @@ def _check_files(parser: argparse.ArgumentParser, options: argparse.Namespace) -
 
 def _settings(options: argparse.Namespace) -> Settings:
     make = ClosedForm.published if options.published else ClosedForm
-    return Settings(options.method, options.views, make(options.depth))
+    return Settings(options.method, options.views, make(options.depth), tolerance=options.tolerance)
 
 
 def _budget(options: argparse.Namespace) -> Budget:

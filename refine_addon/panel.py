@@ -73,6 +73,8 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         column.use_property_split = True
         column.use_property_decorate = False
         column.prop(settings, "method")
+        if settings.method == "auto":
+            column.prop(settings, "tolerance")
         progress = context.window_manager.refine_progress
         if progress >= 0.0:
             layout.progress(factor=progress, text=f"Scoring {progress:.0%} (Esc cancels)")

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 METHODS = (
     ("closed-form", "Closed Form", "REFINE's closed form: fast; takes nothing as hidden"),
     ("occlusion", "Occlusion", "Knows what hides what: better, and takes longer"),
+    ("auto", "Auto", "The cheapest that keeps nearly the same splats as Occlusion"),
 )
 """Methods of scoring, by the names that core gives them."""
 
@@ -113,6 +114,13 @@ class RefineSettings(bpy.types.PropertyGroup):
         default=64,
         min=0,
     )
+    tolerance: FloatProperty(
+        name="Tolerance",
+        description="Share of the kept splats that may differ from those of Occlusion",
+        default=0.01,
+        min=0.0,
+        max=1.0,
+    )
     source: EnumProperty(name="Cameras", description="Which cameras decide", items=SOURCES)
     collection: PointerProperty(
         name="Collection", description="The collection of the cameras", type=bpy.types.Collection
@@ -188,7 +196,7 @@ class RefineSettings(bpy.types.PropertyGroup):
             form = ClosedForm.published(self.depth)
         else:
             form = ClosedForm(self.depth, frustum=self.frustum, margin=decimal(self.margin))
-        return Settings(self.method, self.views, form)
+        return Settings(self.method, self.views, form, tolerance=decimal(self.tolerance))
 
     def to_budget(self) -> Budget:
         """Return the budget of core.

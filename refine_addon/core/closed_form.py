@@ -39,8 +39,8 @@ NEAR_RELATIVE = 0.01
 """Default near plane over the size of the scene, where a view brings none of its own."""
 
 UNSEEN = 1e-6
-"""Factor on 1 / (mean squared distance + eta), the weight of splats that no view sees: it orders
-them by distance, practically below all that is seen."""
+"""Factor on 1 / (squared distance to the views + eta), the weight of splats that no view sees: it
+orders them by distance, practically below all that is seen."""
 
 _CHUNK = 4096
 _VIEW_BLOCK = 64
@@ -171,9 +171,7 @@ class _Scene:
 
     def __init__(self, splats: Splats, views: ViewSet, settings: ClosedForm) -> None:
         self.splats, self.views, self.settings = splats, views, settings
-        self.origin = views.weights @ views.centers
-        offsets = views.centers - self.origin
-        self.spread = float(views.weights @ np.einsum("ij,ij->i", offsets, offsets))
+        self.origin, self.spread = views.middle()
         count = len(splats)
         self.good = np.empty(count, np.bool_)
         self.means = np.empty((count, 3), splats.means.dtype.newbyteorder("="))
@@ -213,8 +211,8 @@ class _Scene:
     def measure(self) -> None:
         """Derive from the size of the scene what is relative to it.
 
-        The median over splats of their squared distance follows the scene's unit, and not its
-        origin, order or outliers.
+        The median over splats of their squared distance to the views follows the scene's unit,
+        and not its origin, order or outliers.
         """
         good = self.good
         size = float(np.sqrt(np.median(self.squared if good.all() else self.squared[good]))) or 1.0

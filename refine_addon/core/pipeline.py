@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from . import closed_form, occlusion, selection
+from . import auto, closed_form, occlusion, selection
 from .errors import RefineError
 from .files import expanded, refuse_existing, refuse_mapped
 from .ply import read_ply
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from .splats import Splats
     from .views import ViewSet
 
-METHODS = ("closed-form", "occlusion")
+METHODS = ("closed-form", "occlusion", "auto")
 
 
 @dataclass(frozen=True)
@@ -37,19 +37,23 @@ class Settings:
 
     Attributes
     ----------
-    method : {"closed-form", "occlusion"}
-        Name of the scoring method: as if nothing hid anything, or with what hides what.
+    method : {"closed-form", "occlusion", "auto"}
+        Name of the scoring method: as if nothing hid anything, with what hides what, or the
+        cheapest that agrees with the latter.
     views : int
         Use at most this many views, spread out evenly; 0 uses all.
     closed_form : ClosedForm
     occlusion : Occlusion
         Settings of the methods of those names.
+    tolerance : float
+        For "auto": share of the kept set that may differ from that of "occlusion".
     """
 
-    method: Literal["closed-form", "occlusion"] = "closed-form"
+    method: Literal["closed-form", "occlusion", "auto"] = "closed-form"
     views: int = 64
     closed_form: closed_form.ClosedForm = field(default_factory=closed_form.ClosedForm)
     occlusion: occlusion.Occlusion = field(default_factory=occlusion.Occlusion)
+    tolerance: float = 0.01
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -61,6 +65,9 @@ class Settings:
         """
         if self.method not in METHODS:
             msg = f"method is {self.method!r}, expected one of {', '.join(METHODS)}"
+            raise RefineError(msg)
+        if not 0.0 <= self.tolerance <= 1.0:
+            msg = f"tolerance is {self.tolerance}, expected a share, 0 to 1"
             raise RefineError(msg)
         if self.views < 0:
             msg = f"views is {self.views}, expected 0 (all) or more"
@@ -120,6 +127,11 @@ def score(
     used = views.spread(settings.views)
     if settings.method == "occlusion":
         return occlusion.score(splats, used, settings.occlusion, progress=progress, threads=threads)
+    if settings.method == "auto":
+        models = (settings.closed_form, settings.occlusion)
+        return auto.score(
+            splats, used, settings.tolerance, models, progress=progress, threads=threads
+        )
     return closed_form.score(splats, used, settings.closed_form, progress=progress, threads=threads)
 
 

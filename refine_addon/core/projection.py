@@ -143,9 +143,9 @@ def prepare(
         worth[piece] = opacity(logits) > ALPHA_CUT
 
     for_chunks(judge, len(splats), 4 * _CHUNK, progress=progress, what="reading", threads=threads)
-    origin = views.weights @ views.centers
+    origin, spread = views.middle()
     means = np.where(good[:, None], splats.means, origin) - origin  # float64
-    frame = Frame(origin, _size(means, good, views, origin))
+    frame = Frame(origin, _size(means, good, spread))
     means /= frame.size
     worth &= np.max(np.abs(means), axis=1) <= _FARTHEST
     index = np.flatnonzero(worth)
@@ -154,15 +154,9 @@ def prepare(
     return _activate(splats, index[order], means[order], frame, threads), frame, good
 
 
-def _size(
-    means: NDArray[np.float64],
-    good: NDArray[np.bool_],
-    views: ViewSet,
-    origin: NDArray[np.float64],
-) -> float:
+def _size(means: NDArray[np.float64], good: NDArray[np.bool_], spread: float) -> float:
     if not good.any():
         return 1.0
-    spread = float(views.weights @ np.sum((views.centers - origin) ** 2, axis=1))
     squared = np.einsum("ij,ij->i", means, means)
     return float(np.sqrt(np.median(squared if good.all() else squared[good]) + spread)) or 1.0
 

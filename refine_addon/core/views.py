@@ -194,6 +194,33 @@ class ViewSet:
             weights /= weights.max()  # first, so that weights of 1e308 do not sum to infinity
             return np.asarray(weights / weights.sum())
 
+    def middle(self) -> tuple[NDArray[np.float64], float]:
+        """Return where the views are, and how far from there, whatever a few stray ones do.
+
+        Returns
+        -------
+        middle : (3,) float64
+            Weighted geometric median of the centres (Weiszfeld's iteration).
+        spread : float
+            Weighted median of the centres' squared distances to it.
+        """
+        centers, weights = self.centers, self.weights
+        middle = weights @ centers
+        with np.errstate(under="ignore"):
+            for _ in range(100):
+                distance = np.linalg.norm(centers - middle, axis=1)
+                reach = distance.max()
+                if reach == 0.0:
+                    break
+                pull = weights / np.maximum(distance, 1e-9 * reach)
+                before, middle = middle, (pull @ centers) / pull.sum()
+                if np.linalg.norm(middle - before) <= 1e-12 * reach:
+                    break
+        squared = np.sum((centers - middle) ** 2, axis=1)
+        order = np.argsort(squared, kind="stable")
+        half = np.searchsorted(np.cumsum(weights[order]), 0.5 - 1e-9)
+        return middle, float(squared[order[half]])
+
     def spread(self, count: int) -> ViewSet:
         """Return at most `count` views that cover the set evenly, in their old order.
 

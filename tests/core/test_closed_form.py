@@ -76,15 +76,26 @@ def random_scene(seed: int, count: int = 300, view_count: int = 5) -> tuple[Spla
     return splats, ViewSet(tuple(views))
 
 
+def middle_of(views: ViewSet) -> tuple[np.ndarray, float]:
+    """Weiszfeld's iteration for the geometric median, and the weighted median from there."""
+    weights = [view.weight / sum(view.weight for view in views) for view in views]
+    middle = sum(w * v.center for w, v in zip(weights, views, strict=True))
+    for _ in range(2000):
+        pulls = [w / np.linalg.norm(v.center - middle) for w, v in zip(weights, views, strict=True)]
+        middle = sum(k * v.center for k, v in zip(pulls, views, strict=True)) / sum(pulls)
+    away = sorted(zip([float(np.sum((v.center - middle) ** 2)) for v in views], weights,
+                      strict=True))  # fmt: skip
+    passed = itertools.accumulate(weight for _, weight in away)
+    return middle, next(d for (d, _), p in zip(away, passed, strict=True) if p >= 0.5)
+
+
 def reference(splats: Splats, views: ViewSet, settings: ClosedForm) -> np.ndarray:
     """Evaluate the formulas of docs/method.md one splat and one view at a time, in float64."""
     count = len(splats)
     weights = [view.weight / sum(view.weight for view in views) for view in views]
     means = splats.means.astype(float)
-    squared = [
-        sum(w * float(np.sum((p - v.center) ** 2)) for w, v in zip(weights, views, strict=True))
-        for p in means
-    ]
+    middle, spread = middle_of(views)
+    squared = [float(np.sum((p - middle) ** 2)) + spread for p in means]
     size = math.sqrt(float(np.median(squared)))
     eta = 0.005 * size**2 if settings.eta is None else settings.eta
     alpha = [1 / (1 + math.exp(-float(x))) for x in splats.opacity_logits]
