@@ -117,6 +117,12 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "--min-seen", type=float, metavar="P", help="remove what fewer than P %% of the views see"
     )
     _add_scoring(prune)
+    prune.add_argument(
+        "--absorb",
+        action="store_true",
+        help="survivors take over what is removed, by what the cameras see of it: far better when "
+        "much is removed, and slower; they change",
+    )
     prune.add_argument("--dry-run", action="store_true", help="decide and report, write nothing")
     _add_common(prune)
     prune.set_defaults(run=_run_prune)
@@ -382,6 +388,7 @@ def _prune_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
         views,
         _budget(options),
         _settings(options),
+        absorb=options.absorb,
         overwrite=options.overwrite,
         progress=run.progress(source.name),
     )
@@ -399,6 +406,7 @@ def _prune_object(run: _Run, views: ViewSet) -> dict[str, Any]:
         views,
         _budget(options),
         _settings(options),
+        absorb=options.absorb,
         output=options.output,
         save=options.save,
         dry_run=options.dry_run,

@@ -17,7 +17,7 @@ from .core.splats import Splats
 from .mesh_layout import KINDS, Column, Layout, add_attributes, check, rest_count
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -152,6 +152,37 @@ def file_from_object(
         _interleave(rows, names, planes)
     nothing = np.empty(0, np.uint8)
     return SplatFile(Path(obj.name), rows, layout.header, nothing, nothing)
+
+
+def stored_columns(obj: bpy.types.Object, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """Return the named columns of a splat object, copies of (N,) each."""
+    read = _Reader(obj.data, check(obj))
+    return {name: read.stored(name).copy() for name in names}
+
+
+def write_columns(obj: bpy.types.Object, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Store columns of a splat object in the attributes that hold them.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+    columns : mapping of str to (N,)
+        Properties of the PLY that the object has.
+    """
+    places = {column.name: column for column in check(obj).columns}
+    vectors: dict[str, NDArray[Any]] = {}
+    for name, values in columns.items():
+        column = places[name]
+        if KINDS[column.kind].width == 1:
+            write_attribute(obj.data, column.attribute, column.kind, values)
+            continue
+        if column.attribute not in vectors:
+            vectors[column.attribute] = read_attribute(obj.data, column.attribute)
+        vectors[column.attribute][:, column.component] = values
+    for attribute, values in vectors.items():
+        write_attribute(obj.data, attribute, "FLOAT_VECTOR", values)
+    if columns:
+        obj.data.update()
 
 
 def normals(obj: bpy.types.Object, layout: Layout) -> NDArray[np.float32]:

@@ -9,12 +9,15 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from . import mesh_layout, plans, preview, score_attributes, session
+from . import mesh_edit, mesh_layout, plans, preview, score_attributes, session
 from .camera_adapter import views_from_scene
+from .core import pipeline
 from .core.errors import Cancelled, RefineError
-from .score_worker import ScoreWorker
+from .core.work import Progress, silent
+from .worker import Worker
 
 if TYPE_CHECKING:
+    from .core.absorb import Absorbed
     from .core.scores import Scores
     from .core.views import ViewSet
 
@@ -57,38 +60,47 @@ class _OnScored(_OnSplats):
         return True
 
 
-class REFINE_OT_score(_OnSplats, bpy.types.Operator):
-    """Score each splat by how much the cameras would miss it (Esc cancels)"""
+def _views(context: bpy.types.Context) -> ViewSet:
+    """Return the views of the cameras that the panel names."""
+    settings = context.scene.refine
+    return views_from_scene(
+        context,
+        settings.source,
+        collection=settings.collection,
+        frames=settings.to_frames(context.scene),
+        splats=context.object,
+    )
 
-    bl_idname = "refine.score"
-    bl_label = "Score"
-    bl_options = {"REGISTER", "UNDO"}
+
+class _OnThread:
+    """An operator that waits for a thread in a window, with a bar to watch and a key to cancel.
+
+    It says what to do in three steps: `prepare` reads what it needs of the scene, `work` runs on
+    the thread and touches arrays alone, `finish` writes the result.
+    """
+
+    doing = ""
 
     def execute(self, context: bpy.types.Context) -> Answer:
-        """Score at once."""
+        """Do all of it at once."""
         try:
-            obj, settings = context.object, context.scene.refine.to_settings()
-            self._name = obj.name
-            views = self._views(context)
-            scores = session.score_object(obj, views, settings)
+            self.prepare(context, context.object)
+            result = self.work(silent)
+            return self.finish(context, context.object, result)
         except RefineError as error:
             return fail(self, error)
-        return self._done(context, scores, views)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
-        """Score on a thread, with a bar to watch and a key to cancel."""
+        """Start the thread, unless there is nobody to watch."""
         if bpy.app.background or context.window is None:
             return self.execute(context)
         try:
-            self._settings = context.scene.refine.to_settings()
-            self._gathered = self._views(context)
-            session.check_scorable(context.object)
-            splats = session.gather(context.object)
+            self.prepare(context, context.object)
         except RefineError as error:
             return fail(self, error)
         # By name: the object itself may not be the same one after an undo.
         self._name = context.object.name
-        self._worker = ScoreWorker(splats, self._gathered, self._settings)
+        self._worker = Worker(self.work)
         manager = context.window_manager
         self._timer = manager.event_timer_add(0.05, window=context.window)
         manager.modal_handler_add(self)
@@ -106,47 +118,22 @@ class REFINE_OT_score(_OnSplats, bpy.types.Operator):
             return {"RUNNING_MODAL"}
         self._clean_up(context)
         try:
-            scores = self._worker.result()
-            obj = session.find(self._name)
-            score_attributes.store(obj, scores, self._gathered, self._settings)
+            result = self._worker.result()
+            return self.finish(context, session.find(self._name), result)
         except Cancelled:
-            self.report({"INFO"}, "Scoring cancelled; nothing was changed")
+            self.report({"INFO"}, f"{self.doing} cancelled; nothing was changed")
             return {"CANCELLED"}
         except RefineError as error:
             return fail(self, error)
-        return self._done(context, scores, self._gathered)
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Stop the thread where Blender ends the operator."""
         self._worker.cancel()
         self._clean_up(context)
 
-    def _views(self, context: bpy.types.Context) -> ViewSet:
-        settings = context.scene.refine
-        return views_from_scene(
-            context,
-            settings.source,
-            collection=settings.collection,
-            frames=settings.to_frames(context.scene),
-            splats=context.object,
-        )
-
-    def _done(self, context: bpy.types.Context, scores: Scores, views: ViewSet) -> Answer:
-        plans.refresh(context)
-        unseen = int((scores.seen == 0).sum())
-        self.report(
-            {"INFO"},
-            f"Scored {len(scores.values):,} splats by {scores.views_used} of {len(views)} views; "
-            f"{unseen:,} lie in none",
-        )
-        notes = [*scores.notes, *([views.note] if views.note else [])]
-        for note in (*notes, *session.modifier_notes(session.find(self._name))):
-            self.report({"WARNING"}, note)
-        return {"FINISHED"}
-
     def _show(self, context: bpy.types.Context, fraction: float) -> None:
         context.window_manager.refine_progress = fraction
-        context.workspace.status_text_set(f"Scoring splats: {fraction:.0%} (Esc cancels)")
+        context.workspace.status_text_set(f"{self.doing}: {fraction:.0%} (Esc cancels)")
         for area in context.window.screen.areas:
             if area.type == "VIEW_3D":
                 area.tag_redraw()
@@ -155,6 +142,42 @@ class REFINE_OT_score(_OnSplats, bpy.types.Operator):
         context.window_manager.event_timer_remove(self._timer)
         self._show(context, -1.0)
         context.workspace.status_text_set(None)
+
+
+class REFINE_OT_score(_OnThread, _OnSplats, bpy.types.Operator):
+    """Score each splat by how much the cameras would miss it (Esc cancels)"""
+
+    bl_idname = "refine.score"
+    bl_label = "Score"
+    bl_options = {"REGISTER", "UNDO"}
+    doing = "Scoring splats"
+
+    def prepare(self, context: bpy.types.Context, obj: bpy.types.Object) -> None:
+        """Gather splats, views and settings."""
+        self._settings = context.scene.refine.to_settings()
+        self._views = _views(context)
+        session.check_scorable(obj)
+        self._splats = session.gather(obj)
+
+    def work(self, progress: Progress) -> Scores:
+        """Score."""
+        return pipeline.score(self._splats, self._views, self._settings, progress=progress)
+
+    def finish(self, context: bpy.types.Context, obj: bpy.types.Object, scores: Scores) -> Answer:
+        """Store the scores on the mesh and say what came of it."""
+        views = self._views
+        score_attributes.store(obj, scores, views, self._settings)
+        plans.refresh(context)
+        unseen = int((scores.seen == 0).sum())
+        self.report(
+            {"INFO"},
+            f"Scored {len(scores.values):,} splats by {scores.views_used} of {len(views)} views; "
+            f"{unseen:,} lie in none",
+        )
+        notes = [*scores.notes, *([views.note] if views.note else [])]
+        for note in (*notes, *session.modifier_notes(obj)):
+            self.report({"WARNING"}, note)
+        return {"FINISHED"}
 
 
 class REFINE_OT_plan(_OnScored, bpy.types.Operator):
@@ -170,26 +193,56 @@ class REFINE_OT_plan(_OnScored, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_apply(_OnScored, bpy.types.Operator):
-    """Delete the splats that the budget does not keep, lowest scores first"""
+class REFINE_OT_apply(_OnThread, _OnScored, bpy.types.Operator):
+    """Delete the splats that the budget does not keep; with Absorb, survivors take them over"""
 
     bl_idname = "refine.apply"
     bl_label = "Apply"
     bl_options = {"REGISTER", "UNDO"}
+    doing = "Absorbing splats"
 
-    def execute(self, context: bpy.types.Context) -> Answer:
-        """Delete them."""
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+        """Delete at once; absorb on a thread."""
+        if not context.scene.refine.absorb:
+            return self.execute(context)
+        return super().invoke(context, event)
+
+    def prepare(self, context: bpy.types.Context, obj: bpy.types.Object) -> None:
+        """Gather what absorbing needs."""
         settings = context.scene.refine
-        try:
-            done = session.apply_object(context.object, settings.to_budget(), settings.protect)
-        except RefineError as error:
-            return fail(self, error)
-        plans.forget(context.object.data)
+        self._absorb = settings.absorb
+        if not self._absorb:
+            return
+        self._settings = settings.to_settings()
+        self._views = _views(context)
+        self._count = int(session.keep_mask(obj, settings.to_budget(), settings.protect).sum())
+        self._protected = session.protected(obj, settings.protect)
+        mesh_edit.check_deletable(obj)
+        self._splats = session.gather(obj, whole=True)
+
+    def work(self, progress: Progress) -> Absorbed | None:
+        """Absorb, where that is asked for."""
+        if not self._absorb:
+            return None
+        return pipeline.absorb_removed(
+            self._splats, self._views, self._count, self._settings,
+            protected=self._protected, progress=progress,
+        )  # fmt: skip
+
+    def finish(
+        self, context: bpy.types.Context, obj: bpy.types.Object, absorbed: Absorbed | None
+    ) -> Answer:
+        """Delete what does not stay, and change what absorbed it."""
+        settings = context.scene.refine
+        done = session.apply_object(obj, settings.to_budget(), settings.protect, absorbed)
+        plans.forget(obj.data)
         self.report(
             {"INFO"},
             f"Kept {done.kept:,} splats, removed {done.removed:,}: "
             f"{done.bytes_before / 1e6:,.1f} -> {done.bytes_after / 1e6:,.1f} MB",
         )
+        if absorbed:
+            self.report({"WARNING"}, absorbed.note())
         return {"FINISHED"}
 
 

@@ -154,9 +154,14 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         column.prop(settings, "budget")
         column.prop(settings, settings.budget)
         column.prop(settings, "protect")
+        column.prop(settings, "absorb")
         obj = context.object
         if mesh_layout.looks_like_splats(obj) and score_attributes.record(obj.data):
             _draw_plan(layout, obj, settings)
+        progress = context.window_manager.refine_progress
+        if progress >= 0.0:
+            layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
+            return
         layout.operator("refine.apply", icon="TRASH")
 
 

@@ -176,6 +176,11 @@ class RefineSettings(bpy.types.PropertyGroup):
         max=100.0,
         update=_plan_again,
     )
+    absorb: BoolProperty(
+        name="Absorb",
+        description="Survivors take over what is removed, by what the cameras see of it: far "
+        "better when much is removed, and slower; the survivors change",
+    )
     protect: StringProperty(
         name="Protect",
         description="Vertex group or boolean point attribute: the splats in it stay",

@@ -29,6 +29,7 @@ from .score_attributes import RECORD, store, stored_scores
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from .core.absorb import Absorbed
     from .core.ply import SplatFile
     from .core.scores import Scores
     from .core.selection import Budget
@@ -54,10 +55,16 @@ class Plan:
     bytes_after: int
 
 
-def gather(obj: bpy.types.Object) -> Splats:
+def gather(obj: bpy.types.Object, *, whole: bool = False) -> Splats:
     """Return an object's splats as they stand in the world, for scoring.
 
     Modifiers are not looked at: what is scored is what is exported.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+    whole : bool
+        Whether to bring view-dependent colour along, for absorbing; the scale must be uniform then.
 
     Raises
     ------
@@ -66,10 +73,10 @@ def gather(obj: bpy.types.Object) -> Splats:
     """
     check(obj)
     matrix = world_matrix(obj, bpy.context.evaluated_depsgraph_get())
-    splats = mesh_adapter.splats_from_object(obj, sh_rest=False)
+    splats = mesh_adapter.splats_from_object(obj, sh_rest=whole)
     if np.array_equal(matrix, np.eye(4)):
         return splats
-    return transformed(splats, matrix, rotate_sh=False)
+    return transformed(splats, matrix, rotate_sh=whole)
 
 
 def modifier_notes(obj: bpy.types.Object) -> list[str]:
@@ -144,10 +151,15 @@ def keep_mask(obj: bpy.types.Object, budget: Budget, protect: str = "") -> NDArr
     return select(
         stored_scores(obj),
         budget,
-        protected=mesh_edit.protected_mask(obj, protect) if protect else None,
+        protected=protected(obj, protect),
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
     )
+
+
+def protected(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
+    """Return what the named attribute or vertex group protects; None for no name."""
+    return mesh_edit.protected_mask(obj, name) if name else None
 
 
 def plan(obj: bpy.types.Object, budget: Budget, protect: str = "") -> Plan:
@@ -159,7 +171,9 @@ def plan(obj: bpy.types.Object, budget: Budget, protect: str = "") -> Plan:
     return _plan(obj, keep)
 
 
-def apply_object(obj: bpy.types.Object, budget: Budget, protect: str = "") -> Plan:
+def apply_object(
+    obj: bpy.types.Object, budget: Budget, protect: str = "", absorbed: Absorbed | None = None
+) -> Plan:
     """Delete the splats that a budget does not keep, by the scores that the object holds.
 
     Everything else of the object and its mesh stays: attributes, vertex groups, custom properties,
@@ -171,6 +185,8 @@ def apply_object(obj: bpy.types.Object, budget: Budget, protect: str = "") -> Pl
     budget : Budget
     protect : str
         See `keep_mask`.
+    absorbed : Absorbed, optional
+        What became of the object's splats, in the world: decides in place of budget and scores.
 
     Returns
     -------
@@ -183,11 +199,33 @@ def apply_object(obj: bpy.types.Object, budget: Budget, protect: str = "") -> Pl
         See `keep_mask` and `mesh_edit.check_deletable`.
     """
     mesh_edit.check_deletable(obj)
-    keep = keep_mask(obj, budget, protect)
+    keep = absorbed.keep if absorbed else keep_mask(obj, budget, protect)
+    if len(keep) != len(obj.data.vertices):
+        msg = (
+            f"object '{obj.name}': has {len(obj.data.vertices)} splats and had {len(keep)} when "
+            "absorbing began; apply again"
+        )
+        raise RefineError(msg)
     done = _plan(obj, keep)
+    if absorbed:
+        mesh_adapter.write_columns(obj, absorbed_columns(obj, absorbed))
     mesh_edit.delete_vertices(obj, ~keep)
     del obj.data[RECORD]
     return done
+
+
+def absorbed_columns(obj: bpy.types.Object, absorbed: Absorbed) -> dict[str, NDArray[Any]]:
+    """Return an object's columns with the survivors as they became, in the object's frame."""
+    matrix = world_matrix(obj, bpy.context.evaluated_depsgraph_get())
+    changed = np.flatnonzero(absorbed.changed)
+    survivors = absorbed.splats.take(changed)
+    if not np.array_equal(matrix, np.eye(4)):
+        survivors = transformed(survivors, np.linalg.inv(matrix))
+    index = np.flatnonzero(absorbed.keep)[changed]
+    columns = mesh_adapter.stored_columns(obj, columns_from_splats(survivors))
+    for name, values in columns_from_splats(survivors).items():
+        columns[name][index] = values
+    return columns
 
 
 def export_object(
@@ -195,6 +233,7 @@ def export_object(
     path: Path | str,
     *,
     keep: NDArray[np.bool_] | None = None,
+    columns: dict[str, NDArray[Any]] | None = None,
     apply_transform: bool = False,
     overwrite: bool = False,
 ) -> SplatFile:
@@ -206,6 +245,8 @@ def export_object(
     path : path-like
     keep : (N,) bool, optional
         Which splats to write; all by default.
+    columns : mapping of str to (N,), optional
+        Properties to write with these values, in the object's frame, in place of the object's.
     apply_transform : bool
         Whether to write the splats as they stand in the world, harmonics turned with them.
     overwrite : bool
@@ -225,7 +266,7 @@ def export_object(
     target = Path(path).expanduser()
     check(obj)
     refuse_existing(target, overwrite=overwrite)
-    file = mesh_adapter.file_from_object(obj, _world_columns(obj) if apply_transform else None)
+    file = mesh_adapter.file_from_object(obj, _world_columns(obj) if apply_transform else columns)
     file.write(target, keep, overwrite=overwrite)
     return file
 
@@ -236,6 +277,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     budget: Budget,
     settings: Settings,
     *,
+    absorb: bool = False,
     output: Path | None = None,
     save: bool = False,
     dry_run: bool = False,
@@ -248,7 +290,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     ----------
     name : str
         Of the object.
-    views, budget, settings, progress
+    views, budget, settings, absorb, progress
         See `refine_addon.core.pipeline.prune`.
     output : Path, optional
         The PLY file to make.
@@ -278,23 +320,26 @@ def prune_object(  # noqa: PLR0913 - the command's options
     if save and not dry_run:
         _check_savable(obj)
     row_bytes, fixed_bytes = mesh_adapter.file_size(obj)
-    splats = gather(obj)
+    splats = gather(obj, whole=absorb)
     read = time.perf_counter()
     result = pipeline.prune(
         splats,
         views,
         budget,
         settings,
+        absorb=absorb,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
         progress=part(progress, 0.0, 0.8),
     )
     decided = time.perf_counter()
     sizes = _plan(obj, result.keep)
+    columns = absorbed_columns(obj, result.absorbed) if result.absorbed and not dry_run else {}
     if target is not None:
-        export_object(obj, target, keep=result.keep, overwrite=overwrite)
+        export_object(obj, target, keep=result.keep, columns=columns, overwrite=overwrite)
     if save and not dry_run:
         store(obj, result.scores, views, settings)
+        mesh_adapter.write_columns(obj, columns)
         mesh_edit.delete_vertices(obj, ~result.keep)
         del obj.data[RECORD]
         _save()

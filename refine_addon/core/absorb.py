@@ -60,6 +60,17 @@ class Absorbed:
     merged: int
     deleted: int
 
+    def facts(self) -> dict[str, int]:
+        """Return the counts, for a report."""
+        changed = int(np.count_nonzero(self.changed))
+        return {"changed": changed, "merged": self.merged, "deleted": self.deleted}
+
+    def note(self) -> str:
+        """Return the counts as a sentence: absorbing is never silent."""
+        return "{changed:,} survivors absorbed {merged:,} splats; {deleted:,} were deleted".format(
+            **self.facts()
+        )
+
 
 def patience(share: float) -> float:
     """Return how much dearer merging is made, by the share of the splats that is to go.

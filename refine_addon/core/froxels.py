@@ -22,6 +22,8 @@ import numpy as np
 from .projection import ALPHA_CUT
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from .projection import Footprints
@@ -30,8 +32,9 @@ if TYPE_CHECKING:
 ALPHA_MAX = 0.99
 """Renderers let no single splat hide more than this."""
 
-DOUBT = 2.0
-"""Shape of the gamma distribution that the thickness in front is believed to have; see `light`."""
+DOUBT = 12.0
+"""The thickness in front is believed to be gamma distributed, its shape this over the side of a
+cell in pixels: coarse cells know less, and as cells shrink nothing is left to doubt."""
 
 MAX_CELLS = 65535
 """Cells are numbered by 16 bits: such numbers sort by counting, in linear time."""
@@ -131,6 +134,18 @@ class Points:
     columns: NDArray[np.int64]
     area: float
 
+    def pieces(self) -> Iterator[tuple[slice, Points]]:
+        """Cut into whole columns, about `_BLOCK` points at a time: (place, points) in turn."""
+        ends = np.cumsum(self.columns)
+        cuts = np.searchsorted(ends, np.arange(_BLOCK, len(self.owners), _BLOCK))
+        start = column = 0
+        for cut in [*np.unique(cuts).tolist(), len(ends) - 1]:
+            if cut >= column:
+                place = slice(start, int(ends[cut]))
+                columns = self.columns[column : cut + 1]
+                yield place, Points(self.owners[place], self.weights[place], columns, self.area)
+                start, column = place.stop, cut + 1
+
 
 def cell_size(footprints: Footprints, view: View, cell: float, density: float) -> float:
     """Return the side of a cell: `cell` pixels, or more where a limit asks for it."""
@@ -179,7 +194,9 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
             else:
                 place = _place(footprints, row, lattice)
                 cells[at], weights[at] = _cells(place, view, side), lattice.weights
-    return _merged(cells, np.repeat(np.arange(len(counts)), counts), weights, side * side)
+    return _merged(
+        cells, np.repeat(np.arange(len(counts), dtype=np.int32), counts), weights, side * side
+    )
 
 
 def _kinds(footprints: Footprints, view: View, scale: float) -> NDArray[np.uint8]:
@@ -242,7 +259,7 @@ def _flat(
 
 def _merged(
     cells: NDArray[np.uint16],
-    owners: NDArray[np.int64],
+    owners: NDArray[np.int32],
     weights: NDArray[np.float32],
     area: float,
 ) -> Points:
@@ -260,13 +277,9 @@ def _merged(
     new[tops] = True
     starts = np.flatnonzero(new)
     columns = np.add.reduceat(new, tops, dtype=np.int64)
-    return Points(owners[starts], np.add.reduceat(weights[order], starts), columns, area)
-
-
-def _lattice_index(sigmas: NDArray[np.float32], scale: float) -> NDArray[np.int64]:
-    """Return which of `COUNTS` has enough points for each axis, (2, n)."""
-    wanted = np.ceil((sigmas * np.float32(scale)).clip(1.0, COUNTS[-1])).astype(np.int64)
-    return np.asarray(np.searchsorted(COUNTS, np.arange(COUNTS[-1] + 1))[wanted])
+    return Points(
+        owners[starts].astype(np.int64), np.add.reduceat(weights[order], starts), columns, area
+    )
 
 
 def thickness(
@@ -291,15 +304,22 @@ def in_front(points: Points, thick: NDArray[np.float32]) -> NDArray[np.float32]:
     return total.astype(np.float32)
 
 
-def light(front: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the expected transmittance through a thickness known from its mean over a cell alone.
+def light(front: NDArray[np.float32], area: float) -> NDArray[np.float32]:
+    """Return the expected transmittance through a thickness of which only the mean is known.
 
-    ``E[exp(-tau)] = (1 + mean / k)^-k`` for tau of a gamma distribution of shape k, `DOUBT`.
+    ``E[exp(-tau)] = (1 + mean / k)^-k`` for tau of a gamma distribution of shape k.
     A cell says how much lies in front, not whether it leaves a gap for the point: ``exp(-mean)``
     would take what shows through foliage for hidden, and the score would throw it away.
+
+    Parameters
+    ----------
+    front : (m,) float32
+        Mean thickness in front of each point.
+    area : float
+        Of a cell, px^2.
     """
-    base = np.float32(1.0) + front * np.float32(1.0 / DOUBT)
-    return np.asarray(np.float32(1.0) / (base * base))
+    shape = np.float32(DOUBT / math.sqrt(area))
+    return np.asarray((np.float32(1.0) + front / shape) ** -shape)
 
 
 def contrast(
@@ -318,7 +338,8 @@ def contrast(
     points : Points
     front, thick : (m,) float32
         Optical thickness in front of it, and its own.
-    colors : (m, 3) float32
+    colors : (n, 3) float32
+        Of the footprints.
     """
     through = np.exp(-np.minimum(front, np.float32(60.0)))
     left = through * np.exp(-thick)
@@ -328,7 +349,7 @@ def contrast(
     scale = np.float32(1.0) / np.maximum(left, np.float32(1e-4))
     squared = np.zeros_like(front)
     for channel in range(3):
-        color = np.ascontiguousarray(colors[:, channel])
+        color = colors[:, channel][points.owners]
         shown = np.cumsum(weight * color, dtype=np.float64)
         behind = (np.repeat(shown[ends], points.columns) - shown).astype(np.float32)
         behind *= scale

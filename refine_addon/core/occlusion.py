@@ -2,7 +2,7 @@
 
     contribution_i = sum over views of  integral of alpha_i  x  mean T        MesonGS, LightGaussian
     contrast_i     = sum over views of  integral of alpha_i^2  x  mean of T^2 |c_i - B_i|^2
-    score_i        = contrast_i  sqrt(contribution_i)
+    score_i        = contrast_i  contribution_i^p,   p = 1/4 + 1/2 (share removed before)
 
 T, the transmittance in front of a splat, and B, the colour behind it, come from `froxels`. The
 contrast is the squared error of the picture without the splat, what REFINE's Hessian stands for;
@@ -139,6 +139,42 @@ def score(
     return Scores(values, seen, len(views), int(np.count_nonzero(~good)))
 
 
+def measure(
+    splats: Splats,
+    views: ViewSet,
+    settings: Occlusion = Occlusion(),
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Measured:
+    """Measure once what the views see of each splat, hidden by all others.
+
+    Parameters
+    ----------
+    splats, views, settings, progress, threads
+        See `score`; the rounds do not matter.
+
+    Returns
+    -------
+    Measured
+        Of all N splats: zero of those that no view shows or no renderer draws.
+
+    Raises
+    ------
+    Cancelled
+        If `progress` answers ``False``.
+    """
+    gaussians, frame, _ = projection.prepare(
+        splats, views, progress=part(progress, 0.0, 0.1), threads=threads
+    )
+    run = _Run(gaussians, frame, views, settings, threads)
+    some = run.measure(gaussians, part(progress, 0.1, 1.0))
+    every = Measured.zero(len(splats))
+    for own, values in zip(vars(every).values(), vars(some).values(), strict=True):
+        own[gaussians.index] = values
+    return every
+
+
 class _Run:
     """One scoring: the scene as Gaussians, and what is left of it."""
 
@@ -182,7 +218,7 @@ class _Run:
             if number == 0:
                 seen[left.index] = measured.seen
                 self.shown = bool(measured.contribution.any())
-            order = np.lexsort((prior[left.index], combined(measured)))
+            order = np.lexsort((prior[left.index], combined(measured, gone / count)))
             last = number == rounds - 1
             stay = 0 if last else round(count * LEAST ** ((number + 1) / (rounds - 1)))
             go = max(len(left) - stay, 0)
@@ -238,9 +274,13 @@ class Measured:
         self.seen[:] += other.seen
 
 
-def combined(measured: Measured) -> NDArray[np.float64]:
-    """Return contrast times the root of contribution."""
-    return np.asarray(measured.contrast * np.sqrt(measured.contribution))
+def combined(measured: Measured, gone: float) -> NDArray[np.float64]:
+    """Return ``contrast contribution^p``, p from 1/4 to 3/4 as the share `gone` goes from 0 to 1.
+
+    The contrast is exact for one splat; the more of its neighbours go too, the more counts what a
+    splat covers, whatever is behind it.
+    """
+    return np.asarray(measured.contrast * measured.contribution ** (0.25 + 0.5 * gone))
 
 
 def measure_view(
@@ -261,12 +301,15 @@ def measure_view(
         side = froxels.cell_size(footprints, view, settings.cell, settings.density)
         points = froxels.scatter(footprints, view, side, settings.density)
         alphas = gaussians.alphas[footprints.index]
+        colors = gaussians.colors[footprints.index]
         mass, mass_squared = froxels.masses(footprints, alphas)
-        thick = froxels.thickness(points, alphas, mass)
-        front = froxels.in_front(points, thick)
-        light = froxels.light(front)
-        colors = gaussians.colors[footprints.index][points.owners]
-        contrast = froxels.contrast(points, front, thick, colors)
+        light = np.empty(len(points.owners), np.float32)
+        contrast = np.empty(len(points.owners), np.float32)
+        for place, piece in points.pieces():
+            thick = froxels.thickness(piece, alphas, mass)
+            front = froxels.in_front(piece, thick)
+            light[place] = froxels.light(front, points.area)
+            contrast[place] = froxels.contrast(piece, front, thick, colors)
         contrast *= light
         contrast *= light
         shown = froxels.per_splat(points, light, count)

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import platform
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from . import absorb as absorbing
 from . import auto, closed_form, occlusion, selection
 from .errors import RefineError
 from .files import expanded, refuse_existing, refuse_mapped
+from .merging import Seen
 from .ply import read_ply
 from .work import Progress, part, report, silent
 
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from .absorb import Absorbed
     from .scores import Scores
     from .selection import Budget
     from .splats import Splats
@@ -83,7 +86,9 @@ class Result:
     keep : (N,) bool
         Which splats stay.
     scores : Scores
-        What decided.
+        What decided; with `absorbed`, what decided how many.
+    absorbed : Absorbed or None
+        The survivors, changed by what they absorbed.
     report : dict
         Counts, settings, weights, timings and versions, ready for JSON.
     """
@@ -91,6 +96,7 @@ class Result:
     keep: NDArray[np.bool_]
     scores: Scores
     report: dict[str, Any]
+    absorbed: Absorbed | None = None
 
 
 def score(
@@ -142,12 +148,13 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
     settings: Settings = Settings(),
     *,
     protected: NDArray[np.bool_] | None = None,
+    absorb: bool = False,
     row_bytes: float = 0.0,
     fixed_bytes: int = 0,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Result:
-    """Score splats and decide which stay.
+    """Score splats and decide which stay; with `absorb`, what becomes of them.
 
     Parameters
     ----------
@@ -156,7 +163,10 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
     budget : Budget
         How much to remove.
     protected : (N,) bool, optional
-        Splats never to remove.
+        Splats never to remove, nor to change.
+    absorb : bool
+        Whether survivors absorb what is removed. The budget then says how many survive; which ones
+        do, and as what, is found by what the views see of each, whatever the method.
     row_bytes, fixed_bytes
         See `Budget.removals`.
 
@@ -170,14 +180,71 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
         See `score`; also if the budget would leave nothing.
     """
     start = time.perf_counter()
-    scores = score(splats, views, settings, progress=part(progress, 0.0, 0.95), threads=threads)
+    if absorb and budget.removals(len(splats), row_bytes or 1.0, fixed_bytes) is not None:
+        # How many go does not depend on the scores: the quick ones say what is seen.
+        settings = replace(settings, method="closed-form")
+    ahead = part(progress, 0.0, 0.2 if absorb else 0.95)
+    scores = score(splats, views, settings, progress=ahead, threads=threads)
     scored = time.perf_counter()
-    report(progress, 0.95, "selecting")
+    report(progress, 0.2 if absorb else 0.95, "selecting")
     keep = selection.select(
         scores, budget, protected=protected, row_bytes=row_bytes, fixed_bytes=fixed_bytes
     )
     timings = {"score_s": scored - start, "select_s": time.perf_counter() - scored}
-    return Result(keep, scores, make_report(scores, keep, views, budget, settings, timings))
+    absorbed = None
+    if absorb:
+        absorbed = absorb_removed(
+            splats, views, int(np.count_nonzero(keep)), settings,
+            protected=protected, progress=part(progress, 0.2, 1.0), threads=threads,
+        )  # fmt: skip
+        keep = absorbed.keep
+        timings["absorb_s"] = time.perf_counter() - scored - timings["select_s"]
+    facts = make_report(scores, keep, views, budget, settings, timings)
+    if absorbed:
+        facts["absorbed"] = absorbed.facts()
+        facts["notes"].append(absorbed.note())
+    return Result(keep, scores, facts, absorbed)
+
+
+def absorb_removed(  # noqa: PLR0913 - the use case, the other one
+    splats: Splats,
+    views: ViewSet,
+    count: int,
+    settings: Settings = Settings(),
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Absorbed:
+    """Reduce splats to `count` survivors that absorb the others, by what the views see of each.
+
+    Parameters
+    ----------
+    splats, views, settings, progress, threads
+        See `score`; the occlusion settings count, whatever the method.
+    count : int
+        How many survive.
+    protected : (N,) bool, optional
+        Splats that neither vanish nor change.
+
+    Returns
+    -------
+    Absorbed
+
+    Raises
+    ------
+    Cancelled
+        If `progress` answers ``False``.
+    """
+    used = views.spread(settings.views)
+
+    def seen(now: Splats, ahead: Progress) -> Seen:
+        measured = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
+        return Seen(measured.contribution, measured.contrast)
+
+    return absorbing.absorb(
+        splats, used, seen, count, protected=protected, progress=progress, threads=threads
+    )
 
 
 def prune_file(  # noqa: PLR0913 - the use case, file to file
@@ -187,6 +254,7 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
     budget: Budget,
     settings: Settings = Settings(),
     *,
+    absorb: bool = False,
     overwrite: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
@@ -199,7 +267,7 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
         The file to read.
     output : path-like or None
         The file to make; None decides and writes nothing.
-    views, budget, settings, progress, threads
+    views, budget, settings, absorb, progress, threads
         See `prune`.
     overwrite : bool
         Whether `output` may replace a file.
@@ -226,6 +294,7 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
         views,
         budget,
         settings,
+        absorb=absorb,
         row_bytes=file.row_bytes,
         fixed_bytes=file.fixed_bytes,
         progress=part(progress, 0.0, 0.8),
@@ -234,7 +303,10 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
     decided = time.perf_counter()
     report(progress, 0.8, "writing")
     if target is not None:
-        file.write(target, result.keep, overwrite=overwrite)
+        if result.absorbed:
+            file.write_survivors(target, result.absorbed, overwrite=overwrite)
+        else:
+            file.write(target, result.keep, overwrite=overwrite)
     timings = result.report["timings"]
     timings["read_s"] = opened - start
     timings["write_s"] = time.perf_counter() - decided

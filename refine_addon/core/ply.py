@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import mmap
 import stat
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from .absorb import Absorbed
     from .splats import Splats
 
 __all__ = [
@@ -152,6 +153,36 @@ class SplatFile:
             else:
                 write_rows(stream, self.rows, keep, columns)
             stream.write(self.after.data)
+
+    def write_survivors(
+        self, path: Path | str, absorbed: Absorbed, *, overwrite: bool = False
+    ) -> None:
+        """Write the survivors of absorbing, in order; those that did not change, as they were.
+
+        Parameters
+        ----------
+        path : path-like
+            The file to make; written whole or not at all.
+        absorbed : Absorbed
+            Of the splats of this file.
+        overwrite : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        RefineError
+            See `write`.
+        """
+        rows = self.rows[absorbed.keep]
+        lines = None
+        if self.lines is not None:
+            lines = [self.lines[index] for index in np.flatnonzero(absorbed.keep).tolist()]
+        columns = {
+            name: np.where(absorbed.changed, values, rows[name]).astype(rows[name].dtype)
+            for name, values in columns_from_splats(absorbed.splats).items()
+        }
+        kept = replace(self, rows=rows, lines=lines)
+        kept.write(path, columns=columns, overwrite=overwrite)
 
 
 def read_ply(path: Path | str) -> SplatFile:

@@ -189,11 +189,13 @@ def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, room,
     """The thread of the window: same scores; after `cancel` its result raises `Cancelled`."""
     core = addon.core
     splats = addon.session.gather(room)
-    worker = addon.score_worker.ScoreWorker(splats, room_views, core.Settings())
+    worker = addon.worker.Worker(
+        lambda progress: core.pipeline.score(splats, room_views, progress=progress)
+    )
     scores = worker.result()
-    cancelled = addon.score_worker.ScoreWorker.__new__(addon.score_worker.ScoreWorker)
-    cancelled._cancelled, cancelled._scores, cancelled._error = True, None, None
-    cancelled._run(splats, room_views, core.Settings())
+    cancelled = addon.worker.Worker.__new__(addon.worker.Worker)
+    cancelled._cancelled, cancelled._result, cancelled._error = True, None, None
+    cancelled._run(lambda progress: core.score(splats, room_views, progress=progress))
 
     assert np.array_equal(scores.values, core.score(splats, room_views).values)
     assert worker.fraction > 0.5

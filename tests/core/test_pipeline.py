@@ -155,3 +155,52 @@ def test_core_imports_where_there_is_no_blender():
     )
 
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.fixture(scope="module")
+def small(file, tmp_path_factory):
+    """Every twentieth splat of the room, as a file."""
+    path = tmp_path_factory.mktemp("small") / "small.ply"
+    keep = np.zeros(len(file), np.bool_)
+    keep[::20] = True
+    file.write(path, keep)
+    return path
+
+
+def test_absorbing_file_to_file_writes_the_changed_survivors_and_the_rest_bit_for_bit(
+    small, views, tmp_path
+):
+    """The budget says how many survive; the report and a note say how many of them changed."""
+    before = read_ply(small)
+    result = prune_file(small, tmp_path / "out.ply", views, Budget(ratio=0.6), absorb=True)
+
+    after = read_ply(tmp_path / "out.ply")
+
+    changed, kept = result.absorbed.changed, before.rows[result.keep]
+    assert len(after) == len(before) - len(before) * 6 // 10
+    assert after.rows[~changed].tobytes() == kept[~changed].tobytes()
+    np.testing.assert_array_equal(
+        after.splats().means, result.absorbed.splats.means.astype(np.float32)
+    )
+    facts = result.report["absorbed"]
+    assert facts["changed"] == np.count_nonzero(changed) > 0
+    assert facts["merged"] + facts["deleted"] == result.report["splats"]["removed"]
+    assert any("survivors absorbed" in note for note in result.report["notes"])
+
+
+def test_a_budget_that_only_scores_can_tell_says_how_many_survivors_absorb(small, views):
+    """The threshold is the median score: half survive, by whatever costs least."""
+    splats = read_ply(small).splats()
+    median = float(np.median(prune(splats, views, Budget(ratio=0.0)).scores.values))
+
+    result = prune(splats, views, Budget(threshold=median), absorb=True)
+
+    assert np.count_nonzero(result.keep) == pytest.approx(len(splats) / 2, abs=1)
+
+
+def test_nothing_to_remove_leaves_absorbing_nothing_to_do(small, views):
+    """All stay, none changes."""
+    result = prune(read_ply(small).splats(), views, Budget(ratio=0.0), absorb=True)
+
+    assert result.keep.all()
+    assert not result.absorbed.changed.any()

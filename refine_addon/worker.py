@@ -1,21 +1,25 @@
-"""Scoring on a thread: arrays only, Blender's data is not safe to touch from there."""
+"""Long work on a thread: arrays only, Blender's data is not safe to touch from there."""
 
 from __future__ import annotations
 
 import threading
-from typing import TYPE_CHECKING
-
-from .core import pipeline
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 if TYPE_CHECKING:
-    from .core.pipeline import Settings
-    from .core.scores import Scores
-    from .core.splats import Splats
-    from .core.views import ViewSet
+    from collections.abc import Callable
+
+    from .core.work import Progress
+
+Result = TypeVar("Result")
 
 
-class ScoreWorker:
-    """A call of `pipeline.score` that runs while the window stays alive.
+class Worker(Generic[Result]):
+    """A call that runs while the window stays alive.
+
+    Parameters
+    ----------
+    work : callable
+        ``work(progress)``; its result, or what it raises, is handed out by `result`.
 
     Attributes
     ----------
@@ -23,14 +27,12 @@ class ScoreWorker:
         How much is done, 0 to 1.
     """
 
-    def __init__(self, splats: Splats, views: ViewSet, settings: Settings) -> None:
+    def __init__(self, work: Callable[[Progress], Result]) -> None:
         self.fraction = 0.0
         self._cancelled = False
-        self._scores: Scores | None = None
+        self._result: Result | None = None
         self._error: BaseException | None = None
-        self._thread = threading.Thread(
-            target=self._run, args=(splats, views, settings), name="refine-score", daemon=True
-        )
+        self._thread = threading.Thread(target=self._run, args=(work,), name="refine", daemon=True)
         self._thread.start()
 
     def running(self) -> bool:
@@ -41,22 +43,22 @@ class ScoreWorker:
         """Ask it to stop; `result` raises `Cancelled` then."""
         self._cancelled = True
 
-    def result(self) -> Scores:
-        """Wait for the scores and return them.
+    def result(self) -> Result:
+        """Wait for the result and return it.
 
         Raises
         ------
         RefineError, Cancelled
-            What the scoring raised.
+            What the work raised.
         """
         self._thread.join()
         if self._error is not None:
             raise self._error
-        return self._scores
+        return self._result
 
-    def _run(self, splats: Splats, views: ViewSet, settings: Settings) -> None:
+    def _run(self, work: Callable[[Progress], Result]) -> None:
         try:
-            self._scores = pipeline.score(splats, views, settings, progress=self._progress)
+            self._result = work(self._progress)
         except BaseException as error:  # noqa: BLE001 - handed to the other thread by `result`
             self._error = error
 
