@@ -77,10 +77,13 @@ def state(name: str) -> dict[str, Any]:
 def picture(folder: str, name: str, settle: float = 2.0) -> Generator[float, None, None]:
     """Save what the X server shows; Blender's own screenshot is black with this driver.
 
-    Before it, wait for ``settle`` seconds: panels glide to their places, slowly where the
-    processor draws.
+    Before it, let Blender draw for ``settle`` seconds: panels glide to their places and shaders
+    are compiled, slowly where the processor does it.
     """
-    yield settle
+    for _ in range(int(settle)):
+        for area in bpy.context.window_manager.windows[0].screen.areas:
+            area.tag_redraw()
+        yield 1.0
     target = Path(folder) / f"{name}.png"
     subprocess.run(["import", "-window", "root", target], check=True)
 
