@@ -1,0 +1,109 @@
+"""Absorbing through the panel and through the command's object path: the same splats as in core."""
+
+from __future__ import annotations
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Euler, Matrix
+
+
+@pytest.fixture
+def few(addon, room, room_cameras):  # noqa: ARG001
+    """Every tenth splat of the room, scored, to be absorbed to two fifths."""
+    core = addon.core
+    remove = np.arange(len(room.data.vertices)) % 10 != 0
+    addon.mesh_edit.delete_vertices(room, remove)
+    settings = bpy.context.scene.refine
+    settings.absorb, settings.ratio = True, 0.6
+    yield room, core.Budget(ratio=0.6)
+    settings.absorb, settings.ratio = False, 0.5
+
+
+def absorbed_in_core(addon, obj, views, budget):
+    return addon.core.prune(addon.session.gather(obj, whole=True), views, budget, absorb=True)
+
+
+def test_apply_with_absorb_leaves_what_core_says(addon, few, room_views):
+    """Survivors, changed or not, equal to the last bit: the object stands where its data is."""
+    room, budget = few
+    expected = absorbed_in_core(addon, room, room_views, budget).absorbed
+    bpy.ops.refine.score()
+    bpy.ops.refine.apply()
+
+    splats = addon.mesh_adapter.splats_from_object(room)
+
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"):
+        wanted = getattr(expected.splats, name).astype(np.float32)
+        np.testing.assert_array_equal(getattr(splats, name), wanted)
+    assert expected.changed.sum() > 100
+
+
+def test_a_moved_object_is_absorbed_in_its_own_frame(addon, few, room_views):
+    """Object and cameras moved together: the data changes as if neither had been."""
+    room, budget = few
+    still = absorbed_in_core(addon, room, room_views, budget).absorbed
+    move = Matrix.Translation((1, 2, 3)) @ Euler((0.3, 0.2, 0.1)).to_matrix().to_4x4()
+    for obj in (room, *(o for o in bpy.data.objects if o.type == "CAMERA")):
+        obj.matrix_world = move @ obj.matrix_world
+    bpy.context.view_layer.update()
+    bpy.ops.refine.score()
+    bpy.ops.refine.apply()
+
+    splats = addon.mesh_adapter.splats_from_object(room)
+
+    # float32 matrices move a few merges across; the survivors are mostly the same ones.
+    here = {tuple(row) for row in np.round(splats.means, 3)}
+    there = {tuple(row) for row in np.round(still.splats.means.astype(np.float32), 3)}
+    assert len(splats) == len(still.splats)
+    assert len(here & there) / len(there) > 0.95
+
+
+def test_uneven_scale_is_refused_and_nothing_changes(addon, few):
+    """Colours cannot follow a stretch, and absorbing writes colours."""
+    room, _ = few
+    bpy.ops.refine.score()
+    room.scale = (1, 2, 1)
+    bpy.context.view_layer.update()
+    before = addon.mesh_adapter.read_attribute(room.data, "f_dc_0")
+
+    with pytest.raises(RuntimeError, match="scales directions differently"):
+        bpy.ops.refine.apply()
+
+    np.testing.assert_array_equal(addon.mesh_adapter.read_attribute(room.data, "f_dc_0"), before)
+    room.scale = (1, 1, 1)
+
+
+def test_the_command_on_an_object_writes_the_same_survivors(addon, few, room_views, tmp_path):
+    """Exported without touching the object."""
+    room, budget = few
+    expected = absorbed_in_core(addon, room, room_views, budget).absorbed
+    count = len(room.data.vertices)
+    out = tmp_path / "out.ply"
+
+    report = addon.session.prune_object(
+        room.name, room_views, budget, addon.core.Settings(), absorb=True, output=out
+    )
+
+    written = addon.core.read_ply(out).splats()
+    wanted = expected.splats.means.astype(np.float32)
+    np.testing.assert_array_equal(np.asarray(written.means), wanted)
+    assert report["absorbed"] == expected.facts()
+    assert len(room.data.vertices) == count
+
+
+def test_protected_splats_neither_vanish_nor_change(addon, few):
+    """A boolean attribute names every third."""
+    room, _ = few
+    marked = np.arange(len(room.data.vertices)) % 3 == 0
+    addon.mesh_adapter.write_attribute(room.data, "mine", "BOOLEAN", marked)
+    before = addon.mesh_adapter.read_attribute(room.data, "position")[marked]
+    bpy.context.scene.refine.protect = "mine"
+    bpy.ops.refine.score()
+    bpy.ops.refine.apply()
+    bpy.context.scene.refine.protect = ""
+
+    after = addon.mesh_adapter.read_attribute(room.data, "position")
+    still = addon.mesh_adapter.read_attribute(room.data, "mine")
+
+    np.testing.assert_array_equal(after[still], before)
