@@ -358,9 +358,20 @@ def contrast(
     return squared
 
 
-def per_splat(points: Points, values: NDArray[np.float32], count: int) -> NDArray[np.float64]:
-    """Sum values, (m,), times the weights over the points of each of `count` splats."""
-    return np.bincount(points.owners, points.weights * values, count).astype(np.float64)
+def mean_light(
+    points: Points, light: NDArray[np.float32], contrast: NDArray[np.float32], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return for each of `count` splats its mean transmittance and its mean visible contrast.
+
+    The former is weighted by alpha, the latter, ``T^2 |c - B|^2``, by alpha^2; what falls outside
+    the image counts as 0.
+    """
+    owners, weights = points.owners, points.weights
+    squares = weights * weights
+    shares = np.bincount(owners, weights, count)
+    errors: NDArray[np.float64] = np.bincount(owners, squares * light * light * contrast, count)
+    errors *= shares / np.maximum(np.bincount(owners, squares, count), 1e-30)
+    return np.asarray(np.bincount(owners, weights * light, count), np.float64), errors
 
 
 def masses(

@@ -310,9 +310,6 @@ def measure_view(
             front = froxels.in_front(piece, thick)
             light[place] = froxels.light(front, points.area)
             contrast[place] = froxels.contrast(piece, front, thick, colors)
-        contrast *= light
-        contrast *= light
-        shown = froxels.per_splat(points, light, count)
-        errors = froxels.per_splat(points, contrast, count)
+        shown, errors = froxels.mean_light(points, light, contrast, count)
         total.contribution[footprints.index] += weight * (mass * shown)
         total.contrast[footprints.index] += weight * (mass_squared * errors)

@@ -151,12 +151,14 @@ def test_what_has_the_colour_of_what_is_behind_it_has_no_contrast():
     assert other.contrast[-1] == pytest.approx(expected, rel=0.02)
 
 
-def test_light_is_the_mean_of_exp_of_a_gamma_distributed_thickness():
-    """Numerically: the average of exp(-tau) over many draws of mean 0, .5, 3 and shape 2."""
-    draws = np.random.default_rng(1).gamma(froxels.DOUBT, size=400_000) / froxels.DOUBT
+@pytest.mark.parametrize("side", [2.0, 4.0, 8.0])
+def test_light_is_the_mean_of_exp_of_a_gamma_distributed_thickness(side):
+    """Numerically: exp(-tau) over many draws of mean 0, .5 and 3; shape 12 over the side."""
+    shape = froxels.DOUBT / side
+    draws = np.random.default_rng(1).gamma(shape, size=400_000) / shape
     mean = np.array([0.0, 0.5, 3.0], np.float32)
 
-    found = froxels.light(mean)
+    found = froxels.light(mean, side * side)
 
     np.testing.assert_allclose(found, [np.exp(-m * draws).mean() for m in mean], atol=2e-3)
 
