@@ -26,7 +26,7 @@ check: $(DEV)         ## lint, format, types
 	.venv/bin/ruff check && .venv/bin/ruff format --check && .venv/bin/mypy
 
 build: $(DEV)         ## the extension's zip, validated, into build/
-	$(PY) tools/build_extension.py
+	$(PY) .ci/build_extension.py
 
 bench: $(BENCH)       ## speed and memory, with medians
 	$(PY) -m benchmarks.speed
@@ -37,7 +37,7 @@ bench-trade: $(BENCH) ## quality over time: docs/trade.md; SCENES="folder ..." m
 	$(PY) -m benchmarks.trade $(SCENES)
 
 fuzz: $(DEV)          ## hostile files, for SECONDS
-	$(PY) tools/fuzz.py --seconds $(or $(SECONDS),300)
+	$(PY) -m tests.fuzz --seconds $(or $(SECONDS),300)
 
 mutants: $(DEV)       ## deliberate faults in core, each to be caught by the tests
 	$(PY) tests/mutants.py

@@ -292,6 +292,9 @@ class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
         # Solid mode draws every point in one grey.
         if self.mode != "OFF" and shading and shading.type in {"SOLID", "WIREFRAME"}:
             shading.type = "MATERIAL"
+        overlay = getattr(context.space_data, "overlay", None)
+        if overlay:  # outlines of a million selected points hide their colours
+            overlay.show_outline_selected = self.mode == "OFF"
         return {"FINISHED"}
 
 

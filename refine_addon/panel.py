@@ -56,6 +56,14 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
             if settings.collection:
                 cameras = [o for o in settings.collection.all_objects if o.type == "CAMERA"]
                 layout.label(text=f"{len(cameras)} cameras", icon="CAMERA_DATA")
+        elif settings.source in {"VISIBLE", "SELECTED"}:
+            shown = (
+                context.selected_objects
+                if settings.source == "SELECTED"
+                else (context.visible_objects)
+            )
+            count = sum(obj.type == "CAMERA" for obj in shown)
+            layout.label(text=f"{count} cameras", icon="CAMERA_DATA")
         elif settings.source == "FRAMES":
             _draw_frames(layout, settings, context.scene)
 
@@ -87,6 +95,8 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
                 text=f"Scored by {record['views_used']} of {record['views_given']} views",
                 icon="CHECKMARK",
             )
+        elif mesh_layout.looks_like_splats(obj) and score_attributes.RANK in obj.data.attributes:
+            layout.label(text="Applied: score again for more", icon="INFO")
 
 
 class REFINE_PT_advanced(_InSidebar, bpy.types.Panel):

@@ -314,6 +314,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     """
     start = time.perf_counter()
     obj = find(name)
+    check(obj)
     target = None if output is None or dry_run else Path(output).expanduser()
     if target is not None:
         refuse_existing(target, overwrite=overwrite)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-from importlib import metadata
 from pathlib import Path
 
 
@@ -14,6 +13,8 @@ def _version() -> str:
         manifest = folder / "blender_manifest.toml"
         if manifest.is_file():
             return str(tomllib.loads(manifest.read_text("utf-8"))["version"])
+    from importlib import metadata  # noqa: PLC0415 - slow to import, and seldom needed
+
     return metadata.version("refine-addon")  # installed by pip
 
 

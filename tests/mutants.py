@@ -68,7 +68,7 @@ def outcome(module: str, old: str, new: str) -> str:
     """
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
-        for name in ("refine_addon", "tests", "benchmarks", "tools"):
+        for name in ("refine_addon", "tests", "benchmarks", ".ci"):
             shutil.copytree(PROJECT / name, copy / name, ignore=shutil.ignore_patterns("e2e"))
         for name in ("pyproject.toml", "blender_manifest.toml"):
             shutil.copy(PROJECT / name, copy / name)

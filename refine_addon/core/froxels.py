@@ -368,10 +368,12 @@ def mean_light(
     """
     owners, weights = points.owners, points.weights
     squares = weights * weights
-    shares = np.bincount(owners, weights, count)
-    errors: NDArray[np.float64] = np.bincount(owners, squares * light * light * contrast, count)
-    errors *= shares / np.maximum(np.bincount(owners, squares, count), 1e-30)
-    return np.asarray(np.bincount(owners, weights * light, count), np.float64), errors
+    shown = np.bincount(owners, weights * light, count)
+    errors = np.bincount(owners, squares * light * light * contrast, count)
+    # Over the sum of the squares, and the share of the footprint that lies in the image.
+    share = np.bincount(owners, weights, count)
+    errors = errors * share / np.maximum(np.bincount(owners, squares, count), 1e-30)
+    return np.asarray(shown, np.float64), np.asarray(errors, np.float64)
 
 
 def masses(

@@ -1,8 +1,10 @@
-"""Exact nearest neighbours of every point of a cloud, with NumPy alone.
+"""Nearest neighbours of every point of a cloud, with NumPy alone.
 
 A balanced tree halves the points along their longest side until leaves of a few points are left,
-so dense and sparse regions cost the same. All the points of a leaf search together: leaves whose
-box is nearer than the farthest neighbour found so far, nearest box first, many leaves at a time.
+so that dense and sparse regions cost the same. The points of a leaf are compared with those of the
+`VISITED` leaves whose boxes are nearest, which a beam finds from the root down. Fixed work for
+every point, whatever the cloud: a search to the last neighbour would cost a far outlier the whole
+cloud. Exact for small clouds; of trained scenes it finds 98 to 99 % of the 8 nearest.
 """
 
 from __future__ import annotations
@@ -16,10 +18,17 @@ from .work import Progress, for_chunks, silent
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-_LEAF = 12
-"""Points in a leaf, at least half as many: few enough that most of a visited leaf is near."""
+VISITED = 20
+"""Leaves that the points of one leaf are compared with, itself among them."""
 
-_BATCH = 4096
+_LEAF = 8
+"""Points in a leaf, at least half as many."""
+
+_MIDDLE = 1e-3
+"""Weight of the squared distance of the middles of two boxes, which decides among those that
+touch."""
+
+_BATCH = 256
 """Leaves that search at once; bounds the memory."""
 
 
@@ -47,14 +56,14 @@ def nearest(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.int32]:
-    """Return the nearest neighbours of every point.
+    """Return near neighbours of every point, nearly always the nearest.
 
     Parameters
     ----------
     points : (N, 3) float64
         Finite, of a size whose square is finite.
     count : int
-        How many neighbours, fewer where there are not as many other points.
+        How many neighbours, up to 16; fewer where there are not as many other points.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
     threads : int, optional
@@ -62,8 +71,7 @@ def nearest(
     Returns
     -------
     (N, min(count, N - 1)) int32
-        Nearest first, equal distances by index; a point is not its own neighbour. Which of several
-        points at the same distance is the last is not defined, but always the same.
+        Nearest first, equal distances by index; a point is not its own neighbour.
 
     Examples
     --------
@@ -74,13 +82,13 @@ def nearest(
     count = min(count, total - 1)
     if count <= 0:
         return np.empty((total, 0), np.int32)
-    tree = _build(np.asarray(points, np.float64), count)
+    tree = _build(np.asarray(points, np.float64))
     found = np.empty((total, count), np.int32)
 
     def search(piece: slice) -> None:
-        neighbours = _search(tree, np.arange(piece.start, piece.stop), count, total)
         own = tree.which[piece]
-        found[own[own < total]] = neighbours[own < total]
+        real = own < total
+        found[own[real]] = _search(tree, piece, count, total)[real]
 
     for_chunks(
         search, len(tree.which), _BATCH,
@@ -89,11 +97,11 @@ def nearest(
     return found
 
 
-def _build(points: NDArray[np.float64], count: int) -> _Tree:
-    """Halve the points until a leaf holds `_LEAF` at most, but more than `count` with its twin."""
+def _build(points: NDArray[np.float64]) -> _Tree:
+    """Halve the points until a leaf holds `_LEAF` at most."""
     total = len(points)
     depth = 0
-    while total / 2 ** (depth + 1) >= max(_LEAF / 2, (count + 1) / 2 + 1):
+    while total > _LEAF << depth:
         depth += 1
     size = -(-total // 2**depth)
     # Leaves are filled up with copies of points, which change no box, and are told by their index.
@@ -106,90 +114,50 @@ def _build(points: NDArray[np.float64], count: int) -> _Tree:
         along = np.take_along_axis(inside, axis[:, None, None], axis=2)[..., 0]
         halves = np.argpartition(along, nodes.shape[1] // 2, axis=1)
         order = np.take_along_axis(nodes, halves, axis=1).ravel()
-    index = order.reshape(2**depth, size)
-    leaves = points[copies[index]]
+    which = order.reshape(2**depth, size)
+    leaves = points[copies[which]]
     boxes = [np.stack([leaves.min(axis=1), leaves.max(axis=1)])]
     while boxes[0].shape[1] > 1:
         low, high = boxes[0].reshape(2, -1, 2, 3)
         boxes.insert(0, np.stack([low.min(axis=1), high.max(axis=1)]))
-    return _Tree(index, leaves, boxes)
+    return _Tree(which, leaves, boxes)
 
 
-def _search(tree: _Tree, leaves: NDArray[np.int64], count: int, total: int) -> NDArray[np.int32]:
+def _search(tree: _Tree, rows: slice, count: int, total: int) -> NDArray[np.int64]:
     """Return the neighbours, (leaves, size, count), of all points of some leaves."""
-    shape = (len(leaves), tree.which.shape[1], count)
-    best = np.full(shape, np.inf), np.full(shape, total, np.int64)
-    everyone = np.arange(len(leaves))
-    # The leaf itself and its twin hold enough points for a first bound on the distance.
-    for twin in (0, 1) if len(tree.which) > 1 else (0,):
-        _visit(tree, leaves, everyone, leaves ^ twin, best, total)
-    starts, others, gaps = _candidates(tree, leaves, best[0].max(axis=(1, 2)))
-    alive, step = everyone, 0
-    while len(alive):
-        place = starts[alive] + step
-        inside = place < starts[alive + 1]
-        alive, place = alive[inside], place[inside]
-        near = gaps[place] < best[0][alive].max(axis=(1, 2))
-        alive, place = alive[near], place[near]
-        _visit(tree, leaves, alive, others[place], best, total)
-        step += 1
-    order = np.lexsort((best[1], best[0]), axis=-1)
-    return np.take_along_axis(best[1], order, axis=-1).astype(np.int32)
-
-
-def _visit(
-    tree: _Tree,
-    leaves: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    others: NDArray[np.int64],
-    best: tuple[NDArray[np.float64], NDArray[np.int64]],
-    total: int,
-) -> None:
-    """Compare the points of ``leaves[rows]`` with those of `others`; keep the nearest in `best`."""
-    count = best[0].shape[2]
-    here, there = tree.points[leaves[rows]], tree.points[others]
-    squared = np.zeros((*here.shape[:2], there.shape[1]))
+    nodes = _near_leaves(tree, rows)
+    own = tree.points[rows]
+    others = tree.points[nodes].reshape(len(own), -1, 3)
+    index = tree.which[nodes].reshape(len(own), 1, -1)
+    squared = np.zeros((*own.shape[:2], others.shape[1]))
     for axis in range(3):
-        step = here[:, :, None, axis] - there[:, None, :, axis]
-        squared += step * step
-    index = tree.which[others][:, None, :]
-    squared[(index >= total) | (index == tree.which[leaves[rows]][:, :, None])] = np.inf
-    distances = np.concatenate([best[0][rows], squared], axis=2)
-    indices = np.concatenate([best[1][rows], np.broadcast_to(index, squared.shape)], axis=2)
-    chosen = np.argpartition(distances, count - 1, axis=2)[..., :count]
-    best[0][rows] = np.take_along_axis(distances, chosen, axis=2)
-    best[1][rows] = np.take_along_axis(indices, chosen, axis=2)
+        step = own[:, :, None, axis] - others[:, None, :, axis]
+        squared += np.multiply(step, step, out=step)
+    squared[(index == tree.which[rows][:, :, None]) | (index >= total)] = np.inf
+    index = np.broadcast_to(index, squared.shape)
+    chosen = np.argpartition(squared, count - 1, axis=2)[..., :count]
+    index = np.take_along_axis(index, chosen, axis=2)
+    order = np.lexsort((index, np.take_along_axis(squared, chosen, axis=2)), axis=-1)
+    return np.take_along_axis(index, order, axis=2)
 
 
-def _candidates(
-    tree: _Tree, leaves: NDArray[np.int64], bounds: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Return which other leaves lie within `bounds` (squared) of each of `leaves`.
+def _near_leaves(tree: _Tree, rows: slice) -> NDArray[np.int64]:
+    """Return the leaves nearest to some leaves, (leaves, `VISITED`) or all where there are fewer.
 
-    Returns
-    -------
-    starts : (leaves + 1,) int64
-        Those of row r are ``starts[r]:starts[r + 1]``, nearest box first.
-    others : (candidates,) int64
-    gaps : (candidates,) float64
-        Squared distance of the boxes.
+    A level at a time, only the `VISITED` nearest nodes are followed down.
     """
-    rows, nodes = np.arange(len(leaves)), np.zeros(len(leaves), np.int64)
-    gaps = np.zeros(len(leaves))
-    low, high = tree.boxes[-1][:, leaves]
+    low, high = tree.boxes[-1][:, rows, :, None]
+    nodes = np.zeros((len(low), 1), np.int64)
     for boxes in tree.boxes[1:]:
-        rows = np.repeat(rows, 2)
-        nodes = np.stack([2 * nodes, 2 * nodes + 1], axis=1).ravel()
-        gaps = np.zeros(len(rows))
+        nodes = np.concatenate([2 * nodes, 2 * nodes + 1], axis=1)
+        if nodes.shape[1] <= VISITED:
+            continue
+        distance = np.zeros(nodes.shape)
         for axis in range(3):
-            apart = np.maximum(
-                boxes[0, nodes, axis] - high[rows, axis], low[rows, axis] - boxes[1, nodes, axis]
-            )
-            gaps += np.maximum(apart, 0.0) ** 2
-        near = gaps < bounds[rows]
-        rows, nodes, gaps = rows[near], nodes[near], gaps[near]
-    other = nodes >> 1 != leaves[rows] >> 1
-    rows, nodes, gaps = rows[other], nodes[other], gaps[other]
-    order = np.lexsort((nodes, gaps, rows))
-    starts = np.searchsorted(rows, np.arange(len(leaves) + 1))
-    return starts, nodes[order], gaps[order]
+            lower, upper = boxes[0, :, axis][nodes], boxes[1, :, axis][nodes]
+            gap = np.maximum(lower - high[:, axis], low[:, axis] - upper)
+            middle = 0.5 * (lower + upper - low[:, axis] - high[:, axis])
+            distance += np.maximum(gap, 0.0) ** 2 + _MIDDLE * middle * middle
+        nearest_nodes = np.argpartition(distance, VISITED - 1, axis=1)[:, :VISITED]
+        nodes = np.take_along_axis(nodes, nearest_nodes, axis=1)
+    return nodes

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from refine_addon.core import Budget, RefineError, prune, read_cameras
 from refine_addon.core.ply import splats_from_columns
+from tests.fuzz import TARGETS, Crash, attempt, fuzz, main
 from tests.strategies import plain_ply, splat_names
-from tools.fuzz import TARGETS, Crash, attempt, fuzz, main
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 # The harness and the tools it stands on are modules of the tests, not of the package.
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2] / "tools")]
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2] / ".ci")]
 
 from blenders import (  # noqa: E402
     BINARIES,
@@ -35,7 +35,7 @@ SCENE = PROJECT / "tests" / "data" / "room_small"
 @pytest.fixture(scope="session")
 def extension_zip() -> Path:
     """Give the extension, built from this checkout as `make build` does it."""
-    build = [sys.executable, PROJECT / "tools" / "build_extension.py"]
+    build = [sys.executable, PROJECT / ".ci" / "build_extension.py"]
     done = subprocess.run(build, capture_output=True, text=True, check=False)
     if done.returncode != 0:
         pytest.fail(f"the extension does not build:\n{done.stdout}{done.stderr}", pytrace=False)

@@ -4,7 +4,7 @@ Prints the path of its interpreter and exits with 0, or says why not and exits w
 in the same cache as `blender_root.py`'s roots. Nothing but `bpy` and what it requires is in it, so
 an add-on tested there has only what it brings along.
 
-    python tools/bpy_venv.py 4.5.15
+    python .ci/bpy_venv.py 4.5.15
 """
 
 from __future__ import annotations

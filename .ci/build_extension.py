@@ -5,8 +5,8 @@ builder wants `__init__.py` beside the manifest), then has Blender's own tool va
 build the zip and validate that. The tool is a plain Python script which the `bpy` wheel carries, so
 no Blender binary is needed; with `--blender PATH` a binary does the same. Prints the zip's path.
 
-    python tools/build_extension.py
-    python tools/build_extension.py --blender /path/to/blender
+    python .ci/build_extension.py
+    python .ci/build_extension.py --blender /path/to/blender
 """
 
 from __future__ import annotations

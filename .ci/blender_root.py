@@ -5,8 +5,8 @@ the root cannot be had (not Linux, not root, a tool missing, no network, the rel
 it says why on stderr and exits with 69, so that a test can be skipped with that reason instead of
 counted as passed.
 
-    python tools/blender_root.py trixie     # Blender 4.3, Python 3.13
-    python tools/blender_root.py sid        # the newest that Debian has; it moves
+    python .ci/blender_root.py trixie     # Blender 4.3, Python 3.13
+    python .ci/blender_root.py sid        # the newest that Debian has; it moves
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Feed broken files to every reader, for as long as there is time.
 
-    python tools/fuzz.py [--seconds 300] [--seed N] [--only ply]
+    python -m tests.fuzz [--seconds 300] [--seed N] [--only ply]
 
 Good files of every format are broken by chance: bytes, words, numbers, lines, JSON values. Each
 must end in a `RefineError` that names the file, or in a result that holds together: a PLY must be
@@ -194,7 +194,7 @@ def broken(files: Files, others: list[Files], chance: random.Random) -> Files:
     name = chance.choice(sorted(files))
     data = files[name]
     for _ in range(chance.choice((1, 1, 1, 2, 3, 5))):
-        if name.endswith(".json") and chance.random() < 0.6:  # noqa: PLR2004
+        if name.endswith(".json") and chance.random() < 0.6:
             data = _other_value(data, chance)
         else:
             other = chance.choice(others).get(name, data)
@@ -278,11 +278,11 @@ def _other_value(data: bytes, chance: random.Random) -> bytes:
         return data
     node, key = chance.choice(places)
     way = chance.random()
-    if way < 0.7:  # noqa: PLR2004
+    if way < 0.7:
         node[key] = chance.choice(VALUES)
-    elif way < 0.8:  # noqa: PLR2004
+    elif way < 0.8:
         del node[key]
-    elif way < 0.9:  # noqa: PLR2004
+    elif way < 0.9:
         node[key] = [node[key]] * chance.choice((1, 2, 1000))
     else:
         text = json.dumps(node[key])
@@ -374,7 +374,7 @@ def attempt(files: Files, use: Callable[[Path], None], folder: Path) -> bool:
         message = str(error)
         if not message.startswith(str(folder)):
             raise Crash(files, f"the error names no file: {message}") from error
-        if len(message) > 2000 or not message.isprintable():  # noqa: PLR2004
+        if len(message) > 2000 or not message.isprintable():
             raise Crash(files, f"the error is no sentence: {message[:300]!r}") from error
     except Exception as error:
         raise Crash(files, traceback.format_exc()) from error
