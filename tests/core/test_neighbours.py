@@ -13,9 +13,9 @@ def brute_force(points, count):
     return np.argsort(squared, axis=1, kind="stable")[:, :count]
 
 
-@pytest.mark.parametrize("total", [2, 3, 12, 13, 25, 97, 500, 1501])
+@pytest.mark.parametrize("total", [2, 3, 8, 9, 25, 97, 128])
 @pytest.mark.parametrize("count", [1, 8, 16])
-def test_neighbours_are_those_of_brute_force(total, count):
+def test_neighbours_in_a_small_cloud_are_those_of_brute_force(total, count):
     points = np.random.default_rng(total).normal(size=(total, 3))
 
     found = nearest(points, count)
@@ -30,15 +30,29 @@ def test_neighbours_do_not_depend_on_the_unit(unit):
     np.testing.assert_array_equal(nearest(points * unit, 5), nearest(points, 5))
 
 
-def test_a_cloud_of_very_uneven_density_is_searched_as_exactly():
-    """Three clusters a million times apart in size, and a line: boxes of every shape."""
+@pytest.mark.parametrize("flatness", [1.0, 0.01])
+def test_neighbours_in_a_large_cloud_are_nearly_all_those_of_brute_force(flatness):
+    """A ball and a surface; the share of the true ones that is found."""
+    points = np.random.default_rng(5).normal(size=(4000, 3)) * [1.0, 1.0, flatness]
+
+    found, expected = nearest(points, 8), brute_force(points, 8)
+
+    assert np.mean((found[:, :, None] == expected[:, None]).any(axis=1)) > 0.97
+    assert (found != np.arange(4000)[:, None]).all()
+    assert np.mean(found[:, 0] == expected[:, 0]) > 0.985
+
+
+def test_a_cloud_of_very_uneven_density_is_searched_as_well():
+    """Clusters a million times apart in size, and a line: the hardest, and still three of four."""
     rng = np.random.default_rng(2)
     points = np.concatenate(
         [rng.normal(size=(400, 3)) * size + size for size in (1e-3, 1.0, 1e3)]
         + [np.linspace(0, 1, 100)[:, None] * [5.0, 0.0, 0.0]]
     )
 
-    np.testing.assert_array_equal(nearest(points, 7)[:1200], brute_force(points, 7)[:1200])
+    found, expected = nearest(points, 7), brute_force(points, 7)
+
+    assert np.mean((found[:, :, None] == expected[:, None]).any(axis=1)) > 0.75
 
 
 def test_points_at_one_place_are_each_others_neighbours():
