@@ -14,6 +14,8 @@ import numpy as np
 
 from refine_addon.core.splats import opacity as activated_opacity
 
+from . import fisher
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -79,6 +81,15 @@ def removal_error(
     return _required(statistics).removal_error
 
 
+def pup_3dgs(splats: Splats, views: ViewSet, statistics: Statistics | None) -> NDArray[np.float64]:
+    """Score by PUP 3D-GS's log determinant (Hanson, Tu et al., CVPR 2025); see `fisher`.
+
+    It renders gradients of its own, so the statistics are no use to it.
+    """
+    del statistics
+    return fisher.pup(splats, views)
+
+
 BASELINES: dict[str, Baseline] = {
     "random": random,
     "opacity": opacity,
@@ -86,6 +97,7 @@ BASELINES: dict[str, Baseline] = {
     "mesongs": meson_gs,
     "radsplat": rad_splat,
     "removal-error": removal_error,
+    "pup-3dgs": pup_3dgs,
 }
 """Name on the command line -> function."""
 

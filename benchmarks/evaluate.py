@@ -12,8 +12,9 @@ Pictures are compared clipped to 0..1, as a screen shows them:
 
     python -m benchmarks.evaluate SCENE_DIR --method closed-form lightgaussian --ratios .3 .5 .7
 
-SCENE_DIR holds ``point_cloud.ply``, ``cameras.json``, ``split.json`` (``{"train": [names], "test":
-[names]}``) and, optionally, ``images/NAME.png`` or ``.jpg``. The train views decide what goes.
+SCENE_DIR holds ``point_cloud.ply``, ``cameras.json`` and, optionally, ``split.json`` (``{"train":
+[names], "test": [names]}``; without it every 8th view is held out) and ``images/NAME.png`` or
+``.jpg``. The train views decide what goes.
 """
 
 from __future__ import annotations
@@ -55,6 +56,8 @@ if TYPE_CHECKING:
 PSNR_CAP = 100.0
 """What identical images count as, dB; for comparison, rounding to 8 bits alone makes 59 dB."""
 METRICS = ("psnr", "ssim", "flip")
+HELD_OUT = 8
+"""Without a split, every 8th view is held out, the first among them."""
 PICTURE_TYPES = (".png", ".jpg", ".jpeg", ".JPG")
 FLIP_MISSING = "FLIP needs the package flip-evaluator: pip install flip-evaluator"
 
@@ -252,21 +255,30 @@ def read_scene(folder: Path | str) -> Scene:
         If a file is missing or not what it should be.
     """
     folder = Path(folder)
-    try:
-        split = json.loads((folder / "split.json").read_text(encoding="utf-8"))
-        train, test = split["train"], split["test"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        msg = f"{folder / 'split.json'}: expected lists of names 'train' and 'test' ({error!r})"
-        raise RefineError(msg) from error
     views = read_cameras(folder / "cameras.json")
+    train, test = _split(folder / "split.json", [view.name for view in views])
     pictures = {}
     for name in [*train, *test]:
         files = [folder / "images" / f"{name}{suffix}" for suffix in PICTURE_TYPES]
+        # Names may bring their own suffix.
+        files.append(folder / "images" / name)
         found = next((file for file in files if file.is_file()), None)
         if found is not None:
             pictures[name] = np.asarray(Image.open(found).convert("RGB"), np.float64) / 255.0
     splats = read_ply(folder / "point_cloud.ply").splats()
     return Scene(splats, views.select(train), views.select(test), pictures)
+
+
+def _split(file: Path, names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the names of the train and of the test views."""
+    if not file.exists():
+        return [name for k, name in enumerate(names) if k % HELD_OUT], list(names[::HELD_OUT])
+    try:
+        split = json.loads(file.read_text(encoding="utf-8"))
+        return split["train"], split["test"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        msg = f"{file}: expected lists of names 'train' and 'test' ({error!r})"
+        raise RefineError(msg) from error
 
 
 def scores_of(method: str, scene: Scene, statistics: Statistics | None) -> Scores:

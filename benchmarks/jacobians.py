@@ -145,10 +145,8 @@ def shape_gradient(
     ``-p_a r2_b / z``; xx = p' S p and so on, and dS / d log s_k = 2 a_k a_k'.
     """
     x, y, z = to_camera(camera, mean)
-    sx, free_x = _clamped(x / z, camera.fx, camera.cx, camera.width)
-    sy, free_y = _clamped(y / z, camera.fy, camera.cy, camera.height)
+    p, q, free_x, free_y = image_rows(mean, camera)
     r0, r1, r2 = camera.rotation[0], camera.rotation[1], camera.rotation[2]
-    p, q = camera.fx / z * (r0 - sx * r2), camera.fy / z * (r1 - sy * r2)
     out[0, :3] = camera.fx / z * (r0 - x / z * r2)
     out[1, :3] = camera.fy / z * (r1 - y / z * r2)
     out[:2, 3:] = 0.0
@@ -163,6 +161,20 @@ def shape_gradient(
         out[2, 3 + b] = 2.0 * pa[b] * pa[b]
         out[3, 3 + b] = 2.0 * pa[b] * qa[b]
         out[4, 3 + b] = 2.0 * qa[b] * qa[b]
+
+
+@numba.njit(cache=True)
+def image_rows(
+    mean: NDArray[np.float64], camera: Camera
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float, float]:
+    """Return the rows of J W, and for each 1 where its slope is not clamped, else 0."""
+    x, y, z = to_camera(camera, mean)
+    sx, free_x = _clamped(x / z, camera.fx, camera.cx, camera.width)
+    sy, free_y = _clamped(y / z, camera.fy, camera.cy, camera.height)
+    forward = camera.rotation[2]
+    p = camera.fx / z * (camera.rotation[0] - sx * forward)
+    q = camera.fy / z * (camera.rotation[1] - sy * forward)
+    return p, q, free_x, free_y
 
 
 @numba.njit(cache=True)

@@ -59,8 +59,8 @@ def version() -> str:
     if command is None:
         return ""
     done = subprocess.run([*command, "--version"], capture_output=True, text=True, check=False)
-    words = done.stdout.split()
-    return next((word for word in words if word[:1] == "v" or word[:1].isdigit()), "?")
+    words = (done.stdout + done.stderr).split()
+    return next((word for word in words if word.lstrip("v")[:1].isdigit()), "?")
 
 
 def decimate(source: Path, target: Path, flag: str, keep_count: int) -> Run:
