@@ -17,7 +17,17 @@ from refine_addon.core.splats import rotation_matrices
 
 from .compositing import bins_of
 from .footprints import Camera, Footprints, Gaussians, camera_of, footprints_of, gaussians_of
-from .jacobians import CONTRAST, E_X, E_Y, SHAPE, WEIGHT, color_gradient, hits_of, shape_gradient
+from .jacobians import (
+    CONTRAST,
+    E_X,
+    E_Y,
+    MOVES,
+    SHAPE,
+    WEIGHT,
+    color_gradient,
+    hits_of,
+    shape_gradient,
+)
 from .rasterizer import dealt
 
 if TYPE_CHECKING:
@@ -110,7 +120,7 @@ def _collect(values: NDArray[np.float64], row: NDArray[np.float64]) -> None:
     """Add one hit to its splat's moments."""
     x, y = values[E_X], values[E_Y]
     w = (x, y, 0.5 * x * x, x * y, 0.5 * y * y)
-    contrast = values[CONTRAST : CONTRAST + 3]
+    contrast = values[MOVES] * values[CONTRAST : CONTRAST + 3]
     square = np.sum(contrast * contrast)
     column = 0
     for i in range(SHAPE):

@@ -32,6 +32,7 @@ from .jacobians import (
     CONTRAST,
     E_X,
     E_Y,
+    MOVES,
     SHAPE,
     WEIGHT,
     color_gradient,
@@ -41,6 +42,8 @@ from .jacobians import (
 )
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from refine_addon.core.splats import Splats
@@ -48,6 +51,7 @@ if TYPE_CHECKING:
 
 PARAMETERS = 14
 MEAN, SCALE, ROTATION, LOGIT, COLOR = 0, 3, 6, 10, 11
+_PIXELS = 10_000  # of a dense Jacobian at once: about 100 MB
 ATTRIBUTES = (slice(0, 10), slice(10, 11), slice(11, 14))
 
 
@@ -92,11 +96,11 @@ def measure(
     hessians = np.zeros((len(members), size * PARAMETERS, size * PARAMETERS))
     removals = np.zeros((len(members), size, size))
     for view in used:
-        rows = _rows(scene, camera_of(view), np.unique(members))
+        rows = rows_of(scene, camera_of(view), np.unique(members))
         for k, group in enumerate(members):
-            jacobian, changes = _dense(rows, group)
-            hessians[k] += jacobian.T @ jacobian
-            removals[k] += changes.T @ changes
+            for jacobian, changes in _dense(rows, group):
+                hessians[k] += jacobian.T @ jacobian
+                removals[k] += changes.T @ changes
     seen = [k for k in range(len(members)) if hessians[k, :PARAMETERS, :PARAMETERS].any()]
     unitless = [_unitless(hessians[k]) for k in seen]
     return Energies(
@@ -179,28 +183,42 @@ def _rotation_gradient(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class Rows(NamedTuple):
-    """The Jacobian of one view, hit by hit, sorted by splat.
+    """The hits of some splats in one view, sorted by splat, and how they move.
 
     Attributes
     ----------
     splats, pixels : (hits,) int64
-    values : (hits, 3, 14) float64
-        By channel and parameter.
-    changes : (hits, 3) float64
-        What the pixel loses with this splat.
+    values : (hits, 7) float64
+        See `jacobians.Hits`.
+    wanted : (M,) int64
+        The splats.
+    shape, color : (M, 6, 14), (M, 3, 14) float64
+        See `gradients`.
     """
 
     splats: NDArray[np.int64]
     pixels: NDArray[np.int64]
     values: NDArray[np.float64]
-    changes: NDArray[np.float64]
+    wanted: NDArray[np.int64]
+    shape: NDArray[np.float64]
+    color: NDArray[np.float64]
+
+    def jacobian(self, hits: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the Jacobian of some hits, (hits, 3, 14), by channel and parameter."""
+        value, place = self.values[hits], np.searchsorted(self.wanted, self.splats[hits])
+        x, y = value[:, E_X], value[:, E_Y]
+        w = np.stack([x, y, 0.5 * x * x, x * y, 0.5 * y * y, np.ones_like(x)], axis=1)
+        along = np.einsum("hs,hsp->hp", w * value[:, MOVES, None], self.shape[place])
+        result = value[:, CONTRAST : CONTRAST + 3, None] * along[:, None, :]
+        result += value[:, WEIGHT, None, None] * self.color[place]
+        return result
 
 
-def _rows(
+def rows_of(
     scene: _Scene, camera: Camera, wanted: NDArray[np.int64], near: float = 0.2,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> Rows:  # fmt: skip
-    """Return the Jacobian of the splats `wanted`."""
+    """Find the hits of the splats `wanted`, which are sorted."""
     footprints = footprints_of(scene.gaussians, camera, near)
     bins = bins_of(footprints.boxes, camera.width, camera.height)
     marked = np.isin(footprints.index, wanted)
@@ -213,19 +231,12 @@ def _rows(
         owners.append(entries[mine])
         pixels.append(hits.pixels[mine])
         values.append(hits.values[mine])
-    owner, pixel, value = map(np.concatenate, (owners, pixels, values))
-    splat = footprints.index[owner]
+    splat = footprints.index[np.concatenate(owners)]
     order = np.argsort(splat, kind="stable")
-    shape, color = gradients(scene, camera, wanted, footprints.index, footprints.table[:, RED:])
-    place = np.searchsorted(wanted, splat[order])
-    value = value[order]
-    x, y = value[:, E_X], value[:, E_Y]
-    w = np.stack([x, y, 0.5 * x * x, x * y, 0.5 * y * y, np.ones_like(x)], axis=1)
-    change = value[:, CONTRAST : CONTRAST + 3]
-    along = np.einsum("hs,hsp->hp", w, shape[place])
-    jacobian = change[:, :, None] * along[:, None, :]
-    jacobian += value[:, WEIGHT, None, None] * color[place]
-    return Rows(splat[order], pixel[order].astype(np.int64), jacobian, change)
+    pixel = np.concatenate(pixels)[order].astype(np.int64)
+    colors = footprints.table[:, RED:]
+    shape, color = gradients(scene, camera, wanted, footprints.index, colors)
+    return Rows(splat[order], pixel, np.concatenate(values)[order], wanted, shape, color)
 
 
 def gradients(
@@ -274,16 +285,21 @@ def _fill(
                 shape[k, 4, ROTATION + turn] += 2.0 * qa * dq
 
 
-def _dense(rows: Rows, group: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the group's Jacobian, (3 pixels, 14 members), and changes, (3 pixels, members)."""
+def _dense(
+    rows: Rows, group: NDArray[np.int64]
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield a group's Jacobian, (3 pixels, 14 members), and changes, (3 pixels, members)."""
     starts = np.searchsorted(rows.splats, group)
     ends = np.searchsorted(rows.splats, group, side="right")
     picked = np.concatenate([np.arange(s, e) for s, e in zip(starts, ends, strict=True)])
-    pixels, place = np.unique(rows.pixels[picked], return_inverse=True)
-    jacobian = np.zeros((len(pixels), 3, len(group), PARAMETERS))
-    changes = np.zeros((len(pixels), 3, len(group)))
     column = np.repeat(np.arange(len(group)), ends - starts)
-    jacobian[place, :, column] = rows.values[picked]
-    changes[place, :, column] = rows.changes[picked]
-    height = 3 * len(pixels)
-    return jacobian.reshape(height, len(group) * PARAMETERS), changes.reshape(height, len(group))
+    pixels, place = np.unique(rows.pixels[picked], return_inverse=True)
+    for first in range(0, len(pixels), _PIXELS):
+        here = (place >= first) & (place < first + _PIXELS)
+        hits, row, member = picked[here], place[here] - first, column[here]
+        height = min(_PIXELS, len(pixels) - first)
+        jacobian = np.zeros((height, 3, len(group), PARAMETERS))
+        changes = np.zeros((height, 3, len(group)))
+        jacobian[row, :, member] = rows.jacobian(hits)
+        changes[row, :, member] = rows.values[hits, CONTRAST : CONTRAST + 3]
+        yield jacobian.reshape(3 * height, -1), changes.reshape(3 * height, -1)

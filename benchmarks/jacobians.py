@@ -45,7 +45,7 @@ SHAPE = 5
 """Numbers of a footprint without its opacity: u, v, xx, xy, yy."""
 
 # Columns of Hits.values.
-WEIGHT, E_X, E_Y, CONTRAST, VALUES = 0, 1, 2, 3, 6
+WEIGHT, E_X, E_Y, CONTRAST, MOVES, VALUES = 0, 1, 2, 3, 6, 7
 
 
 class Hits(NamedTuple):
@@ -57,8 +57,9 @@ class Hits(NamedTuple):
         Which of the tile's entries it is.
     pixels : (hits,) int32
         Row by row in the image.
-    values : (hits, 6) float64
-        alpha T; e, 1 / px; alpha T (colour - B) of red, green, blue, zero where alpha is clamped.
+    values : (hits, 7) float64
+        alpha T; e, 1 / px; alpha T (colour - B) of red, green, blue; 0 where alpha is clamped,
+        else 1.
     """
 
     owners: NDArray[np.int32]
@@ -101,12 +102,11 @@ def hits_of(
             alpha, row = alphas[starts[pixel] + k], footprints.table[shown[k]]
             _slopes(row, place, values)
             values[WEIGHT] = alpha * through[k]
-            moves = 1.0 if alpha < ALPHA_MAX else 0.0
+            values[MOVES] = 1.0 if alpha < ALPHA_MAX else 0.0
             for channel in range(3):
                 behind = colors[end, channel] + through[end] * background[channel]
                 behind = (behind - colors[k + 1, channel]) / through[k + 1]
-                contrast = row[RED + channel] - behind
-                values[CONTRAST + channel] = moves * values[WEIGHT] * contrast
+                values[CONTRAST + channel] = values[WEIGHT] * (row[RED + channel] - behind)
             count += 1
     return Hits(out.owners[:count], out.pixels[:count], out.values[:count])
 

@@ -157,7 +157,7 @@ def _published() -> list[Method]:
             f"refine-{depth}",
             LITERATURE,
             f"REFINE's closed form, {text} (`--published {depth}`)",
-            Settings(closed_form=ClosedForm.published(depth)),
+            Settings(views=0, closed_form=ClosedForm.published(depth)),
         )
         for depth, text in readings.items()
     ]
@@ -175,7 +175,7 @@ def _core() -> list[Method]:
     methods = []
     for name in get_args(get_type_hints(Settings)["method"]):
         about = CORE_ABOUT.get(name, f"method '{name}'")
-        methods.append(_scoring(name, OURS, about, Settings(method=name)))
+        methods.append(_scoring(name, OURS, about, Settings(views=0, method=name)))
     about = "`--absorb`: survivors absorb what goes, by what the views see of each"
     return [*methods, Method("occlusion+absorb", OURS, about, reduce=_absorb)]
 
@@ -183,7 +183,7 @@ def _core() -> list[Method]:
 def _absorb(task: Task, keep_count: int, ratio: float) -> Splats:
     del ratio
     budget = Budget(keep=keep_count)
-    settings = Settings(method="occlusion")
+    settings = Settings(views=0, method="occlusion")
     result = pipeline.prune(task.splats, task.views, budget, settings, absorb=True)
     return task.splats.take(result.keep) if result.absorbed is None else result.absorbed.splats
 

@@ -10,6 +10,7 @@ import pytest
 pytest.importorskip("numba")
 
 from benchmarks import hessian, rasterizer
+from benchmarks.jacobians import CONTRAST, MOVES
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import View, ViewSet
 
@@ -51,12 +52,30 @@ def test_the_jacobian_is_that_of_finite_differences(index: int) -> None:
     expected = np.stack(columns, axis=-1).reshape(-1, 3, 14)
     camera = rasterizer.camera_of(VIEW)
 
-    rows = hessian._rows(hessian._prepare(splats), camera, np.array([index]))
+    rows = hessian.rows_of(hessian._prepare(splats), camera, np.array([index]))
 
     found = np.zeros_like(expected)
-    found[rows.pixels] = rows.values
+    found[rows.pixels] = rows.jacobian(np.arange(len(rows.pixels)))
     assert np.abs(expected).max() > 0.1
     np.testing.assert_allclose(found, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_what_a_hit_changes_is_the_removal_error_of_the_renderer() -> None:
+    """Summed squares over pixels and channels; also of a splat whose alpha is clamped.
+
+    Nothing here is opaque enough to end a pixel, so that removing moves no end.
+    """
+    splats = scene_of()
+    splats.opacity_logits[5] = 9.0
+    camera = rasterizer.camera_of(VIEW)
+    expected = rasterizer.render_with_statistics(splats, VIEW)[1].removal_error
+
+    rows = hessian.rows_of(hessian._prepare(splats), camera, np.arange(len(splats)))
+
+    squares = np.sum(rows.values[:, CONTRAST : CONTRAST + 3] ** 2, axis=1)
+    found = np.bincount(rows.splats, squares, len(splats))
+    assert np.count_nonzero(rows.values[:, MOVES] == 0.0) > 0
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-18)
 
 
 def test_energies_by_hand() -> None:
