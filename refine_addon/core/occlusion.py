@@ -9,6 +9,8 @@ contrast is the squared error of the picture without the splat, what REFINE's He
 it is true for one splat removed among many that stay. The contribution also knows what the splat
 hides once its neighbours are gone; the product is the better order from half removed on.
 
+A floor under it, the closed form, keeps what these views do not show and others may: `coverage`.
+
 Splats are not independent, so the order of removal is found in rounds: part of the budget goes,
 the scores of the survivors are computed anew, and so on to the last tenth. Budgets stay nested.
 """
@@ -20,7 +22,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import closed_form, froxels, projection
+from . import closed_form, coverage, froxels, projection
 from .errors import RefineError
 from .scores import Scores
 from .work import Progress, for_chunks, part, silent
@@ -36,7 +38,7 @@ LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
 
 PRIOR = closed_form.ClosedForm("distance", frustum=False)
-"""What orders splats that no view shows: without a frustum, for they lie in none."""
+"""What is known of splats that no view shows: without a frustum, for they may lie in none."""
 
 _BLOCKS = 8  # of views; sums are added up block by block, so that threads do not matter
 
@@ -136,7 +138,7 @@ def score(
         )
         raise RefineError(msg)
     values[~good] = 0.0
-    return Scores(values, seen, len(views), int(np.count_nonzero(~good)))
+    return Scores(values, seen, len(views), int(np.count_nonzero(~good)), {"prior": run.weight})
 
 
 def measure(
@@ -193,9 +195,8 @@ class _Run:
             threads,
         )
         self.shown = False  # whether any view sees anything
-        self.views = [
-            (view, weight) for view, weight in zip(views, views.weights, strict=True) if weight > 0
-        ]
+        self.weight = 0.0  # of the prior
+        self.views = _by_distance(views)
 
     def rank(
         self, prior: NDArray[np.float32], progress: Progress
@@ -213,12 +214,17 @@ class _Run:
             gone += len(going)
             # Each round has the views times what is left to do; all of them about thrice the first.
             end = start + (1.0 - start) * max(1.0 / (rounds - number), 0.25)
-            measured = self.measure(left, part(progress, start, end))
-            start = end
+            halves = self.measure(left, part(progress, start, end))
+            start, share = end, gone / count
+            floor = prior[left.index].astype(np.float64) ** (1.0 + _exponent(share))
+            if number == 0:
+                self.weight = self._weigh(halves, floor)
+            measured = halves[0].plus(halves[1])
             if number == 0:
                 seen[left.index] = measured.seen
                 self.shown = bool(measured.contribution.any())
-            order = np.lexsort((prior[left.index], combined(measured, gone / count)))
+            scores = coverage.with_prior(combined(measured, share), floor, self.weight)
+            order = np.lexsort((prior[left.index], scores))
             last = number == rounds - 1
             stay = 0 if last else round(count * LEAST ** ((number + 1) / (rounds - 1)))
             go = max(len(left) - stay, 0)
@@ -227,23 +233,42 @@ class _Run:
         values[going] = np.arange(gone + 1, gone + len(going) + 1) / count
         return values, seen
 
-    def measure(self, gaussians: Gaussians, progress: Progress) -> Measured:
-        """Sum contribution and contrast of the Gaussians over all views."""
-        size = -(-len(self.views) // _BLOCKS)
+    def _weigh(self, halves: tuple[Measured, Measured], floor: NDArray[np.float64]) -> float:
+        first, second = halves
+        return coverage.prior_weight(
+            (combined(first, 0.0), combined(second, 0.0)), (first.contrast, second.contrast), floor
+        )
+
+    def measure(self, gaussians: Gaussians, progress: Progress) -> tuple[Measured, Measured]:
+        """Sum contribution and contrast of the Gaussians over either half of the views."""
+        blocks = min(_BLOCKS, len(self.views))
 
         def block(piece: slice) -> Measured:
             total = Measured.zero(len(gaussians))
-            for view, weight in self.views[piece]:
+            for view, weight in self.views[piece.start :: blocks]:
                 measure_view(gaussians, self.frame, view, weight, self.settings, total)
             return total
 
         totals = for_chunks(
-            block, len(self.views), size, progress=progress, what="scoring", threads=self.threads
+            block, blocks, 1, progress=progress, what="scoring", threads=self.threads
         )
-        result = totals[0]
-        for other in totals[1:]:
-            result.add(other)
-        return result
+        halves = Measured.zero(len(gaussians)), Measured.zero(len(gaussians))
+        for number, total in enumerate(totals):
+            halves[number % 2].add(total)
+        return halves
+
+
+def _by_distance(views: ViewSet) -> list[tuple[View, float]]:
+    """Return views and weights, those of no weight left out, in an order that the scene gives.
+
+    By distance from the middle: neither the order of the list nor the frame decides which half of
+    the views a view belongs to.
+    """
+    centers = views.centers - views.weights @ views.centers
+    distance = np.einsum("ij,ij->i", centers, centers)
+    farthest = centers - centers[np.argmax(distance)]
+    order = np.lexsort((np.einsum("ij,ij->i", farthest, farthest), distance))
+    return [(views[int(k)], float(views.weights[k])) for k in order if views.weights[k] > 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,6 +292,13 @@ class Measured:
         """Return sums of no views."""
         return cls(np.zeros(count), np.zeros(count), np.zeros(count, np.int32))
 
+    def plus(self, other: Measured) -> Measured:
+        """Return the sums of both."""
+        total = Measured.zero(len(self.seen))
+        total.add(self)
+        total.add(other)
+        return total
+
     def add(self, other: Measured) -> None:
         """Add the sums of other views."""
         self.contribution[:] += other.contribution
@@ -275,12 +307,16 @@ class Measured:
 
 
 def combined(measured: Measured, gone: float) -> NDArray[np.float64]:
-    """Return ``contrast contribution^p``, p from 1/4 to 3/4 as the share `gone` goes from 0 to 1.
+    """Return ``contrast contribution^p``; p rises with the share `gone` before.
 
     The contrast is exact for one splat; the more of its neighbours go too, the more counts what a
     splat covers, whatever is behind it.
     """
-    return np.asarray(measured.contrast * measured.contribution ** (0.25 + 0.5 * gone))
+    return np.asarray(measured.contrast * measured.contribution ** _exponent(gone))
+
+
+def _exponent(gone: float) -> float:
+    return 0.25 + 0.5 * gone
 
 
 def measure_view(
