@@ -8,6 +8,7 @@ pictures.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -15,10 +16,14 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 PROJECT = Path(__file__).resolve().parent.parent
 ROOM = PROJECT / "tests/data/room_small"
 OUT = PROJECT / "out"
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 CAMERA = "018"
 PERCENTAGE = int(sys.argv[1]) if len(sys.argv) > 1 else 125
 """Size of the pictures; those of the README are 200 % of what the cameras saw."""
@@ -44,12 +49,27 @@ def training_cameras(path: Path) -> int:
     return len(chosen)
 
 
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Keep what Blender prints while rendering off the terminal; it bypasses Python's stdout."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    with Path(os.devnull).open("w") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+
+
 def picture(name: str, mode: str) -> Path:
     """Render what the camera sees of the splats into ``out/``; return the file."""
     scene, obj = bpy.context.scene, bpy.context.object
     preview.show(obj, mode, style="SPLATS")
     scene.render.filepath = str(OUT / name)
-    bpy.ops.render.render(write_still=True)
+    with quiet():
+        bpy.ops.render.render(write_still=True)
     preview.hide(obj)
     return OUT / name
 
