@@ -579,6 +579,8 @@ def test_interrupted_in_the_middle_of_a_write_it_leaves_what_was_there(folder, o
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
+        # Whoever runs the tests in the background has Ctrl-C ignored, and programs inherit that.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
     ) as process:
         assert process.stdout.readline() == b"halfway\n"
         process.send_signal(signal.SIGINT)
