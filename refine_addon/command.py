@@ -44,13 +44,15 @@ DONE, FAILED, USAGE, CANCELLED = 0, 1, 2, 130
 DEFAULT_RATIO = 0.5
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments: Sequence[str], *, scene: bool = False) -> int:
     """Run the command.
 
     Parameters
     ----------
     arguments : sequence of str
         What stands behind ``refine`` on the command line.
+    scene : bool
+        Whether this runs in Blender, whose open scene has objects and cameras.
 
     Returns
     -------
@@ -59,7 +61,7 @@ def main(arguments: Sequence[str]) -> int:
     """
     parser = make_parser()
     try:
-        options = parser.parse_args(list(arguments))
+        options = parser.parse_args(list(arguments), argparse.Namespace(scene=scene))
         _check_usage(parser, options)
     except SystemExit as leaving:  # argparse leaves the process; Blender wants a number
         return int(leaving.code or 0)
@@ -201,7 +203,7 @@ def _check_usage(parser: argparse.ArgumentParser, options: argparse.Namespace) -
             _budget(options)
     except RefineError as error:
         parser.error(str(error))
-    if options.cameras is None and not _scene_is_open():
+    if options.cameras is None and not (options.scene and _scene_is_open()):
         parser.error("no cameras: give --cameras, or open a .blend that has some")
     if options.run is _run_prune:
         _check_prune(parser, options)
@@ -225,7 +227,7 @@ def _check_prune(parser: argparse.ArgumentParser, options: argparse.Namespace) -
     if bool(options.inputs) == bool(options.object):
         parser.error("expected INPUT files or --object NAME, and not both")
     if options.object:
-        if not _in_blender():
+        if not options.scene:
             parser.error(
                 "--object needs Blender: blender -b scene.blend --command refine prune ..."
             )
@@ -263,13 +265,7 @@ def _budget(options: argparse.Namespace) -> Budget:
     return Budget(**(given or {"ratio": DEFAULT_RATIO}))
 
 
-def _in_blender() -> bool:
-    return "bpy" in sys.modules
-
-
 def _scene_is_open() -> bool:
-    if not _in_blender():
-        return False
     import bpy  # noqa: PLC0415 - only there inside Blender
 
     return bool(bpy.data.filepath)

@@ -56,7 +56,7 @@ def register() -> None:
     bpy.types.WindowManager.refine_progress = FloatProperty(default=-1.0, options={"SKIP_SAVE"})
     bpy.types.TOPBAR_MT_file_import.append(_draw_import)
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
-    _commands.append(bpy.utils.register_cli_command("refine", command.main))
+    _commands.append(bpy.utils.register_cli_command("refine", _run_command))
 
 
 def unregister() -> None:
@@ -68,6 +68,10 @@ def unregister() -> None:
     del bpy.types.Scene.refine
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)
+
+
+def _run_command(arguments: list[str]) -> int:
+    return command.main(arguments, scene=True)
 
 
 def _draw_import(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:

@@ -30,7 +30,7 @@ def test_the_command_on_an_object_writes_what_it_writes_for_the_file(addon, scen
         *("--cameras", str(ROOM / "cameras.json")),
     ]
 
-    assert addon.command.main(by_object) == 0
+    assert addon.command.main(by_object, scene=True) == 0
     assert addon.command.main(by_file) == 0
     assert (tmp_path / "object.ply").read_bytes() == (tmp_path / "file.ply").read_bytes()
     assert len(bpy.data.objects["room"].data.vertices) == 39755
@@ -38,7 +38,7 @@ def test_the_command_on_an_object_writes_what_it_writes_for_the_file(addon, scen
 
 def test_save_prunes_the_object_in_the_blend(addon, scene_file):
     """Half of 39755 go, 19878 stay, and are there when the file is opened again."""
-    assert addon.command.main(["prune", "--object", "room", "--save", "--quiet"]) == 0
+    assert addon.command.main(["prune", "--object", "room", "--save", "--quiet"], scene=True) == 0
     bpy.ops.wm.open_mainfile(filepath=str(scene_file))
     mesh = bpy.data.objects["room"].data
 
