@@ -75,7 +75,8 @@ class Row:
 
     Attributes
     ----------
-    kept : int
+    kept, asked : int
+        How many splats are left, and how many should be.
     quality : dict of (views, reference) to dict of str to float
         Views "held-out" or "scoring", reference "renders" or "pictures" -> metric -> mean.
     """
@@ -83,6 +84,7 @@ class Row:
     method: Method
     ratio: float
     kept: int
+    asked: int
     cost: Cost
     quality: dict[tuple[str, str], dict[str, float]]
 
@@ -162,10 +164,10 @@ def measure_method(
         if method.rendered:
             scoring = scoring.plus(rendering[1])
     for ratio in ratios:
-        gone = Budget(ratio=ratio).removals(len(task.splats)) or 0
-        left, cost = _reduced(method, task, (ratio, len(task.splats) - gone), scores, runs)
+        asked = len(task.splats) - (Budget(ratio=ratio).removals(len(task.splats)) or 0)
+        left, cost = _reduced(method, task, (ratio, asked), scores, runs)
         cost = cost.plus(scoring) if scores is not None else cost
-        rows.append(Row(method, ratio, len(left), cost, judge(left)))
+        rows.append(Row(method, ratio, len(left), asked, cost, judge(left)))
         psnr = rows[-1].quality["held-out", "renders"]["psnr"]
         print(f"  {method.name:28} {ratio:4.0%} {psnr:7.2f} dB {cost.seconds:8.2f} s", flush=True)
     return rows

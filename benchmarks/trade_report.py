@@ -110,7 +110,7 @@ def write(output: Path, scenes: Sequence[Measured], options: argparse.Namespace)
             plot = output.with_name(f"{output.stem}_{scene.name}.png")
             draw(plot, scene)
             lines += ["", f"![Quality over time, {scene.name}]({plot.name})"]
-            lines += ["", *_main_table(scene), "", *_detail_tables(scene)]
+            lines += ["", *_main_table(scene), *_miscounts(scene), "", *_detail_tables(scene)]
         lines += _ablation_table(scene, options.ratios) + _flops_table(scene)
         lines += _hessian_table(scene)
         lines += ["", *(f"- Failed: {what}" for what in scene.failed)] if scene.failed else []
@@ -160,6 +160,16 @@ def _main_table(scene: Measured) -> list[str]:
     heads = ["PSNR, held-out views", *(f"{row.ratio:.0%}" for row in first), "seconds", "MB"]
     return ["Removed, against renders of the unpruned splats (ours in bold, best in bold):", "",
             *_table(heads, body)]  # fmt: skip
+
+
+def _miscounts(scene: Measured) -> list[str]:
+    """Say where a method left more or fewer splats than asked for: it is not comparable there."""
+    notes = [
+        f"- {row.method.name} left {row.kept:,} splats at {row.ratio:.0%}, not {row.asked:,}"
+        for row in scene.rows
+        if row.kept != row.asked
+    ]
+    return ["", *notes] if notes else []
 
 
 def _detail_tables(scene: Measured) -> list[str]:

@@ -128,6 +128,22 @@ def test_what_fails_is_said_and_the_rest_is_kept(
     assert "| random |" in output.read_text()
 
 
+def test_a_method_that_leaves_another_number_is_told_apart(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Better pictures of more splats would flatter it."""
+    greedy = methods.Method(
+        "greedy", methods.OURS, "", reduce=lambda task, count, _: task.splats.take(slice(count + 9))
+    )
+    monkeypatch.setattr(methods, "everything", lambda: [greedy])
+    output = tmp_path / "trade.md"
+
+    trade.main([str(small), "--ratios", "0.5", "--runs", "1", "--judged", "1", "--metrics", "psnr",
+                "--parts", "methods", "--output", str(output)])  # fmt: skip
+
+    assert "- greedy left 1,509 splats at 50%, not 1,500" in output.read_text()
+
+
 def test_a_folder_that_is_no_scene_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
