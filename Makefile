@@ -34,6 +34,7 @@ bench: $(BENCH)       ## speed and memory, with medians
 	$(PY) -m benchmarks.in_blender
 
 bench-trade: $(BENCH) ## quality over time: docs/trade.md; SCENES="folder ..." measures others
+	-$(PY) -m benchmarks.splat_transform
 	$(PY) -m benchmarks.trade $(SCENES)
 
 fuzz: $(DEV)          ## hostile files, for SECONDS

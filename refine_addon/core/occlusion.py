@@ -170,10 +170,11 @@ def measure(
         splats, views, progress=part(progress, 0.0, 0.1), threads=threads
     )
     run = _Run(gaussians, frame, views, settings, threads)
-    some = run.measure(gaussians, part(progress, 0.1, 1.0))
-    every = Measured.zero(len(splats))
-    for own, values in zip(vars(every).values(), vars(some).values(), strict=True):
-        own[gaussians.index] = values
+    first, second = run.measure(gaussians, part(progress, 0.1, 1.0))
+    some, every = first.plus(second), Measured.zero(len(splats))
+    every.contribution[gaussians.index] = some.contribution
+    every.contrast[gaussians.index] = some.contrast
+    every.seen[gaussians.index] = some.seen
     return every
 
 
