@@ -3,8 +3,9 @@
 What no scoring view shows may be plain to see from elsewhere. So every splat gets a floor, the
 closed form, which knows nothing of occlusion; the question is how much of it. Views spread densely
 around a scene show all that can be seen, and the floor only keeps what is truly hidden; a few views
-leave much to be guessed. The views answer it themselves: one half of them scores with each weight
-of the prior, and the weight that loses least of what the other half measured is taken.
+leave much to be guessed. The views answer it themselves: an eighth of them at a time is left out,
+the others score with each weight of the floor, and the weight that loses least of what the views
+left out measured is taken.
 """
 
 from __future__ import annotations
@@ -14,59 +15,72 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
-WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-5.0, 0.5, 0.5)))
-"""What is tried, of the mean of the scores."""
+WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-4.0, 1.5, 0.5)))
+"""What is tried, of the mean of the scores for a splat of mean worth that no view looks at."""
 
 SHARES = (0.3, 0.5, 0.7, 0.9)
 """Shares removed at which it is judged."""
 
-DOUBLED = 0.25
-"""All views need so much of the weight that half of them need: it falls about hundredfold from 4
-to 31 views, three doublings (measured on the committed scene's scoring views)."""
-
-_SAMPLE = 1 << 16
+SAMPLE = 1 << 15
+"""How many splats are enough to choose by."""
 
 
-def with_prior(
-    scores: NDArray[np.float64], prior: NDArray[np.float64], weight: float
-) -> NDArray[np.float64]:
-    """Return ``scores / mean + weight prior / mean``, (n,)."""
-    return _unit(scores) + weight * _unit(prior)
+def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> NDArray[np.float64]:
+    """Return what a splat that these views do not show may be worth to others, (n,).
 
-
-def prior_weight(
-    halves: tuple[NDArray[np.float64], NDArray[np.float64]],
-    errors: tuple[NDArray[np.float64], NDArray[np.float64]],
-    prior: NDArray[np.float64],
-) -> float:
-    """Return the weight that the prior should have beside the scores of all views.
+    Of n views that might have shown it none did: by the rule of succession the next one does with
+    a chance of about 1 / (n + 1). The score has `power` factors that visibility enters.
 
     Parameters
     ----------
-    halves : two of (n,) float64
-        Scores by either half of the views.
-    errors : two of (n,) float64
-        What removing a splat costs either half of the views.
     prior : (n,) float64
-        Neighbours in the scene should be near each other: every k-th is judged.
+        Worth if nothing hid anything.
+    seen : (n,) int32
+        In how many views the centre lies.
+    power : float
     """
-    step = -(-len(prior) // _SAMPLE)
-    sample = slice(None, None, step)
-    chosen = []
-    for mine, other in ((0, 1), (1, 0)):
-        truth = errors[other][sample]
-        if not truth.any() or not halves[mine][sample].any():
-            return WEIGHTS[-1]
-        losses = [
-            _loss(with_prior(halves[mine][sample], prior[sample], weight), truth)
-            for weight in WEIGHTS
-        ]
-        chosen.append(losses)
-    best = int(np.argmin(np.mean(chosen, axis=0)))
-    # The largest that was tried is the best of them: nothing says that it is too much.
-    return WEIGHTS[best] * (DOUBLED if best < len(WEIGHTS) - 1 else 1.0)
+    return np.asarray(_unit(prior**power) / (1.0 + seen) ** power)
+
+
+def with_floor(
+    scores: NDArray[np.float64], floors: NDArray[np.float64], weight: float
+) -> NDArray[np.float64]:
+    """Return ``scores / mean + weight floors``, (n,)."""
+    return _unit(scores) + weight * floors
+
+
+def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> NDArray[np.float64]:
+    """Return the weight that the floor should have, for each of `SHARES`.
+
+    Parameters
+    ----------
+    folds : iterable of three of (n,) float64
+        Scores by some views, floors by them, and the errors of removing a splat for the others.
+        Folds in which nothing is seen by the one or the others say nothing.
+
+    Returns
+    -------
+    (len(SHARES),) float64
+        1 where no fold says anything.
+    """
+    losses = [
+        [_losses(with_floor(scores, floors, weight), errors) for weight in WEIGHTS]
+        for scores, floors, errors in folds
+        if scores.any() and errors.any()
+    ]
+    if not losses:
+        return np.ones(len(SHARES))
+    # The smallest weight that is not worse than the best by more than one standard error of the
+    # difference (Breiman et al. 1984): a floor must earn its place.
+    table = np.array(losses)  # (folds, weights, shares)
+    best = np.argmin(table.mean(axis=0), axis=0)
+    worse = table - np.take_along_axis(table, best[None, None, :], axis=1)
+    allowed = worse.std(axis=0) / np.sqrt(max(len(table) - 1, 1))
+    return np.asarray(np.array(WEIGHTS)[np.argmax(worse.mean(axis=0) <= allowed, axis=0)])
 
 
 def _unit(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -74,8 +88,8 @@ def _unit(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return values / mean if mean > 0.0 else np.zeros_like(values)
 
 
-def _loss(scores: NDArray[np.float64], truth: NDArray[np.float64]) -> float:
-    """Mean over `SHARES` of the logarithm of the share of `truth` that would go."""
+def _losses(scores: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the logarithm of the share of `truth` that goes, for each of `SHARES`."""
     running = np.cumsum(truth[np.argsort(scores, kind="stable")])
     going = running[[max(int(share * len(truth)) - 1, 0) for share in SHARES]]
-    return float(np.mean(np.log(np.maximum(going / running[-1], 1e-12))))
+    return np.asarray(np.log(np.maximum(going / running[-1], 1e-12)))

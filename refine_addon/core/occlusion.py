@@ -28,6 +28,8 @@ from .scores import Scores
 from .work import Progress, for_chunks, part, silent
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from .projection import Frame, Gaussians
@@ -138,7 +140,13 @@ def score(
         )
         raise RefineError(msg)
     values[~good] = 0.0
-    return Scores(values, seen, len(views), int(np.count_nonzero(~good)), {"prior": run.weight})
+    return Scores(
+        values,
+        seen,
+        len(views),
+        int(np.count_nonzero(~good)),
+        {"prior": dict(zip(map(str, coverage.SHARES), run.weights.tolist(), strict=True))},
+    )
 
 
 def measure(
@@ -170,8 +178,8 @@ def measure(
         splats, views, progress=part(progress, 0.0, 0.1), threads=threads
     )
     run = _Run(gaussians, frame, views, settings, threads)
-    first, second = run.measure(gaussians, part(progress, 0.1, 1.0))
-    some, every = first.plus(second), Measured.zero(len(splats))
+    some = Measured.sum(run.measure(gaussians, part(progress, 0.1, 1.0)))
+    every = Measured.zero(len(splats))
     every.contribution[gaussians.index] = some.contribution
     every.contrast[gaussians.index] = some.contrast
     every.seen[gaussians.index] = some.seen
@@ -196,7 +204,7 @@ class _Run:
             threads,
         )
         self.shown = False  # whether any view sees anything
-        self.weight = 0.0  # of the prior
+        self.weights = np.zeros(len(coverage.SHARES))  # of the prior
         self.views = _by_distance(views)
 
     def rank(
@@ -215,33 +223,51 @@ class _Run:
             gone += len(going)
             # Each round has the views times what is left to do; all of them about thrice the first.
             end = start + (1.0 - start) * max(1.0 / (rounds - number), 0.25)
-            halves = self.measure(left, part(progress, start, end))
+            blocks = self.measure(left, part(progress, start, end))
             start, share = end, gone / count
-            floor = prior[left.index].astype(np.float64) ** (1.0 + _exponent(share))
+            measured = Measured.sum(blocks)
             if number == 0:
-                self.weight = self._weigh(halves, floor)
-            measured = halves[0].plus(halves[1])
-            if number == 0:
+                self.weights = self._weigh(blocks, measured, prior)
                 seen[left.index] = measured.seen
                 self.shown = bool(measured.contribution.any())
-            scores = coverage.with_prior(combined(measured, share), floor, self.weight)
-            order = np.lexsort((prior[left.index], scores))
             last = number == rounds - 1
             stay = 0 if last else round(count * LEAST ** ((number + 1) / (rounds - 1)))
+            weight = np.interp(1.0 - stay / count, coverage.SHARES, self.weights)
+            floors = coverage.floor(
+                prior[left.index].astype(np.float64), measured.seen, 1.0 + _exponent(share)
+            )
+            scores = coverage.with_floor(combined(measured, share), floors, float(weight))
+            order = np.lexsort((prior[left.index], scores))
             go = max(len(left) - stay, 0)
             going = left.index[order[:go]]
             left = left.take(np.sort(order[go:]))
         values[going] = np.arange(gone + 1, gone + len(going) + 1) / count
         return values, seen
 
-    def _weigh(self, halves: tuple[Measured, Measured], floor: NDArray[np.float64]) -> float:
-        first, second = halves
-        return coverage.prior_weight(
-            (combined(first, 0.0), combined(second, 0.0)), (first.contrast, second.contrast), floor
-        )
+    def _weigh(
+        self, blocks: list[Measured], measured: Measured, prior: NDArray[np.float32]
+    ) -> NDArray[np.float64]:
+        """Return the weights of the floor by what each block of views says of the others."""
+        step = -(-len(self.gaussians) // coverage.SAMPLE)
+        some = slice(None, None, max(step, 1))  # neighbours follow each other: all over the scene
+        worth = prior[self.gaussians.index[some]].astype(np.float64)
+        power = 1.0 + _exponent(0.0)
 
-    def measure(self, gaussians: Gaussians, progress: Progress) -> tuple[Measured, Measured]:
-        """Sum contribution and contrast of the Gaussians over either half of the views."""
+        def folds() -> Iterator[tuple[NDArray[np.float64], ...]]:
+            for block in blocks if len(blocks) > 1 else ():
+                others = Measured(
+                    # What is left of a sum may be negative by rounding.
+                    np.maximum(measured.contribution[some] - block.contribution[some], 0.0),
+                    np.maximum(measured.contrast[some] - block.contrast[some], 0.0),
+                    measured.seen[some] - block.seen[some],
+                )
+                floors = coverage.floor(worth, others.seen, power)
+                yield combined(others, 0.0), floors, block.contrast[some]
+
+        return coverage.floor_weights(folds())
+
+    def measure(self, gaussians: Gaussians, progress: Progress) -> list[Measured]:
+        """Sum contribution and contrast of the Gaussians over the views of each block."""
         blocks = min(_BLOCKS, len(self.views))
 
         def block(piece: slice) -> Measured:
@@ -250,25 +276,23 @@ class _Run:
                 measure_view(gaussians, self.frame, view, weight, self.settings, total)
             return total
 
-        totals = for_chunks(
-            block, blocks, 1, progress=progress, what="scoring", threads=self.threads
-        )
-        halves = Measured.zero(len(gaussians)), Measured.zero(len(gaussians))
-        for number, total in enumerate(totals):
-            halves[number % 2].add(total)
-        return halves
+        return for_chunks(block, blocks, 1, progress=progress, what="scoring", threads=self.threads)
 
 
 def _by_distance(views: ViewSet) -> list[tuple[View, float]]:
     """Return views and weights, those of no weight left out, in an order that the scene gives.
 
-    By distance from the middle: neither the order of the list nor the frame decides which half of
-    the views a view belongs to.
+    By distance from the middle, then from the view farthest from it: neither the order of the list
+    nor, unless they are all alike, the frame decides which block a view belongs to.
     """
     centers = views.centers - views.weights @ views.centers
-    distance = np.einsum("ij,ij->i", centers, centers)
-    farthest = centers - centers[np.argmax(distance)]
-    order = np.lexsort((np.einsum("ij,ij->i", farthest, farthest), distance))
+    order = np.lexsort((*centers.T, *views.rotations[:, 2].T))
+    for _ in range(2):
+        distance = np.einsum("ij,ij->i", centers, centers)
+        largest = float(distance.max()) or 1.0
+        # Rounded, so that what is equal but for rounding keeps the order it has.
+        order = order[np.argsort(np.round(distance[order] / largest, 9), kind="stable")]
+        centers = centers - centers[order[-1]]
     return [(views[int(k)], float(views.weights[k])) for k in order if views.weights[k] > 0]
 
 
@@ -293,11 +317,12 @@ class Measured:
         """Return sums of no views."""
         return cls(np.zeros(count), np.zeros(count), np.zeros(count, np.int32))
 
-    def plus(self, other: Measured) -> Measured:
-        """Return the sums of both."""
-        total = Measured.zero(len(self.seen))
-        total.add(self)
-        total.add(other)
+    @classmethod
+    def sum(cls, parts: list[Measured]) -> Measured:
+        """Return the sums of all parts."""
+        total = cls.zero(len(parts[0].seen))
+        for other in parts:
+            total.add(other)
         return total
 
     def add(self, other: Measured) -> None:
