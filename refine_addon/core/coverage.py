@@ -53,34 +53,34 @@ def with_floor(
     return _unit(scores) + weight * floors
 
 
-def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> NDArray[np.float64]:
-    """Return the weight that the floor should have, for each of `SHARES`.
+def floor_weight(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> float:
+    """Return the weight that the floor should have.
 
     Parameters
     ----------
-    folds : iterable of three of (n,) float64
-        Scores by some views, floors by them, and the errors of removing a splat for the others.
-        Folds in which nothing is seen by the one or the others say nothing.
+    folds : iterable of scores, floors, errors
+        Scores by some views, floors by them, and for each of the others, (views, n), the errors
+        of removing a splat. Views that see nothing say nothing.
 
     Returns
     -------
-    (len(SHARES),) float64
+    float
         1 where no fold says anything.
     """
-    losses = [
-        [_losses(with_floor(scores, floors, weight), errors) for weight in WEIGHTS]
-        for scores, floors, errors in folds
-        if scores.any() and errors.any()
-    ]
+    losses = []
+    for scores, floors, errors in folds:
+        views = errors[errors.any(axis=1)]
+        if scores.any() and len(views):
+            tried = [_losses(with_floor(scores, floors, weight), views) for weight in WEIGHTS]
+            losses.append(np.stack(tried, axis=1).mean(axis=2))
     if not losses:
-        return np.ones(len(SHARES))
+        return 1.0
     # The smallest weight that is not worse than the best by more than one standard error of the
     # difference (Breiman et al. 1984): a floor must earn its place.
-    table = np.array(losses)  # (folds, weights, shares)
-    best = np.argmin(table.mean(axis=0), axis=0)
-    worse = table - np.take_along_axis(table, best[None, None, :], axis=1)
+    table = np.concatenate(losses)  # (views, weights)
+    worse = table - table[:, [np.argmin(table.mean(axis=0))]]
     allowed = worse.std(axis=0) / np.sqrt(max(len(table) - 1, 1))
-    return np.asarray(np.array(WEIGHTS)[np.argmax(worse.mean(axis=0) <= allowed, axis=0)])
+    return WEIGHTS[int(np.argmax(worse.mean(axis=0) <= allowed))]
 
 
 def _unit(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -88,8 +88,8 @@ def _unit(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return values / mean if mean > 0.0 else np.zeros_like(values)
 
 
-def _losses(scores: NDArray[np.float64], truth: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the logarithm of the share of `truth` that goes, for each of `SHARES`."""
-    running = np.cumsum(truth[np.argsort(scores, kind="stable")])
-    going = running[[max(int(share * len(truth)) - 1, 0) for share in SHARES]]
-    return np.asarray(np.log(np.maximum(going / running[-1], 1e-12)))
+def _losses(scores: NDArray[np.float64], errors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the logarithm of the share of each view's errors that goes, (views, SHARES)."""
+    running = np.cumsum(errors[:, np.argsort(scores, kind="stable")], axis=1)
+    places = [max(int(share * len(scores)) - 1, 0) for share in SHARES]
+    return np.asarray(np.log(np.maximum(running[:, places] / running[:, -1:], 1e-12)))

@@ -145,7 +145,7 @@ def score(
         seen,
         len(views),
         int(np.count_nonzero(~good)),
-        {"prior": dict(zip(map(str, coverage.SHARES), run.weights.tolist(), strict=True))},
+        {"floor": run.weight},
     )
 
 
@@ -204,8 +204,11 @@ class _Run:
             threads,
         )
         self.shown = False  # whether any view sees anything
-        self.weights = np.zeros(len(coverage.SHARES))  # of the prior
+        self.weight = 0.0  # of the floor
         self.views = _by_distance(views)
+        # Neighbours follow each other, so every k-th of them is all over the scene.
+        self.some = slice(None, None, max(-(-len(gaussians) // coverage.SAMPLE), 1))
+        self.errors: dict[int, list[NDArray[np.float64]]] = {}  # of those, for the views of a block
 
     def rank(
         self, prior: NDArray[np.float32], progress: Progress
@@ -227,16 +230,15 @@ class _Run:
             start, share = end, gone / count
             measured = Measured.sum(blocks)
             if number == 0:
-                self.weights = self._weigh(blocks, measured, prior)
+                self.weight = self._weigh(blocks, measured, prior)
                 seen[left.index] = measured.seen
                 self.shown = bool(measured.contribution.any())
             last = number == rounds - 1
             stay = 0 if last else round(count * LEAST ** ((number + 1) / (rounds - 1)))
-            weight = np.interp(1.0 - stay / count, coverage.SHARES, self.weights)
             floors = coverage.floor(
                 prior[left.index].astype(np.float64), measured.seen, 1.0 + _exponent(share)
             )
-            scores = coverage.with_floor(combined(measured, share), floors, float(weight))
+            scores = coverage.with_floor(combined(measured, share), floors, self.weight)
             order = np.lexsort((prior[left.index], scores))
             go = max(len(left) - stay, 0)
             going = left.index[order[:go]]
@@ -246,15 +248,14 @@ class _Run:
 
     def _weigh(
         self, blocks: list[Measured], measured: Measured, prior: NDArray[np.float32]
-    ) -> NDArray[np.float64]:
-        """Return the weights of the floor by what each block of views says of the others."""
-        step = -(-len(self.gaussians) // coverage.SAMPLE)
-        some = slice(None, None, max(step, 1))  # neighbours follow each other: all over the scene
+    ) -> float:
+        """Return the weight of the floor by what each block of views says of the others."""
+        some = self.some
         worth = prior[self.gaussians.index[some]].astype(np.float64)
         power = 1.0 + _exponent(0.0)
 
         def folds() -> Iterator[tuple[NDArray[np.float64], ...]]:
-            for block in blocks if len(blocks) > 1 else ():
+            for number, block in enumerate(blocks if len(blocks) > 1 else ()):
                 others = Measured(
                     # What is left of a sum may be negative by rounding.
                     np.maximum(measured.contribution[some] - block.contribution[some], 0.0),
@@ -262,9 +263,9 @@ class _Run:
                     measured.seen[some] - block.seen[some],
                 )
                 floors = coverage.floor(worth, others.seen, power)
-                yield combined(others, 0.0), floors, block.contrast[some]
+                yield combined(others, 0.0), floors, np.array(self.errors[number])
 
-        return coverage.floor_weights(folds())
+        return coverage.floor_weight(folds())
 
     def measure(self, gaussians: Gaussians, progress: Progress) -> list[Measured]:
         """Sum contribution and contrast of the Gaussians over the views of each block."""
@@ -272,8 +273,12 @@ class _Run:
 
         def block(piece: slice) -> Measured:
             total = Measured.zero(len(gaussians))
+            errors = []
             for view, weight in self.views[piece.start :: blocks]:
+                before = total.contrast[self.some].copy()
                 measure_view(gaussians, self.frame, view, weight, self.settings, total)
+                errors.append(total.contrast[self.some] - before)
+            self.errors[piece.start] = errors
             return total
 
         return for_chunks(block, blocks, 1, progress=progress, what="scoring", threads=self.threads)
