@@ -116,7 +116,7 @@ def score(
 
     Notes
     -----
-    Memory: about 130 bytes a splat, and for each thread 100 bytes a point of one view, of which
+    Memory: about 300 bytes a splat, and for each thread 100 bytes a point of one view, of which
     there are at most 4 million (`froxels.MAX_POINTS`).
     """
     if not len(splats):
