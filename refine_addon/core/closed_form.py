@@ -142,7 +142,7 @@ def score(
         msg = "there are no splats to score"
         raise RefineError(msg)
     scene = _Scene(splats, views, settings)
-    for_chunks(
+    ratios = for_chunks(
         scene.read, len(splats), 4 * _CHUNK,
         progress=part(progress, 0.0, 0.2), what="reading", threads=threads,
     )  # fmt: skip
@@ -160,13 +160,13 @@ def score(
             f"{len(views)} views; check that cameras and splats share their frame and unit"
         )
         raise RefineError(msg)
-    return scene.scores()
+    return scene.scores(sum(ratios))
 
 
 class _Scene:
     """What the formula needs of N splats, filled chunk by chunk.
 
-    The splats are read once, since they may be a file larger than memory: 57 bytes of each stay.
+    The splats are read once, since they may be a file larger than memory: 65 bytes of each stay.
     """
 
     def __init__(self, splats: Splats, views: ViewSet, settings: ClosedForm) -> None:
@@ -175,13 +175,12 @@ class _Scene:
         count = len(splats)
         self.good = np.empty(count, np.bool_)
         self.means = np.empty((count, 3), splats.means.dtype.newbyteorder("="))
-        self.squared, self.alpha, self.luma, self.area, self.ratio, self.weight = (
-            np.empty(count) for _ in range(6)
-        )
+        self.squared, self.alpha, self.area, self.weight = (np.empty(count) for _ in range(4))
+        self.luma = np.empty(count, np.float32)  # in 0..1, to 6e-8
         self.seen = np.zeros(count, np.int32)
 
-    def read(self, piece: slice) -> None:
-        """Activate one slice of splats."""
+    def read(self, piece: slice) -> float:
+        """Activate one slice of splats; return the sum of the axis ratios of those drawable."""
         chunk = self.splats.take(piece)
         good = self.good[piece] = drawable(chunk)
         means = self.means[piece] = np.where(good[:, None], chunk.means, 0.0)
@@ -193,7 +192,8 @@ class _Scene:
             red, green, blue = base_color(np.where(good[:, None], chunk.sh_dc, 0.0)).T
             self.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
             logs = np.where(good[:, None], chunk.log_scales, 0.0).astype(np.float64)
-            self.area[piece], self.ratio[piece] = self._axes(logs)
+            self.area[piece], ratio = self._axes(logs)
+        return float(ratio[good].sum())
 
     def _axes(self, logs: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the product of the two largest scales, and longest over shortest."""
@@ -263,13 +263,13 @@ class _Scene:
             depth += np.multiply(step, step, out=step)
         return depth
 
-    def scores(self) -> Scores:
-        """Weigh the three terms and return their sum."""
+    def scores(self, ratios: float) -> Scores:
+        """Weigh the three terms and return their sum; `ratios` is the sum of all axis ratios."""
         good = self.good
         alpha, luma = self.alpha[good], self.luma[good]
         statistics = adaptive.Statistics(
-            anisotropy=float(np.mean(self.ratio[good])),
-            luma_variance=float(np.var(luma)),
+            anisotropy=ratios / len(alpha),
+            luma_variance=float(np.var(luma, dtype=np.float64)),
             translucency=float(np.mean(4.0 * alpha * (1.0 - alpha))),
         )
         lambdas = (1 / 3, 1 / 3, 1 / 3)
@@ -277,7 +277,7 @@ class _Scene:
             lambdas = adaptive.weights(statistics, offset=self.settings.anisotropy_offset or 0.0)
         values = np.zeros(len(good))
         with np.errstate(under="ignore"):
-            contents = (self.area, self.luma * self.luma, self.alpha * self.alpha)
+            contents = (self.area, self.luma.astype(np.float64) ** 2, self.alpha * self.alpha)
             for weight, content in zip(lambdas, contents, strict=True):
                 term = self.weight * content
                 mean = np.mean(term)
