@@ -11,7 +11,11 @@ from .neighbours import nearest
 from .work import Progress, for_chunks, part, report, silent
 
 if TYPE_CHECKING:
-    from .merging import Array, Field, Index
+    from numpy.typing import NDArray
+
+    from .merge_field import Array, Field, Index
+
+    Rows = NDArray[np.int32]
 
 NEIGHBOURS = 8
 """Nearest neighbours of each splat that it may be merged with."""
@@ -74,14 +78,21 @@ class MergeGraph:
         """Find the pairs of near splats that the views see, and price them."""
         rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))
         near = nearest(self.field.means[rows], NEIGHBOURS, progress=progress, threads=self.threads)
-        count = len(rows)
-        own = np.arange(count)[:, None]
-        keys = np.unique(np.minimum(own, near) * count + np.maximum(own, near))
-        # Half the memory: no file holds two billion splats.
-        self.first = rows[keys // max(count, 1)].astype(np.int32)
-        self.second = rows[keys % max(count, 1)].astype(np.int32)
-        self.cost = np.empty(len(keys))
-        self._price(np.arange(len(keys)))
+
+        def pairs(piece: slice) -> tuple[Rows, Rows]:
+            own, others = np.arange(piece.start, piece.stop)[:, None], near[piece]
+            # A pair that is near from both sides counts once.
+            once = (own < others) | ~(near[others] == own[:, :, None]).any(axis=2)
+            own = np.broadcast_to(own, others.shape)
+            return rows[own[once]].astype(np.int32), rows[others[once]].astype(np.int32)
+
+        found = for_chunks(pairs, len(rows), _CHUNK, threads=self.threads)
+        none = np.empty(0, np.int32)
+        # Half the memory of other integers: no file holds two billion splats.
+        self.first = np.concatenate([none, *(first for first, _ in found)])
+        self.second = np.concatenate([none, *(second for _, second in found)])
+        self.cost = np.empty(len(self.first))
+        self._price(np.arange(len(self.first), dtype=np.int32))
 
     def _price(self, edges: Index) -> None:
         """Compute the cost of some pairs; infinite where deleting one of the two costs less."""
@@ -90,7 +101,9 @@ class MergeGraph:
             mine = edges[piece]
             first, second = self.first[mine], self.second[mine]
             with np.errstate(under="ignore"):
-                cost = merging.price(self.field, first, second).cost * self.patience
+                # Two directions, for a merge along one of them costs nothing seen from there.
+                costs = [merging.price(self.field, first, second, tilt).cost for tilt in (-1, 1)]
+            cost = 0.5 * self.patience * (costs[0] + costs[1])
             least = np.minimum(self.field.error[first], self.field.error[second])
             self.cost[mine] = np.where(cost < least, cost, np.inf)
 

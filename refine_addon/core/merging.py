@@ -7,8 +7,8 @@ the pixels of all views; T is the transmittance in front of it::
     contribution  W_i = sum of T alpha              error  E_i = sum of (T alpha)^2 |s_i|^2
 
 E is what deleting the splat costs. Merging i and j to m costs the squared error of the picture,
-in the plane that the cameras look at (across the mean viewing direction of the pair), with the
-inner products ``<f, g>`` of Gaussians in closed form::
+in the plane that the cameras look at (across the viewing direction of the pair), with the inner
+products ``<f, g>`` of Gaussians in closed form::
 
     p = f_i - l_i f_m,  q = f_j - l_j f_m                l: share of the colour, l_i + l_j = 1
     cost = tau (|s_i|^2 <p, p> + 2 s_i.s_j <p, q> + |s_j|^2 <q, q>)
@@ -19,102 +19,35 @@ The merged splat has the mean and covariance of both (weights: mass), their colo
 contribution) and, by its opacity, their mass less the overlap, which the eye counts once:
 ``A_m = A_i + A_j - <f_i, f_j>``. Where that would take an opacity above `OPACITY_MAX`, the splat
 grows instead.
+
+What lies one behind the other along the mean direction would merge for nothing, but other views
+look past it: costs are taken from two directions, a standard deviation to either side (`tilt`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from . import spherical_harmonics
-from .splats import SH_C0, opacity, rotation_matrices
+from .merge_field import Field, Seen, across, footprint, normalized
 from .transform import quaternion
-from .work import for_chunks
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from .merge_field import Array, Footprint, Index
 
-    from .splats import Splats
-    from .views import ViewSet
-
-    Array = NDArray[np.float64]
-    Index = NDArray[np.int64]
-    Footprint = tuple[Array, Array, Array]
+__all__ = ["Field", "Pairs", "Seen", "axes", "merge", "price"]
 
 OPACITY_MAX = 0.99
 """Largest opacity of a merged splat; renderers show no more."""
-
-LOW_PASS = 0.3
-"""Variance that renderers add to every footprint, pixels squared."""
-
-NEAREST = 0.01
-"""Share of the scene's size below which a camera comes no nearer to a splat."""
-
-BESIDE = 1e-6
-"""Weight of a view beside whose image a splat lies, so that every splat has a direction."""
 
 FLATTEST = 1e-14
 """Least eigenvalue of a covariance over their sum: rounding leaves no less."""
 
 CHANNELS = 3
 
-_CHUNK = 1 << 14
+_CANCELLED = 1e-6
 _TINY = 1e-280
-_LOG_RANGE = 80.0
-
-
-class Seen(NamedTuple):
-    """What the views see of each of N splats; both in one unit, such as pixels of all views.
-
-    Attributes
-    ----------
-    contribution : (N,) floating
-        W, the sum of T alpha, >= 0.
-    error : (N,) floating
-        E, the sum of (T alpha)^2 times the squared contrast, >= 0.
-    """
-
-    contribution: Array
-    error: Array
-
-
-@dataclass(eq=False)
-class Field:
-    """Splats as merging sees them; the rows of merged ones are overwritten.
-
-    Attributes
-    ----------
-    means : (N, 3) float64
-    covariances : (N, 6) float64
-        xx, xy, xz, yy, yz, zz.
-    opacity, contribution, error : (N,) float64
-    direction : (N, 3) float64
-        Mean viewing direction, length 1.
-    color : (N, 3) float64
-        Seen along `direction`.
-    blur : (N,) float64
-        Variance of the low-pass at the splat, world units squared.
-    """
-
-    means: Array
-    covariances: Array
-    opacity: Array
-    contribution: Array
-    error: Array
-    direction: Array
-    color: Array
-    blur: Array
-
-    def put(self, rows: Index, other: Field) -> None:
-        """Overwrite `rows` by those of `other`."""
-        for item in fields(self):
-            getattr(self, item.name)[rows] = getattr(other, item.name)
-
-    def take(self, rows: Index) -> Field:
-        """Return a copy of some rows."""
-        return Field(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
 class Pairs(NamedTuple):
@@ -140,88 +73,7 @@ class Pairs(NamedTuple):
     error: Array
 
 
-def look(splats: Splats, views: ViewSet, *, threads: int | None = None) -> tuple[Array, Array]:
-    """Return from where the views look at splats, and how finely, whatever is between.
-
-    A view weighs what its pixels see of the splat, 1 / distance^2, and next to nothing where the
-    splat's centre lies beside the image.
-
-    Returns
-    -------
-    direction : (N, 3) float64
-        Mean viewing direction, length 1.
-    pixel : (N,) float64
-        Area of a pixel at the splat, world units squared.
-    """
-    count = len(splats)
-    direction, pixel = np.empty((count, 3)), np.empty(count)
-    seen_from = [(view, share) for view, share in zip(views, views.weights, strict=True) if share]
-    offset = np.median(splats.means, axis=0) - views.centers if count else np.ones((1, 3))
-    closest = (NEAREST**2 * float(np.median(np.sum(offset * offset, axis=1)))) or 1.0
-
-    def measure(piece: slice) -> None:
-        points = np.asarray(splats.means[piece], np.float64)
-        total, finest, toward = (
-            np.zeros(len(points)),
-            np.zeros(len(points)),
-            np.zeros((3, len(points))),
-        )
-        for view, share in seen_from:
-            offset = (points - view.center).T
-            x, y, z = view.rotation @ offset
-            inside = np.abs(view.fx * x + (view.cx - view.width / 2) * z) <= view.width / 2 * z
-            inside &= np.abs(view.fy * y + (view.cy - view.height / 2) * z) <= view.height / 2 * z
-            squared = np.maximum(np.einsum("ij,ij->j", offset, offset), closest)
-            weight = np.where(inside, share, share * BESIDE) / squared
-            toward += weight / np.sqrt(squared) * offset
-            total += weight
-            finest += weight * (view.fx * view.fy / squared)
-        direction[piece] = _normalized(toward.T)
-        pixel[piece] = total / finest
-
-    for_chunks(measure, count, _CHUNK, threads=threads)
-    return direction, pixel
-
-
-def field(splats: Splats, views: ViewSet, seen: Seen, *, threads: int | None = None) -> Field:
-    """Return drawable splats as merging sees them.
-
-    Parameters
-    ----------
-    splats : Splats
-        All drawable, in the frame and unit of the views.
-    views : ViewSet
-    seen : Seen
-    threads : int, optional
-    """
-    count = len(splats)
-    covariances, color = np.empty((count, 6)), np.empty((count, 3))
-    direction, pixel = look(splats, views, threads=threads)
-    rows, columns = np.triu_indices(3)
-
-    def fill(piece: slice) -> None:
-        logs = np.asarray(splats.log_scales[piece], np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
-        axes = rotation_matrices(splats.quaternions[piece]) * np.exp(logs)[:, None, :]
-        covariances[piece] = (axes @ np.swapaxes(axes, 1, 2))[:, rows, columns]
-        color[piece] = 0.5 + SH_C0 * np.asarray(splats.sh_dc[piece], np.float64)
-        if splats.sh_degree:
-            basis = spherical_harmonics.basis(direction[piece], splats.sh_degree)[:, 1:]
-            color[piece] += np.einsum("nk,nkc->nc", basis, splats.sh_rest[piece])
-
-    for_chunks(fill, count, _CHUNK, threads=threads)
-    return Field(
-        np.array(splats.means, np.float64),
-        covariances,
-        opacity(splats.opacity_logits),
-        np.array(seen.contribution, np.float64),
-        np.array(seen.error, np.float64),
-        direction,
-        np.maximum(color, 0.0, out=color),
-        LOW_PASS * pixel,
-    )
-
-
-def price(splats: Field, first: Index, second: Index) -> Pairs:
+def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pairs:
     """Price merges by the equations at the top of this file.
 
     The factor 2 pi of masses and products cancels and is left out.
@@ -231,9 +83,11 @@ def price(splats: Field, first: Index, second: Index) -> Pairs:
     splats : Field
     first, second : (M,) int
         Rows; both splats of a pair contribute.
+    tilt : float
+        From where: the mean viewing direction plus so many standard deviations of the directions.
     """
     color, rest = _shares(splats.contribution[first], splats.contribution[second])
-    one, two, x, y = _plane(splats, first, second, color)
+    one, two, x, y = _plane(splats, first, second, color, tilt)
     areas = _area(one), _area(two)
     mass_1, mass_2 = splats.opacity[first] * areas[0], splats.opacity[second] * areas[1]
     position, other = _shares(mass_1, mass_2)
@@ -276,7 +130,7 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
     rows, columns = np.triu_indices(3)
     spread = step[:, rows] * step[:, columns] * (position * (1.0 - position))
     covariances = position * one.covariances + (1.0 - position) * two.covariances + spread
-    direction = _normalized(color * one.direction + (1.0 - color) * two.direction)
+    direction = normalized(color * one.direction + (1.0 - color) * two.direction)
     lost = ~direction.any(axis=1)
     direction[lost] = one.direction[lost]
     return Field(
@@ -286,6 +140,7 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
         one.contribution + two.contribution,
         pairs.error,
         direction,
+        _spread(one.spread, two.spread, pairs.color),
         color * one.color + (1.0 - color) * two.color,
         pairs.color * one.blur + (1.0 - pairs.color) * two.blur,
     )
@@ -314,7 +169,7 @@ def _contrast(error: Array, whole: Array) -> Array:
 
 
 def _plane(
-    splats: Field, first: Index, second: Index, share: Array
+    splats: Field, first: Index, second: Index, share: Array, tilt: float
 ) -> tuple[Footprint, Footprint, Array, Array]:
     """Return both footprints and the step between them, across the pair's viewing direction.
 
@@ -332,44 +187,27 @@ def _plane(
     normal = splats.direction[first] * share[:, None]
     normal += splats.direction[second] * (1.0 - share)[:, None]
     # Seen from opposite sides alike: the plane across the first one's direction is as good.
-    lost = np.einsum("ij,ij->i", normal, normal) < BESIDE
+    lost = np.einsum("ij,ij->i", normal, normal) < _CANCELLED
     normal[lost] = splats.direction[first[lost]]
-    across = _across(_normalized(normal))
+    if tilt:
+        normal += tilt * _spread(splats.spread[first], splats.spread[second], share)
+    plane = across(normalized(normal))
     blur = share * splats.blur[first]
     blur += (1.0 - share) * splats.blur[second]
     step = (splats.means[second] - splats.means[first]).T
     return (
-        _footprint(splats.covariances[first], across, blur),
-        _footprint(splats.covariances[second], across, blur),
-        np.einsum("ji,ji->i", step, across[0]),
-        np.einsum("ji,ji->i", step, across[1]),
+        footprint(splats.covariances[first], plane, blur),
+        footprint(splats.covariances[second], plane, blur),
+        np.einsum("ji,ji->i", step, plane[0]),
+        np.einsum("ji,ji->i", step, plane[1]),
     )
 
 
-def _across(normal: Array) -> tuple[Array, Array]:
-    """Return two unit vectors, (3, M), across `normal` and each other (Duff et al. 2017)."""
-    x, y, z = normal.T
-    sign = np.where(z >= 0.0, 1.0, -1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    u = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
-    v = np.stack([b, sign + y * y * a, -y])
-    return u, v
-
-
-def _footprint(covariances: Array, across: tuple[Array, Array], blur: Array) -> Footprint:
-    """Return xx, xy, yy of ``(u, v)' C (u, v) + blur I``."""
-    u, v = across
-    xx, xy, xz, yy, yz, zz = covariances.T
-    cu = (xx * u[0] + xy * u[1] + xz * u[2], xy * u[0] + yy * u[1] + yz * u[2],
-          xz * u[0] + yz * u[1] + zz * u[2])  # fmt: skip
-    cv = (xx * v[0] + xy * v[1] + xz * v[2], xy * v[0] + yy * v[1] + yz * v[2],
-          xz * v[0] + yz * v[1] + zz * v[2])  # fmt: skip
-    return (
-        u[0] * cu[0] + u[1] * cu[1] + u[2] * cu[2] + blur,
-        v[0] * cu[0] + v[1] * cu[1] + v[2] * cu[2],
-        v[0] * cv[0] + v[1] * cv[1] + v[2] * cv[2] + blur,
-    )
+def _spread(one: Array, two: Array, share: Array) -> Array:
+    """Return the mean of spreads, whose sign means nothing, (M, 3)."""
+    sign = np.where(np.einsum("ij,ij->i", one, two) < 0.0, -1.0, 1.0)
+    mean: Array = share[:, None] * one + ((1.0 - share) * sign)[:, None] * two
+    return mean
 
 
 def _mixed(one: Footprint, two: Footprint, share: Array, spread: Footprint) -> Footprint:
@@ -399,10 +237,3 @@ def _product(one: Footprint, other: Footprint, x: Array, y: Array) -> Array:
     square = (total[2] * x * x - 2.0 * total[1] * x * y + total[0] * y * y) / determinant
     product: Array = np.exp(-0.5 * np.clip(square, 0.0, 700.0)) / np.sqrt(determinant)
     return product
-
-
-def _normalized(vectors: Array) -> Array:
-    """Return unit vectors, (M, 3); 0 stays 0."""
-    length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))[:, None]
-    unit: Array = vectors / np.where(length > 0.0, length, 1.0)
-    return unit

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from refine_addon.core import merging
+from refine_addon.core import merge_field, merging
 from refine_addon.core.absorb import absorb, patience
 from refine_addon.core.errors import Cancelled
 from refine_addon.core.merge_graph import MergeGraph
@@ -30,6 +30,7 @@ def flat(opacities, means, variances, *, colors=None, error=None):
         contribution,
         contribution * opacities / 2 if error is None else np.array(error, float),
         np.tile([0.0, 0.0, 1.0], (count, 1)),
+        np.zeros((count, 3)),
         np.full((count, 3), 0.5) if colors is None else np.array(colors, float),
         np.zeros(count),
     )
@@ -171,6 +172,19 @@ def test_the_cost_is_the_squared_error_of_the_pictures():
     )
 
 
+def test_a_merge_along_the_line_of_sight_costs_what_views_from_aside_see():
+    """One behind the other: alike from the front; from the side as two that lie side by side."""
+    field = flat([0.01, 0.01], [[0.0, 0, 0], [0, 0, 4]], [[1.0, 1, 1]] * 2)
+    turned = flat([0.01, 0.01], [[0.0, 0, 0], [4, 0, 0]], [[1.0, 1, 1]] * 2)
+    field.spread[:] = [1e9, 0, 0]
+    pair = np.array([0]), np.array([1])
+
+    front, aside = (merging.price(field, *pair, tilt).cost for tilt in (0.0, 1.0))
+
+    assert front < 1e-4 * aside
+    np.testing.assert_allclose(aside, merging.price(turned, *pair).cost, rtol=1e-6)
+
+
 def test_no_mass_is_created_and_none_is_lost_but_the_overlap():
     rng = np.random.default_rng(2)
     count = 2000
@@ -294,14 +308,14 @@ def test_black_and_white_on_grey_are_not_merged():
 def test_no_merge_is_carried_out_that_costs_more_than_deleting():
     """Every pair merged in the first round was cheaper than either of its splats."""
     splats, views = cloud(2000), around()
-    graph = MergeGraph(merging.field(splats, views, measure(splats)), 2.0)
+    graph = MergeGraph(merge_field.field(splats, views, measure(splats)), 2.0)
     before = graph.field.take(np.arange(2000))
 
     graph.reduce(1950)
 
     (into, gone, _), *_ = graph.merges
     assert len(into)
-    costs = 2.0 * merging.price(before, into, gone).cost
+    costs = merging.price(before, into, gone, -1).cost + merging.price(before, into, gone, 1).cost
     assert (costs < np.minimum(before.error[into], before.error[gone])).all()
 
 

@@ -1,0 +1,246 @@
+"""Splats as merging sees them: what the views see of each, from where, and how finely."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from . import spherical_harmonics
+from .splats import SH_C0, opacity, rotation_matrices
+from .work import for_chunks
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .splats import Splats
+    from .views import View, ViewSet
+
+    Array = NDArray[np.float64]
+    Index = NDArray[np.int64] | NDArray[np.int32]
+    Footprint = tuple[Array, Array, Array]
+
+LOW_PASS = 0.3
+"""Variance that renderers add to every footprint, pixels squared."""
+
+NEAREST = 0.01
+"""Share of the scene's size below which a camera comes no nearer to a splat."""
+
+LOOKS = 32
+"""Views, spread out, that tell from where splats are looked at."""
+
+BESIDE = 1e-6
+"""Weight of a view beside whose image a splat lies, so that every splat has a direction."""
+
+_CHUNK = 1 << 14
+_LOG_RANGE = 80.0
+
+
+class Seen(NamedTuple):
+    """What the views see of each of N splats; both in one unit, such as pixels of all views.
+
+    Attributes
+    ----------
+    contribution : (N,) floating
+        W, the sum of T alpha, >= 0.
+    error : (N,) floating
+        E, the sum of (T alpha)^2 times the squared contrast, >= 0.
+    """
+
+    contribution: Array
+    error: Array
+
+
+@dataclass(eq=False)
+class Field:
+    """Splats as merging sees them; the rows of merged ones are overwritten.
+
+    Attributes
+    ----------
+    means : (N, 3) float64
+    covariances : (N, 6) float64
+        xx, xy, xz, yy, yz, zz.
+    opacity, contribution, error : (N,) float64
+    direction, spread : (N, 3) float64
+        See `Look`.
+    color : (N, 3) float64
+        Seen along `direction`.
+    blur : (N,) float64
+        Variance of the low-pass at the splat, world units squared.
+    """
+
+    means: Array
+    covariances: Array
+    opacity: Array
+    contribution: Array
+    error: Array
+    direction: Array
+    spread: Array
+    color: Array
+    blur: Array
+
+    def put(self, rows: Index, other: Field) -> None:
+        """Overwrite `rows` by those of `other`."""
+        for item in fields(self):
+            getattr(self, item.name)[rows] = getattr(other, item.name)
+
+    def take(self, rows: Index) -> Field:
+        """Return a copy of some rows."""
+        return Field(*(getattr(self, item.name)[rows] for item in fields(self)))
+
+
+class Look(NamedTuple):
+    """How the views look at each of N splats, whatever is between.
+
+    Attributes
+    ----------
+    direction : (N, 3) float64
+        Mean viewing direction, length 1.
+    spread : (N, 3) float64
+        The longest standard deviation of the directions across their mean, of either sign.
+    pixel : (N,) float64
+        Area of a pixel at the splat, world units squared.
+    """
+
+    direction: Array
+    spread: Array
+    pixel: Array
+
+
+def look(splats: Splats, views: ViewSet, *, threads: int | None = None) -> Look:
+    """Return how the views look at splats.
+
+    A view weighs what its pixels see of the splat, 1 / distance^2, and next to nothing where the
+    splat's centre lies beside the image.
+
+    Parameters
+    ----------
+    splats : Splats
+        All drawable.
+    views : ViewSet
+        At most `LOOKS` of them are used.
+    threads : int, optional
+    """
+    count = len(splats)
+    result = Look(np.empty((count, 3)), np.empty((count, 3)), np.empty(count))
+    some = views.spread(LOOKS)
+    looks = [(view, share) for view, share in zip(some, some.weights, strict=True) if share]
+    offset = np.median(splats.means, axis=0) - views.centers if count else np.ones((1, 3))
+    closest = NEAREST**2 * float(np.median(np.sum(offset * offset, axis=1))) or 1.0
+
+    def measure(piece: slice) -> None:
+        points = np.asarray(splats.means[piece], np.float64).T
+        with np.errstate(under="ignore"):
+            found = _look(points, looks, closest)
+        for values, part_of in zip(result, found, strict=True):
+            values[piece] = part_of
+
+    for_chunks(measure, count, _CHUNK, threads=threads)
+    return result
+
+
+def _look(points: Array, looks: list[tuple[View, float]], closest: float) -> Look:
+    """Return how views, each of a weight, look at `points`, (3, M).
+
+    Parameters
+    ----------
+    closest : float
+        Least squared distance of a camera.
+    """
+    rows, columns = np.triu_indices(3)
+    total, finest = np.zeros((2, points.shape[1]))
+    toward, second = np.zeros((3, points.shape[1])), np.zeros((6, points.shape[1]))
+    for view, share in looks:
+        ray = points - view.center[:, None]
+        x, y, z = view.rotation @ ray
+        inside = np.abs(view.fx * x + (view.cx - view.width / 2) * z) <= view.width / 2 * z
+        inside &= np.abs(view.fy * y + (view.cy - view.height / 2) * z) <= view.height / 2 * z
+        squared = np.maximum(np.einsum("ij,ij->j", ray, ray), closest)
+        weight = np.where(inside, share, share * BESIDE) / squared
+        ray /= np.sqrt(squared)
+        weighted = ray * weight
+        toward += weighted
+        second += weighted[rows] * ray[columns]
+        total += weight
+        finest += weight * (view.fx * view.fy / squared)
+    direction = normalized(toward.T)
+    u, v = across(direction)
+    xx, xy, yy = footprint((second / total).T, (u, v), np.zeros(len(direction)))
+    # The longer axis of a 2 x 2 covariance.
+    half, angle = np.hypot(0.5 * (xx - yy), xy), 0.5 * np.arctan2(2.0 * xy, xx - yy)
+    longest = np.sqrt(np.maximum(0.5 * (xx + yy) + half, 0.0))
+    spread = longest * (np.cos(angle) * u + np.sin(angle) * v)
+    return Look(direction, spread.T, total / finest)
+
+
+def field(splats: Splats, views: ViewSet, seen: Seen, *, threads: int | None = None) -> Field:
+    """Return drawable splats as merging sees them.
+
+    Parameters
+    ----------
+    splats : Splats
+        All drawable, in the frame and unit of the views.
+    views : ViewSet
+    seen : Seen
+    threads : int, optional
+    """
+    count = len(splats)
+    covariances, color = np.empty((count, 6)), np.empty((count, 3))
+    seen_from = look(splats, views, threads=threads)
+    rows, columns = np.triu_indices(3)
+
+    def fill(piece: slice) -> None:
+        logs = np.asarray(splats.log_scales[piece], np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
+        axes = rotation_matrices(splats.quaternions[piece]) * np.exp(logs)[:, None, :]
+        covariances[piece] = (axes @ np.swapaxes(axes, 1, 2))[:, rows, columns]
+        color[piece] = 0.5 + SH_C0 * np.asarray(splats.sh_dc[piece], np.float64)
+        if splats.sh_degree:
+            basis = spherical_harmonics.basis(seen_from.direction[piece], splats.sh_degree)[:, 1:]
+            color[piece] += np.einsum("nk,nkc->nc", basis, splats.sh_rest[piece])
+
+    for_chunks(fill, count, _CHUNK, threads=threads)
+    return Field(
+        np.array(splats.means, np.float64),
+        covariances,
+        opacity(splats.opacity_logits),
+        np.array(seen.contribution, np.float64),
+        np.array(seen.error, np.float64),
+        seen_from.direction,
+        seen_from.spread,
+        np.maximum(color, 0.0, out=color),
+        LOW_PASS * seen_from.pixel,
+    )
+
+
+def across(normal: Array) -> tuple[Array, Array]:
+    """Return two unit vectors, (3, M), across `normal` and each other (Duff et al. 2017)."""
+    x, y, z = normal.T
+    sign = np.where(z >= 0.0, 1.0, -1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    u = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
+    v = np.stack([b, sign + y * y * a, -y])
+    return u, v
+
+
+def footprint(covariances: Array, plane: tuple[Array, Array], blur: Array) -> Footprint:
+    """Return xx, xy, yy of ``(u, v)' C (u, v) + blur I``."""
+    u, v = plane
+    xx, xy, xz, yy, yz, zz = covariances.T
+    cu = (xx * u[0] + xy * u[1] + xz * u[2], xy * u[0] + yy * u[1] + yz * u[2],
+          xz * u[0] + yz * u[1] + zz * u[2])  # fmt: skip
+    cv = (xx * v[0] + xy * v[1] + xz * v[2], xy * v[0] + yy * v[1] + yz * v[2],
+          xz * v[0] + yz * v[1] + zz * v[2])  # fmt: skip
+    return (
+        u[0] * cu[0] + u[1] * cu[1] + u[2] * cu[2] + blur,
+        v[0] * cu[0] + v[1] * cu[1] + v[2] * cu[2],
+        v[0] * cv[0] + v[1] * cv[1] + v[2] * cv[2] + blur,
+    )
+
+
+def normalized(vectors: Array) -> Array:
+    """Return unit vectors, (M, 3); 0 stays 0."""
+    length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))[:, None]
+    unit: Array = vectors / np.where(length > 0.0, length, 1.0)
+    return unit
