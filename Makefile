@@ -10,7 +10,7 @@ BENCH := .venv/.bench
 demo: $(DEV)          ## the main job: the committed room, its cameras, half of it pruned, into out/
 	$(PY) docs/demo.py
 
-test: $(DEV)          ## core and add-on tests
+test: $(BENCH)        ## core and add-on tests
 	$(PY) -m pytest
 
 test-core: $(DEV)     ## without Blender, seconds

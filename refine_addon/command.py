@@ -11,7 +11,7 @@ import json
 import os
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,6 +30,7 @@ from .core import (
     score,
 )
 from .core.files import expanded, refuse_existing, whole_file
+from .core.pipeline import scoring_notes
 from .core.splats import drawable
 from .version import VERSION
 
@@ -195,6 +196,7 @@ def _path(text: str) -> Path:
 def _check_usage(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Refuse combinations that argparse cannot; leaves through ``parser.error``, code 2."""
     _check_report(parser, options)
+    _check_output(parser, options)
     if options.run is _run_info:
         return
     try:
@@ -203,7 +205,9 @@ def _check_usage(parser: argparse.ArgumentParser, options: argparse.Namespace) -
             _budget(options)
     except RefineError as error:
         parser.error(str(error))
-    if options.cameras is None and not (options.scene and _scene_is_open()):
+    if options.method == "occlusion" and (options.published or options.depth != "z"):
+        parser.error("--published and --depth are settings of the closed form")
+    if options.cameras is None and not (options.scene and _blend()):
         parser.error("no cameras: give --cameras, or open a .blend that has some")
     if options.run is _run_prune:
         _check_prune(parser, options)
@@ -216,11 +220,26 @@ def _check_report(parser: argparse.ArgumentParser, options: argparse.Namespace) 
     others = [*options.inputs, getattr(options, "output", None), getattr(options, "cameras", None)]
     if getattr(options, "output_dir", None):
         others += [options.output_dir / path.name for path in options.inputs]
+    cameras = getattr(options, "cameras", None)
+    if cameras and cameras.is_dir() and options.report.exists():
+        others += [path for path in cameras.rglob("*") if path.is_file()]
+    if options.scene:
+        others.append(_blend())
     report = os.path.realpath(options.report)
     for other in filter(None, others):
         # Unlike pathlib's, these two never fail, whatever the name.
         if os.path.realpath(os.path.expanduser(other)) == report:  # noqa: PTH111
             parser.error(f"--report {options.report} is {other}, expected a file of its own")
+
+
+def _check_output(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Refuse an output that would replace something other than splats, cameras above all."""
+    output = getattr(options, "output", None)
+    if output is None or not output.is_file() or output.suffix.lower() == ".ply":
+        return
+    with output.open("rb") as stream:
+        if stream.read(3) != b"ply":
+            parser.error(f"{output} exists and is no PLY: write to another name")
 
 
 def _check_prune(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
@@ -265,10 +284,11 @@ def _budget(options: argparse.Namespace) -> Budget:
     return Budget(**(given or {"ratio": DEFAULT_RATIO}))
 
 
-def _scene_is_open() -> bool:
+def _blend() -> str:
+    """Return the path of the open .blend, "" if it was never saved."""
     import bpy  # noqa: PLC0415 - only there inside Blender
 
-    return bool(bpy.data.filepath)
+    return str(bpy.data.filepath)
 
 
 def _views(options: argparse.Namespace) -> ViewSet:
@@ -297,6 +317,9 @@ class _Run:
             print(text, flush=True)
         except UnicodeEncodeError:  # a name that this terminal's encoding cannot show
             print(text.encode("ascii", "backslashreplace").decode(), flush=True)
+        except OSError:  # whoever read this has gone, or its disk is full: the work goes on
+            self.options.quiet = True
+            sys.stdout = open(os.devnull, "w")  # noqa: PTH123, SIM115 - closed with the process
 
     def progress(self, label: str) -> Callable[[float, str], None]:
         """Return a callback that draws on a terminal and is silent elsewhere."""
@@ -312,9 +335,9 @@ class _Run:
         """Do one input's work; note its error, so that the others go on."""
         try:
             self.entries.append({"status": "done", **work()})
-        except RefineError as error:
+        except (RefineError, OSError, MemoryError) as error:
             self.failed = True
-            message = str(error)
+            message = str(error) or type(error).__name__
             # What is wrong with the splats is said without the file.
             files = (Path(label), getattr(self.options, "output", None))
             if not any(file and file.name in message for file in files):
@@ -448,12 +471,16 @@ def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     file.write(output, columns={"refine_score": scores.values}, overwrite=options.overwrite)
     run.clear_line()
     run.say(f"{source}: scored {len(file):,} splats by {scores.views_used} views -> {output}")
+    notes = scoring_notes(scores, views)
+    for note in notes:
+        run.say(f"  note: {note}")
     return {
         "files": {"input": str(source), "output": str(output)},
         "splats": {"before": len(file), "undrawable": scores.undrawable},
         "views": {"given": len(views), "used": scores.views_used},
+        "settings": asdict(_settings(options)),
         "weights": scores.weights,
-        "notes": list(scores.notes),
+        "notes": notes,
     }
 
 
@@ -486,7 +513,7 @@ def describe(file: SplatFile) -> dict[str, Any]:
             finite &= np.isfinite(rows[name])
         broken += int(np.count_nonzero(~finite))
         undrawable += int(np.count_nonzero(~drawable(splats)))
-        means = np.asarray(splats.means, np.float64)[np.isfinite(splats.means).all(axis=1)]
+        means = splats.means[np.isfinite(splats.means).all(axis=1)].astype(np.float64)
         low = np.minimum(low, means.min(axis=0, initial=np.inf))
         high = np.maximum(high, means.max(axis=0, initial=-np.inf))
     names = file.rows.dtype.names or ()

@@ -63,7 +63,8 @@ NORMAL_PLACES = {"nx": ("normal", 0), "ny": ("normal", 1), "nz": ("normal", 2)}
 _COUNT = rb"([\r\n]element[ \t]+vertex[ \t]+)[0-9]+"
 _TAKEN = {
     *("position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"),
-    *("refine_seen", "refine_heat", "refine_color", "refine_remove"),
+    *("refine_score", "refine_rank", "refine_seen"),
+    *("refine_heat", "refine_color", "refine_remove"),
 }
 
 

@@ -6,6 +6,8 @@ import json
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from . import heat_map, mesh_adapter, mesh_edit
 from .core.errors import RefineError
 from .core.scores import Scores
@@ -87,8 +89,17 @@ def stored_scores(obj: bpy.types.Object) -> Scores:
         if noted is None or not attribute or attribute.data_type != kind:
             msg = f"object '{obj.name}': has no scores; score it first"
             raise RefineError(msg)
+    values = mesh_adapter.read_attribute(obj.data, SCORE)
+    # Splats joined or added since hold a score of 0, as those do that no renderer can draw.
+    unscored = int(np.count_nonzero(values == 0.0)) - noted.get("undrawable", 0)
+    if len(values) > noted["splats"] or unscored > 0:
+        msg = (
+            f"object '{obj.name}': scored with {noted['splats']} splats, has {len(values)} now, "
+            f"{max(unscored, 0)} of them without a score; score it again"
+        )
+        raise RefineError(msg)
     return Scores(
-        values=mesh_adapter.read_attribute(obj.data, SCORE),
+        values=values,
         seen=mesh_adapter.read_attribute(obj.data, SEEN),
         views_used=noted["views_used"],
         undrawable=noted.get("undrawable", 0),

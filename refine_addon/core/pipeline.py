@@ -179,7 +179,7 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
     RefineError, Cancelled
         See `score`; also if the budget would leave nothing.
     """
-    start = time.perf_counter()
+    start, asked = time.perf_counter(), settings.method
     if absorb and budget.removals(len(splats), row_bytes or 1.0, fixed_bytes) is not None:
         # How many go does not depend on the scores: the quick ones say what is seen.
         settings = replace(settings, method="closed-form")
@@ -203,6 +203,8 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
     if absorbed:
         facts["absorbed"] = absorbed.facts()
         facts["notes"].append(absorbed.note())
+        if asked != settings.method:
+            facts["notes"].append(f"absorbing measures by occlusion: {asked} had nothing to decide")
     return Result(keep, scores, facts, absorbed)
 
 
@@ -320,6 +322,14 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
     return result
 
 
+def scoring_notes(scores: Scores, views: ViewSet) -> list[str]:
+    """Return what the user should know of a scoring, in sentences."""
+    notes = [*scores.notes, *([views.note] if views.note else [])]
+    if scores.undrawable:
+        notes.append(f"{scores.undrawable} splats cannot be drawn; they rank lowest")
+    return notes
+
+
 def make_report(
     scores: Scores,
     keep: NDArray[np.bool_],
@@ -330,9 +340,6 @@ def make_report(
 ) -> dict[str, Any]:
     """Return everything a pipeline wants to know about a prune, as plain JSON values."""
     kept = int(np.count_nonzero(keep))
-    notes = [*scores.notes, *([views.note] if views.note else [])]
-    if scores.undrawable:
-        notes.append(f"{scores.undrawable} splats cannot be drawn; they rank lowest")
     return {
         "splats": {
             "before": len(keep),
@@ -346,6 +353,6 @@ def make_report(
         "settings": asdict(settings),
         "weights": scores.weights,
         "timings": timings,
-        "notes": notes,
+        "notes": scoring_notes(scores, views),
         "versions": {"python": platform.python_version(), "numpy": np.__version__},
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 import numpy as np
+import pytest
 
 
 def contents(addon, obj) -> dict[str, bytes]:
@@ -96,3 +97,22 @@ def test_an_object_of_another_scene_is_left_alone(addon, room, room_cameras):  #
 
     assert code == 1
     assert contents(addon, elsewhere) == before
+
+
+def test_splats_joined_after_scoring_are_never_deleted_unscored(addon, room, room_cameras):  # noqa: ARG001
+    """Joining gives them a score of 0, the lowest: apply refuses instead."""
+    bpy.ops.refine.score()
+    copy = bpy.data.objects.new("more", room.data.copy())
+    copy.data.attributes.remove(copy.data.attributes["refine_score"])
+    bpy.context.collection.objects.link(copy)
+    with bpy.context.temp_override(
+        active_object=room, object=room, selected_editable_objects=[room, copy],
+        selected_objects=[room, copy],
+    ):  # fmt: skip
+        bpy.ops.object.join()
+    count = len(room.data.vertices)
+
+    with pytest.raises(RuntimeError, match="scored with 39755 splats, has 79510 now"):
+        bpy.ops.refine.apply()
+
+    assert len(room.data.vertices) == count == 2 * 39755

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -651,3 +652,32 @@ def read_all(descriptor: int) -> bytes:
         drawn += more
     os.close(descriptor)
     return drawn
+
+
+def test_an_output_never_replaces_what_is_no_splat_file(folder, capsys):
+    """Cameras, a scene, notes: --overwrite means splats."""
+    before = (folder / "cameras.json").read_bytes()
+
+    code = command.main([*PRUNE, "-o", "cameras.json", "--overwrite"])
+
+    assert code == 2
+    assert "cameras.json exists and is no PLY" in capsys.readouterr().err
+    assert (folder / "cameras.json").read_bytes() == before
+
+
+def test_settings_of_the_closed_form_are_refused_with_occlusion(folder, capsys):  # noqa: ARG001
+    """They would change nothing."""
+    assert command.main([*PRUNE, "-o", "out.ply", "--method", "occlusion", "--published"]) == 2
+    assert "settings of the closed form" in capsys.readouterr().err
+
+
+def test_info_of_a_signalling_not_a_number_does_not_warn(folder, capsys):  # noqa: ARG001
+    """Only finite means are widened to float64."""
+    file = read_ply("in.ply")
+    rows = file.rows.copy()
+    rows["x"].view(np.uint32)[0] = 0x7F800001
+    replace(file, rows=rows).write("snan.ply")
+
+    with np.errstate(all="raise"):
+        assert command.main(["info", "snan.ply"]) == 0
+    assert "non finite rows    1" in capsys.readouterr().out
