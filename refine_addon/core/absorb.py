@@ -175,9 +175,9 @@ def absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     if excess <= 0:
         unchanged = np.zeros(int(np.count_nonzero(keep)), np.bool_)
         return Absorbed(splats.take(keep), keep, unchanged, 0, int(np.count_nonzero(~keep)))
-    own = Seen(seen.contribution[rows], seen.error[rows])
-    field = merge_field.field(splats.take(rows), views, own, threads=threads)
-    graph = MergeGraph(field, factor, threads=threads)
+    graph = MergeGraph(
+        merge_field.field(splats, rows, views, seen, threads=threads), factor, threads=threads
+    )
     graph.reduce(len(rows) - excess, part(progress, 0.1, 0.95))
     keep[rows[~graph.alive]] = False
     return _written(splats, keep, rows, graph)
@@ -206,7 +206,8 @@ def _written(splats: Splats, keep: NDArray[np.bool_], rows: Index, graph: MergeG
     target = place[rows[changed]]
     members = np.flatnonzero(changed[owner])
     harmonics = _Blend(rows[members], place[rows[owner[members]]], share[members])
-    merged = graph.field.take(np.flatnonzero(changed))
+    # The rest of the field makes room for the survivors.
+    merged = graph.field = graph.field.take(np.flatnonzero(changed))
     with np.errstate(under="ignore"):
         logs, quaternions = merging.axes(merged.covariances)
         result = Splats(

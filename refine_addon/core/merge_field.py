@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -87,7 +87,8 @@ class Field:
 
     def take(self, rows: Index) -> Field:
         """Return a copy of some rows."""
-        return Field(*(getattr(self, item.name)[rows] for item in fields(self)))
+        # Twice as fast as square brackets.
+        return Field(*(getattr(self, item.name).take(rows, axis=0) for item in fields(self)))
 
 
 class Look(NamedTuple):
@@ -108,7 +109,7 @@ class Look(NamedTuple):
     pixel: Array
 
 
-def look(splats: Splats, views: ViewSet, *, threads: int | None = None) -> Look:
+def look(means: NDArray[Any], views: ViewSet, *, threads: int | None = None) -> Look:
     """Return how the views look at splats.
 
     A view weighs what its pixels see of the splat, 1 / distance^2, and next to nothing where the
@@ -116,21 +117,21 @@ def look(splats: Splats, views: ViewSet, *, threads: int | None = None) -> Look:
 
     Parameters
     ----------
-    splats : Splats
-        All drawable.
+    means : (N, 3) floating
+        Of drawable splats.
     views : ViewSet
         At most `LOOKS` of them are used.
     threads : int, optional
     """
-    count = len(splats)
+    count = len(means)
     result = Look(np.empty((count, 3)), np.empty((count, 3)), np.empty(count))
     some = views.spread(LOOKS)
     looks = [(view, share) for view, share in zip(some, some.weights, strict=True) if share]
-    offset = np.median(splats.means, axis=0) - views.centers if count else np.ones((1, 3))
+    offset = np.median(means, axis=0) - views.centers if count else np.ones((1, 3))
     closest = NEAREST**2 * float(np.median(np.sum(offset * offset, axis=1))) or 1.0
 
     def measure(piece: slice) -> None:
-        points = np.asarray(splats.means[piece], np.float64).T
+        points = np.asarray(means[piece], np.float64).T
         with np.errstate(under="ignore"):
             found = _look(points, looks, closest)
         for values, part_of in zip(result, found, strict=True):
@@ -174,38 +175,44 @@ def _look(points: Array, looks: list[tuple[View, float]], closest: float) -> Loo
     return Look(direction, spread.T, total / finest)
 
 
-def field(splats: Splats, views: ViewSet, seen: Seen, *, threads: int | None = None) -> Field:
-    """Return drawable splats as merging sees them.
+def field(
+    splats: Splats, rows: Index, views: ViewSet, seen: Seen, *, threads: int | None = None
+) -> Field:
+    """Return some splats as merging sees them.
 
     Parameters
     ----------
     splats : Splats
-        All drawable, in the frame and unit of the views.
+        In the frame and unit of the views.
+    rows : (M,) int
+        Which of them; drawable ones.
     views : ViewSet
     seen : Seen
+        Of all splats.
     threads : int, optional
     """
-    count = len(splats)
+    count = len(rows)
     covariances, color = np.empty((count, 6)), np.empty((count, 3))
-    seen_from = look(splats, views, threads=threads)
-    rows, columns = np.triu_indices(3)
+    seen_from = look(splats.means[rows], views, threads=threads)
+    upper = np.triu_indices(3)
 
     def fill(piece: slice) -> None:
-        logs = np.asarray(splats.log_scales[piece], np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
-        axes = rotation_matrices(splats.quaternions[piece]) * np.exp(logs)[:, None, :]
-        covariances[piece] = (axes @ np.swapaxes(axes, 1, 2))[:, rows, columns]
-        color[piece] = 0.5 + SH_C0 * np.asarray(splats.sh_dc[piece], np.float64)
-        if splats.sh_degree:
-            basis = spherical_harmonics.basis(seen_from.direction[piece], splats.sh_degree)[:, 1:]
-            color[piece] += np.einsum("nk,nkc->nc", basis, splats.sh_rest[piece])
+        chunk = splats.take(rows[piece])
+        logs = np.asarray(chunk.log_scales, np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
+        axes = rotation_matrices(chunk.quaternions) * np.exp(logs)[:, None, :]
+        covariances[piece] = (axes @ np.swapaxes(axes, 1, 2))[:, upper[0], upper[1]]
+        color[piece] = 0.5 + SH_C0 * np.asarray(chunk.sh_dc, np.float64)
+        if chunk.sh_degree:
+            basis = spherical_harmonics.basis(seen_from.direction[piece], chunk.sh_degree)[:, 1:]
+            color[piece] += np.einsum("nk,nkc->nc", basis, chunk.sh_rest)
 
     for_chunks(fill, count, _CHUNK, threads=threads)
     return Field(
-        np.array(splats.means, np.float64),
+        np.asarray(splats.means[rows], np.float64),
         covariances,
-        opacity(splats.opacity_logits),
-        np.array(seen.contribution, np.float64),
-        np.array(seen.error, np.float64),
+        opacity(splats.opacity_logits[rows]),
+        seen.contribution[rows],
+        seen.error[rows],
         seen_from.direction,
         seen_from.spread,
         np.maximum(color, 0.0, out=color),
@@ -239,7 +246,7 @@ def footprint(covariances: Array, plane: tuple[Array, Array], blur: Array) -> Fo
     )
 
 
-def normalized(vectors: Array) -> Array:
+def normalized(vectors: NDArray[Any]) -> Array:
     """Return unit vectors, (M, 3); 0 stays 0."""
     length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))[:, None]
     unit: Array = vectors / np.where(length > 0.0, length, 1.0)

@@ -56,6 +56,8 @@ class MergeGraph:
         self.alive = np.ones(len(field.means), np.bool_)
         self.merges: list[tuple[Index, Index, Array]] = []
         self.deleted = 0
+        self.first = self.second = np.empty(0, np.int32)
+        self.cost = np.empty(0)
 
     def reduce(self, goal: int, progress: Progress = silent) -> None:
         """Merge and delete until `goal` splats are alive.
@@ -73,6 +75,9 @@ class MergeGraph:
                 self._connect(silent)
                 connected = count
             count -= self._round(min(max(int(BATCH * count), 1), count - goal))
+        # Nobody needs the pairs any more, and there are ten million of them in a large scene.
+        self.first = self.second = np.empty(0, np.int32)
+        self.cost = np.empty(0)
 
     def _connect(self, progress: Progress) -> None:
         """Find the pairs of near splats that the views see, and price them."""
@@ -101,9 +106,7 @@ class MergeGraph:
             mine = edges[piece]
             first, second = self.first[mine], self.second[mine]
             with np.errstate(under="ignore"):
-                # Two directions, for a merge along one of them costs nothing seen from there.
-                costs = [merging.price(self.field, first, second, tilt).cost for tilt in (-1, 1)]
-            cost = 0.5 * self.patience * (costs[0] + costs[1])
+                cost = self.patience * merging.costs(self.field, first, second)
             least = np.minimum(self.field.error[first], self.field.error[second])
             self.cost[mine] = np.where(cost < least, cost, np.inf)
 

@@ -36,7 +36,7 @@ from .transform import quaternion
 if TYPE_CHECKING:
     from .merge_field import Array, Footprint, Index
 
-__all__ = ["Field", "Pairs", "Seen", "axes", "merge", "price"]
+__all__ = ["Field", "Pairs", "Seen", "axes", "costs", "merge", "price"]
 
 OPACITY_MAX = 0.99
 """Largest opacity of a merged splat; renderers show no more."""
@@ -76,8 +76,6 @@ class Pairs(NamedTuple):
 def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pairs:
     """Price merges by the equations at the top of this file.
 
-    The factor 2 pi of masses and products cancels and is left out.
-
     Parameters
     ----------
     splats : Field
@@ -86,10 +84,67 @@ def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pair
     tilt : float
         From where: the mean viewing direction plus so many standard deviations of the directions.
     """
-    color, rest = _shares(splats.contribution[first], splats.contribution[second])
-    one, two, x, y = _plane(splats, first, second, color, tilt)
+    return _price(_gather(splats, first, second), tilt)
+
+
+def costs(splats: Field, first: Index, second: Index) -> Array:
+    """Return the costs of merges, (M,): the mean of those from two directions."""
+    ends = _gather(splats, first, second)
+    return 0.5 * (_price(ends, -1.0).cost + _price(ends, 1.0).cost)
+
+
+class _Ends(NamedTuple):
+    """Both splats of each pair, and what they have in common.
+
+    Attributes
+    ----------
+    one, two : Field
+    color, rest : (M,) float64
+        Shares of the first and of the second in the colour.
+    direction, spread : (M, 3) float64
+    blur : (M,) float64
+    apart : (M,) float64
+        Squared difference of their colours.
+    """
+
+    one: Field
+    two: Field
+    color: Array
+    rest: Array
+    direction: Array
+    spread: Array
+    blur: Array
+    apart: Array
+
+
+def _gather(splats: Field, first: Index, second: Index) -> _Ends:
+    """Return what pricing needs of pairs."""
+    one, two = splats.take(first), splats.take(second)
+    color, rest = _shares(one.contribution, two.contribution)
+    direction = one.direction * color[:, None]
+    direction += two.direction * rest[:, None]
+    # Seen from opposite sides alike: the plane across the first one's direction is as good.
+    lost = np.einsum("ij,ij->i", direction, direction) < _CANCELLED
+    direction[lost] = one.direction[lost]
+    step = one.color - two.color
+    return _Ends(
+        one,
+        two,
+        color,
+        rest,
+        normalized(direction),
+        _spread(one.spread, two.spread, color),
+        color * one.blur + rest * two.blur,
+        np.einsum("ij,ij->i", step, step),
+    )
+
+
+def _price(ends: _Ends, tilt: float) -> Pairs:
+    """Price merges seen from one direction; the factor 2 pi of masses and products cancels."""
+    first, second, color, rest = ends.one, ends.two, ends.color, ends.rest
+    one, two, x, y = _plane(ends, tilt)
     areas = _area(one), _area(two)
-    mass_1, mass_2 = splats.opacity[first] * areas[0], splats.opacity[second] * areas[1]
+    mass_1, mass_2 = first.opacity * areas[0], second.opacity * areas[1]
     position, other = _shares(mass_1, mass_2)
     overlap = mass_1 * mass_2 * _product(one, two, x, y)
     spread = position * other
@@ -99,15 +154,14 @@ def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pair
     growth = np.maximum(mass / (_area(merged) * OPACITY_MAX), 1.0)
     merged = (merged[0] * growth, merged[1] * growth, merged[2] * growth)
     area = _area(merged)
-    tau = (splats.contribution[first] + splats.contribution[second]) / (mass_1 + mass_2)
+    tau = (first.contribution + second.contribution) / (mass_1 + mass_2)
     own_1, own_2 = mass_1 * mass_1 / (2.0 * areas[0]), mass_2 * mass_2 / (2.0 * areas[1])
     own = mass * mass / (2.0 * area)
     with_1 = mass_1 * mass * _product(one, merged, other * x, other * y)
     with_2 = mass_2 * mass * _product(two, merged, position * x, position * y)
-    contrast_1 = _contrast(splats.error[first], splats.contribution[first] / mass_1 * own_1)
-    contrast_2 = _contrast(splats.error[second], splats.contribution[second] / mass_2 * own_2)
-    step = splats.color[first] - splats.color[second]
-    both = 0.5 * (contrast_1 + contrast_2 - np.einsum("ij,ij->i", step, step))
+    contrast_1 = _contrast(first.error, first.contribution / mass_1 * own_1)
+    contrast_2 = _contrast(second.error, second.contribution / mass_2 * own_2)
+    both = 0.5 * (contrast_1 + contrast_2 - ends.apart)
     limit = np.sqrt(contrast_1 * contrast_2)
     both = np.clip(both, -limit, limit)
     pp = own_1 - 2.0 * color * with_1 + color * color * own
@@ -168,38 +222,23 @@ def _contrast(error: Array, whole: Array) -> Array:
     return contrast
 
 
-def _plane(
-    splats: Field, first: Index, second: Index, share: Array, tilt: float
-) -> tuple[Footprint, Footprint, Array, Array]:
+def _plane(ends: _Ends, tilt: float) -> tuple[Footprint, Footprint, Array, Array]:
     """Return both footprints and the step between them, across the pair's viewing direction.
-
-    Parameters
-    ----------
-    share : (M,) float64
-        Of the first in the direction.
 
     Returns
     -------
-    first, second : tuple of (M,) float64
+    one, two : tuple of (M,) float64
         xx, xy, yy, low-pass included; world units squared.
     x, y : (M,) float64
     """
-    normal = splats.direction[first] * share[:, None]
-    normal += splats.direction[second] * (1.0 - share)[:, None]
-    # Seen from opposite sides alike: the plane across the first one's direction is as good.
-    lost = np.einsum("ij,ij->i", normal, normal) < _CANCELLED
-    normal[lost] = splats.direction[first[lost]]
-    if tilt:
-        normal += tilt * _spread(splats.spread[first], splats.spread[second], share)
-    plane = across(normalized(normal))
-    blur = share * splats.blur[first]
-    blur += (1.0 - share) * splats.blur[second]
-    step = (splats.means[second] - splats.means[first]).T
+    normal = normalized(ends.direction + tilt * ends.spread) if tilt else ends.direction
+    u, v = across(normal)
+    step = (ends.two.means - ends.one.means).T
     return (
-        footprint(splats.covariances[first], plane, blur),
-        footprint(splats.covariances[second], plane, blur),
-        np.einsum("ji,ji->i", step, plane[0]),
-        np.einsum("ji,ji->i", step, plane[1]),
+        footprint(ends.one.covariances, (u, v), ends.blur),
+        footprint(ends.two.covariances, (u, v), ends.blur),
+        np.einsum("ji,ji->i", step, u),
+        np.einsum("ji,ji->i", step, v),
     )
 
 

@@ -40,7 +40,7 @@ class _Tree(NamedTuple):
     which : (leaves, size) int64
         Which point it is; N and more where a leaf has been filled up.
     points : (leaves, size, 3) float64
-    boxes : list of (2, nodes, 3) float64
+    boxes : list of (2, 3, nodes) float64
         Lower and upper corner, from the root down to the leaves.
     """
 
@@ -109,17 +109,17 @@ def _build(points: NDArray[np.float64]) -> _Tree:
     copies = np.where(order < total, order, (order - total) % total)
     for level in range(depth):
         nodes = order.reshape(2**level, -1)
-        inside = points[copies[nodes]]
+        inside = points.take(copies.take(nodes), axis=0)
         axis = np.argmax(inside.max(axis=1) - inside.min(axis=1), axis=1)
         along = np.take_along_axis(inside, axis[:, None, None], axis=2)[..., 0]
         halves = np.argpartition(along, nodes.shape[1] // 2, axis=1)
         order = np.take_along_axis(nodes, halves, axis=1).ravel()
     which = order.reshape(2**depth, size)
     leaves = points[copies[which]]
-    boxes = [np.stack([leaves.min(axis=1), leaves.max(axis=1)])]
-    while boxes[0].shape[1] > 1:
-        low, high = boxes[0].reshape(2, -1, 2, 3)
-        boxes.insert(0, np.stack([low.min(axis=1), high.max(axis=1)]))
+    boxes = [np.stack([leaves.min(axis=1).T, leaves.max(axis=1).T])]
+    while boxes[0].shape[2] > 1:
+        low, high = boxes[0].reshape(2, 3, -1, 2)
+        boxes.insert(0, np.stack([low.min(axis=2), high.max(axis=2)]))
     return _Tree(which, leaves, boxes)
 
 
@@ -127,8 +127,8 @@ def _search(tree: _Tree, rows: slice, count: int, total: int) -> NDArray[np.int6
     """Return the neighbours, (leaves, size, count), of all points of some leaves."""
     nodes = _near_leaves(tree, rows)
     own = tree.points[rows]
-    others = tree.points[nodes].reshape(len(own), -1, 3)
-    index = tree.which[nodes].reshape(len(own), 1, -1)
+    others = tree.points.take(nodes, axis=0).reshape(len(own), -1, 3)
+    index = tree.which.take(nodes, axis=0).reshape(len(own), 1, -1)
     squared = np.zeros((*own.shape[:2], others.shape[1]))
     for axis in range(3):
         step = own[:, :, None, axis] - others[:, None, :, axis]
@@ -146,17 +146,17 @@ def _near_leaves(tree: _Tree, rows: slice) -> NDArray[np.int64]:
 
     A level at a time, only the `VISITED` nearest nodes are followed down.
     """
-    low, high = tree.boxes[-1][:, rows, :, None]
-    nodes = np.zeros((len(low), 1), np.int64)
+    low, high = tree.boxes[-1][:, :, rows, None]
+    nodes = np.zeros((low.shape[1], 1), np.int64)
     for boxes in tree.boxes[1:]:
         nodes = np.concatenate([2 * nodes, 2 * nodes + 1], axis=1)
         if nodes.shape[1] <= VISITED:
             continue
         distance = np.zeros(nodes.shape)
         for axis in range(3):
-            lower, upper = boxes[0, :, axis][nodes], boxes[1, :, axis][nodes]
-            gap = np.maximum(lower - high[:, axis], low[:, axis] - upper)
-            middle = 0.5 * (lower + upper - low[:, axis] - high[:, axis])
+            lower, upper = boxes[0, axis].take(nodes), boxes[1, axis].take(nodes)
+            gap = np.maximum(lower - high[axis], low[axis] - upper)
+            middle = 0.5 * (lower + upper - low[axis] - high[axis])
             distance += np.maximum(gap, 0.0) ** 2 + _MIDDLE * middle * middle
         nearest_nodes = np.argpartition(distance, VISITED - 1, axis=1)[:, :VISITED]
         nodes = np.take_along_axis(nodes, nearest_nodes, axis=1)

@@ -308,14 +308,14 @@ def test_black_and_white_on_grey_are_not_merged():
 def test_no_merge_is_carried_out_that_costs_more_than_deleting():
     """Every pair merged in the first round was cheaper than either of its splats."""
     splats, views = cloud(2000), around()
-    graph = MergeGraph(merge_field.field(splats, views, measure(splats)), 2.0)
+    graph = MergeGraph(merge_field.field(splats, np.arange(2000), views, measure(splats)), 2.0)
     before = graph.field.take(np.arange(2000))
 
     graph.reduce(1950)
 
     (into, gone, _), *_ = graph.merges
     assert len(into)
-    costs = merging.price(before, into, gone, -1).cost + merging.price(before, into, gone, 1).cost
+    costs = 2.0 * merging.costs(before, into, gone)
     assert (costs < np.minimum(before.error[into], before.error[gone])).all()
 
 
