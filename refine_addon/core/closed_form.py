@@ -171,6 +171,7 @@ class _Scene:
 
     def __init__(self, splats: Splats, views: ViewSet, settings: ClosedForm) -> None:
         self.splats, self.views, self.settings = splats, views, settings
+        self.weights = views.weights
         self.origin, self.spread = views.middle()
         count = len(splats)
         self.good = np.empty(count, np.bool_)
@@ -228,9 +229,8 @@ class _Scene:
         points[:3] = (self.means[piece] - self.origin).T
         total = np.zeros(points.shape[1])
         seen = np.zeros(points.shape[1], np.int32)
-        weights = self.views.weights
         with np.errstate(under="ignore"):
-            for start in range(0, len(weights), _VIEW_BLOCK):
+            for start in range(0, len(self.weights), _VIEW_BLOCK):
                 block = slice(start, start + _VIEW_BLOCK)
                 depth, inside = self.frustums.project(points, block)
                 if not self.settings.frustum:
@@ -242,7 +242,7 @@ class _Scene:
                     squared = self._squared(points, depth, block)
                     squared += self.eta
                     share = np.divide(inside, squared, out=squared)
-                total += np.einsum("v,vn->n", weights[block], share)
+                total += np.einsum("v,vn->n", self.weights[block], share)
             if not seen.all():
                 near = self.squared[piece] + self.eta if self.settings.projection else 1.0
                 total = np.where(seen == 0, UNSEEN / near, total)
