@@ -207,11 +207,17 @@ def apply_object(
         )
         raise RefineError(msg)
     done = _plan(obj, keep)
-    if absorbed:
-        mesh_adapter.write_columns(obj, absorbed_columns(obj, absorbed))
+    _reduce(obj, keep, absorbed_columns(obj, absorbed) if absorbed else {})
+    return done
+
+
+def _reduce(
+    obj: bpy.types.Object, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
+) -> None:
+    """Set what the survivors became, delete the others, and ask for new scores from here on."""
+    mesh_adapter.write_columns(obj, columns)
     mesh_edit.delete_vertices(obj, ~keep)
     del obj.data[RECORD]
-    return done
 
 
 def absorbed_columns(obj: bpy.types.Object, absorbed: Absorbed) -> dict[str, NDArray[Any]]:
@@ -340,9 +346,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
         export_object(obj, target, keep=result.keep, columns=columns, overwrite=overwrite)
     if save and not dry_run:
         store(obj, result.scores, views, settings)
-        mesh_adapter.write_columns(obj, columns)
-        mesh_edit.delete_vertices(obj, ~result.keep)
-        del obj.data[RECORD]
+        _reduce(obj, result.keep, columns)
         _save()
     timings = result.report["timings"]
     timings["read_s"] = read - start

@@ -16,8 +16,7 @@ def few(addon, room, room_cameras):  # noqa: ARG001
     addon.mesh_edit.delete_vertices(room, remove)
     settings = bpy.context.scene.refine
     settings.absorb, settings.ratio = True, 0.6
-    yield room, core.Budget(ratio=0.6)
-    settings.absorb, settings.ratio = False, 0.5
+    return room, core.Budget(ratio=0.6)
 
 
 def absorbed_in_core(addon, obj, views, budget):
@@ -90,6 +89,24 @@ def test_the_command_on_an_object_writes_the_same_survivors(addon, few, room_vie
     np.testing.assert_array_equal(np.asarray(written.means), wanted)
     assert report["absorbed"] == expected.facts()
     assert len(room.data.vertices) == count
+
+
+def test_saving_leaves_in_the_blend_what_apply_leaves(addon, few, room_views, tmp_path):
+    """Survivors as in core, their scores to look at, and none to apply once more."""
+    room, budget = few
+    expected = absorbed_in_core(addon, room, room_views, budget).absorbed
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+
+    addon.session.prune_object(
+        room.name, room_views, budget, addon.core.Settings(), absorb=True, save=True
+    )
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
+
+    obj = bpy.data.objects["room"]
+    means = addon.mesh_adapter.splats_from_object(obj).means
+    np.testing.assert_array_equal(means, expected.splats.means.astype(np.float32))
+    assert "refine_score" in obj.data.attributes
+    assert addon.score_attributes.record(obj.data) is None
 
 
 def test_protected_splats_neither_vanish_nor_change(addon, few):
