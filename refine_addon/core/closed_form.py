@@ -12,6 +12,7 @@ the mean of each term is the authors' code's; it makes the terms comparable.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -142,7 +143,7 @@ def score(
         msg = "there are no splats to score"
         raise RefineError(msg)
     scene = _Scene(splats, views, settings)
-    ratios = for_chunks(
+    tallies = for_chunks(
         scene.read, len(splats), 4 * _CHUNK,
         progress=part(progress, 0.0, 0.2), what="reading", threads=threads,
     )  # fmt: skip
@@ -150,7 +151,7 @@ def score(
         msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
         raise RefineError(msg)
     scene.measure()
-    for_chunks(
+    sums = for_chunks(
         scene.weigh, len(splats), _CHUNK,
         progress=part(progress, 0.2, 0.95), what="scoring", threads=threads,
     )  # fmt: skip
@@ -160,13 +161,42 @@ def score(
             f"{len(views)} views; check that cameras and splats share their frame and unit"
         )
         raise RefineError(msg)
-    return scene.scores(sum(ratios))
+    statistics = _statistics(np.array(tallies))
+    lambdas = (1 / 3, 1 / 3, 1 / 3)
+    if not settings.equal_weights:
+        lambdas = adaptive.weights(statistics, offset=settings.anisotropy_offset or 0.0)
+    means = np.sum(sums, axis=0) / len(splats)
+    factors = np.divide(lambdas, means, out=np.zeros(3), where=means > 0.0)
+    for_chunks(partial(scene.add, factors), len(splats), 4 * _CHUNK, threads=threads)
+    return Scores(
+        values=scene.values,
+        seen=scene.seen,
+        views_used=len(views),
+        undrawable=len(splats) - int(np.count_nonzero(scene.good)),
+        weights={
+            "lambda": dict(zip(adaptive.TERMS, lambdas, strict=True)),
+            "statistics": vars(statistics).copy(),
+        },
+    )
+
+
+def _statistics(tallies: NDArray[np.float64]) -> adaptive.Statistics:
+    """Return the statistics of a scene from those of its chunks; see `_Scene.read`."""
+    count, ratios, translucency, luma, squares = tallies.T
+    total = count.sum()
+    # Around the mean of each chunk, and of these around that of all: nothing cancels.
+    around = luma - luma @ count / total
+    return adaptive.Statistics(
+        anisotropy=float(ratios.sum() / total),
+        luma_variance=float((squares.sum() + around * around @ count) / total),
+        translucency=float(translucency.sum() / total),
+    )
 
 
 class _Scene:
     """What the formula needs of N splats, filled chunk by chunk.
 
-    The splats are read once, since they may be a file larger than memory: 65 bytes of each stay.
+    The splats are read once, since they may be a file larger than memory: 57 bytes of each stay.
     """
 
     def __init__(self, splats: Splats, views: ViewSet, settings: ClosedForm) -> None:
@@ -178,10 +208,18 @@ class _Scene:
         self.means = np.empty((count, 3), splats.means.dtype.newbyteorder("="))
         self.squared, self.alpha, self.area, self.weight = (np.empty(count) for _ in range(4))
         self.luma = np.empty(count, np.float32)  # in 0..1, to 6e-8
+        self.values = np.empty(count, np.float32)
         self.seen = np.zeros(count, np.int32)
 
-    def read(self, piece: slice) -> float:
-        """Activate one slice of splats; return the sum of the axis ratios of those drawable."""
+    def read(self, piece: slice) -> tuple[float, ...]:
+        """Activate one slice of splats.
+
+        Returns
+        -------
+        count, ratios, translucency, luma, squares : float
+            Of those drawable: how many, the sums of axis ratio and 4 alpha (1 - alpha), the mean
+            of the luma and the sum of its squares around that mean.
+        """
         chunk = self.splats.take(piece)
         good = self.good[piece] = drawable(chunk)
         means = self.means[piece] = np.where(good[:, None], chunk.means, 0.0)
@@ -189,12 +227,15 @@ class _Scene:
         # What underflows to 0 is 0 beside everything that counts.
         with np.errstate(under="ignore"):
             self.squared[piece] = np.einsum("ij,ij->i", offset, offset) + self.spread
-            self.alpha[piece] = opacity(np.where(good, chunk.opacity_logits, -np.inf))
+            alpha = self.alpha[piece] = opacity(np.where(good, chunk.opacity_logits, -np.inf))
             red, green, blue = base_color(np.where(good[:, None], chunk.sh_dc, 0.0)).T
             self.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
             logs = np.where(good[:, None], chunk.log_scales, 0.0).astype(np.float64)
             self.area[piece], ratio = self._axes(logs)
-        return float(ratio[good].sum())
+            alpha, luma = alpha[good], self.luma[piece][good].astype(np.float64)
+            mean = luma.sum() / max(len(luma), 1)
+            squares = np.sum(np.square(luma - mean))
+        return len(luma), ratio[good].sum(), np.sum(4.0 * alpha * (1.0 - alpha)), mean, squares
 
     def _axes(self, logs: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the product of the two largest scales, and longest over shortest."""
@@ -223,8 +264,8 @@ class _Scene:
             self.views, self.origin, NEAR_RELATIVE * size, self.settings.margin
         )
 
-    def weigh(self, piece: slice) -> None:
-        """Compute H of one slice of splats, and in how many views it lies."""
+    def weigh(self, piece: slice) -> list[float]:
+        """Compute H of one slice of splats, and in how many views it lies; sum its three terms."""
         points = np.ones((4, piece.stop - piece.start))
         points[:3] = (self.means[piece] - self.origin).T
         total = np.zeros(points.shape[1])
@@ -248,8 +289,15 @@ class _Scene:
                 total = np.where(seen == 0, UNSEEN / near, total)
             if self.settings.visibility:
                 total *= self.alpha[piece]
-        self.weight[piece] = total * self.good[piece]
+            weight = self.weight[piece] = total * self.good[piece]
+            sums = [float(np.sum(weight * content)) for content in self._contents(piece)]
         self.seen[piece] = seen * self.good[piece]
+        return sums
+
+    def _contents(self, piece: slice) -> tuple[NDArray[np.float64], ...]:
+        """Return the three G of one slice of splats."""
+        luma, alpha = self.luma[piece].astype(np.float64), self.alpha[piece]
+        return self.area[piece], luma * luma, alpha * alpha
 
     def _squared(
         self, points: NDArray[np.float64], depth: NDArray[np.float64], block: slice
@@ -263,36 +311,13 @@ class _Scene:
             depth += np.multiply(step, step, out=step)
         return depth
 
-    def scores(self, ratios: float) -> Scores:
-        """Weigh the three terms and return their sum; `ratios` is the sum of all axis ratios."""
-        good = self.good
-        alpha, luma = self.alpha[good], self.luma[good]
-        statistics = adaptive.Statistics(
-            anisotropy=ratios / len(alpha),
-            luma_variance=float(np.var(luma, dtype=np.float64)),
-            translucency=float(np.mean(4.0 * alpha * (1.0 - alpha))),
-        )
-        lambdas = (1 / 3, 1 / 3, 1 / 3)
-        if not self.settings.equal_weights:
-            lambdas = adaptive.weights(statistics, offset=self.settings.anisotropy_offset or 0.0)
-        values = np.zeros(len(good))
+    def add(self, factors: NDArray[np.float64], piece: slice) -> None:
+        """Sum up the terms of one slice of splats, each times its factor."""
+        weight, good = self.weight[piece], self.good[piece]
         with np.errstate(under="ignore"):
-            contents = (self.area, self.luma.astype(np.float64) ** 2, self.alpha * self.alpha)
-            for weight, content in zip(lambdas, contents, strict=True):
-                term = self.weight * content
-                mean = np.mean(term)
-                if mean > 0.0:
-                    values += weight * (term / mean)
-            stored = values.astype(np.float32)
+            terms = zip(factors, self._contents(piece), strict=True)
+            values = sum(factor * (weight * content) for factor, content in terms)
+            stored = np.asarray(values, np.float32)
         # A splat that can be drawn must never tie with one that cannot.
         stored[good] = np.maximum(stored[good], np.finfo(np.float32).tiny)
-        return Scores(
-            values=stored,
-            seen=self.seen,
-            views_used=len(self.views),
-            undrawable=int(np.count_nonzero(~good)),
-            weights={
-                "lambda": dict(zip(adaptive.TERMS, lambdas, strict=True)),
-                "statistics": vars(statistics).copy(),
-            },
-        )
+        self.values[piece] = stored

@@ -74,10 +74,10 @@ class Frustums:
         np.matmul(stack, points, out=product)
         x, y, depth = np.split(product.reshape(-1, points.shape[1])[: len(rows)], 3)
         np.maximum(np.abs(x, out=x), np.abs(y, out=y), out=x)
+        inside = np.less_equal(x, depth)
         near, far = self._near[block], self._far[block]
-        # One number for all views is three times as fast as one for each.
-        least = near if np.ptp(near) > 0.0 else near[0, 0]
-        inside = np.less_equal(np.maximum(x, least, out=x), depth)
+        # One number for all views is twice as fast as one for each.
+        inside &= depth >= (near if np.ptp(near) > 0.0 else near[0, 0])
         if np.isfinite(far).any():
             inside &= depth <= far
         return depth, inside

@@ -7,12 +7,16 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
+import numpy as np
+
 from .errors import Cancelled
 
 Progress = Callable[[float, str], "bool | None"]
 """Called as ``progress(fraction, what)``; returning ``False`` cancels."""
 
 Result = TypeVar("Result")
+
+_HELD = 30_000_000  # bytes; glibc heeds no block above 32 MB
 
 
 def silent(_fraction: float, _what: str) -> None:
@@ -69,6 +73,9 @@ def for_chunks(
     Cancelled
         If `progress` answers ``False``; work that has not begun is dropped.
     """
+    # glibc hands each freed block to the system at once, and takes it back page by page, up to the
+    # size of the largest that was ever freed: chunks are to find their memory where they left it.
+    np.empty(_HELD, np.uint8)
     slices = [slice(start, min(start + chunk, total)) for start in range(0, total, chunk)]
     threads = default_threads() if threads is None else threads
     # About a hundred reports are enough for a bar, and each costs a draw.
