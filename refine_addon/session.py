@@ -18,7 +18,6 @@ from .camera_objects import world_matrix
 from .core import pipeline
 from .core.errors import RefineError
 from .core.files import refuse_existing
-from .core.pipeline import Settings
 from .core.ply import columns_from_splats
 from .core.selection import select
 from .core.transform import transformed
@@ -30,8 +29,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .core.absorb import Absorbed
+    from .core.pipeline import Settings
     from .core.ply import SplatFile
-    from .core.scores import Scores
     from .core.selection import Budget
     from .core.splats import Splats
     from .core.views import ViewSet
@@ -96,40 +95,6 @@ def check_scorable(obj: bpy.types.Object) -> None:
     """Raise `RefineError` if scores could not be stored on an object, before they are computed."""
     check(obj)
     mesh_edit.check_writable(obj)
-
-
-def score_object(
-    obj: bpy.types.Object,
-    views: ViewSet,
-    settings: Settings | None = None,
-    progress: Progress = silent,
-) -> Scores:
-    """Score an object's splats and store the result on its mesh.
-
-    Parameters
-    ----------
-    obj : bpy.types.Object
-    views : ViewSet
-        In the world's frame.
-    settings : Settings, optional
-    progress : callable, optional
-
-    Returns
-    -------
-    Scores
-
-    Raises
-    ------
-    RefineError
-        If the object holds no splats or cannot be written to, or no view sees any of them.
-    Cancelled
-        If `progress` answers ``False``.
-    """
-    settings = settings or Settings()
-    check_scorable(obj)
-    scores = pipeline.score(gather(obj), views, settings, progress=progress)
-    store(obj, scores, views, settings)
-    return scores
 
 
 def keep_mask(obj: bpy.types.Object, budget: Budget, protect: str = "") -> NDArray[np.bool_]:
@@ -315,8 +280,8 @@ def prune_object(  # noqa: PLR0913 - the command's options
     Raises
     ------
     RefineError
-        See `score_object`, `apply_object` and `export_object`; also if there is no such object, or
-        the .blend cannot be saved.
+        See `gather`, `apply_object`, `export_object` and `refine_addon.core.pipeline.prune`; also
+        if there is no such object, or the .blend cannot be saved.
     """
     start = time.perf_counter()
     obj = find(name)

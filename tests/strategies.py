@@ -6,9 +6,13 @@ Nothing here uses the code under test; a file is a concatenation of bytes whose 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from hypothesis import strategies as st
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
 
 TYPES = {
     "char": "i1",
@@ -230,6 +234,18 @@ def plain_ply(count: int = 3, degree: int = 0, *, seed: int = 0) -> bytes:
     values[:, 2] += 4.0
     values[:, [names.index(f"scale_{axis}") for axis in range(3)]] -= 3.0
     return plain_header(count, names) + values.tobytes()
+
+
+def ply_of(columns: dict[str, np.ndarray], comments: Sequence[str] = ()) -> bytes:
+    """Return a binary little-endian PLY with a property a column, in their order and types."""
+    names = {value: name for name, value in TYPES.items() if not name[-1].isdigit()}
+    rows = np.empty(len(columns["x"]), [(n, v.dtype.newbyteorder("<")) for n, v in columns.items()])
+    for name, values in columns.items():
+        rows[name] = values
+    lines = ["ply", "format binary_little_endian 1.0", *(f"comment {text}" for text in comments)]
+    lines.append(f"element vertex {len(rows)}")
+    lines += [f"property {names[v.dtype.str[1:]]} {name}" for name, v in columns.items()]
+    return "\n".join([*lines, "end_header", ""]).encode() + rows.tobytes()
 
 
 def plain_header(count: object, names: list[str], form: str = "binary_little_endian") -> bytes:

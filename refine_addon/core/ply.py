@@ -19,7 +19,7 @@ from .files import expanded, refuse_mapped, whole_file
 from .ply_body import check_counts, read_text, vertex_range
 from .ply_columns import REQUIRED, REST_COUNTS, columns_from_splats, splats_from_columns
 from .ply_header import TEXT, Header, format_of, read_header, with_count, with_properties
-from .ply_write import declarations, write_columns, write_lines, write_rows
+from .ply_write import declarations, write_lines, write_rows
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -37,7 +37,6 @@ __all__ = [
     "columns_from_splats",
     "read_ply",
     "splats_from_columns",
-    "write_columns",
 ]
 
 _NAMES_SHOWN = 12

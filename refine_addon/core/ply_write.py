@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import io
 import re
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import plyfile
 
 from .errors import RefineError
-from .files import whole_file
-from .ply_header import with_count
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+    from pathlib import Path
     from typing import BinaryIO
 
     from numpy.typing import NDArray
@@ -34,43 +30,6 @@ PLY_TYPES = {
 
 _ROWS = 1 << 14
 """Rows gathered at a time: 4 MB at degree 3, as fast as any more and nothing to hold."""
-
-
-def write_columns(
-    path: Path,
-    columns: Mapping[str, NDArray[Any]],
-    *,
-    comments: Sequence[str] = (),
-    overwrite: bool = False,
-) -> None:
-    """Write a new binary little-endian 3DGS PLY from named columns, in their order.
-
-    Parameters
-    ----------
-    path : Path
-        The file to make; written whole or not at all.
-    columns : mapping of str to (N,)
-        One property each, of the type of its array.
-    comments : sequence of str
-        Header comments.
-    overwrite : bool
-        Whether an existing file may be replaced.
-
-    Raises
-    ------
-    RefineError
-        If the file cannot be written, or exists and may not be replaced.
-    """
-    dtype = np.dtype([(name, values.dtype.newbyteorder("<")) for name, values in columns.items()])
-    rows = np.empty(len(columns["x"]), dtype)
-    for name, values in columns.items():
-        rows[name] = values
-    element = plyfile.PlyElement.describe(rows[:0], "vertex")
-    stream = io.BytesIO()
-    plyfile.PlyData([element], text=False, byte_order="<", comments=list(comments)).write(stream)
-    with whole_file(Path(path), overwrite=overwrite) as output:
-        output.write(with_count(stream.getvalue(), len(rows)))
-        write_rows(output, rows, None, {})
 
 
 def write_rows(

@@ -94,6 +94,19 @@ def room_cameras(addon, empty_scene, room_views):
     return collection
 
 
+@pytest.fixture
+def score(addon):
+    """Return a function that scores an object by the views it is given, as the button does."""
+
+    def score(obj, views):
+        settings = addon.core.Settings()
+        addon.session.check_scorable(obj)
+        scores = addon.core.score(addon.session.gather(obj), views, settings)
+        addon.score_attributes.store(obj, scores, views, settings)
+
+    return score
+
+
 def snapshot():
     """Return what an operator must leave alone where it fails, as plain values."""
     facts = {

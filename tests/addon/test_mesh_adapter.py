@@ -8,6 +8,8 @@ import bpy
 import numpy as np
 import pytest
 
+from tests.strategies import ply_of
+
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 
 
@@ -17,8 +19,8 @@ def _link(mesh):
     return obj
 
 
-def _file(addon, path, columns, **options):
-    addon.core.ply.write_columns(path, columns, **options)
+def _file(addon, path, columns, comments=()):
+    path.write_bytes(ply_of(columns, comments))
     return addon.core.read_ply(path)
 
 

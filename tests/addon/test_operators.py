@@ -422,7 +422,7 @@ def test_edit_mode_greys_the_buttons(room, room_cameras):  # noqa: ARG001
 
 
 @pytest.mark.parametrize("how", ["hide_set", "hide_viewport", "exclude"])
-def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_cameras, how):
+def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_cameras, score, how):
     """By the eye, by the monitor icon, by excluding the collection; the command reaches all."""
     views = addon.camera_adapter.views_from_scene(
         bpy.context, "COLLECTION", collection=room_cameras
@@ -440,7 +440,7 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
         collection.objects.link(room)
         bpy.context.scene.collection.objects.unlink(room)
         bpy.context.view_layer.layer_collection.children["excluded"].exclude = True
-    addon.session.score_object(room, views)
+    score(room, views)
     keep = addon.session.keep_mask(room, addon.core.Budget(ratio=0.5))
     addon.session.apply_object(room, addon.core.Budget(ratio=0.5))
 
@@ -448,7 +448,7 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
     assert len(room.data.vertices) == expected.sum()
 
 
-def test_linked_objects_are_refused(addon, room, room_cameras, tmp_path):  # noqa: ARG001
+def test_linked_objects_are_refused(addon, room, room_cameras, score, tmp_path):  # noqa: ARG001
     """What lies in a library cannot be changed from here; exporting it is no change."""
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "library.blend"))
     bpy.ops.wm.read_homefile(use_empty=True)
@@ -459,6 +459,6 @@ def test_linked_objects_are_refused(addon, room, room_cameras, tmp_path):  # noq
     views = addon.core.read_cameras(ROOM / "cameras.json")
 
     with pytest.raises(addon.core.RefineError, match="is linked from"):
-        addon.session.score_object(room, views)
+        score(room, views)
     addon.session.export_object(room, tmp_path / "out.ply")
     assert _bytes(tmp_path / "out.ply") == _bytes(ROOM / "point_cloud.ply")

@@ -6,6 +6,8 @@ import bpy
 import numpy as np
 import pytest
 
+from tests.strategies import ply_of
+
 
 def _evaluated(obj):
     """Return the points that a preview draws."""
@@ -111,7 +113,7 @@ def test_a_rendered_splat_is_a_gaussian(addon, core, tmp_path):
         **{f"scale_{i}": np.full(1, np.log(0.5), np.float32) for i in range(3)},
         "rot_0": np.ones(1, np.float32),
     }
-    core.ply.write_columns(tmp_path / "one.ply", columns)
+    (tmp_path / "one.ply").write_bytes(ply_of(columns))
     bpy.ops.refine.import_ply(filepath=str(tmp_path / "one.ply"))
     scene = bpy.context.scene
     scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))

@@ -10,6 +10,8 @@ import mathutils
 import numpy as np
 import pytest
 
+from tests.strategies import ply_of
+
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 PLY = ROOM / "point_cloud.ply"
 
@@ -84,19 +86,18 @@ def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_ca
     assert len(room.data.vertices) == 39755
 
 
-def _ranked(addon, obj, views):
-    addon.session.score_object(obj, views)
+def _ranked(addon, obj, score):
+    score(obj, addon.camera_adapter.visible_views(bpy.context.scene))
     return addon.mesh_adapter.read_attribute(obj.data, "refine_rank")
 
 
-def test_moving_splats_and_cameras_together_keeps_the_rows(addon, room, room_cameras):
+def test_moving_splats_and_cameras_together_keeps_the_rows(addon, room, room_cameras, score):
     """Both under one parent, moved, turned and scaled by 3: the default ranks by no unit.
 
     Blender's matrices are float32, so neighbours in rank may change places: at most a few rows in
     ten thousand change sides of the middle.
     """
-    views = addon.camera_adapter.visible_views(bpy.context.scene)
-    before = _ranked(addon, room, views) < 0.5
+    before = _ranked(addon, room, score) < 0.5
     parent = bpy.data.objects.new("parent", None)
     bpy.context.scene.collection.objects.link(parent)
     for obj in (room, *room_cameras.objects):
@@ -106,7 +107,7 @@ def test_moving_splats_and_cameras_together_keeps_the_rows(addon, room, room_cam
     parent.location, parent.rotation_euler = (3.0, -2.0, 5.0), (0.3, 1.0, -0.7)
     parent.scale = (3.0, 3.0, 3.0)
     bpy.context.view_layer.update()
-    after = _ranked(addon, room, addon.camera_adapter.visible_views(bpy.context.scene)) < 0.5
+    after = _ranked(addon, room, score) < 0.5
 
     assert np.count_nonzero(before != after) <= 4
 
@@ -117,7 +118,7 @@ def test_an_unevenly_scaled_object_is_scored_as_it_stands_in_the_world(addon, co
     columns = make_splats(count=50)
     for axis in range(3):
         columns[f"scale_{axis}"][:] = -3.0
-    core.ply.write_columns(tmp_path / "in.ply", columns)
+    (tmp_path / "in.ply").write_bytes(ply_of(columns))
     mesh = addon.mesh_adapter.mesh_from_file(core.read_ply(tmp_path / "in.ply"))
     obj = bpy.data.objects.new("stretched", mesh)
     obj.scale = (1.0, 2.0, 1.0)
@@ -162,7 +163,7 @@ def test_normals_turn_with_the_transform(addon, core, make_splats, tmp_path):
     columns = make_splats(count=2)
     for name, values in (("nx", (1, 0)), ("ny", (0, 0)), ("nz", (0, 0))):
         columns[name][:] = values
-    core.ply.write_columns(tmp_path / "in.ply", columns)
+    (tmp_path / "in.ply").write_bytes(ply_of(columns))
     mesh = addon.mesh_adapter.mesh_from_file(core.read_ply(tmp_path / "in.ply"))
     obj = bpy.data.objects.new("turned", mesh)
     obj.rotation_euler.z = math.pi / 2
