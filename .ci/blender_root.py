@@ -19,13 +19,11 @@ import sys
 import tempfile
 from typing import TYPE_CHECKING
 
-from made_once import cache_folder, made_once
+from made_once import UnavailableError, cache_folder, made_once, print_path
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
-
-UNAVAILABLE = 69  # EX_UNAVAILABLE of sysexits.h
 
 PACKAGES = (
     "blender",
@@ -43,10 +41,6 @@ RELEASES = {"trixie": (), "sid": ("python3-cattr", "python3-requests")}
 
 # Each command the tool or its user needs, and the Debian package that has it.
 COMMANDS = {"mmdebstrap": "mmdebstrap", "bwrap": "bubblewrap", "unshare": "util-linux"}
-
-
-class UnavailableError(Exception):
-    """The root cannot be had on this machine; the message says why and what would help."""
 
 
 def install_commands() -> None:
@@ -206,14 +200,7 @@ def main() -> int:
     """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("release", choices=sorted(RELEASES))
-    release = parser.parse_args().release
-    try:
-        root = provide(release)
-    except UnavailableError as error:
-        print(f"blender_root: {release} cannot be had here: {error}", file=sys.stderr)
-        return UNAVAILABLE
-    print(root)
-    return 0
+    return print_path(provide, parser.parse_args().release)
 
 
 if __name__ == "__main__":

@@ -17,22 +17,16 @@ import subprocess
 import sys
 from typing import TYPE_CHECKING
 
-from made_once import made_once
+from made_once import UnavailableError, made_once, print_path
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-UNAVAILABLE = 69  # EX_UNAVAILABLE of sysexits.h
 
 # Every `bpy` from Blender 4.2 to 5.0 is built for this Python and no other.
 PYTHON = (3, 11)
 
 # Blender 4.2 carries numpy 1.24, which its wheel does not ask for; the later ones ask for theirs.
 NUMPY = {"4.2": "numpy==1.24.*"}
-
-
-class UnavailableError(Exception):
-    """The environment cannot be had on this machine; the message says why."""
 
 
 def find_python() -> str:
@@ -124,14 +118,7 @@ def main() -> int:
     """
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("version")
-    version = parser.parse_args().version
-    try:
-        python = provide(version)
-    except UnavailableError as error:
-        print(f"bpy_venv: bpy {version} cannot be had here: {error}", file=sys.stderr)
-        return UNAVAILABLE
-    print(python)
-    return 0
+    return print_path(provide, parser.parse_args().version)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,39 @@
-"""A folder in the user's cache that is made once, whole or not at all."""
+"""A folder in the user's cache that is made once, whole or not at all, or the reason why not."""
 
 from __future__ import annotations
 
 import fcntl
 import os
 import shutil
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+UNAVAILABLE = 69  # EX_UNAVAILABLE of sysexits.h
+
+
+class UnavailableError(Exception):
+    """Something cannot be had on this machine; the message says why and what would help."""
+
+
+def print_path(provide: Callable[[str], Path], name: str) -> int:
+    """Print the path that ``provide(name)`` returns, or why there is none on stderr.
+
+    Returns
+    -------
+    int
+        The program's exit code: 0, or 69 where it cannot be had.
+    """
+    try:
+        path = provide(name)
+    except UnavailableError as error:
+        print(f"{Path(sys.argv[0]).stem}: {name} cannot be had here: {error}", file=sys.stderr)
+        return UNAVAILABLE
+    print(path)
+    return 0
 
 
 def cache_folder() -> Path:

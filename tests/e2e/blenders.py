@@ -18,6 +18,7 @@ from typing import Any
 
 import blender_root
 import bpy_venv
+from made_once import UnavailableError
 
 PROJECT = Path(__file__).resolve().parents[2]
 DRIVER = Path(__file__).parent / "inside" / "run_step.py"
@@ -48,7 +49,7 @@ def provide(name: str) -> tuple[Path | None, str]:
         if name in BINARIES:
             return blender_root.provide(name), ""
         return bpy_venv.provide(name.removeprefix("bpy-")), ""
-    except (blender_root.UnavailableError, bpy_venv.UnavailableError) as error:
+    except UnavailableError as error:
         return None, f"{name} cannot be had here: {error}"
 
 
