@@ -31,6 +31,7 @@ build: $(DEV)         ## the extension's zip, validated, into build/
 bench: $(BENCH)       ## speed and memory, with medians
 	$(PY) -m benchmarks.speed
 	$(PY) -m benchmarks.file_to_file
+	$(PY) -m benchmarks.file_to_file --absorb --splats 1900000 --runs 1
 	$(PY) -m benchmarks.in_blender
 
 bench-trade: $(BENCH) ## quality over time: docs/trade.md; SCENES="folder ..." measures others

@@ -55,16 +55,16 @@ def find() -> list[str] | None:
 
 def version() -> str:
     """Return its version, or "" where it is not installed."""
-    command = find()
-    if command is None:
+    start = find()
+    if start is None:
         return ""
-    done = subprocess.run([*command, "--version"], capture_output=True, text=True, check=False)
+    done = subprocess.run([*start, "--version"], capture_output=True, text=True, check=False)
     words = (done.stdout + done.stderr).split()
     return next((word for word in words if word.lstrip("v")[:1].isdigit()), "?")
 
 
-def decimate(source: Path, target: Path, flag: str, keep_count: int) -> Run:
-    """Write `source`, decimated to `keep_count` splats, to `target`.
+def command(source: Path, target: Path, flag: str, keep_count: int) -> list[str]:
+    """Return the command line that writes `source`, decimated to `keep_count`, to `target`.
 
     Parameters
     ----------
@@ -77,15 +77,26 @@ def decimate(source: Path, target: Path, flag: str, keep_count: int) -> Run:
     Raises
     ------
     RefineError
+        If it is not installed.
+    """
+    start = find()
+    if start is None:
+        raise RefineError(MISSING)
+    return [*start, "-g", "cpu", "-q", "-w", str(source), str(target), flag, str(keep_count)]
+
+
+def decimate(source: Path, target: Path, flag: str, keep_count: int) -> Run:
+    """Run `command`.
+
+    Raises
+    ------
+    RefineError
         If it is not installed, or fails; with what it said.
     """
-    command = find()
-    if command is None:
-        raise RefineError(MISSING)
-    arguments = ["-g", "cpu", "-q", "-w", str(source), str(target), flag, str(keep_count)]
+    arguments = command(source, target, flag, keep_count)
     with tempfile.TemporaryFile() as said:
         start = time.perf_counter()
-        process = subprocess.Popen([*command, *arguments], stdout=said, stderr=said)
+        process = subprocess.Popen(arguments, stdout=said, stderr=said)
         code, peak = _wait(process)
         seconds = time.perf_counter() - start
         said.seek(0)
@@ -125,8 +136,8 @@ def install() -> int:
         print("npm is not installed; the benchmark goes on without splat-transform")
         return 0
     FOLDER.mkdir(parents=True, exist_ok=True)
-    command = [npm, "install", "--no-audit", "--no-fund", "--prefix", str(FOLDER), *PACKAGES]
-    code = subprocess.run(command, check=False).returncode
+    order = [npm, "install", "--no-audit", "--no-fund", "--prefix", str(FOLDER), *PACKAGES]
+    code = subprocess.run(order, check=False).returncode
     print(f"splat-transform {version() or 'was not installed'}")
     return code
 
