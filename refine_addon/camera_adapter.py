@@ -19,8 +19,6 @@ from .core.errors import RefineError
 from .core.views import View, ViewSet
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
 
@@ -133,39 +131,51 @@ def views_from_scene(
         if frames is None:
             frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
         return views_from_frames(context, frames, splats)
-    cameras = list(_cameras(context, source, collection))
+    if source == "COLLECTION" and collection is None:
+        msg = "no cameras: choose the collection that holds them"
+        raise RefineError(msg)
+    context.view_layer.update()  # or the list of objects holds gaps where some were just removed
+    if source == "ACTIVE":
+        cameras = [_active_camera(scene)]
+    else:
+        cameras = chosen_cameras(context, source, collection)
     if not cameras:
-        where = {
-            "SELECTED": "none is selected",
-            "VISIBLE": f"none is visible in scene '{scene.name}'",
-            "COLLECTION": f"none is in collection '{collection.name}'" if collection else "",
-        }[source]
+        where = f"none is visible in scene '{scene.name}'"
+        if source == "SELECTED":
+            where = "none is selected"
+        elif source == "COLLECTION":
+            where = f"none is in collection '{collection.name}'"
         msg = f"no cameras: {where}; scoring needs at least one"
         raise RefineError(msg)
     depsgraph = context.evaluated_depsgraph_get()
     return ViewSet(tuple(view_from_camera(camera, scene, depsgraph) for camera in cameras))
 
 
-def _cameras(
+def chosen_cameras(
     context: bpy.types.Context, source: str, collection: bpy.types.Collection | None
-) -> Iterator[bpy.types.Object]:
+) -> list[bpy.types.Object]:
+    """Return the cameras that a user chose, of any type; quick enough for drawing.
+
+    Parameters
+    ----------
+    context : bpy.types.Context
+    source : {"ACTIVE", "SELECTED", "VISIBLE", "COLLECTION"}
+    collection : bpy.types.Collection or None
+        See `views_from_scene`.
+    """
     layer = context.view_layer
-    layer.update()  # or the list holds gaps where objects were just removed
     if source == "ACTIVE":
-        yield _active_camera(context.scene)
-        return
-    if source == "COLLECTION" and collection is None:
-        msg = "no cameras: choose the collection that holds them"
-        raise RefineError(msg)
-    objects = collection.all_objects if source == "COLLECTION" else layer.objects
-    for obj in objects:
-        wanted = source == "COLLECTION" or (
-            obj.select_get(view_layer=layer)
-            if source == "SELECTED"
-            else obj.visible_get(view_layer=layer)
-        )
-        if obj.type == "CAMERA" and wanted:
-            yield obj
+        objects = [context.scene.camera]
+    elif source == "COLLECTION":
+        objects = collection.all_objects if collection else []
+    else:
+        objects = layer.objects
+    cameras = [obj for obj in objects if obj and obj.type == "CAMERA"]
+    if source == "SELECTED":
+        return [camera for camera in cameras if camera.select_get(view_layer=layer)]
+    if source == "VISIBLE":
+        return [camera for camera in cameras if camera.visible_get(view_layer=layer)]
+    return cameras
 
 
 def _active_camera(scene: bpy.types.Scene) -> bpy.types.Object:

@@ -9,7 +9,15 @@ import bpy
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from . import mesh_edit, mesh_layout, plans, preview, score_attributes, session
+from . import (
+    mesh_edit,
+    mesh_layout,
+    plans,
+    preview,
+    score_attributes,
+    score_origin,
+    session,
+)
 from .camera_adapter import views_from_scene
 from .core import pipeline
 from .core.errors import Cancelled, RefineError
@@ -158,6 +166,7 @@ class REFINE_OT_score(_OnThread, _OnSplats, bpy.types.Operator):
         self._views = _views(context)
         session.check_scorable(obj)
         self._splats = session.gather(obj)
+        self._origin = score_origin.origin(context, obj)
 
     def work(self, progress: Progress) -> Scores:
         """Score."""
@@ -166,7 +175,7 @@ class REFINE_OT_score(_OnThread, _OnSplats, bpy.types.Operator):
     def finish(self, context: bpy.types.Context, obj: bpy.types.Object, scores: Scores) -> Answer:
         """Store the scores on the mesh and say what came of it."""
         views = self._views
-        score_attributes.store(obj, scores, views, self._settings)
+        score_attributes.store(obj, scores, views, self._settings, self._origin)
         plans.refresh(context)
         unseen = int((scores.seen == 0).sum())
         self.report(
@@ -234,7 +243,12 @@ class REFINE_OT_apply(_OnThread, _OnScored, bpy.types.Operator):
     ) -> Answer:
         """Delete what does not stay, and change what absorbed it."""
         settings = context.scene.refine
-        done = session.apply_object(obj, settings.to_budget(), settings.protect, absorbed)
+        budget = settings.to_budget()
+        context.view_layer.update()
+        changed = score_origin.changes(context, obj)
+        if absorbed and budget.removals(len(absorbed.keep), 1.0) is not None:
+            changed = []  # nothing went by the scores
+        done = session.apply_object(obj, budget, settings.protect, absorbed)
         plans.forget(obj.data)
         self.report(
             {"INFO"},
@@ -243,6 +257,12 @@ class REFINE_OT_apply(_OnThread, _OnScored, bpy.types.Operator):
         )
         if absorbed:
             self.report({"WARNING"}, absorbed.note())
+        if changed:
+            self.report(
+                {"WARNING"},
+                f"The scores were from before a change ({', '.join(changed)}); undo and "
+                "score again if it is to count",
+            )
         return {"FINISHED"}
 
 

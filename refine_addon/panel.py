@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from . import mesh_layout, plans, preview, score_attributes
+from . import mesh_layout, plans, preview, score_attributes, score_origin
+from .camera_adapter import chosen_cameras
 
 if TYPE_CHECKING:
     from .properties import RefineSettings
@@ -53,19 +54,11 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
         layout.prop(settings, "source")
         if settings.source == "COLLECTION":
             layout.prop(settings, "collection")
-            if settings.collection:
-                cameras = [o for o in settings.collection.all_objects if o.type == "CAMERA"]
-                layout.label(text=f"{len(cameras)} cameras", icon="CAMERA_DATA")
-        elif settings.source in {"VISIBLE", "SELECTED"}:
-            shown = (
-                context.selected_objects
-                if settings.source == "SELECTED"
-                else (context.visible_objects)
-            )
-            count = sum(obj.type == "CAMERA" for obj in shown)
-            layout.label(text=f"{count} cameras", icon="CAMERA_DATA")
-        elif settings.source == "FRAMES":
+        if settings.source == "FRAMES":
             _draw_frames(layout, settings, context.scene)
+        elif settings.source != "ACTIVE":
+            cameras = chosen_cameras(context, settings.source, settings.collection)
+            layout.label(text=f"{len(cameras)} cameras", icon="CAMERA_DATA")
 
 
 class REFINE_PT_score(_InSidebar, bpy.types.Panel):
@@ -95,6 +88,9 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
                 text=f"Scored by {record['views_used']} of {record['views_given']} views",
                 icon="CHECKMARK",
             )
+            changed = score_origin.changes(context, obj)
+            if changed:
+                layout.label(text=f"Score again: {', '.join(changed)}", icon="ERROR")
         elif mesh_layout.looks_like_splats(obj) and score_attributes.RANK in obj.data.attributes:
             layout.label(text="Applied: score again for more", icon="INFO")
 

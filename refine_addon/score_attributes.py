@@ -27,8 +27,22 @@ RECORD = "refine_scores"
 """Custom property of the mesh: how its scores came to be, as JSON."""
 
 
-def store(obj: bpy.types.Object, scores: Scores, views: ViewSet, settings: Settings) -> None:
+def store(
+    obj: bpy.types.Object,
+    scores: Scores,
+    views: ViewSet,
+    settings: Settings,
+    origin: dict[str, Any] | None = None,
+) -> None:
     """Write scores to the attributes of an object's mesh, and note how they came to be.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+    scores, views, settings
+        What `core.pipeline.score` gave, and was given.
+    origin : dict, optional
+        See `score_origin.origin`.
 
     Raises
     ------
@@ -58,6 +72,7 @@ def store(obj: bpy.types.Object, scores: Scores, views: ViewSet, settings: Setti
             "undrawable": scores.undrawable,
             "weights": scores.weights,
             "notes": [*scores.notes, *([views.note] if views.note else [])],
+            "origin": origin,
         }
     )
     mesh.update()

@@ -105,6 +105,20 @@ def test_a_plan_that_no_longer_holds_is_replaced_by_a_button(draw, room, room_ca
     assert "refine.plan" in draw()
 
 
+def test_scores_older_than_a_change_ask_to_be_made_again(draw, room, room_cameras):  # noqa: ARG001
+    """In one line, below what they were made by."""
+    bpy.ops.refine.score()
+    fresh = draw()
+    room.location.x = 1.0
+    bpy.context.scene.refine.views = 8
+    bpy.context.view_layer.update()
+    old = draw()
+    bpy.ops.refine.score()
+
+    assert set(old) - set(fresh) == {"Score again: object moved, settings changed"}
+    assert not [text for text in draw() if text.startswith("Score again")]
+
+
 def test_while_scoring_a_bar_takes_the_place_of_the_button(draw, room):  # noqa: ARG001
     """The bar says how to cancel."""
     manager = bpy.context.window_manager

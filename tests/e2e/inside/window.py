@@ -50,20 +50,23 @@ def main(name: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
     yield from picture(pictures, "2-scored")
     found["scored"] = state(name)
 
+    bpy.data.objects[name].location.x += 0.1
+    yield from picture(pictures, "3-moved")  # the scores are older than that, says the panel
+
     yield from hand.click("refine.apply(")
     yield from until(lambda: state(name) != found["scored"], "splats are removed")
-    yield from picture(pictures, "3-applied")
+    yield from picture(pictures, "4-applied")
     found["applied"] = state(name)
 
     yield from hand.undo()
     yield from until(lambda: state(name) != found["applied"], "they are back")
-    yield from picture(pictures, "4-undone")
+    yield from picture(pictures, "5-undone")
     found["undone"] = state(name)
 
     # Last, since every frame is slow from here on: the view now draws materials.
     yield from hand.click("refine.preview(mode='HEAT'")
     yield from until(lambda: bpy.data.objects[name].modifiers, "there is a preview")
-    yield from picture(pictures, "5-heat", settle=20.0)  # EEVEE compiles its shaders
+    yield from picture(pictures, "6-heat", settle=20.0)  # EEVEE compiles its shaders
     found["previewed"] = state(name)
     return found
 
