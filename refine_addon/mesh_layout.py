@@ -164,12 +164,13 @@ def sh_degree(mesh: bpy.types.Mesh) -> int:
     return REST_COUNTS.get(rest_count(mesh), 0)
 
 
-def stored_bytes(mesh: bpy.types.Mesh) -> int:
-    """Return about how large the exported file is; cheap enough to draw, and without checks."""
-    layout = _remembered(mesh)
-    # Without a file behind it: position, degree 0 and the harmonics, as floats.
-    row = layout.row_dtype.itemsize if layout else 4 * (14 + rest_count(mesh))
-    return row * len(mesh.vertices)
+def export_bytes(obj: bpy.types.Object) -> int | None:
+    """Return how large the exported file is, None if there can be none; cheap enough to draw."""
+    try:
+        layout = _remembered(obj.data) or _standard(obj)
+    except RefineError:
+        return None
+    return len(layout.header) + layout.row_dtype.itemsize * len(obj.data.vertices)
 
 
 def rest_count(mesh: bpy.types.Mesh) -> int:

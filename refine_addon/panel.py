@@ -36,7 +36,9 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         count = len(obj.data.vertices)
         layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
         layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
-        layout.label(text=f"{mesh_layout.stored_bytes(obj.data) / 1e6:,.1f} MB")
+        size = mesh_layout.export_bytes(obj)
+        if size is not None:
+            layout.label(text=f"{size / 1e6:,.1f} MB")
 
 
 class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):

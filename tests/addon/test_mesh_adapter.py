@@ -144,6 +144,18 @@ def test_meshes_of_blenders_own_importer_are_read(addon, make_splats, tmp_path):
     addon.session.export_object(bpy.context.object, tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
+    size = addon.mesh_layout.export_bytes(bpy.context.object)  # what the panel says
+    assert (tmp_path / "out.ply").stat().st_size == size
+
+
+def test_a_mesh_that_cannot_be_exported_has_no_size(addon, room):
+    """Nor does drawing the panel fail: 44 of 45 coefficients are of no degree."""
+    size = addon.mesh_layout.export_bytes(room)
+    room.data.attributes.remove(room.data.attributes["f_rest_7"])
+    del room.data["refine_layout"]
+
+    assert (ROOM / "point_cloud.ply").stat().st_size == size
+    assert addon.mesh_layout.export_bytes(room) is None
 
 
 def test_kiris_vert_form_is_read_and_its_face_form_refused(addon, make_splats, tmp_path):
