@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import hashlib
 import os
+import platform
+import re
 import secrets
+import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from .errors import RefineError
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -97,23 +106,79 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     except (OSError, RuntimeError, ValueError) as error:  # links in a circle; a zero byte
         msg = f"{path}: cannot be written ({error}); nothing was changed"
         raise RefineError(msg) from error
-    # Of its own name, not the target's: that one may be as long as a name can be.
-    temporary = target.with_name(f".refine-{secrets.token_hex(8)}.tmp")
-    try:
+    _remove_abandoned(target)
+    with contextlib.ExitStack() as held:
+        temporary = None
+        try:
+            temporary, stream = _new_temporary(target, held)
+            with stream:
+                yield stream
+            if overwrite:
+                if target.exists():
+                    temporary.chmod(target.stat().st_mode & 0o7777)
+                temporary.replace(target)
+            else:
+                _publish_new(temporary, target)
+        except OSError as error:
+            raise RefineError(_explain(path, error)) from error
+        finally:
+            if temporary is not None:
+                with contextlib.suppress(OSError):
+                    temporary.unlink(missing_ok=True)
+
+
+def _prefix(target: Path) -> str:
+    """Return what the names of a target's temporary files begin with on this machine.
+
+    Not the target's own name, which may be as long as a name can be. With the machine's, because
+    locks of other machines are not always seen.
+    """
+    owner = platform.node().encode() + b"\0" + os.fsencode(target.name)
+    return f".refine-{hashlib.blake2b(owner, digest_size=8).hexdigest()}-"
+
+
+def _new_temporary(target: Path, held: contextlib.ExitStack) -> tuple[Path, BinaryIO]:
+    """Make a file beside `target`, locked as long as `held` lasts, or this process lives."""
+    while True:
+        temporary = target.with_name(f"{_prefix(target)}{secrets.token_hex(8)}.tmp")
         # Not tempfile: its files are readable by their owner alone, and the name would keep that.
-        with temporary.open("xb") as stream:
-            yield stream
-        if overwrite:
-            if target.exists():
-                temporary.chmod(target.stat().st_mode & 0o7777)
-            temporary.replace(target)
-        else:
-            _publish_new(temporary, target)
-    except OSError as error:
-        raise RefineError(_explain(path, error)) from error
+        stream = temporary.open("xb")
+        if fcntl is None:
+            return temporary, stream
+        # A second descriptor: the file is closed, which may fail, before it gets its name.
+        lock = os.dup(stream.fileno())
+        held.callback(os.close, lock)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            taken = not os.fstat(lock).st_nlink
+        except BlockingIOError:
+            taken = True  # by another run, which sees a file without an owner
+        except OSError:
+            taken = False  # no locks on this file system: nobody removes anything here
+        if not taken:
+            return temporary, stream
+        stream.close()
+
+
+def _remove_abandoned(target: Path) -> None:
+    """Remove what killed runs on this machine left of this target: files that nobody locks."""
+    if fcntl is None:
+        return
+    ours = re.compile(re.escape(_prefix(target)) + r"[0-9a-f]{16}\.tmp")
+    with contextlib.suppress(OSError), os.scandir(target.parent) as entries:
+        for name in [entry.name for entry in entries if ours.fullmatch(entry.name)]:
+            with contextlib.suppress(OSError):
+                _remove_unlocked(target.with_name(name))
+
+
+def _remove_unlocked(temporary: Path) -> None:
+    descriptor = os.open(temporary, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+    try:
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            temporary.unlink()
     finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        os.close(descriptor)
 
 
 def _publish_new(temporary: Path, target: Path) -> None:
