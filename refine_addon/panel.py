@@ -80,7 +80,7 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
             column.prop(settings, "tolerance")
         progress = context.window_manager.refine_progress
         if progress >= 0.0:
-            layout.progress(factor=progress, text=f"Scoring {progress:.0%} (Esc cancels)")
+            layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
             return
         layout.operator("refine.score", icon="CAMERA_DATA")
         obj = context.object
@@ -111,6 +111,8 @@ class REFINE_PT_advanced(_InSidebar, bpy.types.Panel):
         layout.use_property_decorate = False
         settings = context.scene.refine
         layout.prop(settings, "views")
+        if settings.method == "occlusion":
+            return  # the others are settings of the closed form
         layout.prop(settings, "depth")
         layout.prop(settings, "published")
         column = layout.column()

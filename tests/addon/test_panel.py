@@ -126,8 +126,24 @@ def test_while_scoring_a_bar_takes_the_place_of_the_button(draw, room):  # noqa:
     drawn = draw()
     manager.refine_progress = -1.0
 
-    assert "Scoring 43% (Esc cancels)" in drawn
+    assert "43% (Esc cancels)" in drawn
     assert "refine.score" not in drawn
+    assert "refine.apply" not in drawn
+
+
+@pytest.mark.parametrize(
+    ("method", "expected"),
+    [("closed-form", {"views", "depth", "published", "frustum", "margin"}),
+     ("occlusion", {"views"}),
+     ("auto", {"views", "depth", "published", "frustum", "margin", "tolerance"})],
+)  # fmt: skip
+def test_only_settings_that_the_method_looks_at_are_drawn(draw, method, expected):
+    """Occlusion has none in the panel but the number of views."""
+    bpy.context.scene.refine.method = method
+    drawn = draw()
+
+    every = {"views", "depth", "published", "frustum", "margin", "tolerance"}
+    assert every & set(drawn) == expected
 
 
 @pytest.mark.parametrize("source", ["VISIBLE", "ACTIVE", "SELECTED", "COLLECTION", "FRAMES"])
