@@ -89,7 +89,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_prune(commands)
     _add_score(commands)
     info = commands.add_parser("info", help="say what is in 3DGS PLY files")
-    info.add_argument("inputs", nargs="+", type=Path, metavar="INPUT")
+    info.add_argument("inputs", nargs="+", type=Path, metavar="INPUT", help="3DGS PLY files")
     _add_common(info)
     info.set_defaults(run=_run_info)
     return parser
@@ -101,7 +101,9 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     prune.add_argument(
         "--object", metavar="NAME", help="prune this splat object of the open .blend"
     )
-    prune.add_argument("--save", action="store_true", help="save the .blend, with --object")
+    prune.add_argument(
+        "--save", action="store_true", help="with --object: delete the splats there and save"
+    )
     prune.add_argument("-o", "--output", type=_path, metavar="OUT.ply", help="for a single input")
     prune.add_argument(
         "--output-dir", type=_path, metavar="DIR", help="for many inputs; made if it is not there"
@@ -133,8 +135,10 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
 
 def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     scoring = commands.add_parser("score", help="write the file with a float property refine_score")
-    scoring.add_argument("inputs", nargs=1, type=Path, metavar="INPUT")
-    scoring.add_argument("-o", "--output", type=_path, metavar="OUT.ply", required=True)
+    scoring.add_argument("inputs", nargs=1, type=Path, metavar="INPUT", help="a 3DGS PLY file")
+    scoring.add_argument(
+        "-o", "--output", type=_path, metavar="OUT.ply", required=True, help="the file to make"
+    )
     _add_scoring(scoring)
     _add_common(scoring)
     scoring.set_defaults(run=_run_score)
@@ -163,7 +167,11 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
         f"(default {Settings.tolerance})",
     )
     parser.add_argument(
-        "--depth", choices=["z", "distance"], default="z", help="along the view's axis, or from it"
+        "--depth",
+        choices=["z", "distance"],
+        default="z",
+        help="what the closed form takes as distance: along the view's axis (z), or to the view "
+        "itself (default z)",
     )
     parser.add_argument(
         "--published",

@@ -133,7 +133,7 @@ class RefineSettings(bpy.types.PropertyGroup):
     frame_step: IntProperty(name="Step", description="Every how many frames", default=10, min=1)
     budget: EnumProperty(
         name="Budget",
-        description="How much to remove is given by",
+        description="What says how much is removed",
         items=BUDGETS,
         update=_plan_again,
     )
