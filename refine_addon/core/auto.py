@@ -92,17 +92,14 @@ def score(
 
     Parameters
     ----------
-    splats : Splats
-        In the frame and unit of the views.
+    splats, progress, threads
+        See `refine_addon.core.occlusion.score`.
     views : ViewSet
         Those of the full model.
     tolerance : float
         Share of the kept set that may differ from the full model's.
     settings : tuple of ClosedForm and Occlusion
         What the models start from.
-    progress : callable, optional
-        See `refine_addon.core.work.Progress`.
-    threads : int, optional
 
     Returns
     -------
