@@ -209,6 +209,9 @@ def _numbers(header: Header, element: Any, lines: Sequence[bytes]) -> NDArray[An
 _WRONG = (ValueError, DeprecationWarning)
 """What NumPy raises of text that is no number of the type."""
 
+_NO_SPACES = bytes.maketrans(b"\x1c\x1d\x1e\x1f", b"????")
+"""Four characters at which text is split, and bytes are not: part of a word, as in the header."""
+
 
 def _parsed(lines: Sequence[bytes], dtype: Any) -> NDArray[Any]:  # noqa: ANN401
     if not lines:
@@ -219,7 +222,7 @@ def _parsed(lines: Sequence[bytes], dtype: Any) -> NDArray[Any]:  # noqa: ANN401
     with warnings.catch_warnings():
         # 1.5 where a whole number belongs is deprecated.
         warnings.simplefilter("error", DeprecationWarning)
-        text = (line.decode("ascii") for line in lines)
+        text = (line.translate(_NO_SPACES).decode("ascii") for line in lines)
         return np.loadtxt(text, dtype, comments=None, ndmin=1)
 
 

@@ -433,10 +433,6 @@ REFUSED = {
         declared((b"end_header", b"property list uchar int links\nend_header")),
         "property 'links' is a list, expected one number a splat",
     ),
-    "list for a position": (
-        declared((b"property float y", b"property list uchar float y")),
-        "property 'y' is a list, expected one number a splat",
-    ),
     "whole positions": (
         declared((b"float y", b"int y")),
         "property 'y' is of type i4, expected float or double",
@@ -549,6 +545,8 @@ TEXT_WRONG = {
     "remark": (TEXT_ROW.replace(b"7", b"7 # 7"), "expected 15 numbers, got 17"),
     "foreign": (TEXT_ROW.replace(b"7", b"\xff"), r"of type uint8, got '\\xff'"),
     "blank": (b"\n" + TEXT_ROW, "expected 15 numbers, got 0"),
+    "separator": (TEXT_ROW.replace(b"1", b"1\x1d5"), r"of type float32, got '1\x1d5'"),
+    "separator alone": (TEXT_ROW.replace(b" 7", b"\x1f7"), "expected 15 numbers, got 14"),
 }
 
 
