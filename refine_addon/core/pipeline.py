@@ -130,15 +130,21 @@ def score(
     Cancelled
         If `progress` answers ``False``.
     """
-    used = views.spread(settings.views)
-    if settings.method == "occlusion":
-        return occlusion.score(splats, used, settings.occlusion, progress=progress, threads=threads)
-    if settings.method == "auto":
-        models = (settings.closed_form, settings.occlusion)
-        return auto.score(
-            splats, used, settings.tolerance, models, progress=progress, threads=threads
+    # What is too small for a float is nothing beside what counts: it may underflow to 0.
+    with np.errstate(under="ignore"):
+        used = views.spread(settings.views)
+        if settings.method == "occlusion":
+            return occlusion.score(
+                splats, used, settings.occlusion, progress=progress, threads=threads
+            )
+        if settings.method == "auto":
+            models = (settings.closed_form, settings.occlusion)
+            return auto.score(
+                splats, used, settings.tolerance, models, progress=progress, threads=threads
+            )
+        return closed_form.score(
+            splats, used, settings.closed_form, progress=progress, threads=threads
         )
-    return closed_form.score(splats, used, settings.closed_form, progress=progress, threads=threads)
 
 
 def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
@@ -238,15 +244,16 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
     Cancelled
         If `progress` answers ``False``.
     """
-    used = views.spread(settings.views)
 
     def seen(now: Splats, ahead: Progress) -> Seen:
         measured = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
         return Seen(measured.contribution, measured.contrast)
 
-    return absorbing.absorb(
-        splats, used, seen, count, protected=protected, progress=progress, threads=threads
-    )
+    with np.errstate(under="ignore"):  # as for scores
+        used = views.spread(settings.views)
+        return absorbing.absorb(
+            splats, used, seen, count, protected=protected, progress=progress, threads=threads
+        )
 
 
 def prune_file(  # noqa: PLR0913 - the use case, file to file

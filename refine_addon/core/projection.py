@@ -33,6 +33,8 @@ _GRID_BITS = 10
 _FARTHEST = 1e6  # beyond so many scene sizes a splat counts as seen by nobody
 _LOG_SCALE_RANGE = (-16.0, 5.0)  # relative to the size of the scene; keeps float32 in range
 _LARGEST_VARIANCE = 1e12  # px^2; a footprint a million pixels wide is flat over any image
+_FARTHEST_VIEW = 1e18  # scene sizes; from there everything is one point
+_LARGEST_LENS = 1e9  # px; beyond these two float32 would not hold what is computed
 _BEYOND = 0.15  # of the image: the projection is linearised no further outside (0.3 half sizes)
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -213,6 +215,8 @@ def project(gaussians: Gaussians, frame: Frame, view: View) -> Footprints:
     The footprint is the Gaussian of covariance ``J W S W' J' + 0.3 I`` (Zwicker et al., "EWA
     splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean.
     """
+    if not _computable(frame, view):
+        return _nothing()
     near, far = clip_planes(frame, view)
     rotation = _rotation6(view)
     pieces: list[tuple[NDArray[Any], ...]] = []
@@ -225,11 +229,22 @@ def project(gaussians: Gaussians, frame: Frame, view: View) -> Footprints:
             shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)
             pieces.append((touching + start, local[2], *_ellipses(local, shape, view)))
     if not pieces:
-        empty = np.empty((2, 0), np.float32)
-        return Footprints(np.empty(0, np.int64), empty, empty, empty, empty)
+        return _nothing()
     index, depth, *rest = (np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True))
     order = _by_depth(depth)
     return Footprints(index[order], *(np.take(values, order, axis=1) for values in rest))
+
+
+def _nothing() -> Footprints:
+    empty = np.empty((2, 0), np.float32)
+    return Footprints(np.empty(0, np.int64), empty, empty, empty, empty)
+
+
+def _computable(frame: Frame, view: View) -> bool:
+    """Whether float32 holds what the view sees; it shows nothing of the scene where not."""
+    away = float(np.abs(view.center - frame.origin).max())
+    lens = (view.fx, view.fy, abs(view.cx), abs(view.cy), view.width, view.height)
+    return away <= _FARTHEST_VIEW * frame.size and max(lens) <= _LARGEST_LENS
 
 
 def clip_planes(frame: Frame, view: View) -> tuple[float, float]:

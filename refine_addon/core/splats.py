@@ -108,13 +108,14 @@ def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
     largest = np.max(np.abs(q), axis=-1, keepdims=True)
     usable = np.isfinite(largest) & (largest > 0.0)
     # Divide by the largest component first: squares of 1e200 or 1e-200 would leave the range.
-    q = np.where(usable, q, [1.0, 0.0, 0.0, 0.0]) / np.where(usable, largest, 1.0)
-    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
+    with np.errstate(under="ignore"):  # what is beside the largest as 1e-200 to 1 is nothing
+        q = np.where(usable, q, [1.0, 0.0, 0.0, 0.0]) / np.where(usable, largest, 1.0)
+        w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 

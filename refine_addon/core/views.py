@@ -205,21 +205,20 @@ class ViewSet:
             Weighted median of the centres' squared distances to it.
         """
         centers, weights = self.centers, self.weights
-        middle = weights @ centers
         with np.errstate(under="ignore"):
+            middle = weights @ centers
             for _ in range(100):
                 distance = np.linalg.norm(centers - middle, axis=1)
-                reach = distance.max()
+                # Half of the views are nearer than this, however far the farthest strays.
+                reach = _median(distance, weights)
                 if reach == 0.0:
                     break
                 pull = weights / np.maximum(distance, 1e-9 * reach)
                 before, middle = middle, (pull @ centers) / pull.sum()
                 if np.linalg.norm(middle - before) <= 1e-12 * reach:
                     break
-        squared = np.sum((centers - middle) ** 2, axis=1)
-        order = np.argsort(squared, kind="stable")
-        half = np.searchsorted(np.cumsum(weights[order]), 0.5 - 1e-9)
-        return middle, float(squared[order[half]])
+            squared = np.sum((centers - middle) ** 2, axis=1)
+        return middle, _median(squared, weights)
 
     def spread(self, count: int) -> ViewSet:
         """Return at most `count` views that cover the set evenly, in their old order.
@@ -250,3 +249,9 @@ class ViewSet:
             distance[chosen] = -1.0
             chosen.append(int(np.argmax(np.round(distance, 9))))
         return self.take(np.sort(usable[order[chosen]]))
+
+
+def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    """Return the weighted median; of two in the middle the smaller."""
+    order = np.argsort(values, kind="stable")
+    return float(values[order[np.searchsorted(np.cumsum(weights[order]), 0.5 - 1e-9)]])

@@ -61,6 +61,15 @@ def test_a_quaternion_of_any_length_is_a_rotation(length):
     np.testing.assert_allclose(matrix, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
 
 
+@pytest.mark.parametrize("small", [1e-160, 1e-200, 1e-320])
+def test_what_is_small_beside_the_rest_of_a_quaternion_is_nothing(small):
+    """Squares and quotients of it underflow, silently."""
+    with np.errstate(all="raise"):
+        matrix = rotation_matrices(np.array([2.0, small, -small, small]))
+
+    np.testing.assert_allclose(matrix, np.eye(3), atol=1e-150)
+
+
 @pytest.mark.parametrize("broken", [[0, 0, 0, 0], [np.nan, 0, 0, 0], [np.inf, 1, 0, 0]])
 def test_a_quaternion_that_says_nothing_counts_as_the_identity(broken):
     """Zero has no direction."""
