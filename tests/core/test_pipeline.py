@@ -6,6 +6,7 @@ import itertools
 import json
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +16,23 @@ from refine_addon.core import (
     Budget,
     Cancelled,
     ClosedForm,
+    Occlusion,
     RefineError,
+    Scores,
     Settings,
+    Splats,
+    ViewSet,
+    froxels,
+    projection,
     prune,
     prune_file,
     read_cameras,
     read_ply,
+    score,
+    select,
 )
+from refine_addon.core.adaptive import Statistics, weights
+from refine_addon.core.closed_form import LUMA
 from refine_addon.core.selection import rank
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
@@ -133,17 +144,98 @@ def test_settings_that_cannot_be_are_refused():
         Settings(views=-1)
 
 
-@pytest.mark.parametrize("settings", [ClosedForm(), ClosedForm.published("distance")])
-def test_float32_positions_keep_the_splats_that_float64_keeps(file, views, settings):
-    """The file's float32 values, widened first or not, are the same numbers."""
-    from dataclasses import replace  # noqa: PLC0415
+TENTHS = [tenth / 10 for tenth in range(1, 10)]
 
+
+def wide(splats: Splats) -> Splats:
+    """Return the same numbers as doubles, in every attribute."""
+    return Splats(
+        **{item.name: getattr(splats, item.name).astype(np.float64) for item in fields(Splats)}
+    )
+
+
+def differing(one: Scores, other: Scores) -> list[int]:
+    """Return how many splats one keeps and the other does not, at each tenth removed."""
+    return [
+        int(np.count_nonzero(select(one, Budget(ratio=r)) & ~select(other, Budget(ratio=r))))
+        for r in TENTHS
+    ]
+
+
+def in_doubles(splats: Splats, views: ViewSet) -> Scores:
+    """Evaluate the default closed form plainly: every number a double, all splats at once."""
+    middle, spread = views.middle()
+    means = splats.means.astype(np.float64)
+    squared = np.sum((means - middle) ** 2, axis=1) + spread
+    size = np.sqrt(np.median(squared))
+    total, seen = np.zeros(len(means)), np.zeros(len(means), np.int32)
+    for view, weight in zip(views, views.weights, strict=True):
+        x, y, z = view.rotation @ (means - view.center).T
+        inside = (z >= (view.near or 0.01 * size)) & (z <= view.far)
+        inside &= np.abs(view.fx * x + (view.cx - view.width / 2) * z) <= 0.575 * view.width * z
+        inside &= np.abs(view.fy * y + (view.cy - view.height / 2) * z) <= 0.575 * view.height * z
+        total += np.where(inside, weight / (z * z + 0.005 * size * size), 0.0)
+        seen += inside
+    total = np.where(seen == 0, 1e-6 / (squared + 0.005 * size * size), total)
+    alpha = 1.0 / (1.0 + np.exp(-splats.opacity_logits.astype(np.float64)))
+    low, middle_one, high = np.sort(splats.log_scales.astype(np.float64), axis=1).T
+    luma = (0.28209479177387814 * splats.sh_dc.astype(np.float64) + 0.5).clip(0, 1) @ LUMA
+    lambdas = weights(
+        Statistics(
+            float(np.mean(np.minimum(np.exp(high - low), 1e6))),
+            float(np.var(luma)),
+            float(np.mean(4 * alpha * (1 - alpha))),
+        )
+    )
+    values = np.zeros(len(means))
+    for share, content in zip(lambdas, (np.exp(middle_one + high), luma**2, alpha**2), strict=True):
+        term = alpha * total * content
+        values += share * term / term.mean()
+    return Scores(values, seen, len(views), 0)
+
+
+def test_closed_form_of_floats_keeps_the_splats_that_doubles_keep(file, views):
+    """At every tenth: against the same numbers as doubles, and against the formula in doubles."""
     splats = file.splats()
-    wide = replace(splats, means=splats.means.astype(np.float64))
-    for ratio in (0.1, 0.5, 0.9):
-        one = prune(splats, views, Budget(ratio=ratio), Settings(closed_form=settings)).keep
-        two = prune(wide, views, Budget(ratio=ratio), Settings(closed_form=settings)).keep
-        assert np.count_nonzero(one & two) / np.count_nonzero(one | two) >= 0.9999
+    for form in (ClosedForm(), ClosedForm("distance"), ClosedForm.published("z")):
+        settings = Settings(closed_form=form)
+        scores = score(splats, views, settings)
+
+        assert differing(scores, score(wide(splats), views, settings)) == [0] * 9
+
+    assert differing(score(splats, views), in_doubles(splats, views)) == [0] * 9
+
+
+class Doubles:
+    """NumPy, but for what float32 is."""
+
+    float32 = np.float64
+
+    def __getattr__(self, name: str) -> object:
+        """Return what NumPy has."""
+        return getattr(np, name)
+
+
+@pytest.mark.parametrize(("rounds", "every"), [(1, 4), (3, 8)])
+def test_occlusion_in_floats_keeps_the_splats_that_doubles_keep(
+    file, views, monkeypatch, rounds, every
+):
+    """The method computes in float32; the same code with every float32 a double says the same.
+
+    One splat for another at most: a point on the edge of a cell falls on one side or the other.
+    """
+    some = views.take(range(0, len(views), every))
+    settings = Settings("occlusion", occlusion=Occlusion(rounds=rounds))
+    scores = score(file.splats(), some, settings)
+    for module in (projection, froxels):
+        monkeypatch.setattr(module, "np", Doubles())
+    monkeypatch.setattr(projection, "_by_depth", lambda depth: np.argsort(depth, kind="stable"))
+    gaussians, frame, _ = projection.prepare(wide(file.splats()), some)
+    assert projection.project(gaussians, frame, some[0]).centers.dtype == np.float64
+
+    expected = score(wide(file.splats()), some, settings)
+
+    assert max(differing(scores, expected)) <= 1
 
 
 def test_core_imports_where_there_is_no_blender():
