@@ -244,7 +244,8 @@ def _computable(frame: Frame, view: View) -> bool:
     """Whether float32 holds what the view sees; it shows nothing of the scene where not."""
     away = float(np.abs(view.center - frame.origin).max())
     lens = (view.fx, view.fy, abs(view.cx), abs(view.cy), view.width, view.height)
-    return away <= _FARTHEST_VIEW * frame.size and max(lens) <= _LARGEST_LENS
+    known = min(view.fx, view.fy) >= 1.0 / _LARGEST_LENS and max(lens) <= _LARGEST_LENS
+    return known and away <= _FARTHEST_VIEW * frame.size
 
 
 def clip_planes(frame: Frame, view: View) -> tuple[float, float]:
