@@ -8,9 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from refine_addon.core import RefineError, Splats, View, ViewSet, froxels, occlusion, projection
+from refine_addon.core import (
+    RefineError,
+    Splats,
+    View,
+    ViewSet,
+    coverage,
+    froxels,
+    occlusion,
+    projection,
+)
 from refine_addon.core.occlusion import Measured, Occlusion
-from refine_addon.core.splats import SH_C0
+from refine_addon.core.splats import SH_C0, rotation_matrices
 from refine_addon.core.transform import transformed
 
 ONCE = Occlusion(rounds=1)
@@ -83,6 +92,29 @@ def agreement(first, second) -> float:
     return len(kept[0] & kept[1]) / (len(first) - half)
 
 
+def plain_footprint(splats: Splats, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """Return centre and 2D covariance of the first splat, the Jacobian by differences.
+
+    Where the centre lies more than .15 of the image beside it, the projection is linearised there.
+    """
+    axes = rotation_matrices(splats.quaternions[0]) * np.exp(splats.log_scales[0])
+    turned = view.rotation @ axes
+    local = view.rotation @ (splats.means[0] - view.center)
+
+    def pixel(point):
+        return np.array([view.fx, view.fy]) * point[:2] / point[2] + [view.cx, view.cy]
+
+    size = np.array([view.width, view.height])
+    bound = pixel(local).clip(-0.15 * size, 1.15 * size)
+    slope = (bound - [view.cx, view.cy]) / [view.fx, view.fy]
+    at = np.array([*slope * local[2], local[2]])
+    step = 1e-6 * local[2]
+    jacobian = np.stack(
+        [(pixel(at + step * unit) - pixel(at - step * unit)) / (2 * step) for unit in np.eye(3)], 1
+    )
+    return pixel(local), jacobian @ turned @ turned.T @ jacobian.T + 0.3 * np.eye(2)
+
+
 # ----- numbers by hand
 
 
@@ -136,6 +168,25 @@ def test_a_wall_hides_what_is_behind_it_and_not_what_is_before_it():
     assert share[1] < 0.05
 
 
+def test_a_wall_hides_nothing_beside_it():
+    """One before the right half of the image leaves all of the left half as it is."""
+    means = wall(2.0)
+    means = means[means[:, 0] > 0.2]
+    small = np.random.default_rng(1).uniform([-1.4, -1.0, 4.0], [-0.2, 1.0, 4.5], size=(200, 3))
+
+    alone = measured(splats_of(small, scales=0.02), look_along_z())
+    beside = measured(
+        splats_of(
+            np.vstack([means, small]),
+            np.r_[np.full(len(means), 0.99), np.full(len(small), 0.5)],
+            np.r_[np.full(len(means), 0.05), np.full(len(small), 0.02)][:, None].repeat(3, 1),
+        ),
+        look_along_z(),
+    )
+
+    np.testing.assert_allclose(beside.contribution[len(means) :], alone.contribution, rtol=1e-4)
+
+
 def test_what_has_the_colour_of_what_is_behind_it_has_no_contrast():
     """In front of an opaque wall of its own gray a splat can go; of another gray it cannot."""
     means = np.vstack([wall(2.0), [[0, 0, 1.5]]])
@@ -172,6 +223,281 @@ def test_every_lattice_has_the_moments_of_the_normal_distribution():
         np.testing.assert_allclose(points @ weights, 0.0, atol=1e-4)
         variances = (points * points) @ weights
         assert all(abs(v - 1) < 1e-4 or v == 0.0 for v in variances)
+
+
+# ----- veils: splats so large that they cover the image evenly, by hand
+
+
+def veils(alphas, grays, depths) -> Splats:
+    """Return splats a thousand times as large as the image."""
+    return splats_of([[0, 0, z] for z in depths], alphas, 1000.0, grays)
+
+
+def square(**changes) -> View:
+    """Return a view of 64 x 64 px: 16 x 16 cells of 4, each with one point of every veil."""
+    return replace(look_along_z(), width=64, height=64, cx=32.0, cy=32.0, **changes)
+
+
+def let_through(*alphas: float) -> float:
+    """Return the mean of exp(-tau), tau gamma distributed of shape 12 / 4, mean -sum log(1 - a)."""
+    return (1.0 - sum(math.log(1.0 - (alpha - CUT)) for alpha in alphas) / 3.0) ** -3
+
+
+def test_a_veil_lets_through_what_it_leaves_uncovered():
+    """Behind veils of alpha .6 and .9 a small splat contributes T, its contrast is T^2."""
+    small = splats_of([[0, 0, 3]])
+    behind = measured(
+        Splats(
+            **{
+                name: np.concatenate([getattr(veils([0.6, 0.9], 0.0, [1, 2]), name), values])
+                for name, values in vars(small).items()
+            }
+        ),
+        square(),
+    )
+    alone = measured(small, square())
+
+    passed = let_through(0.6, 0.9)
+    assert behind.contribution[2] / alone.contribution[0] == pytest.approx(passed, rel=1e-4)
+    assert behind.contrast[2] / alone.contrast[0] == pytest.approx(passed**2, rel=1e-4)
+
+
+def test_the_contrast_of_each_veil_is_to_what_lies_behind_it():
+    """White .3 before gray .5 before .8 of gray .25: B = a c + (1 - a) B' from the back."""
+    alphas, grays = np.array([0.3, 0.5, 0.8]), np.array([1.0, 0.5, 0.25])
+    cover = alphas - CUT
+    behind = [cover[1] * 0.5 + (1 - cover[1]) * cover[2] * 0.25, cover[2] * 0.25, 0.0]
+    passed = [1.0, let_through(0.3), let_through(0.3, 0.5)]
+
+    found = measured(veils(alphas, grays, [1, 2, 3]), square())
+
+    for index in range(3):
+        one = slice(index, index + 1)
+        alone = measured(veils(alphas[one], grays[one], [1]), square())
+        expected = (passed[index] * (grays[index] - behind[index]) / grays[index]) ** 2
+        assert found.contrast[index] / alone.contrast[0] == pytest.approx(expected, rel=1e-3)
+        light = found.contribution[index] / alone.contribution[0]
+        assert light == pytest.approx(passed[index], rel=1e-4)
+
+
+@pytest.mark.parametrize(("x", "y"), [(0, 0), (40, 0), (0, -40), (-30, 35)])
+def test_a_splat_larger_than_the_image_contributes_what_lies_over_its_pixels(x, y):
+    """Sigma about 80 px, its centre so many pixels aside: alpha summed over 64 x 64 of them."""
+    splats = splats_of([[x / 50, y / 50, 2]], 0.5, 1.6)
+    center, covariance = plain_footprint(splats, square(near=0.1))
+
+    found = measured(splats, square(near=0.1))
+
+    steps = np.stack(np.meshgrid(np.arange(64) + 0.5, np.arange(64) + 0.5), -1) - center
+    inverse = np.linalg.inv(covariance)
+    alphas = np.exp(-0.5 * np.einsum("xyi,ij,xyj->xy", steps, inverse, steps)) * (0.5 - CUT)
+    assert found.contribution[0] == pytest.approx(alphas.sum(), rel=1e-2)
+
+
+def test_a_splat_covers_no_more_of_a_cell_than_its_opacity():
+    """Sigma 2 px in a cell of 4: 2 pi 2^2 .5 / 16 is .78 of it, and yet half goes through."""
+    settings = Occlusion(cell=4.0, density=1.0, rounds=1)  # one point for each
+    middle = np.array([0.02, 0.02])  # 2 px off the middle of the image: that of a cell
+    front = splats_of([[*middle, 1.0], [*middle * 2, 2.0]], scales=[[0.02] * 3, [0.04] * 3])
+
+    found = measured(front, square(), settings=settings)
+    alone = measured(front.take(slice(1, 2)), square(), settings=settings)
+
+    passed = (1.0 + math.log(2.0) / 3.0) ** -3
+    assert found.contribution[1] / alone.contribution[0] == pytest.approx(passed, rel=1e-3)
+
+
+@pytest.mark.parametrize(("x", "y"), [(-0.8, 0), (0.8, 0), (0, -0.6), (0, 0.6)])
+def test_half_of_a_splat_on_the_edge_of_the_image_counts(x, y):
+    """At depth 2 and 100 px these are the edges of 80 x 60 px; sigma is 8 of them."""
+    inside = measured(splats_of([[0, 0, 2]], scales=0.16), look_along_z())
+
+    found = measured(splats_of([[x, y, 2]], scales=0.16), look_along_z())
+
+    assert found.contribution[0] / inside.contribution[0] == pytest.approx(0.5, abs=0.05)
+    assert found.contrast[0] / inside.contrast[0] == pytest.approx(0.5, abs=0.05)
+
+
+@pytest.mark.parametrize(("x", "y"), [(-0.82, 0), (0.82, 0), (0, -0.62), (0, 0.62)])
+def test_a_splat_beside_the_image_contributes_what_reaches_in_and_is_not_seen(x, y):
+    """A pixel outside, of sigma 2.5: a third of it."""
+    found = measured(splats_of([[x, y, 2]]), look_along_z())
+
+    assert found.contribution[0] > 0.0
+    assert found.seen.tolist() == [0]
+
+
+# ----- footprints
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_footprints_are_those_of_the_linearised_projection(seed):
+    """Long splats turned anyhow, seen by a turned camera whose principal point is off the middle.
+
+    Half of them lie beside the image and reach into it.
+    """
+    rng = np.random.default_rng(seed)
+    view = look_along_z(
+        rng.normal(size=3), fx=90.0, fy=130.0, cx=rng.uniform(10, 70), cy=rng.uniform(10, 50)
+    )
+    view = replace(view, rotation=np.linalg.qr(rng.normal(size=(3, 3)))[0])
+    wide = 1.5 if seed % 2 else 0.9
+    image = np.array([80, 60]) * (0.5 + wide * (rng.random(2) - 0.5))
+    image = [80 * 1.4, image[1]] if seed % 4 == 1 else image
+    image = [image[0], -60 * 0.4] if seed % 4 == 3 else image
+    depth = rng.uniform(2, 5)
+    local = np.array([(image[0] - view.cx) / 90.0, (image[1] - view.cy) / 130.0, 1.0]) * depth
+    splats = replace(
+        splats_of([view.rotation.T @ local + view.center], 0.9, [[0.7, 0.25, 0.05]]),
+        quaternions=rng.normal(size=(1, 4)),
+    )
+    center, covariance = plain_footprint(splats, view)
+
+    gaussians, frame, _ = projection.prepare(splats, ViewSet((view,)), threads=1)
+    found = projection.project(gaussians, frame, view)
+
+    halves = np.stack([found.major[:, 0], found.minor[:, 0]], axis=1).astype(float)
+    np.testing.assert_allclose(found.centers[:, 0], center, rtol=1e-4)
+    np.testing.assert_allclose(
+        halves @ halves.T, covariance, rtol=2e-3, atol=1e-3 * covariance[0, 0]
+    )
+    assert abs(halves[:, 0] @ halves[:, 1]) < 1e-3 * covariance.max()
+    np.testing.assert_allclose(found.sigmas[:, 0], np.linalg.norm(halves, axis=0), rtol=1e-5)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e3])
+def test_near_and_far_planes_are_lengths_of_the_world(unit):
+    """Depths 1, 2, 3, 4 between planes at 1.5 and 3.5, in metres and in millimetres."""
+    splats = splats_of([[0.1 * z * unit, 0, z * unit] for z in (1, 2, 3, 4)], scales=0.05 * unit)
+
+    found = measured(splats, look_along_z(near=1.5 * unit, far=3.5 * unit))
+
+    assert (found.contribution > 0).tolist() == [False, True, True, False]
+    assert found.seen.tolist() == [0, 1, 1, 0]
+
+
+def test_without_planes_what_is_nearer_than_a_hundredth_of_the_scene_is_not_seen():
+    """The size of the scene is the median distance, 2."""
+    splats = splats_of(
+        [[0, 0, 0.019], [0, 0, 0.021], [0, 0, 2], [0, 0, 3], [0, 0, 1e7]], scales=1e-4
+    )
+
+    assert measured(splats, look_along_z()).seen.tolist() == [0, 1, 1, 1]
+
+
+@pytest.mark.parametrize(("cx", "cy"), [(4.0, 30.0), (76.0, 30.0), (40.0, 3.0), (40.0, 57.0)])
+def test_all_of_an_image_is_seen_wherever_its_principal_point_lies(cx, cy):
+    """Small splats in its corners and on its middle."""
+    pixels = np.array([[2, 2], [78, 2], [2, 58], [78, 58], [40, 30]])
+    means = np.column_stack([(pixels - [cx, cy]) / 100.0 * 2.0, np.full(5, 2.0)])
+
+    found = measured(splats_of(means, scales=0.005), look_along_z(cx=cx, cy=cy))
+
+    assert found.seen.tolist() == [1] * 5
+    np.testing.assert_allclose(found.contribution, found.contribution[4], rtol=0.05)
+
+
+def test_what_lies_below_a_wide_image_is_not_seen():
+    """Of 80 x 60 px, row 70 would be inside of 80 rows."""
+    splats = splats_of([[0, 0.4 * 2, 2], [0, 0, 2]])
+
+    assert measured(splats, look_along_z()).seen.tolist() == [0, 1]
+
+
+# ----- rounds, weights, floor
+
+
+def test_the_score_is_the_contrast_times_a_power_of_the_contribution():
+    """P = 1/4 + 1/2 of what has gone: 3 x 16^(1/4) = 6, and 3 x 16^(1/2) = 12 from half on."""
+    sums = Measured(np.array([16.0]), np.array([3.0]), np.array([1], np.int32))
+
+    assert occlusion.combined(sums, 0.0) == pytest.approx([6.0])
+    assert occlusion.combined(sums, 0.5) == pytest.approx([12.0])
+
+
+def test_a_view_of_thrice_the_weight_counts_thrice():
+    """Weights are shares: 1/4 and 3/4 of what either says alone."""
+    splats, (one, two) = cloud(), ring(2)
+    alone = [occlusion.measure(splats, ViewSet((view,))) for view in (one, two)]
+
+    both = occlusion.measure(splats, ViewSet((one, replace(two, weight=3.0))))
+
+    for name in ("contribution", "contrast"):
+        first, second = (getattr(sums, name) for sums in alone)
+        np.testing.assert_allclose(
+            getattr(both, name), 0.25 * first + 0.75 * second, rtol=1e-3, atol=1e-3 * first.max()
+        )
+
+
+def test_two_rounds_order_nine_tenths_at_first_and_measure_the_last_tenth_anew():
+    """That tenth is all that is left by then; what hid it has gone."""
+    splats, views = cloud(), ring()
+
+    once = occlusion.score(splats, views, ONCE).values
+    twice = occlusion.score(splats, views, Occlusion(rounds=2)).values
+
+    order, anew = np.argsort(once), np.argsort(twice)
+    np.testing.assert_array_equal(order[:270], anew[:270])
+    assert set(order[270:]) == set(anew[270:])
+    assert (order[270:] != anew[270:]).any()
+
+
+def test_what_no_renderer_draws_goes_first_the_least_first():
+    """Opacity below 1/255: by the closed form, whatever the order of the file."""
+    splats = cloud(60)
+    faint = np.arange(0, 60, 3)
+    splats.means[faint] = [0.0, 0.0, 0.1]
+    splats.log_scales[faint] = -3.0
+    splats.sh_dc[faint] = 0.0
+    splats.opacity_logits[faint] = np.random.default_rng(6).permutation(20) * 0.1 - 9.0
+
+    values = occlusion.score(splats, ring(), Occlusion(rounds=3)).values
+
+    assert (
+        np.argsort(values)[:20].tolist() == faint[np.argsort(splats.opacity_logits[faint])].tolist()
+    )
+
+
+def test_a_large_splat_that_one_view_does_not_show_outlasts_a_faint_one_that_it_shows():
+    """One view leaves all to be guessed: what is large and near may be plain from elsewhere."""
+    splats = splats_of(
+        [[0, 0, 2], [0.3, 0, 2], [3, 0, 0.5]],
+        [0.9, 0.05, 0.9],
+        [[0.1] * 3, [0.02] * 3, [0.1] * 3],
+    )
+
+    values = occlusion.score(splats, ViewSet((look_along_z(),)), ONCE).values
+
+    assert values.tolist() == pytest.approx([1.0, 1 / 3, 2 / 3])
+
+
+def test_the_floor_falls_with_the_views_that_might_have_shown_a_splat():
+    """Worth 1, 1, 4 in 0, 3, 0 views, power 1/2: 1, 1/2, 2 over the mean of 1, 1 and 2."""
+    floors = coverage.floor(np.array([1.0, 1, 4]), np.array([0, 3, 0], np.int32), 0.5)
+
+    np.testing.assert_allclose(floors, np.array([1.0, 0.5, 2.0]) * 0.75)
+    np.testing.assert_allclose(
+        coverage.with_floor(np.array([2.0, 4, 6]), floors, 2.0),
+        np.array([0.5, 1, 1.5]) + 2 * floors,
+    )
+
+
+def test_the_weight_of_the_floor_is_as_small_as_what_the_left_out_views_say_allows():
+    """0 where the scores are right, much where the floor is, 1 where nothing was left out.
+
+    A view that sees nothing says nothing, and one that is bright says no more than others.
+    """
+    rng = np.random.default_rng(7)
+    right, wrong = rng.random(200), rng.random(200)
+    dark = np.zeros((1, 200))
+    errors = np.stack([right * rng.uniform(0.9, 1.1, 200) for _ in range(4)])
+
+    assert coverage.floor_weight([(right, wrong, errors), (right, wrong, dark)]) == 0.0
+    assert coverage.floor_weight([(wrong, right, errors)]) >= 10.0
+    assert coverage.floor_weight([]) == 1.0
+    assert coverage.floor_weight([(right, wrong, dark)]) == 1.0
+    glare = np.vstack([errors, wrong * 1e6])
+    assert coverage.floor_weight([(right, wrong, glare)]) < 0.1
 
 
 # ----- laws
@@ -279,6 +605,21 @@ def test_no_scene_makes_numpy_complain(focal, spread):
 
     assert np.isfinite(found.values).all()
     assert (found.values > 0).all()
+
+
+def test_cells_grow_until_the_points_of_a_view_fit_the_memory(monkeypatch):
+    """Of 4,000 splats of a hundred points each; one more for each where a cell is not full."""
+    rng = np.random.default_rng(9)
+    means = rng.uniform([-0.7, -0.5, 2], [0.7, 0.5, 2], size=(4000, 3))
+    splats, view = splats_of(means, scales=0.15), look_along_z()
+    footprints = projection.project(*projection.prepare(splats, ViewSet((view,)))[:2], view)
+    free = froxels.cell_size(footprints, view, 4.0, 3.2)
+    monkeypatch.setattr(froxels, "MAX_POINTS", 20_000)
+
+    side = froxels.cell_size(footprints, view, 4.0, 3.2)
+
+    assert free == 4.0
+    assert len(froxels.scatter(footprints, view, side, 3.2).owners) <= 2 * 20_000
 
 
 def test_an_image_of_any_shape_has_few_enough_cells():
