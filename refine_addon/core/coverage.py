@@ -5,7 +5,8 @@ closed form, which knows nothing of occlusion; the question is how much of it. V
 around a scene show all that can be seen, and the floor only keeps what is truly hidden; a few views
 leave much to be guessed. The views answer it themselves: an eighth of them at a time is left out,
 the others score with each weight of the floor, and the weight that loses least of what the views
-left out measured is taken.
+left out measured is taken. The more splats go, the more the floor may weigh: what goes first is
+next to nothing, and a floor that is little to the last is a wall to the first.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
-WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-4.0, 1.5, 0.5)))
+WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-6.0, 1.5, 0.5)))
 """What is tried, of the mean of the scores for a splat of mean worth that no view looks at."""
 
-SHARES = (0.3, 0.5, 0.7, 0.9)
-"""Shares removed at which it is judged."""
+SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
+"""Shares removed for each of which a weight is chosen, by what goes up to there."""
 
 SAMPLE = 1 << 15
 """How many splats are enough to choose by."""
@@ -33,7 +34,8 @@ def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> 
     """Return what a splat that these views do not show may be worth to others, (n,).
 
     Of n views that might have shown it none did: by the rule of succession the next one does with
-    a chance of about 1 / (n + 1). The score has `power` factors that visibility enters.
+    a chance of about 1 / (n + 1). Visibility enters the score with one power more than the worth:
+    contrast has the square of the transmittance.
 
     Parameters
     ----------
@@ -43,7 +45,7 @@ def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> 
         In how many views the centre lies.
     power : float
     """
-    return np.asarray(_unit(prior**power) / (1.0 + seen) ** power)
+    return np.asarray(_unit(prior**power) / (1.0 + seen) ** (1.0 + power))
 
 
 def with_floor(
@@ -53,8 +55,8 @@ def with_floor(
     return _unit(scores) + weight * floors
 
 
-def floor_weight(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> float:
-    """Return the weight that the floor should have.
+def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[float]:
+    """Return the weights that the floor should have, one for each of `SHARES`.
 
     Parameters
     ----------
@@ -64,7 +66,7 @@ def floor_weight(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> float:
 
     Returns
     -------
-    float
+    list of float
         1 where no fold says anything.
     """
     losses = []
@@ -72,15 +74,43 @@ def floor_weight(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> float:
         views = errors[errors.any(axis=1)]
         if scores.any() and len(views):
             tried = [_losses(with_floor(scores, floors, weight), views) for weight in WEIGHTS]
-            losses.append(np.stack(tried, axis=1).mean(axis=2))
+            losses.append(np.stack(tried, axis=1))
     if not losses:
-        return 1.0
+        return [1.0] * len(SHARES)
     # The smallest weight that is not worse than the best by more than one standard error of the
     # difference (Breiman et al. 1984): a floor must earn its place.
-    table = np.concatenate(losses)  # (views, weights)
-    worse = table - table[:, [np.argmin(table.mean(axis=0))]]
+    table = np.concatenate(losses)  # (views, weights, shares)
+    best = table.mean(axis=0).argmin(axis=0)
+    worse = table - np.take_along_axis(table, best[None, None], axis=1)
     allowed = worse.std(axis=0) / np.sqrt(max(len(table) - 1, 1))
-    return WEIGHTS[int(np.argmax(worse.mean(axis=0) <= allowed))]
+    return [WEIGHTS[k] for k in (worse.mean(axis=0) <= allowed).argmax(axis=0)]
+
+
+def order(
+    scores: NDArray[np.float64],
+    floors: NDArray[np.float64],
+    ties: NDArray[np.float32],
+    weights: Sequence[float],
+    stops: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """Return all n splats in the order in which they go, exact up to the last of `stops`.
+
+    Parameters
+    ----------
+    scores, floors, ties : (n,) array
+        `ties` decides between those that are equal.
+    weights : sequence of float
+        Of the floor.
+    stops : array of int
+        How many have gone when each weight is done with; ascending.
+    """
+    left, going = np.arange(len(scores)), [np.arange(0)]
+    for weight, count in zip(weights, np.diff(stops, prepend=0), strict=True):
+        if count > 0:
+            left = left[np.lexsort((ties[left], with_floor(scores, floors, weight)[left]))]
+            going.append(left[:count])
+            left = left[count:]
+    return np.concatenate([*going, left])
 
 
 def _unit(values: NDArray[np.float64]) -> NDArray[np.float64]:

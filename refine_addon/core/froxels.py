@@ -33,7 +33,7 @@ ALPHA_MAX = 0.99
 """Renderers let no single splat hide more than this."""
 
 DOUBT = 12.0
-"""The thickness in front is believed to be gamma distributed, its shape this over the side of a
+"""What lies loosely in front is believed to be gamma distributed, its shape this over the side of a
 cell in pixels: coarse cells know less, and as cells shrink nothing is left to doubt."""
 
 MAX_CELLS = 65535
@@ -304,22 +304,34 @@ def in_front(points: Points, thick: NDArray[np.float32]) -> NDArray[np.float32]:
     return total.astype(np.float32)
 
 
-def light(front: NDArray[np.float32], area: float) -> NDArray[np.float32]:
+def evenness(footprints: Footprints, area: float) -> NDArray[np.float32]:
+    """Return how evenly each splat covers the cells it lies in, (n,): 0 a dot, 1 a veil."""
+    narrow = footprints.sigmas[1] ** 2
+    return np.asarray(narrow / (narrow + np.float32(area)))
+
+
+def light(
+    front: NDArray[np.float32], even: NDArray[np.float32], area: float
+) -> NDArray[np.float32]:
     """Return the expected transmittance through a thickness of which only the mean is known.
 
     ``E[exp(-tau)] = (1 + mean / k)^-k`` for tau of a gamma distribution of shape k.
     A cell says how much lies in front, not whether it leaves a gap for the point: ``exp(-mean)``
-    would take what shows through foliage for hidden, and the score would throw it away.
+    would take what shows through foliage for hidden, and the score would throw it away. Splats
+    wider than a cell leave no gaps: for them it is ``exp(-mean)``.
 
     Parameters
     ----------
     front : (m,) float32
         Mean thickness in front of each point.
+    even : (m,) float32
+        The part of it that covers the cell evenly.
     area : float
         Of a cell, px^2.
     """
     shape = np.float32(DOUBT / math.sqrt(area))
-    return np.asarray((np.float32(1.0) + front / shape) ** -shape)
+    gaps = np.maximum(front - even, np.float32(0.0))
+    return np.asarray(np.exp(-even) * (np.float32(1.0) + gaps / shape) ** -shape)
 
 
 def contrast(

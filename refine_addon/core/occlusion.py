@@ -9,7 +9,8 @@ contrast is the squared error of the picture without the splat, what REFINE's He
 it is true for one splat removed among many that stay. The contribution also knows what the splat
 hides once its neighbours are gone; the product is the better order from half removed on.
 
-A floor under it, the closed form, keeps what these views do not show and others may: `coverage`.
+A floor under it, the closed form, keeps what these views do not show and others may, the more the
+more splats go: `coverage`.
 
 Splats are not independent, so the order of removal is found in rounds: part of the budget goes,
 the scores of the survivors are computed anew, and so on to the last tenth. Budgets stay nested.
@@ -60,8 +61,8 @@ class Occlusion:
     """
 
     cell: float = 4.0
-    density: float = 3.2
-    rounds: int = 8
+    density: float = 4.5
+    rounds: int = 6
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -145,7 +146,7 @@ def score(
         seen,
         len(views),
         int(np.count_nonzero(~good)),
-        {"floor": run.weight},
+        {"floor": run.weights},
     )
 
 
@@ -204,7 +205,7 @@ class _Run:
             threads,
         )
         self.shown = False  # whether any view sees anything
-        self.weight = 0.0  # of the floor
+        self.weights = [0.0] * len(coverage.SHARES)  # of the floor, up to each share
         self.views = _by_distance(views)
         # Neighbours follow each other, so every k-th of them is all over the scene.
         self.some = slice(None, None, max(-(-len(gaussians) // coverage.SAMPLE), 1))
@@ -230,7 +231,7 @@ class _Run:
             start, share = end, gone / count
             measured = Measured.sum(blocks)
             if number == 0:
-                self.weight = self._weigh(blocks, measured, prior)
+                self.weights = self._weigh(blocks, measured, prior)
                 seen[left.index] = measured.seen
                 self.shown = bool(measured.contribution.any())
             last = number == rounds - 1
@@ -238,9 +239,12 @@ class _Run:
             floors = coverage.floor(
                 prior[left.index].astype(np.float64), measured.seen, 1.0 + _exponent(share)
             )
-            scores = coverage.with_floor(combined(measured, share), floors, self.weight)
-            order = np.lexsort((prior[left.index], scores))
             go = max(len(left) - stay, 0)
+            stops = np.clip(np.rint(np.multiply(coverage.SHARES, count)) - gone, 0, go).astype(int)
+            stops[-1] = go
+            order = coverage.order(
+                combined(measured, share), floors, prior[left.index], self.weights, stops
+            )
             going = left.index[order[:go]]
             left = left.take(np.sort(order[go:]))
         values[going] = np.arange(gone + 1, gone + len(going) + 1) / count
@@ -248,8 +252,8 @@ class _Run:
 
     def _weigh(
         self, blocks: list[Measured], measured: Measured, prior: NDArray[np.float32]
-    ) -> float:
-        """Return the weight of the floor by what each block of views says of the others."""
+    ) -> list[float]:
+        """Return the weights of the floor by what each block of views says of the others."""
         some = self.some
         worth = prior[self.gaussians.index[some]].astype(np.float64)
         power = 1.0 + _exponent(0.0)
@@ -265,7 +269,7 @@ class _Run:
                 floors = coverage.floor(worth, others.seen, power)
                 yield combined(others, 0.0), floors, np.array(self.errors[number])
 
-        return coverage.floor_weight(folds())
+        return coverage.floor_weights(folds())
 
     def measure(self, gaussians: Gaussians, progress: Progress) -> list[Measured]:
         """Sum contribution and contrast of the Gaussians over the views of each block."""
@@ -370,12 +374,14 @@ def measure_view(
         alphas = gaussians.alphas[footprints.index]
         colors = gaussians.colors[footprints.index]
         mass, mass_squared = froxels.masses(footprints, alphas)
+        evenness = froxels.evenness(footprints, points.area)
         light = np.empty(len(points.owners), np.float32)
         contrast = np.empty(len(points.owners), np.float32)
         for place, piece in points.pieces():
             thick = froxels.thickness(piece, alphas, mass)
             front = froxels.in_front(piece, thick)
-            light[place] = froxels.light(front, points.area)
+            even = froxels.in_front(piece, thick * evenness[piece.owners])
+            light[place] = froxels.light(front, even, points.area)
             contrast[place] = froxels.contrast(piece, front, thick, colors)
         shown, errors = froxels.mean_light(points, light, contrast, count)
         total.contribution[footprints.index] += weight * (mass * shown)

@@ -204,14 +204,30 @@ def test_what_has_the_colour_of_what_is_behind_it_has_no_contrast():
 
 @pytest.mark.parametrize("side", [2.0, 4.0, 8.0])
 def test_light_is_the_mean_of_exp_of_a_gamma_distributed_thickness(side):
-    """Numerically: exp(-tau) over many draws of mean 0, .5 and 3; shape 12 over the side."""
+    """Numerically: exp(-tau) over many draws of mean 0, .5 and 3; shape 12 over the side.
+
+    What is even before it takes its exact share of that.
+    """
     shape = froxels.DOUBT / side
     draws = np.random.default_rng(1).gamma(shape, size=400_000) / shape
     mean = np.array([0.0, 0.5, 3.0], np.float32)
+    even = np.array([0.0, 0.5, 1.0], np.float32)
 
-    found = froxels.light(mean, side * side)
+    loose = froxels.light(mean, np.zeros_like(mean), side * side)
+    partly = froxels.light(mean + even, even, side * side)
 
-    np.testing.assert_allclose(found, [np.exp(-m * draws).mean() for m in mean], atol=2e-3)
+    np.testing.assert_allclose(loose, [np.exp(-m * draws).mean() for m in mean], atol=2e-3)
+    np.testing.assert_allclose(partly, loose * np.exp(-even), rtol=1e-5)
+
+
+def test_a_splat_as_narrow_as_a_cell_is_half_even():
+    """By its narrow side: sigma 4 px on cells of 16 px^2; a third of it is a tenth, thrice .9."""
+    sigmas = np.array([[50.0, 5.0, 12.0], [4.0, 4 / 3, 12.0]], np.float32)
+    footprints = projection.Footprints(np.arange(3), sigmas, sigmas, sigmas, sigmas)
+
+    found = froxels.evenness(footprints, 16.0)
+
+    np.testing.assert_allclose(found, [0.5, 0.1, 0.9], rtol=1e-6)
 
 
 def test_every_lattice_has_the_moments_of_the_normal_distribution():
@@ -239,8 +255,8 @@ def square(**changes) -> View:
 
 
 def let_through(*alphas: float) -> float:
-    """Return the mean of exp(-tau), tau gamma distributed of shape 12 / 4, mean -sum log(1 - a)."""
-    return (1.0 - sum(math.log(1.0 - (alpha - CUT)) for alpha in alphas) / 3.0) ** -3
+    """Return the product of 1 - a: what is as wide as these veils leaves no gaps."""
+    return math.prod(1.0 - (alpha - CUT) for alpha in alphas)
 
 
 def test_a_veil_lets_through_what_it_leaves_uncovered():
@@ -295,7 +311,10 @@ def test_a_splat_larger_than_the_image_contributes_what_lies_over_its_pixels(x, 
 
 
 def test_a_splat_covers_no_more_of_a_cell_than_its_opacity():
-    """Sigma 2 px in a cell of 4: 2 pi 2^2 .5 / 16 is .78 of it, and yet half goes through."""
+    """Sigma 2 px in a cell of 4: 2 pi 2^2 .5 / 16 is .78 of it, and yet half goes through.
+
+    Of its thickness log 2 the share 4.3 / (4.3 + 16) is even, the rest gamma distributed.
+    """
     settings = Occlusion(cell=4.0, density=1.0, rounds=1)  # one point for each
     middle = np.array([0.02, 0.02])  # 2 px off the middle of the image: that of a cell
     front = splats_of([[*middle, 1.0], [*middle * 2, 2.0]], scales=[[0.02] * 3, [0.04] * 3])
@@ -303,7 +322,8 @@ def test_a_splat_covers_no_more_of_a_cell_than_its_opacity():
     found = measured(front, square(), settings=settings)
     alone = measured(front.take(slice(1, 2)), square(), settings=settings)
 
-    passed = (1.0 + math.log(2.0) / 3.0) ** -3
+    even = (2.0**2 + 0.3) / (2.0**2 + 0.3 + 16.0)
+    passed = 2.0**-even * (1.0 + (1.0 - even) * math.log(2.0) / 3.0) ** -3
     assert found.contribution[1] / alone.contribution[0] == pytest.approx(passed, rel=1e-3)
 
 
@@ -472,10 +492,10 @@ def test_a_large_splat_that_one_view_does_not_show_outlasts_a_faint_one_that_it_
 
 
 def test_the_floor_falls_with_the_views_that_might_have_shown_a_splat():
-    """Worth 1, 1, 4 in 0, 3, 0 views, power 1/2: 1, 1/2, 2 over the mean of 1, 1 and 2."""
+    """Worth 1, 1, 4 in 0, 3, 0 views, power 1/2: 1, 1/8, 2 over the mean of 1, 1 and 2."""
     floors = coverage.floor(np.array([1.0, 1, 4]), np.array([0, 3, 0], np.int32), 0.5)
 
-    np.testing.assert_allclose(floors, np.array([1.0, 0.5, 2.0]) * 0.75)
+    np.testing.assert_allclose(floors, np.array([1.0, 0.125, 2.0]) * 0.75)
     np.testing.assert_allclose(
         coverage.with_floor(np.array([2.0, 4, 6]), floors, 2.0),
         np.array([0.5, 1, 1.5]) + 2 * floors,
@@ -492,12 +512,44 @@ def test_the_weight_of_the_floor_is_as_small_as_what_the_left_out_views_say_allo
     dark = np.zeros((1, 200))
     errors = np.stack([right * rng.uniform(0.9, 1.1, 200) for _ in range(4)])
 
-    assert coverage.floor_weight([(right, wrong, errors), (right, wrong, dark)]) == 0.0
-    assert coverage.floor_weight([(wrong, right, errors)]) >= 10.0
-    assert coverage.floor_weight([]) == 1.0
-    assert coverage.floor_weight([(right, wrong, dark)]) == 1.0
+    assert set(coverage.floor_weights([(right, wrong, errors), (right, wrong, dark)])) == {0.0}
+    assert min(coverage.floor_weights([(wrong, right, errors)])) >= 10.0
+    assert coverage.floor_weights([]) == [1.0] * len(coverage.SHARES)
+    assert coverage.floor_weights([(right, wrong, dark)]) == [1.0] * len(coverage.SHARES)
     glare = np.vstack([errors, wrong * 1e6])
-    assert coverage.floor_weight([(right, wrong, glare)]) < 0.1
+    assert max(coverage.floor_weights([(right, wrong, glare)])) < 0.1
+
+
+def test_each_share_has_the_weight_that_is_right_up_to_there():
+    """Scores tell the tenth that is worth least apart, floors all others."""
+    rng = np.random.default_rng(8)
+    truth = rng.permutation(400) + 1.0
+    scores, floors = np.minimum(truth, 41.0), np.where(truth <= 40, 41.0, truth)
+    errors = np.stack([truth * rng.uniform(0.9, 1.1, 400) for _ in range(4)])
+
+    found = coverage.floor_weights([(scores, floors, errors)])
+
+    assert found[0] == 0.0
+    assert min(found[1:3]) > 0.0
+
+
+def test_splats_go_by_the_weight_of_the_floor_that_holds_up_to_each_stop():
+    """Two by scores alone, none by a weight whose stop is no further, then by a large floor."""
+    scores, floors = np.array([5.0, 1, 2, 3, 4]), np.array([1.0, 9, 9, 4, 3])
+    ties = np.zeros(5, np.float32)
+
+    found = coverage.order(scores, floors, ties, (0.0, 50.0, 1e3), np.array([2, 2, 5]))
+
+    assert found.tolist() == [1, 2, 0, 4, 3]
+
+
+def test_what_goes_after_the_last_stop_and_ties_are_in_order_too():
+    """No splat is lost; of equal ones that with the smaller tie goes first."""
+    scores, ties = np.array([1.0, 1, 0, 2]), np.array([2, 1, 0, 0], np.float32)
+
+    found = coverage.order(scores, np.zeros(4), ties, (0.0, 1.0), np.array([1, 2]))
+
+    assert found.tolist() == [2, 1, 0, 3]
 
 
 # ----- laws
