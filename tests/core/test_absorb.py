@@ -1,9 +1,11 @@
 """Merging and absorbing: the moments by hand, the laws, and what must not happen."""
 
+import itertools
+
 import numpy as np
 import pytest
 
-from refine_addon.core import merge_field, merging
+from refine_addon.core import merge_field, merge_graph, merging
 from refine_addon.core.absorb import absorb, patience
 from refine_addon.core.errors import Cancelled
 from refine_addon.core.merge_graph import MergeGraph
@@ -245,6 +247,140 @@ def test_survivors_that_absorbed_nothing_are_the_same_to_the_bit():
     same(result.splats.take(~result.changed), splats.take(result.keep).take(~result.changed))
 
 
+def three_of_five(order=(0, 1, 2, 3, 4)):
+    """Return three faint splats at one place and two far from all, and what is seen of them."""
+    splats = cloud(5)
+    splats.means[:] = [[0, 0, 0], [1e-6, 0, 0], [2e-6, 0, 0], [0, 3, 0], [0, 0, 3]]
+    splats.log_scales[:], splats.quaternions[:] = -2.0, [1, 0, 0, 0]
+    splats.opacity_logits[:] = np.log(0.01 / 0.99)
+    splats.sh_dc[:] = np.array([0.0, 0.1, 0.2, 0.5, -0.5])[:, None] + [0.0, 0.03, 0.05]
+    splats.sh_rest[:] = np.arange(5)[:, None, None] * 0.1
+    splats = splats.take(np.array(order))
+    contribution = np.array([1.0, 2, 5, 9, 9])[list(order)]
+    return splats, lambda _splats, _progress: Seen(contribution, contribution * 0.005)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (2, 4, 1, 0, 3), (1, 3, 2, 0, 4)])
+def test_a_survivor_has_the_colours_of_all_it_absorbed_by_what_is_seen_of_each(order):
+    """Of those seen as 1, 2 and 5, harmonics included; the one that is seen most stays.
+
+    Three times the opacity of .01, less what they hide of each other.
+    """
+    splats, seen = three_of_five(order)
+    place = [order.index(index) for index in range(5)]
+
+    result = absorb(splats, around(), seen, 3)
+
+    assert (result.merged, result.deleted) == (2, 0)
+    assert result.keep.tolist() == [index > 1 for index in order]
+    (survivor,) = np.flatnonzero(result.changed)
+    assert np.flatnonzero(result.keep)[survivor] == place[2]
+    shares = np.array([1, 2, 5]) / 8
+    for name in ("sh_dc", "sh_rest"):
+        expected = np.tensordot(shares, getattr(splats, name)[place[:3]].astype(float), 1)
+        np.testing.assert_allclose(getattr(result.splats, name)[survivor], expected, rtol=1e-5)
+    assert 0.0298 < opacity(result.splats.opacity_logits[survivor]) < 0.03
+    np.testing.assert_allclose(result.splats.log_scales[survivor], -2.0, atol=1e-4)
+    np.testing.assert_allclose(result.splats.means[survivor], [1e-6, 0, 0], atol=1e-9)
+
+
+def test_each_stage_leaves_three_fifths_and_is_measured_anew():
+    """From 500 to 50: what hides what has changed by then."""
+    sizes = []
+
+    def counting(splats, progress):
+        sizes.append(len(splats))
+        return measure(splats, progress)
+
+    absorb(cloud(500), around(), counting, 50)
+
+    assert sizes[0] == 500
+    assert all(after >= 0.6 * before - 1 for before, after in itertools.pairwise([*sizes, 50]))
+
+
+def test_protected_splats_stay_though_nobody_sees_them_or_can_draw_them():
+    """Undrawable and unseen ones go first, but not these."""
+    splats = cloud(100)
+    splats.means[[5, 6], 0] = np.nan
+    protected = np.zeros(100, bool)
+    protected[[5, 50, 51]] = True
+
+    def partly(left, progress):
+        seen = measure(left, progress)
+        seen.contribution[~np.isin(np.arange(len(left)), range(20, 45))] = 0.0
+        seen.error[:] = 0.0
+        return seen
+
+    result = absorb(splats, around(), partly, 60, protected=protected)
+
+    assert result.keep[[5, 50, 51]].all()
+    assert not result.keep[6]
+
+
+# From where splats are looked at
+
+
+def looking(at, center, **changes):
+    """Return a view from `center` to `at`, 320 x 240 px."""
+    forward = np.array(at, float) - center
+    forward /= np.linalg.norm(forward)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    lens = {"fx": 200.0, "fy": 250.0, "cx": 160.0, "cy": 120.0, "width": 320, "height": 240}
+    return View(rotation, np.array(center, float), **lens | changes)
+
+
+def test_a_splat_is_looked_at_along_the_mean_direction_of_what_sees_it():
+    """From 45 degrees either side: along the bisector, with a spread of sin 45 to the side."""
+    views = ViewSet((looking([0, 0, 0], [2, 0, -2]), looking([0, 0, 0], [-2, 0, -2])))
+
+    found = merge_field.look(np.zeros((1, 3)), views)
+
+    np.testing.assert_allclose(found.direction, [[0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(np.abs(found.spread), [[np.sqrt(0.5), 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(found.pixel, [8 / (200 * 250)])
+
+
+def test_a_nearer_view_counts_by_its_pixels():
+    """At distances 1 and 2 as 4 to 1."""
+    views = ViewSet((looking([0, 0, 0], [1, 0, 0]), looking([0, 0, 0], [0, 0, -2])))
+
+    found = merge_field.look(np.zeros((1, 3)), views)
+
+    np.testing.assert_allclose(found.direction, [np.array([-4, 0, 1]) / np.sqrt(17)], atol=1e-12)
+
+
+@pytest.mark.parametrize("aside", [[0.85, 0, 0], [0, 0.5, 0]])
+def test_a_view_beside_whose_image_a_splat_lies_hardly_counts(aside):
+    """The image reaches .8 to the side and .48 down."""
+    views = ViewSet(
+        (looking([0, 0, 1], [0, 0, 0]), looking(np.add([0, 0, 1], aside), [-3, 0, 1.0]))
+    )
+
+    found = merge_field.look(np.add([[0.0, 0, 1]], aside), views)
+
+    expected = np.add([0, 0, 1], aside) - [-3, 0, 1]
+    np.testing.assert_allclose(found.direction, [expected / np.linalg.norm(expected)], atol=1e-4)
+
+
+def test_colour_is_that_seen_along_the_mean_direction_and_blur_a_third_of_a_pixel():
+    """Along +z of harmonics of degree 1: 1/2 + .28209 dc + .48860 rest_1; negative ones are 0."""
+    splats = cloud(2)
+    splats.means[:], splats.sh_dc[:], splats.sh_rest[:] = 0.0, 0.2, 0.7
+    splats.sh_rest[:, 1] = [[0.3, 0.3, 0.3], [-3, -3, -3]]
+    views = ViewSet((looking([0, 0, 0], [0, 0, -2]),))
+
+    field = merge_field.field(splats, np.arange(2), views, measure(splats))
+
+    expected = 0.5 + 0.28209479 * 0.2 + 0.48860251 * 0.3
+    np.testing.assert_allclose(field.color, [[expected] * 3, [0.0] * 3], rtol=1e-6)
+    np.testing.assert_allclose(field.blur, 0.3 * 4 / (200 * 250))
+
+
+# Laws
+
+
 def test_nothing_happens_where_nothing_must_go():
     splats = cloud(50)
 
@@ -317,6 +453,76 @@ def test_no_merge_is_carried_out_that_costs_more_than_deleting():
     assert len(into)
     costs = 2.0 * merging.costs(before, into, gone)
     assert (costs < np.minimum(before.error[into], before.error[gone])).all()
+
+
+def cheapest_first(field, patience, goal):
+    """Return who went into whom, None for nobody, one operation at a time, every pair priced."""
+    alive, done = list(range(len(field.means))), []
+    while len(alive) > goal:
+        operations = [(field.error[row], row, None) for row in alive]
+        for pair in itertools.combinations(alive, 2):
+            cost = patience * merging.costs(field, *(np.array([row]) for row in pair))[0]
+            operations.append((cost, *pair))
+        _, one, other = min(operations, key=lambda operation: operation[0])
+        if other is None:
+            alive.remove(one)
+            done.append((one, None))
+            continue
+        if field.contribution[one] > field.contribution[other]:
+            one, other = other, one
+        _, merged = merged_of(field, other, one)
+        field.put(np.array([other]), merged)
+        alive.remove(one)
+        done.append((one, other))
+    return done
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_cheapest_of_all_operations_is_next_each_time(seed):
+    """Nine splats are all neighbours of each other; merging changes what the next merge costs."""
+    rng = np.random.default_rng(seed)
+    field = flat(
+        rng.uniform(0.1, 0.6, 9), rng.normal(size=(9, 3)), rng.uniform(0.5, 2, size=(9, 3)),
+        colors=rng.uniform(size=(9, 3)),
+    )  # fmt: skip
+    field.error *= rng.uniform(0.02, 1.0, 9)
+    graph = MergeGraph(field.take(np.arange(9)), 1.0)
+
+    graph.reduce(2)
+
+    expected = cheapest_first(field, 1.0, 2)
+    merges = {
+        int(gone): int(into)
+        for into, gone in ((m[0][0], m[1][0]) for m in graph.merges if len(m[0]))
+    }
+    assert merges == {gone: into for gone, into in expected if into is not None}
+    assert set(np.flatnonzero(~graph.alive).tolist()) == {gone for gone, _ in expected}
+    assert graph.deleted == sum(into is None for _, into in expected)
+
+
+def test_neighbours_of_what_is_absorbed_are_neighbours_of_what_absorbed_it(monkeypatch):
+    """Each knows its nearest alone: 2 knows 1, which goes into 0, and so 2 follows."""
+    monkeypatch.setattr(merge_graph, "NEIGHBOURS", 1)
+    places = [0.0, 0.001, 1.5, 50, 100, 200, 400, 800]
+    field = flat([0.03, 0.02, 0.01] + [0.5] * 5, np.outer(places, [1, 0, 0]), np.ones((8, 3)))
+    graph = MergeGraph(field, 1.0)
+
+    graph.reduce(6)
+
+    assert [(into.tolist(), gone.tolist()) for into, gone, _ in graph.merges] == [
+        ([0], [1]),
+        ([0], [2]),
+    ]
+
+
+def test_when_half_have_gone_neighbours_are_found_anew():
+    """Two heaps of a dozen: each has its neighbours in its own, and one is left of both."""
+    places = np.outer(np.r_[np.arange(12) * 1e-4, 0.3 + np.arange(12) * 1e-4], [1, 0, 0])
+    graph = MergeGraph(flat([0.01] * 24, places, np.ones((24, 3))), 1.0)
+
+    graph.reduce(1)
+
+    assert graph.deleted == 0
 
 
 def test_undrawable_splats_go_first():

@@ -16,6 +16,7 @@ from refine_addon.core import (
     RefineError,
     Scores,
     Settings,
+    View,
     ViewSet,
     auto,
     occlusion,
@@ -88,6 +89,123 @@ def test_the_report_says_what_was_tried_chosen_and_why(scene):
     facts = json.loads(json.dumps(report, allow_nan=False))["weights"]["auto"]
     assert set(facts) == {"model", "views", "estimate", "tolerance", "tried"}
     assert any("estimated to keep" in note and facts["model"] in note for note in report["notes"])
+
+
+class Told:
+    """Both scoring methods, as told: rankings of 1,000 splats by model and number of views.
+
+    Of a ranking with k swaps, k splats of the kept tenth are others: the share k / 100.
+    """
+
+    def __init__(self, monkeypatch, **swaps) -> None:
+        """Take the place of the methods; `swaps` says how many, a number or one by views."""
+        self.swaps = {"open": 50, "closed": 50, "once": 50, "full": 0} | swaps
+        monkeypatch.setattr(auto.closed_form, "score", self.closed_form)
+        monkeypatch.setattr(auto.occlusion, "score", self.occlusion)
+
+    def closed_form(self, _splats, views, settings, **_):
+        """Stand for the closed form."""
+        return self.ranking("closed" if settings.frustum else "open", views)
+
+    def occlusion(self, _splats, views, settings, **_):
+        """Stand for occlusion."""
+        return self.ranking("once" if settings.rounds == 1 else "full", views)
+
+    def ranking(self, model, views):
+        """Return the ranking of a model."""
+        swaps = self.swaps[model]
+        swaps = swaps.get(len(views), 0) if isinstance(swaps, dict) else swaps
+        values = np.arange(1000)
+        low, high = 899 - np.arange(swaps), 900 + np.arange(swaps)
+        values[low], values[high] = values[high], values[low].copy()
+        return Scores(values.astype(np.float32), np.ones(1000, np.int32), len(views), 0)
+
+    def chosen(self, tolerance, count=64):
+        """Return what auto reports, of `count` views."""
+        view = View(np.eye(3), np.zeros(3), 50.0, 50.0, 50.0, 50.0, 100, 100)
+        views = ViewSet(tuple(replace(view, center=np.array([x, 0.0, 0.0])) for x in range(count)))
+        scores = auto.score(None, views, tolerance, CHEAP)
+        return scores.weights["auto"]
+
+
+NAMES = ["closed form without frustum test", "closed form", "occlusion measured once", "occlusion"]
+
+
+@pytest.mark.parametrize("agreeing", range(4))
+def test_the_cheapest_model_that_agrees_is_taken(monkeypatch, agreeing):
+    """Whatever dearer ones agree as well."""
+    swaps = dict.fromkeys(["open", "closed", "once", "full"][agreeing:], 0)
+
+    facts = Told(monkeypatch, **swaps).chosen(0.1)
+
+    assert facts["model"] == NAMES[agreeing]
+    assert list(facts["tried"])[: min(agreeing + 1, 3)] == NAMES[: min(agreeing + 1, 3)]
+
+
+@pytest.mark.parametrize(("swaps", "model"), [(2, NAMES[2]), (3, NAMES[3])])
+def test_what_probes_say_of_models_counts_four_times(monkeypatch, swaps, model):
+    """2 of 100 are .08, within a tolerance of .1; 3 are .12, and the full model runs."""
+    facts = Told(monkeypatch, once=swaps).chosen(0.1, 8)
+
+    assert facts["model"] == model
+    assert facts["tried"]["occlusion measured once"] == pytest.approx(0.04 * swaps)
+
+
+def test_views_are_doubled_until_the_rest_of_the_series_is_within_the_tolerance(monkeypatch):
+    """Changes of .02 and .01 fall by half, so .01 is left: 32 of 128 views are enough.
+
+    After one change nothing tells how fast they fall: nine times .02 may be left.
+    """
+    told = Told(monkeypatch, full={8: 3, 16: 1})
+
+    facts = told.chosen(0.15, 128)
+
+    assert facts["views"] == 32
+    assert facts["estimate"] == pytest.approx(0.01)
+    assert facts["tried"]["8 instead of 16 views"] == pytest.approx(0.02)
+    assert facts["tried"]["16 instead of 32 views"] == pytest.approx(0.01)
+
+
+def test_where_doubling_will_not_do_all_views_are_used_at_once(monkeypatch):
+    """A first change of .1 leaves .9 for all that one knows: the doublings are left out."""
+    facts = Told(monkeypatch, full={8: 10}).chosen(0.2, 128)
+
+    assert (facts["views"], facts["estimate"]) == (128, 0.0)
+    assert list(facts["tried"])[3:] == ["8 instead of 16 views"]
+
+
+def test_the_model_and_the_views_share_the_tolerance(monkeypatch):
+    """Of .2 the model may spend .08 and the views .12; the estimate is the sum of both.
+
+    A first change of .02 leaves .18, which the doublings to come may halve twice to .045; one of
+    .03 leaves .27, and .0675 is too much once the model has spent .16.
+    """
+    told = Told(monkeypatch, once={8: 5, 16: 2, 32: 1}, full={8: 3})
+    facts = told.chosen(0.2, 128)
+
+    assert facts["model"] == "occlusion measured once"
+    assert facts["views"] == 32
+    # 3 swaps are made at first, then 1: a third of .01, and half of that again.
+    assert facts["estimate"] == pytest.approx(0.08 + 0.01 * (1 / 3) / (1 - 1 / 3))
+
+    dearer = Told(monkeypatch, once={8: 4, 16: 1}, full=0).chosen(0.2, 128)
+
+    assert dearer["tried"]["occlusion measured once"] == pytest.approx(0.16)
+    assert dearer["views"] == 128
+    assert dearer["estimate"] == pytest.approx(0.16)
+
+
+def test_views_of_no_weight_are_not_waited_for(scene):
+    """Half of them have none, so the eight that probe are all there are."""
+    splats, views = scene
+    some = ViewSet(
+        tuple(replace(view, weight=float(place % 2)) for place, view in enumerate(views))
+    )
+
+    scores = auto.score(splats, some, 0.0, CHEAP)
+
+    assert scores.views_used == 8
+    assert list(scores.weights["auto"]["tried"]) == NAMES[:3]
 
 
 def test_probes_that_see_nothing_leave_it_to_the_full_model(scene, monkeypatch):
