@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-6.0, 1.5, 0.5)))
+WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-5.0, 1.5, 0.5)))
 """What is tried, of the mean of the scores for a splat of mean worth that no view looks at."""
 
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
