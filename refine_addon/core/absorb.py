@@ -108,8 +108,7 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
     views : ViewSet
         They tell from where each splat is looked at.
     measure : callable
-        ``measure(splats, progress)`` returns a `Seen`; called once a stage. Splats that contribute
-        nothing are only ever deleted, the lowest `error` first.
+        ``measure(splats, progress)`` returns a `Seen`; called once a stage.
     keep_count : int
         How many survive; more where more are protected. Splats that no renderer can draw go first.
     protected : (N,) bool, optional
@@ -167,9 +166,7 @@ def absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     keep = np.ones(len(splats), np.bool_)
     excess = len(splats) - keep_count
     excess -= _delete(keep, np.flatnonzero(free & ~good), excess)
-    unseen = np.flatnonzero(free & good & ~(seen.contribution > 0.0))
-    excess -= _delete(keep, unseen[np.argsort(seen.error[unseen], kind="stable")], excess)
-    rows = np.flatnonzero(keep & good & free & (seen.contribution > 0.0))
+    rows = np.flatnonzero(keep & good & free)
     excess = min(excess, len(rows))
     report(progress, 0.0, "absorbing")
     if excess <= 0:

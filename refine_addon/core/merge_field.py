@@ -102,11 +102,14 @@ class Look(NamedTuple):
         The longest standard deviation of the directions across their mean, of either sign.
     pixel : (N,) float64
         Area of a pixel at the splat, world units squared.
+    inside : (N,) float64
+        In how many of the views the centre lies.
     """
 
     direction: Array
     spread: Array
     pixel: Array
+    inside: Array
 
 
 def look(means: NDArray[Any], views: ViewSet, *, threads: int | None = None) -> Look:
@@ -124,7 +127,7 @@ def look(means: NDArray[Any], views: ViewSet, *, threads: int | None = None) -> 
     threads : int, optional
     """
     count = len(means)
-    result = Look(np.empty((count, 3)), np.empty((count, 3)), np.empty(count))
+    result = Look(np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count))
     some = views.spread(LOOKS)
     looks = [(view, share) for view, share in zip(some, some.weights, strict=True) if share]
     offset = np.median(means, axis=0) - views.centers if count else np.ones((1, 3))
@@ -150,13 +153,14 @@ def _look(points: Array, looks: list[tuple[View, float]], closest: float) -> Loo
         Least squared distance of a camera.
     """
     rows, columns = np.triu_indices(3)
-    total, finest = np.zeros((2, points.shape[1]))
+    total, finest, seen = np.zeros((3, points.shape[1]))
     toward, second = np.zeros((3, points.shape[1])), np.zeros((6, points.shape[1]))
     for view, share in looks:
         ray = points - view.center[:, None]
         x, y, z = view.rotation @ ray
         inside = np.abs(view.fx * x + (view.cx - view.width / 2) * z) <= view.width / 2 * z
         inside &= np.abs(view.fy * y + (view.cy - view.height / 2) * z) <= view.height / 2 * z
+        seen += inside
         squared = np.maximum(np.einsum("ij,ij->j", ray, ray), closest)
         weight = np.where(inside, share, share * BESIDE) / squared
         ray /= np.sqrt(squared)
@@ -172,13 +176,16 @@ def _look(points: Array, looks: list[tuple[View, float]], closest: float) -> Loo
     half, angle = np.hypot(0.5 * (xx - yy), xy), 0.5 * np.arctan2(2.0 * xy, xx - yy)
     longest = np.sqrt(np.maximum(0.5 * (xx + yy) + half, 0.0))
     spread = longest * (np.cos(angle) * u + np.sin(angle) * v)
-    return Look(direction, spread.T, total / finest)
+    return Look(direction, spread.T, total / finest, seen)
 
 
 def field(
     splats: Splats, rows: Index, views: ViewSet, seen: Seen, *, threads: int | None = None
 ) -> Field:
     """Return some splats as merging sees them.
+
+    What these views do not show may be plain to see from elsewhere: each splat gets a floor, what
+    it would be worth to one more view if nothing hid anything (`_floored`).
 
     Parameters
     ----------
@@ -207,17 +214,37 @@ def field(
             color[piece] += np.einsum("nk,nkc->nc", basis, chunk.sh_rest)
 
     for_chunks(fill, count, _CHUNK, threads=threads)
+    alpha, blur = opacity(splats.opacity_logits[rows]), LOW_PASS * seen_from.pixel
+    with np.errstate(under="ignore"):
+        xx, xy, yy = footprint(covariances, across(seen_from.direction), blur)
+        mass = alpha * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / seen_from.pixel
+        contribution = _floored(seen.contribution[rows], mass, seen_from.inside)
+        error = _floored(seen.error[rows], mass * alpha, seen_from.inside)
     return Field(
         np.asarray(splats.means[rows], np.float64),
         covariances,
-        opacity(splats.opacity_logits[rows]),
-        seen.contribution[rows],
-        seen.error[rows],
+        alpha,
+        contribution,
+        error,
         seen_from.direction,
         seen_from.spread,
         np.maximum(color, 0.0, out=color),
-        LOW_PASS * seen_from.pixel,
+        blur,
     )
+
+
+def _floored(values: Array, worth: Array, inside: Array) -> Array:
+    """Return `values` and, on top, what one more view may see of each splat, (M,).
+
+    Were nothing hidden, a splat would give its `worth` to each view that its centre lies in; of all
+    that, the views saw some share. Of n views that might have shown a splat none did, at worst: by
+    the rule of succession the next one does with a chance of about 1 / (n + 1).
+    """
+    shown = inside @ worth
+    if not shown > 0.0:
+        return values
+    floored: Array = values + worth * (values.sum() / shown) / (1.0 + inside)
+    return floored
 
 
 def across(normal: Array) -> tuple[Array, Array]:

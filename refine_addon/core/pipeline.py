@@ -5,6 +5,7 @@ The panel, the command and Python code all come through here, so that they keep 
 
 from __future__ import annotations
 
+import math
 import platform
 import time
 from dataclasses import asdict, dataclass, field, replace
@@ -18,6 +19,7 @@ from .errors import RefineError
 from .files import expanded, refuse_existing, refuse_mapped
 from .merging import Seen
 from .ply import read_ply
+from .selection import Budget
 from .work import Progress, part, report, silent
 
 if TYPE_CHECKING:
@@ -27,11 +29,14 @@ if TYPE_CHECKING:
 
     from .absorb import Absorbed
     from .scores import Scores
-    from .selection import Budget
     from .splats import Splats
     from .views import ViewSet
 
 METHODS = ("closed-form", "occlusion", "auto")
+
+FIRST = 0.1
+"""Share of the splats that goes before any are merged: what the views would miss least is next to
+nothing, and any merge changes more."""
 
 
 @dataclass(frozen=True)
@@ -241,19 +246,33 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
 
     Raises
     ------
-    Cancelled
-        If `progress` answers ``False``.
+    RefineError, Cancelled
+        See `score`.
     """
+    used = views.spread(settings.views)
+    total = len(splats)
+    first = min(math.floor(FIRST * total), total - count)
+    rest = np.ones(total, np.bool_)
+    if first > 0:
+        once = Settings("occlusion", 0, occlusion=replace(settings.occlusion, rounds=1))
+        scores = score(splats, used, once, progress=part(progress, 0.0, 0.2), threads=threads)
+        # What no renderer draws scores lowest, so it is among these, or all of these are such.
+        rest = selection.select(scores, Budget(keep=total - first), protected=protected)
 
     def seen(now: Splats, ahead: Progress) -> Seen:
         measured = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
         return Seen(measured.contribution, measured.contrast)
 
     with np.errstate(under="ignore"):  # as for scores
-        used = views.spread(settings.views)
-        return absorbing.absorb(
-            splats, used, seen, count, protected=protected, progress=progress, threads=threads
-        )
+        absorbed = absorbing.absorb(
+            splats.take(rest), used, seen, count,
+            protected=None if protected is None else protected[rest],
+            progress=part(progress, 0.2, 1.0), threads=threads,
+        )  # fmt: skip
+    keep = np.zeros(total, np.bool_)
+    keep[np.flatnonzero(rest)[absorbed.keep]] = True
+    gone = total - int(np.count_nonzero(rest))
+    return replace(absorbed, keep=keep, deleted=absorbed.deleted + gone)
 
 
 def prune_file(  # noqa: PLR0913 - the use case, file to file

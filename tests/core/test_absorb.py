@@ -264,7 +264,9 @@ def three_of_five(order=(0, 1, 2, 3, 4)):
 def test_a_survivor_has_the_colours_of_all_it_absorbed_by_what_is_seen_of_each(order):
     """Of those seen as 1, 2 and 5, harmonics included; the one that is seen most stays.
 
-    Three times the opacity of .01, less what they hide of each other.
+    Each as one more view may see it: of all that would be seen were nothing hidden, 26 were, and
+    that share of its mass counts with a chance of 1 / (n + 1) after n views. Three times the
+    opacity of .01, less what they hide of each other.
     """
     splats, seen = three_of_five(order)
     place = [order.index(index) for index in range(5)]
@@ -275,7 +277,11 @@ def test_a_survivor_has_the_colours_of_all_it_absorbed_by_what_is_seen_of_each(o
     assert result.keep.tolist() == [index > 1 for index in order]
     (survivor,) = np.flatnonzero(result.changed)
     assert np.flatnonzero(result.keep)[survivor] == place[2]
-    shares = np.array([1, 2, 5]) / 8
+    look = merge_field.look(splats.means[place], around())
+    mass = 0.01 * (np.exp(-4.0) + 0.3 * look.pixel) / look.pixel
+    floor = mass * 26 / (look.inside @ mass) / (look.inside + 1)
+    shares = np.array([1, 2, 5]) + floor[:3]
+    shares /= shares.sum()
     for name in ("sh_dc", "sh_rest"):
         expected = np.tensordot(shares, getattr(splats, name)[place[:3]].astype(float), 1)
         np.testing.assert_allclose(getattr(result.splats, name)[survivor], expected, rtol=1e-5)
@@ -413,7 +419,9 @@ def test_more_survive_where_more_are_protected():
 
 
 def test_where_nothing_is_seen_absorbing_is_deleting_the_lowest_errors():
-    splats = cloud(200)
+    """All are alike, and so are their floors."""
+    splats = cloud(200, spread=1e-3)
+    splats.log_scales[:], splats.opacity_logits[:] = -2.0, 0.0
     error = np.random.default_rng(5).permutation(200).astype(float)
     table = {tuple(mean): value for mean, value in zip(splats.means, error, strict=True)}
 
@@ -424,6 +432,20 @@ def test_where_nothing_is_seen_absorbing_is_deleting_the_lowest_errors():
 
     np.testing.assert_array_equal(result.keep, error >= 80)
     same(result.splats, splats.take(result.keep))
+
+
+def test_what_these_views_do_not_show_is_worth_what_another_may_see():
+    """Two alike, one hidden in all of four views: both get a fifth of what a view saw of each.
+
+    Of the two in four views 8 was seen, 1 a splat and view: the floor is 1 / (4 + 1).
+    """
+    splats = cloud(1).take(np.array([0, 0]))
+    seen = Seen(np.array([8.0, 0.0]), np.array([4.0, 0.0]))
+
+    field = merge_field.field(splats, np.arange(2), around(), seen)
+
+    np.testing.assert_allclose(field.contribution, [8.2, 0.2], rtol=1e-12)
+    np.testing.assert_allclose(field.error, [4.1, 0.1], rtol=1e-12)
 
 
 def test_black_and_white_on_grey_are_not_merged():

@@ -491,9 +491,13 @@ def test_any_values_at_once_absorb_each_other_and_stay_splats(data, count):
         }
     )
 
-    result = absorb_removed(splats, drawn_views(data), count, METHODS["occlusion"], threads=1)
-
-    check_absorbed(splats, result, count)
+    try:
+        result = absorb_removed(splats, drawn_views(data), count, METHODS["occlusion"], threads=1)
+    except RefineError as error:
+        if "no camera sees the splats" not in str(error):
+            raise
+    else:
+        check_absorbed(splats, result, count)
 
 
 @pytest.mark.parametrize("name", [item.name for item in fields(Splats)])

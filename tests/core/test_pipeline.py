@@ -296,3 +296,20 @@ def test_nothing_to_remove_leaves_absorbing_nothing_to_do(small, views):
 
     assert result.keep.all()
     assert not result.absorbed.changed.any()
+
+
+@pytest.mark.parametrize("ratio", [0.03, 0.1])
+def test_the_first_tenth_goes_as_occlusion_says_and_nothing_absorbs_it(ratio):
+    """What the views would miss least is next to nothing: any merge would change more."""
+    room, views = read_ply(ROOM / "point_cloud.ply").splats(), read_cameras(ROOM / "cameras.json")
+    splats, budget = room.take(slice(None, None, 16)), Budget(ratio=ratio)
+
+    absorbed = prune(splats, views, budget, Settings(views=8), absorb=True)
+    deleted = prune(splats, views, budget, Settings("occlusion", views=8))
+
+    np.testing.assert_array_equal(absorbed.keep, deleted.keep)
+    assert absorbed.report["absorbed"] == {
+        "changed": 0,
+        "merged": 0,
+        "deleted": len(splats) - np.count_nonzero(deleted.keep),
+    }
