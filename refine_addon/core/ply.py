@@ -18,7 +18,15 @@ from .errors import RefineError
 from .files import expanded, refuse_mapped, whole_file
 from .ply_body import check_counts, read_text, vertex_range
 from .ply_columns import REQUIRED, REST_COUNTS, columns_from_splats, splats_from_columns
-from .ply_header import TEXT, Header, format_of, read_header, with_count, with_properties
+from .ply_header import (
+    TEXT,
+    Header,
+    format_of,
+    read_header,
+    shown,
+    with_count,
+    with_properties,
+)
 from .ply_write import declarations, write_lines, write_rows
 
 if TYPE_CHECKING:
@@ -232,7 +240,7 @@ def _vertex_index(header: Header) -> int:
     if "vertex" not in names:
         msg = (
             f"{header.path}: not a splat file: expected an element 'vertex', "
-            f"got {', '.join(names[:_NAMES_SHOWN]) or 'none'}"
+            f"got {', '.join(name[:40] for name in names[:_NAMES_SHOWN]) or 'none'}"
         )
         raise RefineError(msg)
     return names.index("vertex")
@@ -249,10 +257,11 @@ def _check_properties(header: Header, vertex: int) -> None:
         raise RefineError(msg)
     missing = [name for name in REQUIRED if name not in kinds]
     if missing:
-        shown = ", ".join([*kinds][:_NAMES_SHOWN]) + (", ..." if len(kinds) > _NAMES_SHOWN else "")
+        some = ", ".join(name[:40] for name in [*kinds][:_NAMES_SHOWN])
+        some += ", ..." if len(kinds) > _NAMES_SHOWN else ""
         msg = (
             f"{header.path}: {_guess(header, kinds)}: vertex lacks {', '.join(missing)} "
-            f"(it has {shown or 'no property'})"
+            f"(it has {some or 'no property'})"
         )
         raise RefineError(msg)
     rest = [name for name in kinds if name.startswith("f_rest_")]
@@ -264,10 +273,12 @@ def _check_properties(header: Header, vertex: int) -> None:
         raise RefineError(msg)
     for name, kind in kinds.items():
         if kind == "list":
-            msg = f"{header.path}: property '{name}' is a list, expected one number a splat"
+            msg = f"{header.path}: property {shown(name)} is a list, expected one number a splat"
             raise RefineError(msg)
         if kind not in ("f4", "f8") and (name in REQUIRED or name in rest):
-            msg = f"{header.path}: property '{name}' is of type {kind}, expected float or double"
+            msg = (
+                f"{header.path}: property {shown(name)} is of type {kind}, expected float or double"
+            )
             raise RefineError(msg)
 
 

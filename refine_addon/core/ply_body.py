@@ -10,7 +10,7 @@ import numpy as np
 import plyfile
 
 from .errors import RefineError
-from .ply_header import TEXT, Header
+from .ply_header import TEXT, Header, shown
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,13 +37,13 @@ def check_counts(header: Header, available: int) -> None:
     for element, count in zip(header.elements, header.counts, strict=True):
         row = _least_bytes(element, text=text)
         if not row and count:
-            msg = f"{header.path}: element '{element.name}' has {count} rows and no property"
+            msg = f"{header.path}: element {shown(element.name)} has {count} rows and no property"
             raise RefineError(msg)
         least += row * count
         if least > available + text:  # the last line of a text may lack its line end
             msg = (
                 f"{header.path}: truncated: the header announces {count} rows of "
-                f"'{element.name}', at least {least} bytes so far, but only {available} bytes "
+                f"{shown(element.name)}, at least {least} bytes so far, but only {available} bytes "
                 "follow it"
             )
             raise RefineError(msg)
@@ -116,7 +116,7 @@ def _behind_lists(
                     at += reader.size
                 if length < 0:
                     msg = (
-                        f"{header.path}: element '{element.name}' row {row}: "
+                        f"{header.path}: element {shown(element.name)} row {row}: "
                         f"a list of {length} numbers, expected 0 or more"
                     )
                     raise RefineError(msg)
@@ -126,7 +126,7 @@ def _behind_lists(
         if at > len(data):
             msg = (
                 f"{header.path}: truncated: the file ends in row {row} of {count} of "
-                f"'{element.name}'"
+                f"{shown(element.name)}"
             )
             raise RefineError(msg)
     return at
@@ -138,8 +138,8 @@ def _length_reader(header: Header, element: Any, prop: Any) -> struct.Struct | N
     kind = np.dtype(prop.len_dtype)
     if kind.kind == "f":
         msg = (
-            f"{header.path}: element '{element.name}': the length of list '{prop.name}' is of type "
-            f"{kind}, expected a whole number"
+            f"{header.path}: element {shown(element.name)}: the length of list "
+            f"{shown(prop.name)} is of type {kind}, expected a whole number"
         )
         raise RefineError(msg)
     return struct.Struct(header.order + kind.char)
@@ -179,7 +179,7 @@ def read_text(
         if len(lines) < before + count:
             msg = (
                 f"{header.path}: truncated: the file ends in row {len(lines) - before} of {count} "
-                f"of '{element.name}'"
+                f"of {shown(element.name)}"
             )
             raise RefineError(msg)
         before += count
@@ -199,7 +199,7 @@ def _numbers(header: Header, element: Any, lines: Sequence[bytes]) -> NDArray[An
     else:
         index = next(i for i, word in enumerate(words) if not _is_number(word, dtype[i]))
         problem = (
-            f"property '{dtype.names[index]}': expected a number of type {dtype[index]}, "
+            f"property {shown(dtype.names[index])}: expected a number of type {dtype[index]}, "
             f"got {words[index][:40].decode('ascii', 'backslashreplace')!r}"
         )
     msg = f"{header.path}: vertex row {row}: {problem}"

@@ -82,7 +82,7 @@ def read_header(path: Path, stream: BinaryIO) -> Header:
     try:
         data = plyfile.PlyData.read(io.BytesIO(plain))
     except (plyfile.PlyParseError, ValueError) as error:
-        msg = f"{path}: header: {error}"
+        msg = f"{path}: header: {str(error)[:200]}"
         raise RefineError(msg) from error
     order = TEXT if data.text else data.byte_order
     return Header(path, raw, tuple(data.elements), tuple(counts), order)
@@ -120,6 +120,12 @@ def with_properties(raw: bytes, declared: Sequence[bytes]) -> bytes:
             break
     lines[last + 1 : last + 1] = declared
     return _line_end(raw).join(lines)
+
+
+def shown(word: bytes | str) -> str:
+    """Return a word of the file for a message: in quotes, and not endless."""
+    text = word if isinstance(word, str) else word.decode("ascii", "replace")
+    return repr(text[:40])
 
 
 def _line_end(raw: bytes) -> bytes:
@@ -163,17 +169,13 @@ def _plain(path: Path, raw: bytes) -> tuple[bytes, list[int]]:
 
 def _count(path: Path, number: int, word: bytes) -> int:
     if not re.fullmatch(rb"[0-9]{1,30}", word):
-        msg = f"{path}: header line {number}: expected a number of rows, got {_shown(word)}"
+        msg = f"{path}: header line {number}: expected a number of rows, got {shown(word)}"
         raise RefineError(msg)
     return int(word)
 
 
 def _refuse_double(path: Path, number: int, name: bytes, seen: set[bytes]) -> None:
     if name in seen:
-        msg = f"{path}: header line {number}: {_shown(name)} is declared twice, expected once"
+        msg = f"{path}: header line {number}: {shown(name)} is declared twice, expected once"
         raise RefineError(msg)
     seen.add(name)
-
-
-def _shown(word: bytes) -> str:
-    return repr(word[:40].decode("ascii", "replace"))

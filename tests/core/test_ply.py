@@ -529,6 +529,38 @@ def test_a_file_that_is_wrong_is_refused_with_its_name_and_the_place(tmp_path, n
     assert data == (tmp_path / "in.ply").read_bytes()
 
 
+LONG = b"n" * 5000
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        declared((b"float rot_3", b"float " + LONG)),
+        declared((b"element vertex", b"element " + LONG)),
+        declared((b"end_header", b"property list uchar int %s\nend_header" % LONG)),
+        declared((b"end_header", b"property float f_rest_%s\nend_header" % LONG)),
+        declared((b"end_header", b"element %s 1\nproperty double a\nend_header" % LONG)),
+        declared((b"end_header", b"element %s 7\nend_header" % LONG)),
+        declared((VERTEX, LIST_AHEAD.replace(b"face", LONG) % b"float")),
+        declared(
+            (VERTEX, LIST_AHEAD.replace(b"face", LONG) % b"uchar"),
+            (b"end_header\n", b"end_header\n\xff"),
+        ),
+        declared((b"property float x", b"property float x%s\nproperty float x%s" % (LONG, LONG))),
+        declared((b"property float x", b"property %s x" % LONG)),
+        declared((b"property float x", b"%s float x" % LONG)),
+        declared((VERTEX, b"element vertex %s\n" % LONG)),
+        declared((b"binary_little_endian", LONG)),
+    ],
+)
+def test_names_that_do_not_end_do_not_flood_the_message(tmp_path, data):
+    """Forty characters of each are shown."""
+    with pytest.raises(RefineError) as caught:
+        opened(tmp_path, data)
+
+    assert len(str(caught.value)) < 1000
+
+
 TEXT_HEADER = plain_header(2, NAMES, "ascii").replace(
     b"end_header", b"property uchar tag\nend_header"
 )
