@@ -31,7 +31,14 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from refine_addon.command import describe  # noqa: E402 - from this checkout, installed or not
-from refine_addon.core import RefineError, read_cameras, read_ply, score  # noqa: E402
+from refine_addon.core import (  # noqa: E402
+    Occlusion,
+    RefineError,
+    Settings,
+    read_cameras,
+    read_ply,
+    score,
+)
 from refine_addon.core.ply import splats_from_columns  # noqa: E402
 
 MEMORY = 40_000_000
@@ -317,20 +324,22 @@ def use_ply(folder: Path) -> None:
 
 
 def use_cameras(folder: Path) -> None:
-    """Read cameras, and score a few splats by them."""
+    """Read cameras, and score a few splats by them, by either method."""
     files = sorted(path for path in folder.iterdir() if path.name != "dataparser_transforms.json")
     views = read_cameras(files[0])
     values = np.random.default_rng(0).normal(size=(20, 14)).astype(np.float32)
     columns = dict(zip(REQUIRED.split(), values.T, strict=True))
-    try:
-        scores = score(splats_from_columns(columns), views)
-    except RefineError as error:
-        if "no camera sees the splats" in str(error):
-            return
-        raise
-    if not np.isfinite(scores.values).all():
-        msg = "scores are not finite"
-        raise AssertionError(msg)
+    for settings in (Settings(), Settings("occlusion", occlusion=Occlusion(16.0, 1.0, 1))):
+        try:
+            # In this thread: NumPy's flags are raised in it alone.
+            scores = score(splats_from_columns(columns), views, settings, threads=1)
+        except RefineError as error:
+            if "no camera sees the splats" in str(error):
+                continue
+            raise
+        if not np.isfinite(scores.values).all():
+            msg = "scores are not finite"
+            raise AssertionError(msg)
 
 
 Target = tuple[Callable[[], list[Files]], Callable[[Path], None]]
