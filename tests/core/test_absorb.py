@@ -187,6 +187,30 @@ def test_a_merge_along_the_line_of_sight_costs_what_views_from_aside_see():
     np.testing.assert_allclose(aside, merging.price(turned, *pair).cost, rtol=1e-6)
 
 
+def test_splats_that_do_not_stand_out_cost_nothing_to_merge_whatever_their_colours():
+    """No contrast to what lies behind: colours that say otherwise are those of other places."""
+    field = flat(
+        [0.5, 0.5], [[0.0, 0, 0], [1, 0, 0]], [[1.0, 1, 1]] * 2,
+        colors=[[0.0] * 3, [1.0] * 3], error=[0.0, 0.0],
+    )  # fmt: skip
+
+    pairs, _ = merged_of(field)
+
+    assert pairs.cost.tolist() == pairs.error.tolist() == [0.0]
+
+
+def test_splats_seen_from_opposite_sides_do_not_lose_their_direction():
+    """The mean of opposites is none, and a spread to the left is one to the right."""
+    field = flat([0.3, 0.3], [[0.0, 0, 0], [1, 0, 0]], [[1.0, 1, 1]] * 2)
+    field.direction[:] = [[0, 0, 1], [0, 0, -1]]
+    field.spread[:] = [[0.5, 0, 0], [-0.5, 0, 0]]
+
+    _, merged = merged_of(field)
+
+    np.testing.assert_allclose(np.abs(merged.direction), [[0, 0, 1]])
+    np.testing.assert_allclose(np.abs(merged.spread), [[0.5, 0, 0]])
+
+
 def test_no_mass_is_created_and_none_is_lost_but_the_overlap():
     rng = np.random.default_rng(2)
     count = 2000
@@ -581,6 +605,19 @@ def test_the_order_of_the_file_does_not_matter():
     np.testing.assert_array_equal(one.keep[order], other.keep)
     place = np.argsort(order[other.keep])
     np.testing.assert_allclose(other.splats.means[place], one.splats.means, atol=1e-9)
+
+
+def test_the_order_of_the_views_does_not_matter():
+    splats, views = cloud(400), around(7)
+
+    one = absorb(splats, views, measure, 150)
+    other = absorb(splats, views.take([3, 0, 6, 2, 5, 1, 4]), measure, 150)
+
+    np.testing.assert_array_equal(one.keep, other.keep)
+    for name in FIELDS:
+        np.testing.assert_allclose(
+            getattr(one.splats, name), getattr(other.splats, name), rtol=1e-6, atol=1e-9
+        )
 
 
 def test_threads_change_nothing():
