@@ -18,7 +18,7 @@ the scores of the survivors are computed anew, and so on to the last tenth. Budg
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -120,6 +120,44 @@ def score(
     Memory: about 300 bytes a splat, and for each thread 100 bytes a point of one view, of which
     there are at most 4 million (`froxels.MAX_POINTS`).
     """
+    return _scored(splats, views, settings, progress, threads)[0]
+
+
+def score_once(
+    splats: Splats,
+    views: ViewSet,
+    settings: Occlusion = Occlusion(),
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> tuple[Scores, Measured]:
+    """Score splats in one round; return also what was measured of all N.
+
+    Parameters
+    ----------
+    splats, views, settings, progress, threads
+        See `score`; the rounds do not matter.
+
+    Returns
+    -------
+    Scores, Measured
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `score`.
+    """
+    scores, run = _scored(splats, views, replace(settings, rounds=1), progress, threads)
+    return scores, run.measured.spread(run.gaussians.index, len(splats))
+
+
+def _scored(
+    splats: Splats,
+    views: ViewSet,
+    settings: Occlusion,
+    progress: Progress,
+    threads: int | None,
+) -> tuple[Scores, _Run]:
     if not len(splats):
         msg = "there are no splats to score"
         raise RefineError(msg)
@@ -141,13 +179,8 @@ def score(
         )
         raise RefineError(msg)
     values[~good] = 0.0
-    return Scores(
-        values,
-        seen,
-        len(views),
-        int(np.count_nonzero(~good)),
-        {"floor": run.weights},
-    )
+    scores = Scores(values, seen, len(views), int(np.count_nonzero(~good)), {"floor": run.weights})
+    return scores, run
 
 
 def measure(
@@ -180,11 +213,7 @@ def measure(
     )
     run = _Run(gaussians, frame, views, settings, threads)
     some = Measured.sum(run.measure(gaussians, part(progress, 0.1, 1.0)))
-    every = Measured.zero(len(splats))
-    every.contribution[gaussians.index] = some.contribution
-    every.contrast[gaussians.index] = some.contrast
-    every.seen[gaussians.index] = some.seen
-    return every
+    return some.spread(gaussians.index, len(splats))
 
 
 class _Run:
@@ -205,6 +234,7 @@ class _Run:
             threads,
         )
         self.shown = False  # whether any view sees anything
+        self.measured = Measured.zero(len(gaussians))  # in the first round
         self.weights = [0.0] * len(coverage.SHARES)  # of the floor, up to each share
         self.views = _by_distance(views)
         # Neighbours follow each other, so every k-th of them is all over the scene.
@@ -233,6 +263,7 @@ class _Run:
             if number == 0:
                 self.weights = self._weigh(blocks, measured, prior)
                 seen[left.index] = measured.seen
+                self.measured = measured
                 self.shown = bool(measured.contribution.any())
             last = number == rounds - 1
             stay = 0 if last else round(count * LEAST ** ((number + 1) / (rounds - 1)))
@@ -333,6 +364,14 @@ class Measured:
         for other in parts:
             total.add(other)
         return total
+
+    def spread(self, index: NDArray[np.int64], count: int) -> Measured:
+        """Return the sums for `count` splats, of which these are those at `index`; 0 of others."""
+        every = Measured.zero(count)
+        every.contribution[index] = self.contribution
+        every.contrast[index] = self.contrast
+        every.seen[index] = self.seen
+        return every
 
     def add(self, other: Measured) -> None:
         """Add the sums of other views."""

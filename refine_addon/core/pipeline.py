@@ -253,16 +253,24 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
     total = len(splats)
     first = min(math.floor(FIRST * total), total - count)
     rest = np.ones(total, np.bool_)
-    if first > 0:
-        once = Settings("occlusion", 0, occlusion=replace(settings.occlusion, rounds=1))
-        scores = score(splats, used, once, progress=part(progress, 0.0, 0.2), threads=threads)
-        # What no renderer draws scores lowest, so it is among these, or all of these are such.
-        rest = selection.select(scores, Budget(keep=total - first), protected=protected)
+    known: list[Seen] = []
 
     def seen(now: Splats, ahead: Progress) -> Seen:
+        if known:  # what went first hid and showed next to nothing
+            return known.pop()
         measured = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
         return Seen(measured.contribution, measured.contrast)
 
+    if first > 0:
+        with np.errstate(under="ignore"):  # as for scores
+            scores, measured = occlusion.score_once(
+                splats, used, settings.occlusion,
+                progress=part(progress, 0.0, 0.2), threads=threads,
+            )  # fmt: skip
+        # What no renderer draws scores lowest, so it is among these, or all of these are such.
+        rest = selection.select(scores, Budget(keep=total - first), protected=protected)
+        known.append(Seen(measured.contribution[rest], measured.contrast[rest]))
+        del scores, measured
     with np.errstate(under="ignore"):  # as for scores
         absorbed = absorbing.absorb(
             splats.take(rest), used, seen, count,
