@@ -189,11 +189,7 @@ MUTANTS = {
             "shares of harmonics swapped",
         ),
         ("reversed(graph.merges)", "graph.merges", "merges followed forwards"),
-        (
-            "np.flatnonzero(free & good & ~(seen",
-            "np.flatnonzero(good & ~(seen",
-            "protection forgotten (unseen)",
-        ),
+        ("np.flatnonzero(keep & good & free)", "np.flatnonzero(keep & good)", "unprotected"),
         (
             "protected=spared[origin]",
             "protected=spared[: len(origin)]",
@@ -212,6 +208,8 @@ MUTANTS = {
         ),
     ],
     "merge_field.py": [
+        ("/ (1.0 + inside)", "", "as likely after many views"),
+        ("shown = inside @ worth", "shown = worth.sum()", "all seen once"),
         ("np.where(inside, share, share * BESIDE)", "share", "views beside count"),
         ("<= view.height / 2 * z", "<= view.width / 2 * z", "image by its width"),
         (
