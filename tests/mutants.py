@@ -299,6 +299,15 @@ MUTANTS = {
             "blind probes take the cheap",
         ),
     ],
+    "pipeline.py": [
+        ("math.floor(FIRST * total)", "0", "merged from the first"),
+        ("else protected[rest]", "else None", "protection forgotten"),
+        (
+            "keep[np.flatnonzero(rest)[absorbed.keep]] = True",
+            "keep[np.flatnonzero(absorbed.keep)] = True",
+            "survivors of other rows",
+        ),
+    ],
     "neighbours.py": [
         (
             "(index == tree.which[rows][:, :, None]) | (index >= total)",

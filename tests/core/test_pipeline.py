@@ -288,6 +288,18 @@ def test_a_budget_that_only_scores_can_tell_says_how_many_survivors_absorb(small
     assert np.count_nonzero(result.keep) == pytest.approx(len(splats) / 2, abs=1)
 
 
+def test_protected_splats_stay_as_they_are_while_others_absorb(small, views):
+    """Every third is protected, and six of ten go."""
+    splats = read_ply(small).splats()
+    protected = np.arange(len(splats)) % 3 == 0
+
+    result = prune(splats, views, Budget(ratio=0.6), protected=protected, absorb=True)
+
+    assert result.keep[protected].all()
+    assert np.count_nonzero(result.keep) == len(splats) - len(splats) * 6 // 10
+    assert not result.absorbed.changed[protected[result.keep]].any()
+
+
 def test_nothing_to_remove_leaves_absorbing_nothing_to_do(small, views):
     """All stay, none changes."""
     result = prune(read_ply(small).splats(), views, Budget(ratio=0.0), absorb=True)
