@@ -163,23 +163,15 @@ MUTANTS = {
         ("known and away <=", "known or away <=", "farther than float32 holds"),
     ],
     "coverage.py": [
-        ("(1.0 + seen) ** (1.0 + power)", "1.0", "seen forgotten in floor"),
+        ("/ (1.0 + seen)", "/ 1.0", "seen forgotten in floor"),
+        ("max(pair) for pair", "pair[0] for pair", "no floor where views agree"),
         (
             'np.argsort(scores, kind="stable")]',
             'np.argsort(-scores, kind="stable")]',
             "best go first",
         ),
         ("return [1.0] * len(SHARES)", "return [0.0] * len(SHARES)", "trust in what nobody judges"),
-        (
-            "table.mean(axis=0).argmin(axis=0)",
-            "table.mean(axis=0).argmax(axis=0)",
-            "the worst weight",
-        ),
-        (
-            "(worse.mean(axis=0) <= allowed)",
-            "(worse.mean(axis=0) <= 0.0 * allowed)",
-            "the best for the smallest weight",
-        ),
+        ("table.argmin(axis=0)", "table.argmax(axis=0)", "the worst weight"),
     ],
     "absorb.py": [
         ("(1.0 - share) / share)", "share / (1.0 - share))", "patience upside down"),

@@ -7,6 +7,9 @@ leave much to be guessed. The views answer it themselves: an eighth of them at a
 the others score with each weight of the floor, and the weight that loses least of what the views
 left out measured is taken. The more splats go, the more the floor may weigh: what goes first is
 next to nothing, and a floor that is little to the last is a wall to the first.
+
+Views can only answer for views like them. All of them in one corner of a room agree that the rest
+of it is not worth a thing; so from half removed on there is always some floor, `LEAST_WEIGHTS`.
 """
 
 from __future__ import annotations
@@ -20,11 +23,15 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-5.0, 1.5, 0.5)))
+WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-5.0, 0.5, 0.5)))
 """What is tried, of the mean of the scores for a splat of mean worth that no view looks at."""
 
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Shares removed for each of which a weight is chosen, by what goes up to there."""
+
+LEAST_WEIGHTS = (0.0, 0.0, 0.03, 0.03, 0.03)
+"""The least that the floor weighs at each of `SHARES`: it costs tenths of a dB on views like those
+that score, and is worth up to 20 dB on others."""
 
 SAMPLE = 1 << 15
 """How many splats are enough to choose by."""
@@ -34,8 +41,7 @@ def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> 
     """Return what a splat that these views do not show may be worth to others, (n,).
 
     Of n views that might have shown it none did: by the rule of succession the next one does with
-    a chance of about 1 / (n + 1). Visibility enters the score with one power more than the worth:
-    contrast has the square of the transmittance.
+    a chance of about 1 / (n + 1).
 
     Parameters
     ----------
@@ -45,7 +51,7 @@ def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> 
         In how many views the centre lies.
     power : float
     """
-    return np.asarray(_unit(prior**power) / (1.0 + seen) ** (1.0 + power))
+    return np.asarray(_unit(prior**power) / (1.0 + seen))
 
 
 def with_floor(
@@ -77,13 +83,9 @@ def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[floa
             losses.append(np.stack(tried, axis=1))
     if not losses:
         return [1.0] * len(SHARES)
-    # The smallest weight that is not worse than the best by more than one standard error of the
-    # difference (Breiman et al. 1984): a floor must earn its place.
-    table = np.concatenate(losses)  # (views, weights, shares)
-    best = table.mean(axis=0).argmin(axis=0)
-    worse = table - np.take_along_axis(table, best[None, None], axis=1)
-    allowed = worse.std(axis=0) / np.sqrt(max(len(table) - 1, 1))
-    return [WEIGHTS[k] for k in (worse.mean(axis=0) <= allowed).argmax(axis=0)]
+    table = np.mean(np.concatenate(losses), axis=0)  # (weights, shares)
+    best = [WEIGHTS[k] for k in table.argmin(axis=0)]
+    return [max(pair) for pair in zip(best, LEAST_WEIGHTS, strict=True)]
 
 
 def order(

@@ -492,18 +492,18 @@ def test_a_large_splat_that_one_view_does_not_show_outlasts_a_faint_one_that_it_
 
 
 def test_the_floor_falls_with_the_views_that_might_have_shown_a_splat():
-    """Worth 1, 1, 4 in 0, 3, 0 views, power 1/2: 1, 1/8, 2 over the mean of 1, 1 and 2."""
+    """Worth 1, 1, 4 in 0, 3, 0 views, power 1/2: 1, 1/4, 2 over the mean of 1, 1 and 2."""
     floors = coverage.floor(np.array([1.0, 1, 4]), np.array([0, 3, 0], np.int32), 0.5)
 
-    np.testing.assert_allclose(floors, np.array([1.0, 0.125, 2.0]) * 0.75)
+    np.testing.assert_allclose(floors, np.array([1.0, 0.25, 2.0]) * 0.75)
     np.testing.assert_allclose(
         coverage.with_floor(np.array([2.0, 4, 6]), floors, 2.0),
         np.array([0.5, 1, 1.5]) + 2 * floors,
     )
 
 
-def test_the_weight_of_the_floor_is_as_small_as_what_the_left_out_views_say_allows():
-    """0 where the scores are right, much where the floor is, 1 where nothing was left out.
+def test_the_floor_weighs_what_loses_least_of_what_the_left_out_views_saw():
+    """Least where the scores are right, most where the floor is, 1 where nothing was left out.
 
     A view that sees nothing says nothing, and one that is bright says no more than others.
     """
@@ -512,12 +512,27 @@ def test_the_weight_of_the_floor_is_as_small_as_what_the_left_out_views_say_allo
     dark = np.zeros((1, 200))
     errors = np.stack([right * rng.uniform(0.9, 1.1, 200) for _ in range(4)])
 
-    assert set(coverage.floor_weights([(right, wrong, errors), (right, wrong, dark)])) == {0.0}
-    assert min(coverage.floor_weights([(wrong, right, errors)])) >= 10.0
+    found = coverage.floor_weights([(right, wrong, errors), (right, wrong, dark)])
+    assert found == list(coverage.LEAST_WEIGHTS)
+    assert min(coverage.floor_weights([(wrong, right, errors)])) == max(coverage.WEIGHTS)
     assert coverage.floor_weights([]) == [1.0] * len(coverage.SHARES)
     assert coverage.floor_weights([(right, wrong, dark)]) == [1.0] * len(coverage.SHARES)
-    glare = np.vstack([errors, wrong * 1e6])
-    assert max(coverage.floor_weights([(right, wrong, glare)])) < 0.1
+    plain, glare = (np.vstack([errors, wrong * light]) for light in (1.0, 1e6))
+    assert coverage.floor_weights([(right, wrong, plain)]) == coverage.floor_weights(
+        [(right, wrong, glare)]
+    )
+
+
+def test_what_lies_behind_all_cameras_does_not_all_go():
+    """Views in one place agree that nothing else counts; half of the splats go nevertheless."""
+    splats, behind = cloud(600), np.arange(600) >= 300
+    splats.means[:, 2] += np.where(behind, -6.0, 6.0)
+    views = ViewSet(tuple(look_along_z((x, 0.0, 0.0)) for x in np.linspace(-0.2, 0.2, 9)))
+
+    values = occlusion.score(splats, views).values
+
+    kept = values > np.median(values)
+    assert 0.2 < np.mean(kept[behind]) < np.mean(kept[~behind])
 
 
 def test_each_share_has_the_weight_that_is_right_up_to_there():
