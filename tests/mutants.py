@@ -96,21 +96,33 @@ MUTANTS = {
         ("    values[~good] = 0.0\n", "", "undrawable not lowest"),
     ],
     "froxels.py": [
-        ("-np.log(np.float32(1.0) - share)", "share", "thickness of a thin point"),
+        ("    np.log(share, out=share)\n", "", "thickness of a thin point"),
         (
-            "np.minimum(alphas, ALPHA_MAX).astype(np.float32)[points.owners]",
+            "np.minimum(alphas, np.float32(ALPHA_MAX)).take(points.owners)",
             "np.float32(ALPHA_MAX)",
             "covers more than opacity",
         ),
-        ("    total -= thick\n", "", "a splat hides itself"),
-        ("    total -= np.repeat(total[starts], points.columns)\n", "", "one cell hides the next"),
+        ("steps[1:] = values[:-1]", "steps[:] = values", "a splat hides itself"),
+        (
+            "    steps[starts[1:]] = -np.add.reduceat(steps, starts)[:-1]\n",
+            "",
+            "one cell hides the next",
+        ),
         (
             "squares * light * light * contrast",
             "squares * light * contrast",
             "transmittance not squared",
         ),
-        ("(np.repeat(shown[ends], points.columns) - shown)", "shown", "colour in front for behind"),
-        ("number *= across", "number *= down", "rows of another length"),
+        (
+            "(through * color)[::-1], points.columns[::-1])[::-1]",
+            "through * color, points.columns)",
+            "colour in front for behind",
+        ),
+        (
+            "number *= math.ceil(view.width / side)",
+            "number *= math.ceil(view.height / side)",
+            "rows of another length",
+        ),
         ("errors = errors * share /", "errors = errors /", "outside counts"),
         (
             "_points_needed(footprints, side, density) > MAX_POINTS",

@@ -22,7 +22,8 @@ import numpy as np
 from .projection import ALPHA_CUT
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
+    from typing import Any
 
     from numpy.typing import NDArray
 
@@ -54,7 +55,7 @@ Line = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
 _EXTENT, _WIDE_EXTENT, _WIDE = 2.4, 3.0, 8  # standard deviations; the latter from 8 points on
 _GROWTH = 2.0**0.25
 _OUTSIDE = MAX_CELLS  # the number of no cell
-_BLOCK = 1 << 14  # points worked on at a time: what they need fits the cache of one core
+_BLOCK = 1 << 16  # points worked on at a time: fewer calls to wait for, and memory stays bounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,15 +137,20 @@ class Points:
 
     def pieces(self) -> Iterator[tuple[slice, Points]]:
         """Cut into whole columns, about `_BLOCK` points at a time: (place, points) in turn."""
-        ends = np.cumsum(self.columns)
-        cuts = np.searchsorted(ends, np.arange(_BLOCK, len(self.owners), _BLOCK))
-        start = column = 0
-        for cut in [*np.unique(cuts).tolist(), len(ends) - 1]:
-            if cut >= column:
-                place = slice(start, int(ends[cut]))
-                columns = self.columns[column : cut + 1]
-                yield place, Points(self.owners[place], self.weights[place], columns, self.area)
-                start, column = place.stop, cut + 1
+        for cells, place in _runs(self.columns):
+            columns = self.columns[cells]
+            yield place, Points(self.owners[place], self.weights[place], columns, self.area)
+
+
+def _runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
+    """Cut groups of such sizes into runs of about `_BLOCK` members: (groups, members) in turn."""
+    ends = np.cumsum(sizes)
+    cuts = np.searchsorted(ends, np.arange(_BLOCK, int(sizes.sum()), _BLOCK)) + 1
+    start = member = 0
+    for cut in np.unique([*cuts, len(sizes)]).tolist():
+        if cut > start:
+            yield slice(start, cut), slice(member, int(ends[cut - 1]))
+            start, member = cut, int(ends[cut - 1])
 
 
 def cell_size(footprints: Footprints, view: View, cell: float, density: float) -> float:
@@ -175,25 +181,17 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
     density : float
         Points per standard deviation for cells of that size.
     """
-    table = lattices()
     kinds = _kinds(footprints, view, density / side)
-    counts = np.array([len(lattice.weights) for lattice in table])[kinds]
-    first = np.cumsum(counts) - counts
+    sizes, *_ = _table()
+    counts = sizes[kinds]
     cells = np.empty(int(counts.sum()), np.uint16)
     weights = np.empty(len(cells), np.float32)
-    rows = np.argsort(kinds, kind="stable")
-    end = 0
-    for kind, number in enumerate(np.bincount(kinds)):
-        lattice, start, end = table[kind], end, end + int(number)
-        step = max(_BLOCK // len(lattice.weights), 1)
-        for begin in range(start, end, step):
-            row = rows[begin : min(begin + step, end)]
-            at = first[row][:, None] + np.arange(len(lattice.weights))
-            if kind == len(table) - 1:
-                cells[at], weights[at] = _flat(footprints, row, lattice, view, side)
-            else:
-                place = _place(footprints, row, lattice)
-                cells[at], weights[at] = _cells(place, view, side), lattice.weights
+    for row, place in _runs(counts):
+        cells[place], weights[place] = _laid(footprints, row, kinds[row], view, side)
+    vast = np.flatnonzero(kinds == len(sizes) - 1)
+    if len(vast):
+        at = np.cumsum(counts)[vast][:, None] - np.arange(FLAT**2, 0, -1)
+        cells[at], weights[at] = _flat(footprints, vast, lattices()[-1], view, side)
     return _merged(
         cells, np.repeat(np.arange(len(counts), dtype=np.int32), counts), weights, side * side
     )
@@ -211,37 +209,55 @@ def _kinds(footprints: Footprints, view: View, scale: float) -> NDArray[np.uint8
     return np.where(vast, np.uint8(len(COUNTS) ** 2), kinds)
 
 
-def _place(
-    footprints: Footprints, row: NDArray[np.int64], lattice: Lattice
-) -> list[NDArray[np.float32]]:
-    """Return column and row, pixels, of every point of some footprints, each (n, k)."""
+@functools.cache
+def _table() -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any], NDArray[Any]]:
+    """Return the lattices one after the other: size and start of each, points and weights."""
+    sizes = np.array([len(lattice.weights) for lattice in lattices()])
+    points = np.concatenate([lattice.points for lattice in lattices()], axis=1)
+    weights = np.concatenate([lattice.weights for lattice in lattices()])
+    return sizes, np.cumsum(sizes) - sizes, points, weights
+
+
+def _laid(
+    footprints: Footprints, row: slice, kinds: NDArray[np.uint8], view: View, side: float
+) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
+    """Return cell and weight of every point of some footprints, one footprint after the other."""
+    sizes, starts, points, weights = _table()
+    counts = sizes[kinds]
+    first = np.cumsum(counts) - counts
+    which = np.arange(int(counts.sum())) - np.repeat(first - starts[kinds], counts)
+    along, across = points[0].take(which), points[1].take(which)
     place = []
     for axis in range(2):
-        where = footprints.major[axis, row][:, None] * lattice.points[0]
-        where += footprints.minor[axis, row][:, None] * lattice.points[1]
-        where += footprints.centers[axis, row][:, None]
+        where = along * np.repeat(footprints.major[axis, row], counts)
+        where += across * np.repeat(footprints.minor[axis, row], counts)
+        where += np.repeat(footprints.centers[axis, row], counts)
         place.append(where)
-    return place
+    return _cells(place, view, side), weights.take(which)
 
 
-def _cells(place: list[NDArray[np.float32]], view: View, side: float) -> NDArray[np.int32]:
+def _cells(place: list[NDArray[np.float32]], view: View, side: float) -> NDArray[np.uint16]:
     """Return the number of the cell that each point lies in, or `_OUTSIDE`."""
-    across, down = math.ceil(view.width / side), math.ceil(view.height / side)
-    u, v = place
-    inside = (u >= 0.0) & (u < view.width)
-    inside &= (v >= 0.0) & (v < view.height)
-    # Clipped before rounding: far outside they would not fit the integers, and rounding may put
-    # the last pixel one cell beyond the last.
-    column = (u * np.float32(1.0 / side)).clip(0.0, across - 1).astype(np.int32)
-    number = (v * np.float32(1.0 / side)).clip(0.0, down - 1).astype(np.int32)
-    number *= across
-    number += column
-    return np.where(inside, number, np.int32(_OUTSIDE))
+    inside = np.ones(place[0].shape, np.bool_)
+    number = np.zeros(place[0].shape, np.int32)
+    for where, size in zip(place[::-1], (view.height, view.width), strict=True):
+        inside &= where >= 0.0
+        inside &= where < size
+        # Clipped before rounding: far outside they would not fit the integers, and rounding may
+        # put the last pixel one cell beyond the last.
+        cell = where * np.float32(1.0 / side)
+        np.maximum(cell, np.float32(0.0), out=cell)
+        np.minimum(cell, np.float32(math.ceil(size / side) - 1), out=cell)
+        number *= math.ceil(view.width / side)
+        number += cell.astype(np.int32)
+    cells = number.astype(np.uint16)
+    cells[~inside] = _OUTSIDE
+    return cells
 
 
 def _flat(
     footprints: Footprints, row: NDArray[np.int64], lattice: Lattice, view: View, side: float
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
     """Return cells and weights of points all over the image, for splats larger than it."""
     u = np.float32(view.width / 2) * (lattice.points[0] + 1)
     v = np.float32(view.height / 2) * (lattice.points[1] + 1)
@@ -270,7 +286,7 @@ def _merged(
     order = np.argsort(cells, kind="stable")[: filled.sum()]
     if not len(order):
         return Points(order, weights[:0], order, area)
-    owners = owners[order]
+    owners = owners.take(order)
     tops = np.cumsum(filled) - filled
     new = np.empty(len(owners), np.bool_)
     np.not_equal(owners[1:], owners[:-1], out=new[1:])
@@ -278,7 +294,10 @@ def _merged(
     starts = np.flatnonzero(new)
     columns = np.add.reduceat(new, tops, dtype=np.int64)
     return Points(
-        owners[starts].astype(np.int64), np.add.reduceat(weights[order], starts), columns, area
+        owners.take(starts).astype(np.int64),
+        np.add.reduceat(weights.take(order), starts),
+        columns,
+        area,
     )
 
 
@@ -290,18 +309,32 @@ def thickness(
     ``-log(1 - a)``, a the share of the cell that it covers: its mass over the cell's area, and no
     more than the splat's opacity.
     """
-    share = points.weights * (mass / np.float32(points.area))[points.owners]
-    np.minimum(share, np.minimum(alphas, ALPHA_MAX).astype(np.float32)[points.owners], out=share)
-    return np.asarray(-np.log(np.float32(1.0) - share))
+    share = points.weights * (mass / np.float32(points.area)).take(points.owners)
+    np.minimum(share, np.minimum(alphas, np.float32(ALPHA_MAX)).take(points.owners), out=share)
+    np.subtract(np.float32(1.0), share, out=share)
+    np.log(share, out=share)
+    return np.negative(share, out=share)
 
 
-def in_front(points: Points, thick: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Sum the thickness, (m,), in front of each point in its cell."""
-    total = np.cumsum(thick, dtype=np.float64)
-    total -= thick
-    starts = np.cumsum(points.columns) - points.columns
-    total -= np.repeat(total[starts], points.columns)
-    return total.astype(np.float32)
+def in_front(
+    points: Points, thick: NDArray[np.float32], even: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Sum two thicknesses, (m,) each, in front of each point in its cell."""
+    both = np.empty(len(thick), np.complex128)  # running sums of two take as long as of one
+    both.real, both.imag = thick, even
+    both = _before(both, points.columns)
+    return both.real.astype(np.float32), both.imag.astype(np.float32)
+
+
+def _before(values: NDArray[Any], columns: NDArray[np.int64]) -> NDArray[Any]:
+    """Sum what stands before each of `values`, (m,), in its group of so many; in float64."""
+    starts = np.cumsum(columns) - columns
+    steps = np.empty(len(values), np.result_type(values, np.float64))
+    steps[1:] = values[:-1]
+    steps[starts] = 0.0
+    # Each group begins by taking back what the last one came to.
+    steps[starts[1:]] = -np.add.reduceat(steps, starts)[:-1]
+    return np.cumsum(steps)
 
 
 def evenness(footprints: Footprints, area: float) -> NDArray[np.float32]:
@@ -338,7 +371,7 @@ def contrast(
     points: Points,
     front: NDArray[np.float32],
     thick: NDArray[np.float32],
-    colors: NDArray[np.float32],
+    colors: Sequence[NDArray[Any]],
 ) -> NDArray[np.float32]:
     """Squared difference between each point's colour and that behind it in its cell, (m,).
 
@@ -350,23 +383,23 @@ def contrast(
     points : Points
     front, thick : (m,) float32
         Optical thickness in front of it, and its own.
-    colors : (n, 3) float32
-        Of the footprints.
+    colors : sequence of (n,) arrays
+        Of the footprints; complex where two channels are one.
     """
     through = np.exp(-np.minimum(front, np.float32(60.0)))
     left = through * np.exp(-thick)
-    weight = through - left
-    ends = np.cumsum(points.columns) - 1
+    through -= left
     # Where less than this is left, what is behind changes nothing that could be seen.
     scale = np.float32(1.0) / np.maximum(left, np.float32(1e-4))
     squared = np.zeros_like(front)
-    for channel in range(3):
-        color = colors[:, channel][points.owners]
-        shown = np.cumsum(weight * color, dtype=np.float64)
-        behind = (np.repeat(shown[ends], points.columns) - shown).astype(np.float32)
+    for pair in colors:
+        color = pair.take(points.owners)
+        behind = _before((through * color)[::-1], points.columns[::-1])[::-1].astype(pair.dtype)
         behind *= scale
         behind -= color
-        squared += behind * behind
+        squared += np.square(behind.real)
+        if np.iscomplexobj(pair):
+            squared += np.square(behind.imag)
     return squared
 
 

@@ -411,15 +411,15 @@ def measure_view(
         side = froxels.cell_size(footprints, view, settings.cell, settings.density)
         points = froxels.scatter(footprints, view, side, settings.density)
         alphas = gaussians.alphas[footprints.index]
-        colors = gaussians.colors[footprints.index]
+        red, green, blue = gaussians.colors[footprints.index].T
+        colors = ((red + np.complex64(1j) * green), blue.copy())
         mass, mass_squared = froxels.masses(footprints, alphas)
         evenness = froxels.evenness(footprints, points.area)
         light = np.empty(len(points.owners), np.float32)
         contrast = np.empty(len(points.owners), np.float32)
         for place, piece in points.pieces():
             thick = froxels.thickness(piece, alphas, mass)
-            front = froxels.in_front(piece, thick)
-            even = froxels.in_front(piece, thick * evenness[piece.owners])
+            front, even = froxels.in_front(piece, thick, thick * evenness.take(piece.owners))
             light[place] = froxels.light(front, even, points.area)
             contrast[place] = froxels.contrast(piece, front, thick, colors)
         shown, errors = froxels.mean_light(points, light, contrast, count)
