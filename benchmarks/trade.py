@@ -26,7 +26,17 @@ from typing import TYPE_CHECKING, Any
 from refine_addon.core.errors import RefineError
 from refine_addon.core.selection import Budget, select
 
-from . import ablation, evaluate, flops, hessian, methods, rasterizer, splat_transform, trade_report
+from . import (
+    ablation,
+    cheaper,
+    evaluate,
+    flops,
+    hessian,
+    methods,
+    rasterizer,
+    splat_transform,
+    trade_report,
+)
 from .methods import Method, Task
 
 if TYPE_CHECKING:
@@ -42,7 +52,7 @@ ROOT = Path(__file__).resolve().parent.parent
 ROOM = ROOT / "tests/data/room_small"
 PATIENCE = 40.0
 """Seconds after which nothing is run once more for the median."""
-PARTS = ("methods", "ablation", "flops", "hessian")
+PARTS = ("methods", "cheaper", "ablation", "flops", "hessian")
 
 
 @dataclass(frozen=True)
@@ -97,6 +107,7 @@ class Measured:
     facts: dict[str, str]
     rows: list[Row] = field(default_factory=list)
     unpruned: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
+    cheaper: list[cheaper.Line] = field(default_factory=list)
     ablation: list[ablation.Line] = field(default_factory=list)
     flops: flops.Counts | None = None
     hessian: hessian.Energies | None = None
@@ -206,6 +217,9 @@ def measure(folder: Path, options: argparse.Namespace) -> Measured:
         found.unpruned = judge(splats)
         _measure_methods(task, judge, found, options)
     # An hour's measurements are not lost because one of them fails; it is said, and is an error.
+    if "cheaper" in options.parts:
+        with _noted("cheaper", found.failed):
+            found.cheaper = cheaper.measure(task, held_out, options.ratios)
     if "ablation" in options.parts:
         with _noted("ablation", found.failed):
             found.ablation = ablation.measure(task, held_out, options.ratios)

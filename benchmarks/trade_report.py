@@ -111,6 +111,7 @@ def write(output: Path, scenes: Sequence[Measured], options: argparse.Namespace)
             draw(plot, scene)
             lines += ["", f"![Quality over time, {scene.name}]({plot.name})"]
             lines += ["", *_main_table(scene), *_miscounts(scene), "", *_detail_tables(scene)]
+        lines += _cheaper_table(scene, options.ratios)
         lines += _ablation_table(scene, options.ratios) + _flops_table(scene)
         lines += _hessian_table(scene)
         lines += ["", *(f"- Failed: {what}" for what in scene.failed)] if scene.failed else []
@@ -195,6 +196,19 @@ def _detail_tables(scene: Measured) -> list[str]:
 
 def _cell(quality: dict[str, float]) -> str:
     return " / ".join(f"{value:.{DIGITS[name]}f}" for name, value in quality.items())
+
+
+def _cheaper_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
+    if not scene.cheaper:
+        return []
+    body = [
+        [line.way, *(f"{value:.1f}" for value in line.psnr), f"{line.seconds:.2f}"]
+        for line in scene.cheaper
+    ]
+    return ["", f"### {scene.name}: speed for accuracy within occlusion", "",
+            ("PSNR on held-out views against renders of the unpruned splats. Views are `--views`; "
+            "cells, density and rounds are settings of the core (`Occlusion`)."), "",
+            *_table(["occlusion", *(f"{r:.0%}" for r in ratios), "seconds"], body)]  # fmt: skip
 
 
 def _ablation_table(scene: Measured, ratios: Sequence[float]) -> list[str]:

@@ -92,7 +92,8 @@ def test_the_report_says_what_was_measured(small: Path, tmp_path: Path) -> None:
     arguments = "--methods opacity closed-form ghap-moments --ratios 0.5 --runs 1 --judged 2"
 
     code = trade.main([str(small), *arguments.split(), "--metrics", "psnr", "ssim",
-                       "--parts", "methods", "ablation", "--output", str(output)])  # fmt: skip
+                       "--parts", "methods", "cheaper", "ablation",
+                       "--output", str(output)])  # fmt: skip
 
     text = output.read_text()
     assert code == 0
@@ -103,6 +104,7 @@ def test_the_report_says_what_was_measured(small: Path, tmp_path: Path) -> None:
     assert "against pictures where" in text
     assert "views against pictures" not in text
     assert "published, z: without visibility" in text
+    assert "| cells of 8 px, 3 rounds |" in text
     assert str(small.parent) not in text
     rows = [line for line in text.splitlines() if line.startswith("| opacity |")]
     assert len(rows) == 3
