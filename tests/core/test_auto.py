@@ -66,6 +66,17 @@ def test_the_kept_set_differs_from_the_full_models_by_no_more_than_the_tolerance
     assert scores.weights["auto"]["estimate"] <= tolerance
 
 
+def test_on_the_whole_committed_scene_auto_keeps_its_tolerance_too():
+    """All splats and cameras, the full model as it is by default."""
+    splats = read_ply(ROOM / "point_cloud.ply").splats()
+    views = read_cameras(ROOM / "cameras.json")
+    full = score(splats, views, Settings("occlusion", views=0))
+
+    for tolerance in (0.05, 0.2):
+        scores = score(splats, views, Settings("auto", views=0, tolerance=tolerance))
+        assert auto.disagreement(full, scores) <= tolerance
+
+
 def test_no_tolerance_is_the_full_model_to_the_bit(scene):
     """Nothing cheaper agrees wholly, so that runs."""
     expected = occlusion.score(*scene, CHEAP[1]).values
