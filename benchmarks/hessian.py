@@ -40,6 +40,7 @@ from .jacobians import (
     image_rows,
     shape_gradient,
 )
+from .rasterizer import accumulate_statistics
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -88,10 +89,11 @@ class _Scene(NamedTuple):
 def measure(
     splats: Splats, views: ViewSet, *, groups: int = 100, neighbours: int = 30, most_views: int = 8
 ) -> Energies:
-    """Measure all ratios on `groups` random splats, each with its nearest neighbours."""
+    """Measure all ratios on `groups` random splats that are seen, each with its neighbours."""
     used = views.spread(most_views)
     scene = _prepare(splats)
-    members = _groups(splats, scene.opacities, groups, neighbours)
+    drawn = accumulate_statistics(splats, used).hits > 0
+    members = _groups(splats, scene.opacities > 1.0 / 255.0, drawn, (groups, neighbours))
     size = members.shape[1]
     hessians = np.zeros((len(members), size * PARAMETERS, size * PARAMETERS))
     removals = np.zeros((len(members), size, size))
@@ -142,11 +144,15 @@ def _mean(values: list[float]) -> float:
 
 
 def _groups(
-    splats: Splats, opacities: NDArray[np.float64], count: int, neighbours: int
+    splats: Splats,
+    visible: NDArray[np.bool_],
+    drawn: NDArray[np.bool_],
+    sizes: tuple[int, int],
 ) -> NDArray[np.int64]:
-    """Draw splats that can be seen; return each with its neighbours, (count, 1 + neighbours)."""
-    usable = np.flatnonzero(opacities > 1.0 / 255.0)
-    chosen = np.random.default_rng(0).choice(usable, min(count, len(usable)), replace=False)
+    """Draw splats; return each with its visible neighbours, (count, 1 + neighbours)."""
+    count, neighbours = sizes
+    usable, hit = np.flatnonzero(visible), np.flatnonzero(visible & drawn)
+    chosen = np.random.default_rng(0).choice(hit, min(count, len(hit)), replace=False)
     means = np.asarray(splats.means, np.float64)[usable]
     rows = []
     for index in chosen:

@@ -33,10 +33,10 @@ HOW = """\
   the unpruned splats by `benchmarks/rasterizer.py`, and against pictures where the scene has any.
 - All methods get the same splats in memory and the same scoring views. The held-out views never
   decide: those that `split.json` names as test views, else every {every}th.
-- Seconds are those of scoring and pruning, at 50 % or the ratio next to it, the median of {runs}
-  (fewer where one takes long), reading and writing left out; splat-transform is another program and
-  its seconds are file to file. Rendered baselines share one pass of compiled rendering; each of
-  them is charged its whole time.
+- Seconds are those of scoring and pruning, at 50 % or the ratio next to it, the median of at most
+  {runs} runs, reading and writing left out; splat-transform is another program and its seconds
+  are file to file. Rendered baselines share one pass of compiled rendering; each of them is
+  charged its whole time.
 - MB is the most memory in use beyond the scene itself; of splat-transform, all of it."""
 COLORS = {OURS: "#d1495b", LITERATURE: "#30638e", EXTERNAL: "#6a994e"}
 MARKERS = {OURS: "o", LITERATURE: "s", EXTERNAL: "^"}

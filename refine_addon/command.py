@@ -126,7 +126,8 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "--absorb",
         action="store_true",
         help="survivors take over what is removed, by what the cameras see of it: far better when "
-        "much is removed, and slower; they change",
+        "much is removed, and slower; they change; --method then only matters with --threshold and "
+        "--min-seen",
     )
     prune.add_argument("--dry-run", action="store_true", help="decide and report, write nothing")
     _add_common(prune)

@@ -186,6 +186,7 @@ MUTANTS = {
         ("table.argmin(axis=0)", "table.argmax(axis=0)", "the worst weight"),
     ],
     "absorb.py": [
+        ("members[taken >= 0]", "1 + 0 * taken[taken >= 0]", "members of the last stage alone"),
         ("(1.0 - share) / share)", "share / (1.0 - share))", "patience upside down"),
         (
             "share[gone] = share[into] * (1.0 - kept_share)",
@@ -286,7 +287,8 @@ MUTANTS = {
             "tolerance ignored",
         ),
         ("(tolerance - spent, trials)", "(tolerance, trials)", "tolerance spent twice"),
-        ("rest = change * shrink / (1.0 - shrink)", "rest = 0.0", "settled at once"),
+        ("rest = _series(change, shrink, doublings)", "rest = 0.0", "settled at once"),
+        (" * (1.0 - shrink**doublings)", "", "views without end"),
         (
             "return model(views.spread(0), part(progress, done, 1.0)), 0.0",
             "return scores, 0.0",
@@ -298,9 +300,14 @@ MUTANTS = {
             "estimate of the views alone",
         ),
         (
-            "name, full = models.popitem()",
-            "name, full = 'closed form', models['closed form']",
+            "scores = models[last](views, part(progress, 0.3, 1.0))",
+            "scores = models['closed form'](views, part(progress, 0.3, 1.0))",
             "blind probes take the cheap",
+        ),
+        (
+            "trials.append(Trial(name, 1.0))",
+            "trials.append(Trial(name, 0.0))",
+            "blind models agree",
         ),
     ],
     "pipeline.py": [

@@ -51,7 +51,7 @@ class Absorbed:
     changed : (K,) bool
         Which of them absorbed others; the rest are what they were, to the bit.
     merged, deleted : int
-        How many splats went into a survivor, and how many altogether.
+        How many splats went into a survivor, and how many are gone altogether.
     """
 
     splats: Splats
@@ -129,27 +129,27 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
     count = len(splats)
     spared = np.zeros(count, np.bool_) if protected is None else np.array(protected, np.bool_)
     goal = max(keep_count, int(np.count_nonzero(spared)), 0)
-    origin, changed = np.arange(count), np.zeros(count, np.bool_)
-    merged = 0
+    origin, members = np.arange(count), np.ones(count, np.int64)
     factor = patience(1.0 - goal / max(count, 1))
     stages = math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE)) if goal < count else 0
     for stage in range(stages):
         ahead = part(progress, stage / stages, (stage + 1) / stages)
         left = round(count * (goal / count) ** ((stage + 1) / stages))
         seen = measure(splats, part(ahead, 0.0, 0.5))
-        step = absorb_once(
+        splats, kept, taken = _absorb_once(
             splats, views, seen, max(left, goal), protected=spared[origin],
             factor=factor, progress=part(ahead, 0.5, 1.0), threads=threads,
         )  # fmt: skip
-        splats, merged = step.splats, merged + step.merged
-        origin = origin[step.keep]
-        changed[origin[step.changed]] = True
+        # A survivor stands for all that those it took stood for.
+        members = np.bincount(taken[taken >= 0], members[taken >= 0], len(splats)).astype(np.int64)
+        origin = origin[kept]
     keep = np.zeros(count, np.bool_)
     keep[origin] = True
-    return Absorbed(splats, keep, changed[keep], merged, count - len(origin) - merged)
+    merged = int(members.sum()) - len(origin)
+    return Absorbed(splats, keep, members > 1, merged, count - len(origin) - merged)
 
 
-def absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
+def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     splats: Splats,
     views: ViewSet,
     seen: Seen,
@@ -159,8 +159,18 @@ def absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     factor: float,
     progress: Progress = silent,
     threads: int | None = None,
-) -> Absorbed:
-    """Do one stage of `absorb`; `factor` is on the cost of merging."""
+) -> tuple[Splats, NDArray[np.bool_], Index]:
+    """Do one stage of `absorb`; `factor` is on the cost of merging.
+
+    Returns
+    -------
+    splats : Splats
+        The K survivors of N.
+    keep : (N,) bool
+        Which they are.
+    taken : (N,) int64
+        Into which survivor each splat went; -1 where it was deleted.
+    """
     seen = Seen(np.asarray(seen.contribution, np.float64), np.asarray(seen.error, np.float64))
     good, free = drawable(splats), ~protected
     keep = np.ones(len(splats), np.bool_)
@@ -170,8 +180,7 @@ def absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     excess = min(excess, len(rows))
     report(progress, 0.0, "absorbing")
     if excess <= 0:
-        unchanged = np.zeros(int(np.count_nonzero(keep)), np.bool_)
-        return Absorbed(splats.take(keep), keep, unchanged, 0, int(np.count_nonzero(~keep)))
+        return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1)
     graph = MergeGraph(
         merge_field.field(splats, rows, views, seen, threads=threads), factor, threads=threads
     )
@@ -187,8 +196,10 @@ def _delete(keep: NDArray[np.bool_], rows: Index, count: int) -> int:
     return len(rows)
 
 
-def _written(splats: Splats, keep: NDArray[np.bool_], rows: Index, graph: MergeGraph) -> Absorbed:
-    """Return the survivors, the merged splats written over those that absorbed."""
+def _written(
+    splats: Splats, keep: NDArray[np.bool_], rows: Index, graph: MergeGraph
+) -> tuple[Splats, NDArray[np.bool_], Index]:
+    """Return what `_absorb_once` does, the merged splats written over those that absorbed."""
     own = np.arange(len(rows))
     owner, share = own.copy(), np.ones(len(rows))
     # Backwards, so that a splat absorbed early follows its survivor to the last one.
@@ -215,10 +226,9 @@ def _written(splats: Splats, keep: NDArray[np.bool_], rows: Index, graph: MergeG
             harmonics.put(splats.sh_dc[:, None], splats.sh_dc[keep][:, None])[:, 0],
             harmonics.put(splats.sh_rest, splats.sh_rest[keep]),
         )
-    flags = np.zeros(len(result), np.bool_)
-    flags[target] = True
-    absorbed = sum(len(gone) for _, gone, _ in graph.merges)
-    return Absorbed(result, keep, flags, absorbed, int(np.count_nonzero(~keep)) - absorbed)
+    taken = np.where(keep, place, -1)
+    taken[rows] = np.where(graph.alive[owner], place[rows[owner]], -1)
+    return result, keep, taken
 
 
 class _Blend:

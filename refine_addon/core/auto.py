@@ -112,25 +112,26 @@ def score(
         See `refine_addon.core.occlusion.score`.
     """
     models = _models(splats, settings, threads)
+    last, probes = list(models)[-1], views.spread(PROBES)
+    why = ""
     try:
-        name, probed, trials = _cheapest(
-            models, views.spread(PROBES), tolerance, part(progress, 0.0, 0.3)
+        name, probed, trials = _cheapest(models, probes, tolerance, part(progress, 0.0, 0.3))
+    except RefineError:  # whether the other views see anything, the full model says
+        name, trials, total = last, [], 0.0
+        scores = models[last](views, part(progress, 0.3, 1.0))
+        why = f", as the {len(probes)} that probed see nothing"
+    else:
+        # What is left of the tolerance is for the views.
+        spent = trials[-1].disagreement if name != last else 0.0
+        scores, estimate = _settled(
+            models[name], views, probed, (tolerance - spent, trials), part(progress, 0.3, 1.0)
         )
-    except RefineError:  # the probes see nothing; whether the others do, the full model says
-        name, full = models.popitem()
-        scores = full(views, part(progress, 0.3, 1.0))
-        note = f"auto: {name}, all {len(views)} views, as the {PROBES} probing ones see nothing"
-        return replace(scores, notes=(*scores.notes, note))
-    # What is left of the tolerance is for the views.
-    spent = trials[-1].disagreement if name != list(models)[-1] else 0.0
-    scores, estimate = _settled(
-        models[name], views, probed, (tolerance - spent, trials), part(progress, 0.3, 1.0)
-    )
-    total = min(spent + estimate, 1.0)
-    note = (
-        f"auto: {name}, {scores.views_used} of {len(views)} views; estimated to keep "
-        f"{total:.1%} other splats than the full model (tolerance {tolerance:.1%})"
-    )
+        total = min(spent + estimate, 1.0)
+    other = "that is the full model"
+    if total:
+        other = f"estimated to keep {total:.1%} other splats than the full model"
+        other += f" (tolerance {tolerance:.1%})"
+    note = f"auto: {name}, {scores.views_used} of {len(views)} views{why}; {other}"
     facts = {
         "model": name,
         "views": scores.views_used,
@@ -174,7 +175,11 @@ def _cheapest(
     trials = []
     for index, name in enumerate(cheaper):
         span = part(progress, 0.6 + 0.4 * index / 3, 0.6 + 0.4 * (index + 1) / 3)
-        scores = models[name](probes, span)
+        try:
+            scores = models[name](probes, span)
+        except RefineError:  # it sees nothing where the full model does
+            trials.append(Trial(name, 1.0))
+            continue
         trials.append(Trial(name, min(CAUTION * disagreement(reference, scores), 1.0)))
         if trials[-1].disagreement <= tolerance:
             return name, scores, trials
@@ -191,11 +196,11 @@ def _settled(
     """Return scores by the fewest views whose ranking has settled, and the estimated change.
 
     Each doubling of the views changes the kept set by some share, smaller each time by a factor
-    that the last two doublings tell; what further doublings would change is the sum of a geometric
-    series. Where that says that all views are needed, the doublings between are left out.
+    that the last two doublings tell; what those up to all views would change is the sum of a
+    geometric series. Where that says that all are needed, the doublings between are left out.
     """
     tolerance, trials = allowed
-    total = np.count_nonzero(views.weights > 0.0)
+    total = sum(view.weight > 0.0 for view in views)
     change, done = 0.0, 0.0
     while scores.views_used < total:
         count = min(2 * scores.views_used, int(total))
@@ -207,14 +212,20 @@ def _settled(
         trials.append(Trial(f"{scores.views_used} instead of {count} views", change))
         scores = fuller
         shrink = min(change / before, 0.9) if before else 0.9
-        rest = change * shrink / (1.0 - shrink)
         if count == total:
             break
+        doublings = float(np.log2(total / count))
+        rest = _series(change, shrink, doublings)
         if rest <= tolerance:
             return scores, rest
-        doublings = np.log2(total / count)
-        # Whatever the rest, it will hardly halve with each doubling.
+        # Whether one doubling less than all would do; whatever is known, each hardly halves it.
         hope = shrink if before else 0.5
-        if rest * hope ** max(doublings - 1, 0) > tolerance:
+        saved = max(doublings - 1.0, 0.0)
+        if _series(change * hope**saved, shrink, doublings - saved) > tolerance:
             return model(views.spread(0), part(progress, done, 1.0)), 0.0
     return scores, 0.0
+
+
+def _series(change: float, shrink: float, doublings: float) -> float:
+    """Return what so many doublings will change, each `shrink` times the last; it was `change`."""
+    return float(change * shrink * (1.0 - shrink**doublings) / (1.0 - shrink))

@@ -80,7 +80,7 @@ class MergeGraph:
         self.cost = np.empty(0)
 
     def _connect(self, progress: Progress) -> None:
-        """Find the pairs of near splats that the views see, and price them."""
+        """Find the pairs of near splats, and price them."""
         rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))
         near = nearest(self.field.means[rows], NEIGHBOURS, progress=progress, threads=self.threads)
 

@@ -117,7 +117,8 @@ def score(
 
     Notes
     -----
-    Memory: about 300 bytes a splat, and for each thread 100 bytes a point of one view, of which
+    Memory: about 300 bytes a splat, a third more for each thread beyond the first; where a view
+    has many points, 100 bytes for each of them and thread, of which
     there are at most 4 million (`froxels.MAX_POINTS`).
     """
     return _scored(splats, views, settings, progress, threads)[0]

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .absorb import Absorbed
+    from .occlusion import Measured
     from .scores import Scores
     from .splats import Splats
     from .views import ViewSet
@@ -91,7 +92,7 @@ class Result:
     keep : (N,) bool
         Which splats stay.
     scores : Scores
-        What decided; with `absorbed`, what decided how many.
+        What decided; with `absorbed`, what decided how many, or which tenth went first.
     absorbed : Absorbed or None
         The survivors, changed by what they absorbed.
     report : dict
@@ -190,12 +191,16 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
     RefineError, Cancelled
         See `score`; also if the budget would leave nothing.
     """
-    start, asked = time.perf_counter(), settings.method
-    if absorb and budget.removals(len(splats), row_bytes or 1.0, fixed_bytes) is not None:
-        # How many go does not depend on the scores: the quick ones say what is seen.
-        settings = replace(settings, method="closed-form")
+    start = time.perf_counter()
+    _refuse_meaningless(budget, settings)
     ahead = part(progress, 0.0, 0.2 if absorb else 0.95)
-    scores = score(splats, views, settings, progress=ahead, threads=threads)
+    known = None
+    if absorb and budget.removals(len(splats), row_bytes or 1.0, fixed_bytes) is not None:
+        # How many go does not depend on the scores, so those that absorbing needs will do.
+        known = _score_once(splats, views, settings, ahead, threads)
+        scores = known[0]
+    else:
+        scores = score(splats, views, settings, progress=ahead, threads=threads)
     scored = time.perf_counter()
     report(progress, 0.2 if absorb else 0.95, "selecting")
     keep = selection.select(
@@ -205,7 +210,7 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
     absorbed = None
     if absorb:
         absorbed = absorb_removed(
-            splats, views, int(np.count_nonzero(keep)), settings,
+            splats, views, int(np.count_nonzero(keep)), settings, known=known,
             protected=protected, progress=part(progress, 0.2, 1.0), threads=threads,
         )  # fmt: skip
         keep = absorbed.keep
@@ -214,9 +219,37 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
     if absorbed:
         facts["absorbed"] = absorbed.facts()
         facts["notes"].append(absorbed.note())
-        if asked != settings.method:
-            facts["notes"].append(f"absorbing measures by occlusion: {asked} had nothing to decide")
+        if known and settings.method != "occlusion":
+            name = settings.method
+            facts["notes"].append(f"absorbing measures by occlusion: {name} had nothing to decide")
     return Result(keep, scores, facts, absorbed)
+
+
+def _score_once(
+    splats: Splats, views: ViewSet, settings: Settings, progress: Progress, threads: int | None
+) -> tuple[Scores, Measured]:
+    with np.errstate(under="ignore"):  # as for scores
+        return occlusion.score_once(
+            splats,
+            views.spread(settings.views),
+            settings.occlusion,
+            progress=progress,
+            threads=threads,
+        )
+
+
+def _refuse_meaningless(budget: Budget, settings: Settings) -> None:
+    """Refuse budgets that the method gives no fixed meaning."""
+    if settings.method == "auto" and budget.kind in ("threshold", "min_seen"):
+        msg = (
+            f"method auto may score by any model, and {budget.kind} means something else to each: "
+            "choose closed-form or occlusion, or another budget"
+        )
+        raise RefineError(msg)
+    uncounted = settings.method == "closed-form" and not settings.closed_form.frustum
+    if uncounted and budget.kind == "min_seen":
+        msg = "without the frustum test every view sees every splat: min_seen would remove none"
+        raise RefineError(msg)
 
 
 def absorb_removed(  # noqa: PLR0913 - the use case, the other one
@@ -225,6 +258,7 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
     count: int,
     settings: Settings = Settings(),
     *,
+    known: tuple[Scores, Measured] | None = None,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
@@ -237,6 +271,8 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
         See `score`; the occlusion settings count, whatever the method.
     count : int
         How many survive.
+    known : tuple of Scores and Measured, optional
+        What `occlusion.score_once` says of these splats and views, if it was asked already.
     protected : (N,) bool, optional
         Splats that neither vanish nor change.
 
@@ -249,28 +285,23 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
     RefineError, Cancelled
         See `score`.
     """
-    used = views.spread(settings.views)
-    total = len(splats)
-    first = min(math.floor(FIRST * total), total - count)
-    rest = np.ones(total, np.bool_)
-    known: list[Seen] = []
+    used, total = views.spread(settings.views), len(splats)
+    scores, measured = known or _score_once(
+        splats, views, settings, part(progress, 0.0, 0.2), threads
+    )
+    first = max(min(math.floor(FIRST * total), total - count), 0)
+    # What no renderer draws scores lowest, so it is among these, or all of these are such.
+    rest = selection.select(scores, Budget(keep=total - first), protected=protected)
+    # What goes first hid and showed next to nothing: what was measured with it still holds.
+    at_first = [Seen(measured.contribution[rest], measured.contrast[rest])]
+    del known, scores, measured
 
     def seen(now: Splats, ahead: Progress) -> Seen:
-        if known:  # what went first hid and showed next to nothing
-            return known.pop()
-        measured = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
-        return Seen(measured.contribution, measured.contrast)
+        if at_first:
+            return at_first.pop()
+        found = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
+        return Seen(found.contribution, found.contrast)
 
-    if first > 0:
-        with np.errstate(under="ignore"):  # as for scores
-            scores, measured = occlusion.score_once(
-                splats, used, settings.occlusion,
-                progress=part(progress, 0.0, 0.2), threads=threads,
-            )  # fmt: skip
-        # What no renderer draws scores lowest, so it is among these, or all of these are such.
-        rest = selection.select(scores, Budget(keep=total - first), protected=protected)
-        known.append(Seen(measured.contribution[rest], measured.contrast[rest]))
-        del scores, measured
     with np.errstate(under="ignore"):  # as for scores
         absorbed = absorbing.absorb(
             splats.take(rest), used, seen, count,

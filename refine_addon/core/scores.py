@@ -17,7 +17,7 @@ class Scores:
     Attributes
     ----------
     values : (N,) float32
-        Finite, >= 0; 0 only for splats that no renderer can draw. Only the order matters.
+        Finite, >= 0; 0 only for splats that no renderer can draw. Each method has its own scale.
     seen : (N,) int32
         In how many of the views used the splat's centre lies.
     views_used : int

@@ -261,6 +261,16 @@ def test_exactly_as_many_survive_as_asked():
         assert result.merged + result.deleted == 500 - keep_count
 
 
+def test_what_went_into_splats_that_went_later_is_deleted():
+    """All that is free goes, so none of it lives on."""
+    splats = cloud(800)
+
+    result = absorb(splats, around(), measure, 400, protected=np.arange(800) % 2 == 0)
+
+    assert not result.changed.any()
+    assert (result.merged, result.deleted) == (0, 400)
+
+
 def test_survivors_that_absorbed_nothing_are_the_same_to_the_bit():
     splats = cloud(800)
 

@@ -163,43 +163,43 @@ def test_what_probes_say_of_models_counts_four_times(monkeypatch, swaps, model):
 
 
 def test_views_are_doubled_until_the_rest_of_the_series_is_within_the_tolerance(monkeypatch):
-    """Changes of .02 and .01 fall by half, so .01 is left: 32 of 128 views are enough.
+    """Changes of .02 and .01 fall by half; two more leave .005 + .0025: 32 of 128 views will do.
 
-    After one change nothing tells how fast they fall: nine times .02 may be left.
+    After one change nothing tells how fast they fall: by a tenth each, three leave .0488.
     """
     told = Told(monkeypatch, full={8: 3, 16: 1})
 
-    facts = told.chosen(0.15, 128)
+    facts = told.chosen(0.04, 128)
 
     assert facts["views"] == 32
-    assert facts["estimate"] == pytest.approx(0.01)
+    assert facts["estimate"] == pytest.approx(0.0075)
     assert facts["tried"]["8 instead of 16 views"] == pytest.approx(0.02)
     assert facts["tried"]["16 instead of 32 views"] == pytest.approx(0.01)
 
 
 def test_where_doubling_will_not_do_all_views_are_used_at_once(monkeypatch):
-    """A first change of .1 leaves .9 for all that one knows: the doublings are left out."""
-    facts = Told(monkeypatch, full={8: 10}).chosen(0.2, 128)
+    """A first change of .1 may halve twice, then again .0225 are to come: those are left out."""
+    facts = Told(monkeypatch, full={8: 10}).chosen(0.02, 128)
 
     assert (facts["views"], facts["estimate"]) == (128, 0.0)
     assert list(facts["tried"])[3:] == ["8 instead of 16 views"]
 
 
 def test_the_model_and_the_views_share_the_tolerance(monkeypatch):
-    """Of .2 the model may spend .08 and the views .12; the estimate is the sum of both.
+    """Of .14 the model spends .08, and .06 are the views'; the estimate is the sum of both.
 
-    A first change of .02 leaves .18, which the doublings to come may halve twice to .045; one of
-    .03 leaves .27, and .0675 is too much once the model has spent .16.
+    A first change of .03 leaves .073, but where it halves twice only .007; that is too much once
+    the model has spent all but .005.
     """
     told = Told(monkeypatch, once={8: 5, 16: 2, 32: 1}, full={8: 3})
-    facts = told.chosen(0.2, 128)
+    facts = told.chosen(0.14, 128)
 
     assert facts["model"] == "occlusion measured once"
     assert facts["views"] == 32
-    # 3 swaps are made at first, then 1: a third of .01, and half of that again.
-    assert facts["estimate"] == pytest.approx(0.08 + 0.01 * (1 / 3) / (1 - 1 / 3))
+    # 3 swaps are made at first, then 1: a third of .01, and a third of that again.
+    assert facts["estimate"] == pytest.approx(0.08 + 0.01 * (1 / 3 + 1 / 9))
 
-    dearer = Told(monkeypatch, once={8: 4, 16: 1}, full=0).chosen(0.2, 128)
+    dearer = Told(monkeypatch, once={8: 4, 16: 1}, full=0).chosen(0.165, 128)
 
     assert dearer["tried"]["occlusion measured once"] == pytest.approx(0.16)
     assert dearer["views"] == 128
@@ -231,7 +231,30 @@ def test_probes_that_see_nothing_leave_it_to_the_full_model(scene, monkeypatch):
 
     expected = occlusion.score(splats, many, CHEAP[1]).values
     np.testing.assert_array_equal(scores.values, expected)
-    assert "see nothing" in scores.notes[-1]
+    assert "as the 1 that probed see nothing; that is the full model" in scores.notes[-1]
+    assert scores.weights["auto"]["model"] == "occlusion"
+
+
+def test_a_cheaper_model_that_sees_nothing_does_not_agree(monkeypatch):
+    """No centre lies in a view, but what is larger reaches in: the closed form refuses that."""
+    told = Told(monkeypatch, once=0)
+
+    def blind(*_, **__):
+        msg = "no camera sees the splats"
+        raise RefineError(msg)
+
+    monkeypatch.setattr(auto.closed_form, "score", blind)
+    facts = told.chosen(0.1)
+
+    assert facts["model"] == "occlusion measured once"
+    assert facts["tried"]["closed form"] == 1.0
+
+
+@pytest.mark.parametrize("budget", [Budget(threshold=0.5), Budget(min_seen=3)])
+def test_budgets_that_mean_something_else_to_each_model_are_refused(scene, budget):
+    """A threshold of occlusion's places is none of the closed form's errors."""
+    with pytest.raises(RefineError, match=f"{budget.kind} means something else to each"):
+        prune(*scene, budget, Settings("auto"))
 
 
 @pytest.mark.parametrize("tolerance", [-0.1, 1.1, float("nan")])

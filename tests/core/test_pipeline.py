@@ -288,6 +288,29 @@ def test_a_budget_that_only_scores_can_tell_says_how_many_survivors_absorb(small
     assert np.count_nonzero(result.keep) == pytest.approx(len(splats) / 2, abs=1)
 
 
+def test_without_the_frustum_test_no_number_of_views_is_counted(small, views):
+    """Every view would count as seeing every splat."""
+    published = Settings(closed_form=ClosedForm.published("z"))
+
+    with pytest.raises(RefineError, match="min_seen would remove none"):
+        prune(read_ply(small).splats(), views, Budget(min_seen=3), published)
+
+
+@pytest.mark.parametrize("method", ["closed-form", "occlusion"])
+def test_a_report_of_absorbing_says_what_decided_and_what_was_asked(small, views, method):
+    """Occlusion's measure decides; a method that had nothing to decide is said not to have."""
+    splats = read_ply(small).splats()
+    once = score(splats, views, Settings("occlusion", occlusion=Occlusion(rounds=1)))
+
+    report = prune(splats, views, Budget(ratio=0.5), Settings(method), absorb=True).report
+
+    assert report["settings"]["method"] == method
+    assert report["weights"] == once.weights
+    assert report["splats"]["unseen"] == np.count_nonzero(once.seen == 0)
+    said = any("closed-form had nothing to decide" in note for note in report["notes"])
+    assert said == (method == "closed-form")
+
+
 def test_protected_splats_stay_as_they_are_while_others_absorb(small, views):
     """Every third is protected, and six of ten go."""
     splats = read_ply(small).splats()
