@@ -289,6 +289,7 @@ MUTANTS = {
         ("(tolerance - spent, trials)", "(tolerance, trials)", "tolerance spent twice"),
         ("rest = _series(change, shrink, doublings)", "rest = 0.0", "settled at once"),
         (" * (1.0 - shrink**doublings)", "", "views without end"),
+        ("HASTE * change", "change", "haste"),
         (
             "return model(views.spread(0), part(progress, done, 1.0)), 0.0",
             "return scores, 0.0",
