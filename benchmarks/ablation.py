@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from refine_addon.core import closed_form
 from refine_addon.core.closed_form import ClosedForm
-from refine_addon.core.selection import Budget, select
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -50,10 +49,7 @@ def measure(task: Task, evaluator: Evaluator, ratios: Sequence[float]) -> list[L
     for reading, settings in READINGS.items():
         for change, values in CHANGES.items():
             scores = closed_form.score(task.splats, task.views, replace(settings, **values))
-            psnr = []
-            for ratio in ratios:
-                left = task.splats.take(select(scores, Budget(ratio=ratio)))
-                psnr.append(evaluator.evaluate(left).renders.mean["psnr"])
-            lines.append(Line(reading, change, tuple(psnr)))
+            psnr = evaluator.psnr(task.splats, scores, ratios)
+            lines.append(Line(reading, change, psnr))
             print(f"  {reading}, {change}: {[round(value, 2) for value in psnr]}", flush=True)
     return lines

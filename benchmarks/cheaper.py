@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from refine_addon.core import pipeline
 from refine_addon.core.occlusion import Occlusion
 from refine_addon.core.pipeline import Settings
-from refine_addon.core.selection import Budget, select
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -58,10 +57,7 @@ def measure(task: Task, evaluator: Evaluator, ratios: Sequence[float]) -> list[L
         start = time.perf_counter()
         scores = pipeline.score(task.splats, task.views, settings)
         seconds = time.perf_counter() - start
-        psnr = []
-        for ratio in ratios:
-            left = task.splats.take(select(scores, Budget(ratio=ratio)))
-            psnr.append(evaluator.evaluate(left).renders.mean["psnr"])
-        lines.append(Line(way, seconds, tuple(psnr)))
+        psnr = evaluator.psnr(task.splats, scores, ratios)
+        lines.append(Line(way, seconds, psnr))
         print(f"  {way}: {seconds:.2f} s {[round(value, 2) for value in psnr]}", flush=True)
     return lines

@@ -155,6 +155,11 @@ class Evaluator:
         renders = [(n, images[n], self.references[n]) for n in names]
         return Evaluation(self._quality(renders), self._quality(pairs) if pairs else None)
 
+    def psnr(self, splats: Splats, scores: Scores, ratios: Sequence[float]) -> tuple[float, ...]:
+        """Return the mean PSNR, dB, against the original with each share removed by `scores`."""
+        kept = (splats.take(select(scores, Budget(ratio=ratio))) for ratio in ratios)
+        return tuple(float(self.evaluate(left).renders.mean["psnr"]) for left in kept)
+
     def _render(self, splats: Splats) -> dict[str, NDArray[np.float64]]:
         prepared = rasterizer.gaussians_of(splats)
         return {
