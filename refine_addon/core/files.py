@@ -55,7 +55,7 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
             msg = f"{path}: is a device, expected the name of a file"
             raise RefineError(msg)
         if path.exists() and not overwrite:
-            msg = f"{path}: exists already; choose another name or ask to overwrite it"
+            msg = f"{path}: exists already; choose another name or overwrite it (--overwrite)"
             raise RefineError(msg)
         if not path.parent.is_dir():
             msg = f"{path}: cannot be written, there is no folder {path.parent}"

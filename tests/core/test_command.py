@@ -462,7 +462,7 @@ FAILS = {
     ),
     "a report that exists": (
         [*PRUNE, "-o", "out.ply", "--report", "mesh.ply"],
-        "mesh.ply: exists already; choose another name or ask to overwrite it",
+        "mesh.ply: exists already; choose another name or overwrite it (--overwrite)",
     ),
     "a report nowhere": (
         [*PRUNE, "-o", "out.ply", "--report", "none/report.json"],
