@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from refine_addon.core import pipeline
 from refine_addon.core.occlusion import Occlusion
@@ -16,19 +16,18 @@ if TYPE_CHECKING:
     from .evaluate import Evaluator
     from .methods import Task
 
-WAYS = {
-    "default, all views": Settings(views=0, method="occlusion"),
-    "32 views": Settings(views=32, method="occlusion"),
-    "16 views": Settings(views=16, method="occlusion"),
-    "8 views": Settings(views=8, method="occlusion"),
-    "3 rounds": Settings(views=0, method="occlusion", occlusion=Occlusion(rounds=3)),
-    "1 round": Settings(views=0, method="occlusion", occlusion=Occlusion(rounds=1)),
-    "density 3": Settings(views=0, method="occlusion", occlusion=Occlusion(density=3.0)),
-    "cells of 6 px": Settings(views=0, method="occlusion", occlusion=Occlusion(cell=6.0)),
-    "cells of 8 px": Settings(views=0, method="occlusion", occlusion=Occlusion(cell=8.0)),
-    "cells of 8 px, 3 rounds": Settings(
-        views=0, method="occlusion", occlusion=Occlusion(cell=8.0, rounds=3)
-    ),
+BASE = Settings(method="occlusion", views=0)
+WAYS: dict[str, dict[str, Any]] = {
+    "default, all views": {},
+    "32 views": {"views": 32},
+    "16 views": {"views": 16},
+    "8 views": {"views": 8},
+    "3 rounds": {"occlusion": Occlusion(rounds=3)},
+    "1 round": {"occlusion": Occlusion(rounds=1)},
+    "density 3": {"occlusion": Occlusion(density=3.0)},
+    "cells of 6 px": {"occlusion": Occlusion(cell=6.0)},
+    "cells of 8 px": {"occlusion": Occlusion(cell=8.0)},
+    "cells of 8 px, 3 rounds": {"occlusion": Occlusion(cell=8.0, rounds=3)},
 }
 
 
@@ -53,9 +52,9 @@ class Line:
 def measure(task: Task, evaluator: Evaluator, ratios: Sequence[float]) -> list[Line]:
     """Measure all ways."""
     lines = []
-    for way, settings in WAYS.items():
+    for way, changes in WAYS.items():
         start = time.perf_counter()
-        scores = pipeline.score(task.splats, task.views, settings)
+        scores = pipeline.score(task.splats, task.views, replace(BASE, **changes))
         seconds = time.perf_counter() - start
         psnr = evaluator.psnr(task.splats, scores, ratios)
         lines.append(Line(way, seconds, psnr))

@@ -174,8 +174,10 @@ def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     seen = Seen(np.asarray(seen.contribution, np.float64), np.asarray(seen.error, np.float64))
     good, free = drawable(splats), ~protected
     keep = np.ones(len(splats), np.bool_)
-    excess = len(splats) - keep_count
-    excess -= _delete(keep, np.flatnonzero(free & ~good), excess)
+    excess = max(len(splats) - keep_count, 0)
+    hopeless = np.flatnonzero(free & ~good)[:excess]
+    keep[hopeless] = False
+    excess -= len(hopeless)
     rows = np.flatnonzero(keep & good & free)
     excess = min(excess, len(rows))
     report(progress, 0.0, "absorbing")
@@ -187,13 +189,6 @@ def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     graph.reduce(len(rows) - excess, part(progress, 0.1, 0.95))
     keep[rows[~graph.alive]] = False
     return _written(splats, keep, rows, graph)
-
-
-def _delete(keep: NDArray[np.bool_], rows: Index, count: int) -> int:
-    """Clear `keep` for at most `count` of `rows`, the first of them; return for how many."""
-    rows = rows[: max(count, 0)]
-    keep[rows] = False
-    return len(rows)
 
 
 def _written(

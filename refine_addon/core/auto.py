@@ -207,7 +207,7 @@ def _settled(
     total = sum(view.weight > 0.0 for view in views)
     change, done = 0.0, 0.0
     while scores.views_used < total:
-        count = min(2 * scores.views_used, int(total))
+        count = min(2 * scores.views_used, total)
         # The cost is in proportion to the views, and those of all doublings sum to twice the last.
         step = part(progress, done, done + (1.0 - done) * 0.5)
         done += (1.0 - done) * 0.5

@@ -188,10 +188,11 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
     weights = np.empty(len(cells), np.float32)
     for row, place in _runs(counts):
         cells[place], weights[place] = _laid(footprints, row, kinds[row], view, side)
+    # Few, if any: theirs are laid again, over the image.
     vast = np.flatnonzero(kinds == len(sizes) - 1)
     if len(vast):
         at = np.cumsum(counts)[vast][:, None] - np.arange(FLAT**2, 0, -1)
-        cells[at], weights[at] = _flat(footprints, vast, lattices()[-1], view, side)
+        cells[at], weights[at] = _flat(footprints, vast, view, side)
     return _merged(
         cells, np.repeat(np.arange(len(counts), dtype=np.int32), counts), weights, side * side
     )
@@ -256,11 +257,12 @@ def _cells(place: list[NDArray[np.float32]], view: View, side: float) -> NDArray
 
 
 def _flat(
-    footprints: Footprints, row: NDArray[np.int64], lattice: Lattice, view: View, side: float
+    footprints: Footprints, row: NDArray[np.int64], view: View, side: float
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
     """Return cells and weights of points all over the image, for splats larger than it."""
-    u = np.float32(view.width / 2) * (lattice.points[0] + 1)
-    v = np.float32(view.height / 2) * (lattice.points[1] + 1)
+    points = lattices()[-1].points
+    u = np.float32(view.width / 2) * (points[0] + 1)
+    v = np.float32(view.height / 2) * (points[1] + 1)
     squared = np.zeros((len(row), len(u)), np.float32)
     dx = u - footprints.centers[0, row][:, None]
     dy = v - footprints.centers[1, row][:, None]

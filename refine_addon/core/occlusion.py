@@ -173,7 +173,7 @@ def _scored(
         splats, views, PRIOR, progress=part(progress, 0.05, 0.1), threads=threads
     )
     values, seen = run.rank(prior.values, part(progress, 0.1, 1.0))
-    if not run.shown:
+    if not run.measured.contribution.any():
         msg = (
             f"no camera sees the splats: none of {len(splats)} reaches into the image of any of "
             f"{len(views)} views; check that cameras and splats share their frame and unit"
@@ -234,7 +234,6 @@ class _Run:
             settings,
             threads,
         )
-        self.shown = False  # whether any view sees anything
         self.measured = Measured.zero(len(gaussians))  # in the first round
         self.weights = [0.0] * len(coverage.SHARES)  # of the floor, up to each share
         self.views = _by_distance(views)
@@ -265,7 +264,6 @@ class _Run:
                 self.weights = self._weigh(blocks, measured, prior)
                 seen[left.index] = measured.seen
                 self.measured = measured
-                self.shown = bool(measured.contribution.any())
             last = number == rounds - 1
             stay = 0 if last else round(count * LEAST ** ((number + 1) / (rounds - 1)))
             floors = coverage.floor(
@@ -413,7 +411,7 @@ def measure_view(
         points = froxels.scatter(footprints, view, side, settings.density)
         alphas = gaussians.alphas[footprints.index]
         red, green, blue = gaussians.colors[footprints.index].T
-        colors = ((red + np.complex64(1j) * green), blue.copy())
+        colors = (red + np.complex64(1j) * green, blue.copy())
         mass, mass_squared = froxels.masses(footprints, alphas)
         evenness = froxels.evenness(footprints, points.area)
         light = np.empty(len(points.owners), np.float32)

@@ -240,10 +240,15 @@ def _vertex_index(header: Header) -> int:
     if "vertex" not in names:
         msg = (
             f"{header.path}: not a splat file: expected an element 'vertex', "
-            f"got {', '.join(name[:40] for name in names[:_NAMES_SHOWN]) or 'none'}"
+            f"got {_first(names) or 'none'}"
         )
         raise RefineError(msg)
     return names.index("vertex")
+
+
+def _first(names: list[str]) -> str:
+    """Return the first of the file's names, none of them endless."""
+    return ", ".join(name[:40] for name in names[:_NAMES_SHOWN])
 
 
 def _check_properties(header: Header, vertex: int) -> None:
@@ -257,7 +262,7 @@ def _check_properties(header: Header, vertex: int) -> None:
         raise RefineError(msg)
     missing = [name for name in REQUIRED if name not in kinds]
     if missing:
-        some = ", ".join(name[:40] for name in [*kinds][:_NAMES_SHOWN])
+        some = _first([*kinds])
         some += ", ..." if len(kinds) > _NAMES_SHOWN else ""
         msg = (
             f"{header.path}: {_guess(header, kinds)}: vertex lacks {', '.join(missing)} "
