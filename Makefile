@@ -29,14 +29,14 @@ build: $(DEV)         ## the extension's zip, validated, into build/
 	$(PY) .ci/build_extension.py
 
 bench: $(BENCH)       ## speed and memory, with medians
-	$(PY) -m benchmarks.speed
-	$(PY) -m benchmarks.file_to_file
-	$(PY) -m benchmarks.file_to_file --absorb --splats 1900000 --runs 1
-	$(PY) -m benchmarks.in_blender
+	$(PY) -m benchmarks.speed.scoring
+	$(PY) -m benchmarks.speed.file_to_file
+	$(PY) -m benchmarks.speed.file_to_file --absorb --splats 1900000 --runs 1
+	$(PY) -m benchmarks.speed.in_blender
 
 bench-trade: $(BENCH) ## quality over time: docs/trade.md; SCENES="folder ..." measures others
-	-$(PY) -m benchmarks.splat_transform
-	$(PY) -m benchmarks.trade $(SCENES)
+	-$(PY) -m benchmarks.baselines.splat_transform
+	$(PY) -m benchmarks.tables.trade $(SCENES)
 
 fuzz: $(DEV)          ## hostile files, for SECONDS
 	$(PY) -m tests.fuzz --seconds $(or $(SECONDS),300)

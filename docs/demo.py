@@ -37,7 +37,8 @@ import bpy  # noqa: E402
 import numpy as np  # noqa: E402
 
 import refine_addon  # noqa: E402
-from refine_addon import preview, score_attributes  # noqa: E402
+from refine_addon.mesh import scores as mesh_scores  # noqa: E402
+from refine_addon.ui import preview  # noqa: E402
 
 
 def training_cameras(path: Path) -> int:
@@ -111,7 +112,7 @@ def main() -> None:
     scored = time.perf_counter()
     bpy.ops.refine.score()
     scored = time.perf_counter() - scored
-    record = score_attributes.record(splats.data)
+    record = mesh_scores.record(splats.data)
     print(f"scored by {record['views_used']} views in {scored:.2f} s")
     pictures = [picture("before.png", "COLOR"), picture("heat_map.png", "HEAT")]
 

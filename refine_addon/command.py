@@ -29,9 +29,9 @@ from .core import (
     read_ply,
     score,
 )
-from .core.files import expanded, refuse_existing, whole_file
 from .core.pipeline import scoring_notes
 from .core.splats import drawable
+from .core.whole_file import expanded, refuse_existing, whole_file
 from .version import VERSION
 
 if TYPE_CHECKING:
@@ -305,9 +305,9 @@ def _views(options: argparse.Namespace) -> ViewSet:
         return read_cameras(options.cameras)
     import bpy  # noqa: PLC0415
 
-    from . import camera_adapter  # noqa: PLC0415
+    from .cameras import sets as camera_sets  # noqa: PLC0415
 
-    return camera_adapter.visible_views(bpy.context.scene)
+    return camera_sets.visible_views(bpy.context.scene)
 
 
 @dataclass
@@ -426,10 +426,10 @@ def _prune_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
 
 
 def _prune_object(run: _Run, views: ViewSet) -> dict[str, Any]:
-    from . import session  # noqa: PLC0415 - needs Blender
+    from . import splat_object  # noqa: PLC0415 - needs Blender
 
     options = run.options
-    report = session.prune_object(
+    report = splat_object.prune_object(
         options.object,
         views,
         _budget(options),

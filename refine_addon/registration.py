@@ -6,15 +6,15 @@ import bpy
 from bpy.props import FloatProperty, PointerProperty
 
 from . import command
-from .import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
-from .operators import (
+from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
+from .ui.operators import (
     REFINE_OT_apply,
     REFINE_OT_export_ply,
     REFINE_OT_plan,
     REFINE_OT_preview,
     REFINE_OT_score,
 )
-from .panel import (
+from .ui.panel import (
     REFINE_PT_advanced,
     REFINE_PT_apply,
     REFINE_PT_cameras,
@@ -23,7 +23,7 @@ from .panel import (
     REFINE_PT_score,
     REFINE_PT_splats,
 )
-from .properties import RefineSettings
+from .ui.properties import RefineSettings
 
 CLASSES = (
     RefineSettings,

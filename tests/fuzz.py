@@ -31,15 +31,8 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from refine_addon.command import describe  # noqa: E402 - from this checkout, installed or not
-from refine_addon.core import (  # noqa: E402
-    Occlusion,
-    RefineError,
-    Settings,
-    read_cameras,
-    read_ply,
-    score,
-)
-from refine_addon.core.ply import splats_from_columns  # noqa: E402
+from refine_addon.core import Occlusion, RefineError, Settings, read_cameras, read_ply, score  # noqa: E402
+from refine_addon.core.formats.ply import splats_from_columns  # noqa: E402
 
 MEMORY = 40_000_000
 """Bytes that any of these small inputs may cost; NumPy and JSON need some of their own."""

@@ -18,19 +18,19 @@ from pathlib import Path
 PROJECT = Path(__file__).resolve().parent.parent
 
 MUTANTS = {
-    "frustum.py": [
+    "scoring/frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
         ("(near if np.ptp(near) > 0.0 else near[0, 0])", "0.0", "near plane ignored"),
         ("inside &= depth <= far", "inside &= depth < far", "far plane excluded"),
         ("(view.cx - view.width / 2)", "(view.width / 2 - view.cx)", "shift mirrored"),
         ("half_height = view.height", "half_height = view.width", "axes swapped"),
     ],
-    "closed_form.py": [
+    "scoring/closed_form.py": [
         ("total *= self.alpha[piece]", "total *= self.alpha[piece] ** 2", "opacity twice"),
         ("LUMA = (0.299, 0.587, 0.114)", "LUMA = (0.114, 0.587, 0.299)", "BGR"),
         ("largest + middle", "largest + smallest", "wrong two scales"),
     ],
-    "adaptive.py": [
+    "scoring/adaptive.py": [
         ("math.log(geometry)", "math.log(1 + geometry)", "wrong logarithm"),
     ],
     "selection.py": [
@@ -46,7 +46,7 @@ MUTANTS = {
     "spherical_harmonics.py": [
         ("points @ rotation, degree", "points @ rotation.T, degree", "inverse"),
     ],
-    "transform.py": [
+    "affine.py": [
         ("> 0 else -rotation", "> 0 else rotation", "mirror not undone"),
     ],
     "views.py": [
@@ -62,14 +62,14 @@ MUTANTS = {
             "median without weights",
         ),
     ],
-    "ply_columns.py": [
+    "formats/ply_columns.py": [
         (
             "sh_rest = planes.transpose(0, 2, 1)",
             "sh_rest = planes.reshape(size, -1, 3)",
             "SH channel order",
         ),
     ],
-    "occlusion.py": [
+    "scoring/occlusion.py": [
         ("return 0.25 + 0.5 * gone", "return 0.25", "what has gone forgotten"),
         (
             "LEAST ** ((number + 1) / (rounds - 1))",
@@ -95,7 +95,7 @@ MUTANTS = {
         ("footprints.index[footprints.inside(view)]", "footprints.index", "seen beside the image"),
         ("    values[~good] = 0.0\n", "", "undrawable not lowest"),
     ],
-    "froxels.py": [
+    "scoring/froxels.py": [
         ("    np.log(share, out=share)\n", "", "thickness of a thin point"),
         (
             "np.minimum(alphas, np.float32(ALPHA_MAX)).take(points.owners)",
@@ -136,7 +136,7 @@ MUTANTS = {
             "a dot covers evenly",
         ),
     ],
-    "projection.py": [
+    "scoring/projection.py": [
         ("(r[a, j] * r[b, i] if i != j else 0.0)", "0.0", "covariance off the diagonal"),
         (
             "(across * shape[5] - 2 * shape[2])",
@@ -174,7 +174,7 @@ MUTANTS = {
         ),
         ("known and away <=", "known or away <=", "farther than float32 holds"),
     ],
-    "coverage.py": [
+    "scoring/coverage.py": [
         ("/ (1.0 + seen)", "/ 1.0", "seen forgotten in floor"),
         ("max(pair) for pair", "pair[0] for pair", "no floor where views agree"),
         (
@@ -185,7 +185,7 @@ MUTANTS = {
         ("return [1.0] * len(SHARES)", "return [0.0] * len(SHARES)", "trust in what nobody judges"),
         ("table.argmin(axis=0)", "table.argmax(axis=0)", "the worst weight"),
     ],
-    "absorb.py": [
+    "absorbing/absorb.py": [
         ("members[taken >= 0]", "1 + 0 * taken[taken >= 0]", "members of the last stage alone"),
         ("(1.0 - share) / share)", "share / (1.0 - share))", "patience upside down"),
         (
@@ -212,7 +212,7 @@ MUTANTS = {
             "sign in the logit",
         ),
     ],
-    "merge_field.py": [
+    "absorbing/merge_field.py": [
         ("/ (1.0 + inside)", "", "as likely after many views"),
         ("shown = inside @ worth", "shown = worth.sum()", "all seen once"),
         ("np.where(inside, share, share * BESIDE)", "share", "views beside count"),
@@ -229,7 +229,7 @@ MUTANTS = {
         ),
         ("color[piece] += np.einsum", "color[piece] -= np.einsum", "sign of harmonics"),
     ],
-    "merging.py": [
+    "absorbing/merging.py": [
         (
             "mass_1 + mass_2 - np.minimum(overlap, np.minimum(mass_1, mass_2))",
             "mass_1 + mass_2",
@@ -259,7 +259,7 @@ MUTANTS = {
             "direction lost",
         ),
     ],
-    "merge_graph.py": [
+    "absorbing/merge_graph.py": [
         (
             "(cost == best[first]) & (cost == best[second])",
             "(cost == best[first]) | (cost == best[second])",
@@ -275,7 +275,7 @@ MUTANTS = {
         ("self.patience * merging.costs", "merging.costs", "patience ignored"),
         ("count < connected / 2", "count < 0", "never connected anew"),
     ],
-    "auto.py": [
+    "scoring/auto.py": [
         (
             "CAUTION * disagreement(reference, scores)",
             "disagreement(reference, scores)",
@@ -320,7 +320,7 @@ MUTANTS = {
             "survivors of other rows",
         ),
     ],
-    "neighbours.py": [
+    "absorbing/neighbours.py": [
         (
             "(index == tree.which[rows][:, :, None]) | (index >= total)",
             "index >= total",
@@ -337,11 +337,11 @@ MUTANTS = {
 """Module of core -> lines to change, what they become, and what is wrong then."""
 
 TESTS = {
-    "closed_form": ["frustum.py", "adaptive.py"],
-    "occlusion": ["froxels.py", "projection.py", "coverage.py"],
-    "absorb": ["merge_field.py", "merging.py", "merge_graph.py"],
-    "transform": ["spherical_harmonics.py"],
-    "ply": ["ply_columns.py"],
+    "closed_form": ["scoring/frustum.py", "scoring/adaptive.py"],
+    "occlusion": ["scoring/froxels.py", "scoring/projection.py", "scoring/coverage.py"],
+    "absorb": ["absorbing/merge_field.py", "absorbing/merging.py", "absorbing/merge_graph.py"],
+    "affine": ["spherical_harmonics.py"],
+    "ply": ["formats/ply_columns.py"],
 }
 """Modules whose tests are not in the file of their own name; those run first."""
 
@@ -352,7 +352,7 @@ SECONDS = 900
 def tests_of(module: str) -> list[str]:
     """Return the files of tests to run: that of the module, then all others."""
     names = [name for name, modules in TESTS.items() if module in modules]
-    own = f"test_{names[0] if names else module.removesuffix('.py')}.py"
+    own = f"test_{names[0] if names else Path(module).stem}.py"
     paths = sorted(PROJECT.glob("tests/core/test_*.py"), key=lambda path: path.name != own)
     return [str(path.relative_to(PROJECT)) for path in paths]
 

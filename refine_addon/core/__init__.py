@@ -7,13 +7,13 @@ In short::
     file.write("pruned.ply", result.keep)
 """
 
-from .camera_files import read_cameras
-from .closed_form import ClosedForm
+from .cameras.read import read_cameras
 from .errors import Cancelled, RefineError
-from .occlusion import Occlusion
+from .formats.ply import SplatFile, read_ply
 from .pipeline import METHODS, Result, Settings, prune, prune_file, score
-from .ply import SplatFile, read_ply
 from .scores import Scores
+from .scoring.closed_form import ClosedForm
+from .scoring.occlusion import Occlusion
 from .selection import Budget, rank, select
 from .splats import Splats
 from .views import View, ViewSet

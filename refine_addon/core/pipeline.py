@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from . import absorb as absorbing
-from . import auto, closed_form, occlusion, selection
+from . import selection
+from .absorbing import absorb as absorbing
+from .absorbing.merging import Seen
 from .errors import RefineError
-from .files import expanded, refuse_existing, refuse_mapped
-from .merging import Seen
-from .ply import read_ply
+from .formats.ply import read_ply
+from .scoring import auto, closed_form, occlusion
 from .selection import Budget
+from .whole_file import expanded, refuse_existing, refuse_mapped
 from .work import Progress, part, report, silent
 
 if TYPE_CHECKING:
@@ -27,9 +28,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from .absorb import Absorbed
-    from .occlusion import Measured
+    from .absorbing.absorb import Absorbed
     from .scores import Scores
+    from .scoring.occlusion import Measured
     from .splats import Splats
     from .views import ViewSet
 

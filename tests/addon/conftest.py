@@ -43,7 +43,7 @@ def extension(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def addon(extension):
-    """Return the package with its modules as attributes: ``addon.session``."""
+    """Return the package with its modules as attributes: ``addon.splat_object``."""
     for path in (ROOT / "refine_addon").glob("*.py"):
         if not path.stem.startswith("__"):
             importlib.import_module(f"{MODULE}.{path.stem}")
@@ -69,7 +69,7 @@ def empty_scene():
 def room(addon, empty_scene):
     """Import the small trained room."""
     file = addon.core.read_ply(ROOM / "point_cloud.ply")
-    mesh = addon.mesh_adapter.mesh_from_file(file)
+    mesh = addon.mesh.attributes.mesh_from_file(file)
     obj = bpy.data.objects.new("room", mesh)
     empty_scene.collection.objects.link(obj)
     bpy.context.view_layer.objects.active = obj
@@ -88,7 +88,7 @@ def room_cameras(addon, empty_scene, room_views):
     """Import the room's cameras as objects, in a collection."""
     collection = bpy.data.collections.new("cameras")
     empty_scene.collection.children.link(collection)
-    addon.camera_adapter.create_cameras(room_views, collection)
+    addon.cameras.sets.create_cameras(room_views, collection)
     empty_scene.refine.collection = collection
     empty_scene.refine.source = "COLLECTION"
     return collection
@@ -100,9 +100,9 @@ def score(addon):
 
     def score(obj, views):
         settings = addon.core.Settings()
-        addon.session.check_scorable(obj)
-        scores = addon.core.score(addon.session.gather(obj), views, settings)
-        addon.score_attributes.store(obj, scores, views, settings)
+        addon.splat_object.check_scorable(obj)
+        scores = addon.core.score(addon.splat_object.gather(obj), views, settings)
+        addon.mesh.scores.store(obj, scores, views, settings)
 
     return score
 

@@ -13,14 +13,14 @@ def few(addon, room, room_cameras):  # noqa: ARG001
     """Every tenth splat of the room, scored, to be absorbed to two fifths."""
     core = addon.core
     remove = np.arange(len(room.data.vertices)) % 10 != 0
-    addon.mesh_edit.delete_vertices(room, remove)
+    addon.mesh.edit.delete_vertices(room, remove)
     settings = bpy.context.scene.refine
     settings.absorb, settings.ratio = True, 0.6
     return room, core.Budget(ratio=0.6)
 
 
 def absorbed_in_core(addon, obj, views, budget):
-    return addon.core.prune(addon.session.gather(obj, whole=True), views, budget, absorb=True)
+    return addon.core.prune(addon.splat_object.gather(obj, whole=True), views, budget, absorb=True)
 
 
 def test_apply_with_absorb_leaves_what_core_says(addon, few, room_views):
@@ -30,7 +30,7 @@ def test_apply_with_absorb_leaves_what_core_says(addon, few, room_views):
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
 
-    splats = addon.mesh_adapter.splats_from_object(room)
+    splats = addon.mesh.attributes.splats_from_object(room)
 
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"):
         wanted = getattr(expected.splats, name).astype(np.float32)
@@ -49,7 +49,7 @@ def test_a_moved_object_is_absorbed_in_its_own_frame(addon, few, room_views):
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
 
-    splats = addon.mesh_adapter.splats_from_object(room)
+    splats = addon.mesh.attributes.splats_from_object(room)
 
     # float32 matrices move a few merges across; the survivors are mostly the same ones.
     here = {tuple(row) for row in np.round(splats.means, 3)}
@@ -64,12 +64,12 @@ def test_uneven_scale_is_refused_and_nothing_changes(addon, few):
     bpy.ops.refine.score()
     room.scale = (1, 2, 1)
     bpy.context.view_layer.update()
-    before = addon.mesh_adapter.read_attribute(room.data, "f_dc_0")
+    before = addon.mesh.attributes.read_attribute(room.data, "f_dc_0")
 
     with pytest.raises(RuntimeError, match="scales directions differently"):
         bpy.ops.refine.apply()
 
-    np.testing.assert_array_equal(addon.mesh_adapter.read_attribute(room.data, "f_dc_0"), before)
+    np.testing.assert_array_equal(addon.mesh.attributes.read_attribute(room.data, "f_dc_0"), before)
     room.scale = (1, 1, 1)
 
 
@@ -80,7 +80,7 @@ def test_the_command_on_an_object_writes_the_same_survivors(addon, few, room_vie
     count = len(room.data.vertices)
     out = tmp_path / "out.ply"
 
-    report = addon.session.prune_object(
+    report = addon.splat_object.prune_object(
         room.name, room_views, budget, addon.core.Settings(), absorb=True, output=out
     )
 
@@ -97,30 +97,30 @@ def test_saving_leaves_in_the_blend_what_apply_leaves(addon, few, room_views, tm
     expected = absorbed_in_core(addon, room, room_views, budget).absorbed
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
 
-    addon.session.prune_object(
+    addon.splat_object.prune_object(
         room.name, room_views, budget, addon.core.Settings(), absorb=True, save=True
     )
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
 
     obj = bpy.data.objects["room"]
-    means = addon.mesh_adapter.splats_from_object(obj).means
+    means = addon.mesh.attributes.splats_from_object(obj).means
     np.testing.assert_array_equal(means, expected.splats.means.astype(np.float32))
     assert "refine_score" in obj.data.attributes
-    assert addon.score_attributes.record(obj.data) is None
+    assert addon.mesh.scores.record(obj.data) is None
 
 
 def test_protected_splats_neither_vanish_nor_change(addon, few):
     """A boolean attribute names every third."""
     room, _ = few
     marked = np.arange(len(room.data.vertices)) % 3 == 0
-    addon.mesh_adapter.write_attribute(room.data, "mine", "BOOLEAN", marked)
-    before = addon.mesh_adapter.read_attribute(room.data, "position")[marked]
+    addon.mesh.attributes.write_attribute(room.data, "mine", "BOOLEAN", marked)
+    before = addon.mesh.attributes.read_attribute(room.data, "position")[marked]
     bpy.context.scene.refine.protect = "mine"
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     bpy.context.scene.refine.protect = ""
 
-    after = addon.mesh_adapter.read_attribute(room.data, "position")
-    still = addon.mesh_adapter.read_attribute(room.data, "mine")
+    after = addon.mesh.attributes.read_attribute(room.data, "position")
+    still = addon.mesh.attributes.read_attribute(room.data, "mine")
 
     np.testing.assert_array_equal(after[still], before)

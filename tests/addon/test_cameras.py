@@ -27,7 +27,7 @@ def _set(target, values):
 
 
 def _view(addon, obj):
-    return addon.camera_objects.view_from_camera(
+    return addon.cameras.objects.view_from_camera(
         obj, bpy.context.scene, bpy.context.evaluated_depsgraph_get()
     )
 
@@ -218,7 +218,7 @@ def test_a_disabled_camera_is_read_if_it_can_be(addon):
 
 
 def _names(addon, source, **options):
-    views = addon.camera_adapter.views_from_scene(bpy.context, source, **options)
+    views = addon.cameras.sets.views_from_scene(bpy.context, source, **options)
     return [view.name for view in views]
 
 
@@ -240,7 +240,7 @@ def test_each_source_gives_its_cameras(addon):
     assert _names(addon, "SELECTED") == ["second"]
     assert sorted(_names(addon, "VISIBLE")) == ["first", "second"]
     assert sorted(_names(addon, "COLLECTION", collection=outer)) == ["second", "third"]
-    assert addon.camera_adapter.visible_views(scene).views[0].name in ("first", "second")
+    assert addon.cameras.sets.visible_views(scene).views[0].name in ("first", "second")
 
 
 def _animate(obj, path, values, index=-1):
@@ -259,7 +259,7 @@ def test_a_shot_is_a_view_set_and_the_frame_is_put_back(addon):
     _animate(scene.camera, "location", {1: 1.0, 5: 5.0}, index=0)
     _animate(scene.camera.data, "lens", {1: 50.0, 5: 100.0})
     scene.frame_set(4, subframe=0.25)
-    views = addon.camera_adapter.views_from_frames(bpy.context, range(1, 6, 2))
+    views = addon.cameras.sets.views_from_frames(bpy.context, range(1, 6, 2))
 
     assert [round(view.center[0], 5) for view in views] == [1.0, 3.0, 5.0]
     assert math.isclose(views[2].fx, 2 * views[0].fx)
@@ -274,7 +274,7 @@ def test_cameras_bound_to_markers_take_over(addon):
     for frame, camera in ((1, first), (3, second)):
         scene.timeline_markers.new(camera.name, frame=frame).camera = camera
     scene.camera = other
-    views = addon.camera_adapter.views_from_frames(bpy.context, range(1, 5))
+    views = addon.cameras.sets.views_from_frames(bpy.context, range(1, 5))
 
     assert [view.name.split(",")[0] for view in views] == ["first", "first", "second", "second"]
     assert scene.camera is other
@@ -291,7 +291,7 @@ def test_an_error_in_the_midst_of_a_shot_puts_the_frame_back(addon):
     scene.frame_set(2)
 
     with pytest.raises(addon.core.RefineError, match="'flat' is orthographic"):
-        addon.camera_adapter.views_from_frames(bpy.context, range(1, 5))
+        addon.cameras.sets.views_from_frames(bpy.context, range(1, 5))
     assert scene.frame_current == 2
     assert scene.camera is first
 
@@ -299,7 +299,7 @@ def test_an_error_in_the_midst_of_a_shot_puts_the_frame_back(addon):
 def test_an_empty_range_of_frames_is_refused(addon):
     """From 5 to 4."""
     with pytest.raises(addon.core.RefineError, match="starts at 5 and ends at 4"):
-        addon.camera_adapter.views_from_frames(bpy.context, range(5, 5))
+        addon.cameras.sets.views_from_frames(bpy.context, range(5, 5))
 
 
 def test_a_turntable_is_seen_from_all_sides(addon, room):
@@ -312,7 +312,7 @@ def test_a_turntable_is_seen_from_all_sides(addon, room):
     scene.camera = _camera(location=(4.0, 0.0, 0.0))
     _animate(room, "rotation_euler", {1: 0.0, 2: math.pi / 2}, index=2)
     scene.frame_set(1)
-    views = addon.camera_adapter.views_from_frames(bpy.context, range(1, 3), room)
+    views = addon.cameras.sets.views_from_frames(bpy.context, range(1, 3), room)
 
     assert np.allclose(views[0].center, [4, 0, 0])
     assert np.allclose(views[1].center, [0, -4, 0], atol=1e-6)
@@ -327,7 +327,7 @@ def test_an_animated_scale_of_the_splats_is_refused(addon, room):
     _animate(room, "scale", {1: 1.0, 2: 2.0}, index=2)
 
     with pytest.raises(addon.core.RefineError, match="scale is animated"):
-        addon.camera_adapter.views_from_frames(bpy.context, range(1, 3), room)
+        addon.cameras.sets.views_from_frames(bpy.context, range(1, 3), room)
 
 
 def _close(got, expected):
@@ -340,9 +340,7 @@ def _close(got, expected):
 def test_imported_cameras_give_back_the_views_of_their_file(addon, room_cameras, room_views):
     """To the last digit, though Blender's matrices are float32 and the render size is another."""
     bpy.context.scene.render.resolution_x = 999
-    views = addon.camera_adapter.views_from_scene(
-        bpy.context, "COLLECTION", collection=room_cameras
-    )
+    views = addon.cameras.sets.views_from_scene(bpy.context, "COLLECTION", collection=room_cameras)
 
     assert len(views) == 72
     for got, expected in zip(views, room_views, strict=True):
@@ -353,9 +351,7 @@ def test_blender_shows_what_the_imported_camera_saw(addon, room_cameras, room_vi
     """Without the note: at the file's resolution pose and frame agree to float32."""
     for camera in room_cameras.objects:
         del camera["refine_view"]
-    views = addon.camera_adapter.views_from_scene(
-        bpy.context, "COLLECTION", collection=room_cameras
-    )
+    views = addon.cameras.sets.views_from_scene(bpy.context, "COLLECTION", collection=room_cameras)
 
     for got, expected in zip(views, room_views, strict=True):
         assert np.allclose(got.rotation, expected.rotation, atol=1e-6)
@@ -369,11 +365,11 @@ def test_blender_shows_what_the_imported_camera_saw(addon, room_cameras, room_vi
 
 def test_the_kept_rows_do_not_hang_on_the_note(addon, core, room, room_cameras, room_views):
     """Float32 moves scores in the seventh digit; on this scene no row changes sides."""
-    expected = core.prune(addon.session.gather(room), room_views, core.Budget(ratio=0.5)).keep
+    expected = core.prune(addon.splat_object.gather(room), room_views, core.Budget(ratio=0.5)).keep
     for camera in room_cameras.objects:
         del camera["refine_view"]
-    views = addon.camera_adapter.visible_views(bpy.context.scene)
-    got = core.prune(addon.session.gather(room), views, core.Budget(ratio=0.5)).keep
+    views = addon.cameras.sets.visible_views(bpy.context.scene)
+    got = core.prune(addon.splat_object.gather(room), views, core.Budget(ratio=0.5)).keep
 
     assert np.count_nonzero(got != expected) == 0
 
@@ -415,7 +411,7 @@ def test_any_view_becomes_a_camera_that_blender_frames_alike(
         rotation = rotation * np.array([-1.0, 1.0, 1.0])
     cx, cy = middle[0] * 240, middle[1] * 160
     expected = core.View(rotation, np.array(center), focal, focal, cx, cy, 240, 160)
-    camera = addon.camera_objects.camera_from_view(expected)
+    camera = addon.cameras.objects.camera_from_view(expected)
     bpy.context.scene.collection.objects.link(camera)
     del camera["refine_view"]
     got = _view(addon, camera)

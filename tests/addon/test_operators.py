@@ -42,7 +42,7 @@ def test_every_budget_keeps_the_rows_that_core_keeps(addon, room, room_cameras, 
     settings.budget = kind
     setattr(settings, kind, value)
     bpy.ops.refine.score()
-    got = addon.session.keep_mask(room, settings.to_budget())
+    got = addon.splat_object.keep_mask(room, settings.to_budget())
     core = addon.core
     file = core.read_ply(ROOM / "point_cloud.ply")
     expected = core.prune(
@@ -75,10 +75,10 @@ def test_settings_reach_core_as_they_were_typed(addon):
 def test_scoring_writes_scores_ranks_views_and_colours(addon, room, room_cameras):  # noqa: ARG001
     """Rank 0 belongs to the lowest score, 1 to the highest; the colour follows the rank."""
     bpy.ops.refine.score()
-    read = addon.mesh_adapter.read_attribute
+    read = addon.mesh.attributes.read_attribute
     score, rank = read(room.data, "refine_score"), read(room.data, "refine_rank")
     seen, heat = read(room.data, "refine_seen"), read(room.data, "refine_heat")
-    ramp = addon.heat_map.ramp()
+    ramp = addon.mesh.heat_map.ramp()
 
     assert rank[np.argmin(score)] == 0.0
     assert score[np.argmax(rank)] == score.max()
@@ -92,17 +92,17 @@ def test_apply_keeps_everything_else_of_the_object(addon, room, room_cameras):  
     """Attributes, groups, custom properties, materials and modifiers of the kept vertices."""
     mesh = room.data
     row = np.arange(len(mesh.vertices), dtype=np.int32)
-    addon.mesh_adapter.write_attribute(mesh, "row", "INT", row)
+    addon.mesh.attributes.write_attribute(mesh, "row", "INT", row)
     group = room.vertex_groups.new(name="tenth")
     group.add([int(i) for i in row[::10]], 0.5, "REPLACE")
     mesh.materials.append(bpy.data.materials.new("mine"))
     mesh["mine"], room["yours"] = 3, "x"
     room.modifiers.new("mine", "SUBSURF")
     bpy.ops.refine.score()
-    keep = addon.session.keep_mask(room, bpy.context.scene.refine.to_budget())
+    keep = addon.splat_object.keep_mask(room, bpy.context.scene.refine.to_budget())
     names = {a.name for a in mesh.attributes} - {"refine_remove"}
     bpy.ops.refine.apply()
-    kept = addon.mesh_adapter.read_attribute(room.data, "row")
+    kept = addon.mesh.attributes.read_attribute(room.data, "row")
 
     assert np.array_equal(kept, row[keep])
     assert names <= {a.name for a in room.data.attributes}
@@ -150,39 +150,39 @@ def test_operators_that_change_the_scene_can_be_undone(name):
 def test_protected_splats_stay_by_group_or_attribute(addon, room, room_cameras):  # noqa: ARG001
     """Keeping 500 of 39755 with 100 protected that would all go: the 100 are among the 500."""
     bpy.ops.refine.score()
-    score = addon.mesh_adapter.read_attribute(room.data, "refine_score")
+    score = addon.mesh.attributes.read_attribute(room.data, "refine_score")
     lowest = np.argsort(score, kind="stable")[:100]
     group = room.vertex_groups.new(name="group")
     group.add([int(i) for i in lowest], 0.1, "REPLACE")
     mask = np.zeros(len(score), np.bool_)
     mask[lowest] = True
-    addon.mesh_adapter.write_attribute(room.data, "mask", "BOOLEAN", mask)
+    addon.mesh.attributes.write_attribute(room.data, "mask", "BOOLEAN", mask)
     budget = addon.core.Budget(keep=500)
-    by_group = addon.session.keep_mask(room, budget, "group")
-    by_mask = addon.session.keep_mask(room, budget, "mask")
+    by_group = addon.splat_object.keep_mask(room, budget, "group")
+    by_mask = addon.splat_object.keep_mask(room, budget, "mask")
 
     assert by_group[lowest].all()
     assert by_group.sum() == 500
     assert np.array_equal(by_group, by_mask)
     assert "REFINE read" not in bpy.data.objects
     with pytest.raises(addon.core.RefineError, match="named 'opacity' \\('opacity' is FLOAT"):
-        addon.session.keep_mask(room, budget, "opacity")
+        addon.splat_object.keep_mask(room, budget, "opacity")
 
 
 def test_the_plan_says_before_apply_what_apply_does(addon, room, room_cameras):  # noqa: ARG001
     """Made by scoring and by every change of the budget; never by drawing."""
     settings = bpy.context.scene.refine
     bpy.ops.refine.score()
-    first = addon.plans.stored(room, settings)
+    first = addon.ui.plans.stored(room, settings)
     settings.ratio = 0.75
-    second = addon.plans.stored(room, settings)
+    second = addon.ui.plans.stored(room, settings)
     bpy.ops.refine.apply()
 
     assert (first["kept"], first["removed"]) == (19878, 19877)
     assert second["removed"] == 39755 * 3 // 4
     assert len(room.data.vertices) == second["kept"]
-    assert addon.mesh_adapter.file_size(room)[0] == 248
-    assert second["bytes_after"] == addon.mesh_adapter.file_from_object(room).size()
+    assert addon.mesh.attributes.file_size(room)[0] == 248
+    assert second["bytes_after"] == addon.mesh.attributes.file_from_object(room).size()
 
 
 def test_a_plan_of_another_budget_is_not_shown(addon, room, room_cameras):  # noqa: ARG001
@@ -191,12 +191,12 @@ def test_a_plan_of_another_budget_is_not_shown(addon, room, room_cameras):  # no
     bpy.ops.refine.score()
     bpy.context.view_layer.objects.active = None
     settings.ratio = 0.9
-    stale = addon.plans.stored(room, settings)
+    stale = addon.ui.plans.stored(room, settings)
     bpy.context.view_layer.objects.active = room
     bpy.ops.refine.plan()
 
     assert stale is None
-    assert addon.plans.stored(room, settings)["removed"] == 39755 * 9 // 10
+    assert addon.ui.plans.stored(room, settings)["removed"] == 39755 * 9 // 10
 
 
 def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(
@@ -211,7 +211,7 @@ def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(
     settings.budget, settings.threshold = "threshold", 1e9
     unchanged.start()
 
-    assert "would remove all" in addon.plans.stored(room, settings)["error"]
+    assert "would remove all" in addon.ui.plans.stored(room, settings)["error"]
     with pytest.raises(RuntimeError, match="would remove all"):
         bpy.ops.refine.apply()
     unchanged()
@@ -226,7 +226,7 @@ def test_upright_turns_the_object_and_the_cameras_but_not_the_data(addon, tmp_pa
         obj = bpy.context.object
         bpy.ops.refine.import_cameras(filepath=str(ROOM / "cameras.json"), upright=upright)
         bpy.ops.refine.score()
-        masks.append(addon.session.keep_mask(obj, addon.core.Budget(ratio=0.5)))
+        masks.append(addon.splat_object.keep_mask(obj, addon.core.Budget(ratio=0.5)))
         bpy.ops.refine.export_ply(filepath=str(tmp_path / f"{upright}.ply"))
     up = np.array(obj.matrix_world)[:3, :3] @ [0, -1, 0]
 
@@ -424,11 +424,9 @@ def test_edit_mode_greys_the_buttons(room, room_cameras):  # noqa: ARG001
 @pytest.mark.parametrize("how", ["hide_set", "hide_viewport", "exclude"])
 def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_cameras, score, how):
     """By the eye, by the monitor icon, by excluding the collection; the command reaches all."""
-    views = addon.camera_adapter.views_from_scene(
-        bpy.context, "COLLECTION", collection=room_cameras
-    )
+    views = addon.cameras.sets.views_from_scene(bpy.context, "COLLECTION", collection=room_cameras)
     expected = addon.core.prune(
-        addon.session.gather(room), views, addon.core.Budget(ratio=0.5)
+        addon.splat_object.gather(room), views, addon.core.Budget(ratio=0.5)
     ).keep
     if how == "hide_set":
         room.hide_set(True)
@@ -441,8 +439,8 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
         bpy.context.scene.collection.objects.unlink(room)
         bpy.context.view_layer.layer_collection.children["excluded"].exclude = True
     score(room, views)
-    keep = addon.session.keep_mask(room, addon.core.Budget(ratio=0.5))
-    addon.session.apply_object(room, addon.core.Budget(ratio=0.5))
+    keep = addon.splat_object.keep_mask(room, addon.core.Budget(ratio=0.5))
+    addon.splat_object.apply_object(room, addon.core.Budget(ratio=0.5))
 
     assert np.array_equal(keep, expected)
     assert len(room.data.vertices) == expected.sum()
@@ -460,5 +458,5 @@ def test_linked_objects_are_refused(addon, room, room_cameras, score, tmp_path):
 
     with pytest.raises(addon.core.RefineError, match="is linked from"):
         score(room, views)
-    addon.session.export_object(room, tmp_path / "out.ply")
+    addon.splat_object.export_object(room, tmp_path / "out.ply")
     assert _bytes(tmp_path / "out.ply") == _bytes(ROOM / "point_cloud.ply")

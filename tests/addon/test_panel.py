@@ -55,9 +55,9 @@ def draw(addon, monkeypatch):
         drawn = []
         with monkeypatch.context() as patch:
             for name in ("plan", "keep_mask", "stored_scores", "gather", "apply_object"):
-                patch.setattr(addon.session, name, never)
-            patch.setattr(addon.mesh_adapter, "read_attribute", never)
-            patch.setattr(addon.mesh_adapter, "write_attribute", never)
+                patch.setattr(addon.splat_object, name, never)
+            patch.setattr(addon.mesh.attributes, "read_attribute", never)
+            patch.setattr(addon.mesh.attributes, "write_attribute", never)
             for cls in addon.registration.CLASSES:
                 if issubclass(cls, bpy.types.Panel):
                     cls.draw(SimpleNamespace(layout=Layout(drawn)), bpy.context)

@@ -45,7 +45,7 @@ def test_turning_it_off_leaves_nothing_behind(addon, room, unchanged):
     """No modifier, no attribute, no node group, no material."""
     unchanged.start()
     bpy.ops.refine.preview(mode="COLOR")
-    shown = addon.preview.shown(room)
+    shown = addon.ui.preview.shown(room)
     bpy.ops.refine.preview(mode="OFF")
 
     assert shown == ("COLOR", False)
@@ -65,11 +65,11 @@ def test_two_objects_share_one_preview_and_lose_it_one_by_one(addon, room):
     other = bpy.data.objects.new("other", room.data.copy())
     bpy.context.scene.collection.objects.link(other)
     for obj in (room, other):
-        addon.preview.show(obj, "COLOR")
+        addon.ui.preview.show(obj, "COLOR")
     groups = [len(bpy.data.node_groups)]
-    addon.preview.hide(room)
+    addon.ui.preview.hide(room)
     groups.append(len(bpy.data.node_groups))
-    addon.preview.hide(other)
+    addon.ui.preview.hide(other)
     groups.append(len(bpy.data.node_groups))
 
     assert groups == [1, 1, 0]
@@ -81,7 +81,7 @@ def test_the_preview_outlives_an_apply(addon, room, room_cameras):  # noqa: ARG0
     bpy.ops.refine.preview(mode="HEAT", hide_removed=True)
     bpy.ops.refine.apply()
 
-    assert addon.preview.shown(room) == ("HEAT", True)
+    assert addon.ui.preview.shown(room) == ("HEAT", True)
     assert _point_count(room) == len(room.data.vertices) == 19878
 
 
@@ -118,8 +118,8 @@ def test_a_rendered_splat_is_a_gaussian(addon, core, tmp_path):
     scene = bpy.context.scene
     scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(scene.camera)
-    addon.preview.show(bpy.context.object, "COLOR", style="SPLATS")
-    addon.preview.set_up_render(scene)
+    addon.ui.preview.show(bpy.context.object, "COLOR", style="SPLATS")
+    addon.ui.preview.set_up_render(scene)
     image = _render(tmp_path / "one.png")
 
     assert abs(image[80, 120, 0] - 231 / 255) < 0.02

@@ -10,7 +10,7 @@ import pytest
 def contents(addon, obj) -> dict[str, bytes]:
     """Return every point attribute of an object, by its bytes."""
     return {
-        a.name: addon.mesh_adapter.read_attribute(obj.data, a.name).tobytes()
+        a.name: addon.mesh.attributes.read_attribute(obj.data, a.name).tobytes()
         for a in obj.data.attributes
         if a.domain == "POINT" and not a.name.startswith(".")
     }
@@ -75,7 +75,7 @@ def test_a_shot_of_five_thousand_frames_is_a_view_set(addon, room):
 
     bpy.ops.refine.score()
 
-    record = addon.score_attributes.record(room.data)
+    record = addon.mesh.scores.record(room.data)
     assert (record["views_used"], record["views_given"]) == (64, 5000)
     settings.source, settings.frame_step = "VISIBLE", 10
 

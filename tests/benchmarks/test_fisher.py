@@ -11,7 +11,8 @@ import pytest
 
 pytest.importorskip("numba")
 
-from benchmarks import fisher, rasterizer
+from benchmarks.baselines import fisher
+from benchmarks.renderer import rasterizer
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import View
 

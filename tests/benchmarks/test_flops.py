@@ -9,11 +9,11 @@ import pytest
 
 pytest.importorskip("numba")
 
-from benchmarks import flops
-from benchmarks.flops import ANALYTIC, Counting
-from refine_addon.core import closed_form
-from refine_addon.core.closed_form import ClosedForm
+from benchmarks.tables import flops
+from benchmarks.tables.flops import ANALYTIC, Counting
 from refine_addon.core.pipeline import Settings
+from refine_addon.core.scoring import closed_form
+from refine_addon.core.scoring.closed_form import ClosedForm
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import View, ViewSet
 

@@ -9,8 +9,9 @@ import pytest
 
 pytest.importorskip("numba")
 
-from benchmarks import hessian, rasterizer
-from benchmarks.jacobians import CONTRAST, MOVES
+from benchmarks.renderer import rasterizer
+from benchmarks.renderer.jacobians import CONTRAST, MOVES
+from benchmarks.tables import hessian
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import View, ViewSet
 

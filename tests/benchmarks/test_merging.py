@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import merging
+from benchmarks.baselines import merging
 from refine_addon.core.splats import Splats, opacity, rotation_matrices
 
 

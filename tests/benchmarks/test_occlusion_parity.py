@@ -9,9 +9,10 @@ import pytest
 
 pytest.importorskip("numba")
 
-from benchmarks import rasterizer
-from refine_addon.core import Splats, View, ViewSet, occlusion, projection
-from refine_addon.core.occlusion import Measured, Occlusion
+from benchmarks.renderer import rasterizer
+from refine_addon.core import Splats, View, ViewSet
+from refine_addon.core.scoring import occlusion, projection
+from refine_addon.core.scoring.occlusion import Measured, Occlusion
 
 SIDES = (12.0, 6.0, 3.0, 1.5)
 

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("numba")
 pytest.importorskip("skimage")
 
-from benchmarks.evaluate import Evaluator, read_scene
+from benchmarks.tables.evaluate import Evaluator, read_scene
 from refine_addon.core import Budget, ClosedForm, Settings, prune
 
 ROOM = Path(__file__).parents[1] / "data/room_small"

@@ -13,8 +13,8 @@ special = pytest.importorskip("scipy.special")
 
 import numba  # noqa: E402
 
-from benchmarks import rasterizer  # noqa: E402
-from benchmarks.rasterizer import Camera, Gaussians  # noqa: E402
+from benchmarks.renderer import rasterizer  # noqa: E402
+from benchmarks.renderer.rasterizer import Camera, Gaussians  # noqa: E402
 from refine_addon.core.splats import Splats, rotation_matrices  # noqa: E402
 from refine_addon.core.views import View  # noqa: E402
 

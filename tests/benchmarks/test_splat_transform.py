@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks import splat_transform
+from benchmarks.baselines import splat_transform
 from refine_addon.core.errors import RefineError
-from refine_addon.core.ply import read_ply
+from refine_addon.core.formats.ply import read_ply
 
 ROOM = Path(__file__).parents[1] / "data/room_small/point_cloud.ply"
 
@@ -26,7 +26,7 @@ def test_its_absence_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     monkeypatch.setattr(splat_transform, "find", lambda: None)
 
     assert splat_transform.version() == ""
-    with pytest.raises(RefineError, match=r"python -m benchmarks\.splat_transform"):
+    with pytest.raises(RefineError, match=r"python -m benchmarks\.baselines\.splat_transform"):
         splat_transform.decimate(ROOM, tmp_path / "a.ply", "--decimate", 10)
 
 

@@ -14,11 +14,12 @@ pytest.importorskip("numba")
 pytest.importorskip("skimage")
 pytest.importorskip("matplotlib")
 
-from benchmarks import evaluate, methods, splat_transform, trade
-from refine_addon.core.camera_files import read_cameras
+from benchmarks.baselines import splat_transform
+from benchmarks.tables import evaluate, methods, trade
+from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.errors import RefineError
+from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.pipeline import METHODS
-from refine_addon.core.ply import read_ply
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 
@@ -165,7 +166,7 @@ def test_memory_is_what_was_added_at_the_peak() -> None:
     In a process of its own: one that has run other tests may hold 80 MB to give out again.
     """
     code = (
-        "import numpy as np; from benchmarks import trade\n"
+        "import numpy as np; from benchmarks.tables import trade\n"
         "cost = trade.measured(lambda: float(np.ones(10_000_000).sum()), 2)[1]\n"
         "print(cost.peak_bytes, cost.runs)"
     )

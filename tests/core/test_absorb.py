@@ -5,13 +5,13 @@ import itertools
 import numpy as np
 import pytest
 
-from refine_addon.core import merge_field, merge_graph, merging
-from refine_addon.core.absorb import absorb, patience
+from refine_addon.core.absorbing import merge_field, merge_graph, merging
+from refine_addon.core.absorbing.absorb import absorb, patience
+from refine_addon.core.absorbing.merge_graph import MergeGraph
+from refine_addon.core.absorbing.merging import Field, Seen
+from refine_addon.core.affine import transformed
 from refine_addon.core.errors import Cancelled
-from refine_addon.core.merge_graph import MergeGraph
-from refine_addon.core.merging import Field, Seen
 from refine_addon.core.splats import Splats, opacity, rotation_matrices
-from refine_addon.core.transform import transformed
 from refine_addon.core.views import View, ViewSet
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")

@@ -18,13 +18,12 @@ from refine_addon.core import (
     Settings,
     View,
     ViewSet,
-    auto,
-    occlusion,
     prune,
     read_cameras,
     read_ply,
     score,
 )
+from refine_addon.core.scoring import auto, occlusion
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 CHEAP = (ClosedForm(), Occlusion(cell=16.0, density=1.0, rounds=3))

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from refine_addon.core import RefineError, ViewSet, read_cameras, read_ply
-from refine_addon.core.camera_checks import Place
+from refine_addon.core.cameras.place import Place
 
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from refine_addon.core import ClosedForm, RefineError, Splats, View, ViewSet, closed_form
+from refine_addon.core import ClosedForm, RefineError, Splats, View, ViewSet
+from refine_addon.core.scoring import closed_form
 
 READINGS = [
     ClosedForm(),

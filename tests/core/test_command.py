@@ -21,13 +21,14 @@ from refine_addon.core import (
     Budget,
     ClosedForm,
     Settings,
-    ply,
     prune,
     prune_file,
     read_cameras,
     read_ply,
     score,
 )
+from refine_addon.core.formats import ply
+from refine_addon.core.scoring import closed_form
 from refine_addon.version import VERSION
 from tests.strategies import plain_header, plain_ply, splat_names
 
@@ -553,7 +554,7 @@ def test_the_exit_code_is_that_of_the_process(arguments, code):
 STOPPED = """
 import sys, time
 from refine_addon import command
-from refine_addon.core import ply
+from refine_addon.core.formats import ply
 
 write = ply.write_rows
 
@@ -601,11 +602,8 @@ def test_cancelled_anywhere_it_is_code_130(folder, monkeypatch, capsys, stage):
     def interrupt(*_, **__):
         raise KeyboardInterrupt
 
-    target = {"score": "refine_addon.core.closed_form.score", "write_rows": "refine_addon.core.ply"}
-    if stage == "score":
-        monkeypatch.setattr(target[stage], interrupt)
-    else:
-        monkeypatch.setattr(ply, stage, interrupt)
+    module = {"score": closed_form, "write_rows": ply}[stage]
+    monkeypatch.setattr(module, stage, interrupt)
 
     assert command.main([*PRUNE, "-o", "out.ply", "--report", "report.json"]) == 130
 

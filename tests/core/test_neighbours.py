@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from refine_addon.core.absorbing.neighbours import nearest
 from refine_addon.core.errors import Cancelled
-from refine_addon.core.neighbours import nearest
 
 
 def brute_force(points, count):

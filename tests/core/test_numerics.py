@@ -21,16 +21,14 @@ from refine_addon.core import (
     Splats,
     View,
     ViewSet,
-    froxels,
-    merge_field,
-    merge_graph,
-    projection,
     prune,
     score,
     select,
 )
-from refine_addon.core.adaptive import Statistics, weights
+from refine_addon.core.absorbing import merge_field, merge_graph
 from refine_addon.core.pipeline import absorb_removed
+from refine_addon.core.scoring import froxels, projection
+from refine_addon.core.scoring.adaptive import Statistics, weights
 from refine_addon.core.splats import drawable, opacity
 
 FINITE = [

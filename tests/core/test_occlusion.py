@@ -8,19 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from refine_addon.core import (
-    RefineError,
-    Splats,
-    View,
-    ViewSet,
-    coverage,
-    froxels,
-    occlusion,
-    projection,
-)
-from refine_addon.core.occlusion import Measured, Occlusion
+from refine_addon.core import RefineError, Splats, View, ViewSet
+from refine_addon.core.affine import transformed
+from refine_addon.core.scoring import coverage, froxels, occlusion, projection
+from refine_addon.core.scoring.occlusion import Measured, Occlusion
 from refine_addon.core.splats import SH_C0, rotation_matrices
-from refine_addon.core.transform import transformed
 
 ONCE = Occlusion(rounds=1)
 CUT = 1.0 / 255.0

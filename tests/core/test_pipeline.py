@@ -22,8 +22,6 @@ from refine_addon.core import (
     Settings,
     Splats,
     ViewSet,
-    froxels,
-    projection,
     prune,
     prune_file,
     read_cameras,
@@ -31,8 +29,9 @@ from refine_addon.core import (
     score,
     select,
 )
-from refine_addon.core.adaptive import Statistics, weights
-from refine_addon.core.closed_form import LUMA
+from refine_addon.core.scoring import froxels, projection
+from refine_addon.core.scoring.adaptive import Statistics, weights
+from refine_addon.core.scoring.closed_form import LUMA
 from refine_addon.core.selection import rank
 
 ROOM = Path(__file__).parents[1] / "data/room_small"

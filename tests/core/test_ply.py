@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core import RefineError, read_ply
-from refine_addon.core.ply import columns_from_splats, splats_from_columns
+from refine_addon.core.formats.ply import columns_from_splats, splats_from_columns
 from tests.strategies import (
     LINE_ENDS,
     TYPES,

@@ -1,0 +1,154 @@
+"""How long a prune takes from file to file, and what memory it needs.
+
+    python -m benchmarks.speed.file_to_file [--splats 3000000] [--runs 5]
+    python -m benchmarks.speed.file_to_file --absorb --splats 1900000 --runs 3
+
+The first is against copying the file; the second, with survivors that absorb, against
+splat-transform's decimation to the same number of splats, where that is installed.
+
+The input is the committed room's rows, repeated, each copy a little elsewhere and so much smaller
+that the surfaces stay as covered as they were: 744 MB for 3 million splats of degree 3. All
+commands are processes of their own, interpreter start included; they run in turn, one not counted,
+with the input in the page cache and nothing at the output's place. Seconds of the processor, of all
+cores together, tell what a busy machine hides.
+
+Memory is sampled from ``/proc``: the pages that belong to the process alone (RssAnon). What it maps
+of the input is the page cache's, which the system takes back when others need it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from benchmarks.baselines import splat_transform
+from refine_addon.core import Budget, read_ply
+from refine_addon.core.formats.ply_header import with_count
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+ROOT = Path(__file__).parents[2]
+ROOM = ROOT / "tests/data/room_small"
+
+TARGET_RATIO = {"copy": 3.0, "decimate": 1.0}
+"""A prune takes at most this many times as long as what it is compared with."""
+
+TARGET_MEMORY = {"copy": 400.0, "decimate": 2000.0}
+"""Megabytes that a prune may hold beyond the page cache, by what it is compared with."""
+
+
+def make_input(path: Path, count: int) -> None:
+    """Write a file of `count` splats: the room's again and again, moved by 2 cm of noise."""
+    file = read_ply(ROOM / "point_cloud.ply")
+    random = np.random.default_rng(0)
+    smaller = math.log(max(count / len(file), 1.0)) / 2
+    with path.open("wb") as stream:
+        stream.write(with_count(file.header, count))
+        for start in range(0, count, len(file)):
+            rows = file.rows[: count - start].copy()
+            for axis in "xyz":
+                rows[axis] += random.normal(scale=0.02, size=len(rows)).astype(np.float32)
+            for axis in range(3):
+                rows[f"scale_{axis}"] -= np.float32(smaller)
+            stream.write(rows.data)
+
+
+def run(command: Sequence[str | Path]) -> tuple[float, float, float]:
+    """Run a command from the checkout; return its seconds, the processor's, and peak megabytes."""
+    peak = 0.0
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    start = time.perf_counter()
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
+        status = Path(f"/proc/{process.pid}/status")
+        while process.poll() is None:
+            peak = max(peak, _anonymous(status))
+            time.sleep(0.002)
+        seconds = time.perf_counter() - start
+    if process.returncode:
+        sys.exit(process.returncode)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    busy = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+    return seconds, busy, peak
+
+
+def _anonymous(status: Path) -> float:
+    try:
+        lines = status.read_text().splitlines()
+    except OSError:  # it ended in between, or this is no Linux
+        return 0.0
+    return sum(int(line.split()[1]) / 1000 for line in lines if line.startswith("RssAnon:"))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print medians, their ratio, the peak of memory and where the time goes."""
+    parser = argparse.ArgumentParser(description="Time a prune against a copy or a decimation.")
+    parser.add_argument("--splats", type=int, default=3_000_000)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--ratio", default="0.5")
+    parser.add_argument("--absorb", action="store_true", help="against a decimation by merging")
+    parser.add_argument("--folder", type=Path, help="on the disk to measure; default the system's")
+    options = parser.parse_args(arguments)
+    other = "decimate" if options.absorb else "copy"
+    with tempfile.TemporaryDirectory(dir=options.folder) as made:
+        source, output, report = (
+            Path(made) / name for name in ("in.ply", "out.ply", "report.json")
+        )
+        make_input(source, options.splats)
+        print(f"{options.splats:,} splats, {source.stat().st_size / 1e6:.0f} MB, {made}")
+        prune = [sys.executable, "-m", "refine_addon", "prune", source, "-o", output, "--ratio"]
+        prune += [options.ratio, "--cameras", ROOM / "cameras.json", "--report", report]
+        commands = {
+            "start": [sys.executable, "-m", "refine_addon", "--version"],
+            "prune": [*prune, *(["--method", "occlusion", "--absorb"] if options.absorb else [])],
+        }
+        if not options.absorb:
+            commands["copy"] = ["cp", source, output]
+        elif splat_transform.find():
+            left = options.splats - Budget(ratio=float(options.ratio)).removals(options.splats)
+            flag = splat_transform.FLAGS[0]
+            commands["decimate"] = splat_transform.command(source, output, flag, left)
+        else:
+            print(splat_transform.MISSING)
+        seconds: dict[str, list[float]] = {name: [] for name in commands}
+        busy: dict[str, list[float]] = {name: [] for name in commands}
+        peaks: dict[str, float] = dict.fromkeys(commands, 0.0)
+        parts: list[dict[str, float]] = []
+        for turn in range(options.runs + 1):
+            for name, command in commands.items():
+                took, worked, peak = run(command)
+                if turn:
+                    seconds[name].append(took)
+                    busy[name].append(worked)
+                    peaks[name] = max(peaks[name], peak)
+                output.unlink(missing_ok=True)
+            parts.append(json.loads(report.read_text())["results"][0]["timings"])
+            report.unlink()
+    medians = {name: statistics.median(values) for name, values in seconds.items()}
+    for name, values in seconds.items():
+        every = " ".join(f"{value:.2f}" for value in values)
+        print(
+            f"{name:8} {medians[name]:6.2f} s ({every}), {statistics.median(busy[name]):.2f} s of "
+            f"the processor, peak {peaks[name]:.0f} MB of its own"
+        )
+    for name in parts[0]:
+        print(f"    {name:9} {statistics.median(part[name] for part in parts[1:]):6.2f}")
+    if other in medians:
+        ratio = medians["prune"] / medians[other]
+        print(f"prune / {other}: {ratio:.2f}, target at most {TARGET_RATIO[other]:g}")
+    print(f"memory: {peaks['prune']:.0f} MB, target at most {TARGET_MEMORY[other]:g}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,384 @@
+"""How good the pictures of a pruned scene are, and the table of it for a scene and some methods.
+
+Pictures are compared clipped to 0..1, as a screen shows them:
+
+- PSNR in dB, the mean over views of each view's. Identical images count as 100 dB rather than
+  infinity, so that one view in which nothing changed does not hide the others.
+- SSIM (Wang et al. 2004: Gaussian window of sigma 1.5), 1 is identical.
+- FLIP (Andersson et al. 2020), at its default 67 pixels per degree, 0 is identical. It needs the
+  package ``flip-evaluator``; without it the others are still measured.
+
+::
+
+    python -m benchmarks.tables.evaluate SCENE_DIR --method closed-form lightgaussian --ratios .3 .5
+
+SCENE_DIR holds ``point_cloud.ply``, ``cameras.json`` and, optionally, ``split.json`` (``{"train":
+[names], "test": [names]}``; without it every 8th view is held out) and ``images/NAME.png`` or
+``.jpg``. The train views decide what goes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numba
+import numpy as np
+from PIL import Image
+from skimage.metrics import structural_similarity
+
+from refine_addon.core.cameras.read import read_cameras
+from refine_addon.core.errors import RefineError
+from refine_addon.core.formats.ply import read_ply
+from refine_addon.core.pipeline import Settings, score
+from refine_addon.core.scores import Scores
+from refine_addon.core.selection import Budget, select
+
+from ..baselines.rendered import BASELINES, RENDERED
+from ..renderer import rasterizer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from refine_addon.core.splats import Splats
+    from refine_addon.core.views import ViewSet
+
+    from ..renderer.rasterizer import Statistics
+
+PSNR_CAP = 100.0
+"""What identical images count as, dB; for comparison, rounding to 8 bits alone makes 59 dB."""
+METRICS = ("psnr", "ssim", "flip")
+HELD_OUT = 8
+"""Without a split, every 8th view is held out, the first among them."""
+PICTURE_TYPES = (".png", ".jpg", ".jpeg", ".JPG")
+FLIP_MISSING = "FLIP needs the package flip-evaluator: pip install flip-evaluator"
+
+
+@dataclass(frozen=True, eq=False)
+class Quality:
+    """Each metric for each view; all of one length.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The views.
+    values : dict of str to (V,) float64
+        Metric ("psnr", "ssim", "flip") -> its value in every view.
+    """
+
+    names: tuple[str, ...]
+    values: dict[str, NDArray[np.float64]]
+
+    @property
+    def mean(self) -> dict[str, float]:
+        """Mean over the views of each metric."""
+        return {metric: float(np.mean(values)) for metric, values in self.values.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What `Evaluator.evaluate` measures.
+
+    Attributes
+    ----------
+    renders : Quality
+        Against renders of the original splats.
+    pictures : Quality or None
+        Against pictures, for the views that have one.
+    """
+
+    renders: Quality
+    pictures: Quality | None
+
+
+class Evaluator:
+    """Judges changed versions of one scene; the original is rendered once.
+
+    Parameters
+    ----------
+    original : Splats
+    views : ViewSet
+        The views to judge by.
+    pictures : mapping of str to (H, W, 3) floating, optional
+        Name of a view -> its picture, 0..1.
+    metrics : sequence of str
+        Among `METRICS`.
+    near : float
+        Near plane, world units.
+    """
+
+    def __init__(
+        self,
+        original: Splats,
+        views: ViewSet,
+        pictures: Mapping[str, NDArray[np.float64]] | None = None,
+        *,
+        metrics: Sequence[str] = METRICS[:2],
+        near: float = 0.2,
+    ) -> None:
+        """Render the original from every view.
+
+        Raises
+        ------
+        ModuleNotFoundError
+            If FLIP is asked for and not installed.
+        ValueError
+            If a picture is not of its view's size.
+        """
+        if "flip" in metrics and not flip_installed():
+            raise ModuleNotFoundError(FLIP_MISSING)
+        self.views = views
+        self.metrics = tuple(metrics)
+        self.near = near
+        self.pictures = dict(pictures or {})
+        for view in views:
+            shape = self.pictures.get(view.name, np.empty((view.height, view.width, 3))).shape
+            if shape != (view.height, view.width, 3):
+                msg = f"picture of view {view.name!r} is {shape}, expected {view.width} columns, "
+                msg += f"{view.height} rows, 3 channels"
+                raise ValueError(msg)
+        self.references = self._render(original)
+
+    def evaluate(self, changed: Splats) -> Evaluation:
+        """Compare pictures of `changed` with those of the original and with the real ones."""
+        images = self._render(changed)
+        names = tuple(view.name for view in self.views)
+        pairs = [(n, image, self.pictures[n]) for n, image in images.items() if n in self.pictures]
+        renders = [(n, images[n], self.references[n]) for n in names]
+        return Evaluation(self._quality(renders), self._quality(pairs) if pairs else None)
+
+    def psnr(self, splats: Splats, scores: Scores, ratios: Sequence[float]) -> tuple[float, ...]:
+        """Return the mean PSNR, dB, against the original with each share removed by `scores`."""
+        kept = (splats.take(select(scores, Budget(ratio=ratio))) for ratio in ratios)
+        return tuple(float(self.evaluate(left).renders.mean["psnr"]) for left in kept)
+
+    def _render(self, splats: Splats) -> dict[str, NDArray[np.float64]]:
+        prepared = rasterizer.gaussians_of(splats)
+        return {
+            view.name: np.clip(rasterizer.render(prepared, view, near=self.near), 0.0, 1.0)
+            for view in self.views
+        }
+
+    def _quality(
+        self, pairs: Iterable[tuple[str, NDArray[np.float64], NDArray[np.float64]]]
+    ) -> Quality:
+        rows = [(name, compare(image, other, self.metrics)) for name, image, other in pairs]
+        return Quality(
+            tuple(name for name, _ in rows),
+            {metric: np.array([row[metric] for _, row in rows]) for metric in self.metrics},
+        )
+
+
+def compare(
+    image: NDArray[np.float64], reference: NDArray[np.float64], metrics: Sequence[str]
+) -> dict[str, float]:
+    """Compare two images.
+
+    Parameters
+    ----------
+    image, reference : (H, W, 3) floating
+        0..1, sRGB.
+    metrics : sequence of str
+        Among `METRICS`.
+
+    Examples
+    --------
+    >>> black = np.zeros((16, 16, 3))
+    >>> compare(black + 0.1, black, ["psnr"])["psnr"].__round__(6)
+    20.0
+    >>> compare(black, black, ["psnr", "ssim"])
+    {'psnr': 100.0, 'ssim': 1.0}
+    """
+    measure = {"psnr": _psnr, "ssim": _ssim, "flip": _flip}
+    return {metric: measure[metric](image, reference) for metric in metrics}
+
+
+def flip_installed() -> bool:
+    """Say whether FLIP can be measured here."""
+    return importlib.util.find_spec("flip_evaluator") is not None
+
+
+def _psnr(image: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
+    error = float(np.mean((image - reference) ** 2))
+    return PSNR_CAP if error == 0.0 else min(PSNR_CAP, -10.0 * float(np.log10(error)))
+
+
+def _ssim(image: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
+    return float(
+        structural_similarity(
+            image,
+            reference,
+            data_range=1.0,
+            channel_axis=2,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+        )
+    )
+
+
+def _flip(image: NDArray[np.float64], reference: NDArray[np.float64]) -> float:
+    import flip_evaluator  # noqa: PLC0415 - optional
+
+    arrays = (np.ascontiguousarray(a, np.float32) for a in (reference, image))
+    return float(flip_evaluator.evaluate(*arrays, "LDR", applyMagma=False)[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A benchmark scene.
+
+    Attributes
+    ----------
+    splats : Splats
+    train, test : ViewSet
+        The views that decide, and those held out.
+    pictures : dict of str to (H, W, 3) float64
+        Name of a view -> its picture, 0..1; empty where there are none.
+    """
+
+    splats: Splats
+    train: ViewSet
+    test: ViewSet
+    pictures: dict[str, NDArray[np.float64]]
+
+
+def read_scene(folder: Path | str) -> Scene:
+    """Read a folder as the module's docstring describes it.
+
+    Raises
+    ------
+    RefineError
+        If a file is missing or not what it should be.
+    """
+    folder = Path(folder)
+    views = read_cameras(folder / "cameras.json")
+    train, test = _split(folder / "split.json", [view.name for view in views])
+    pictures = {}
+    for name in [*train, *test]:
+        files = [folder / "images" / f"{name}{suffix}" for suffix in PICTURE_TYPES]
+        # Names may bring their own suffix.
+        files.append(folder / "images" / name)
+        found = next((file for file in files if file.is_file()), None)
+        if found is not None:
+            pictures[name] = np.asarray(Image.open(found).convert("RGB"), np.float64) / 255.0
+    splats = read_ply(folder / "point_cloud.ply").splats()
+    return Scene(splats, views.select(train), views.select(test), pictures)
+
+
+def _split(file: Path, names: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the names of the train and of the test views."""
+    if not file.exists():
+        return [name for k, name in enumerate(names) if k % HELD_OUT], list(names[::HELD_OUT])
+    try:
+        split = json.loads(file.read_text(encoding="utf-8"))
+        return split["train"], split["test"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        msg = f"{file}: expected lists of names 'train' and 'test' ({error!r})"
+        raise RefineError(msg) from error
+
+
+def scores_of(method: str, scene: Scene, statistics: Statistics | None) -> Scores:
+    """Score a scene by a baseline, or by a method of the core under its name.
+
+    Raises
+    ------
+    RefineError
+        If there is no such method.
+    """
+    if method in BASELINES:
+        values = BASELINES[method](scene.splats, scene.train, statistics)
+        return Scores(values, np.zeros(len(values), np.int32), len(scene.train), 0)
+    return score(scene.splats, scene.train, Settings(method=method))
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the table; return the exit code."""
+    options = _parse(arguments)
+    numba.set_num_threads(min(options.threads or numba.get_num_threads(), numba.get_num_threads()))
+    if "flip" in options.metrics and not flip_installed():
+        sys.stderr.write(f"{FLIP_MISSING}\n")
+        options.metrics.remove("flip")
+    try:
+        _measure(options)
+    except (RefineError, ValueError) as error:
+        sys.stderr.write(f"{error}\n")
+        return 1
+    return 0
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    summary = (__doc__ or "").split("\n", maxsplit=1)[0]
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.tables.evaluate", description=summary
+    )
+    parser.add_argument("scene", type=Path, metavar="SCENE_DIR")
+    parser.add_argument("--ratios", type=float, nargs="+", default=[0.3, 0.5, 0.7, 0.9])
+    parser.add_argument("--views", choices=["test", "train"], default="test", help="judged by")
+    parser.add_argument(
+        "--method",
+        nargs="+",
+        default=[Settings().method],
+        help=f"of the core, or {', '.join(BASELINES)}; default: %(default)s",
+    )
+    parser.add_argument("--metrics", nargs="+", choices=METRICS, default=list(METRICS))
+    parser.add_argument("--threads", type=int, help="for rendering; default: all")
+    return parser.parse_args(arguments)
+
+
+def _measure(options: argparse.Namespace) -> None:
+    """Score, prune, render, compare and print a line for each method and ratio."""
+    scene = read_scene(options.scene)
+    views = getattr(scene, options.views)
+    evaluator = Evaluator(scene.splats, views, scene.pictures, metrics=options.metrics)
+    print(
+        f"{options.scene}: {len(scene.splats)} splats, {len(scene.train)} views decide, "
+        f"{len(views)} {options.views} views judge"
+    )
+    print(_heading(options.metrics, pictures=any(view.name in scene.pictures for view in views)))
+    print(_line("unpruned", "0", "", evaluator.evaluate(scene.splats)))
+    statistics, rendering = None, 0.0
+    if RENDERED.intersection(options.method):
+        start = time.perf_counter()
+        statistics = rasterizer.accumulate_statistics(scene.splats, scene.train)
+        rendering = time.perf_counter() - start
+    for method in options.method:
+        start = time.perf_counter()
+        scores = scores_of(method, scene, statistics)
+        seconds = time.perf_counter() - start + (rendering if method in RENDERED else 0.0)
+        for ratio in options.ratios:
+            keep = select(scores, Budget(ratio=ratio))
+            found = evaluator.evaluate(scene.splats.take(keep))
+            print(_line(method, f"{ratio:g}", f"{seconds:.2f}", found), flush=True)
+
+
+def _heading(metrics: Sequence[str], *, pictures: bool) -> str:
+    """Return the two lines over the table."""
+    names = "".join(f"{name.upper():>9}" for name in metrics)
+    width = len(names)
+    first = f"{'':40}{'vs unpruned':>{width}}" + (f"   {'vs pictures':>{width}}" * pictures)
+    second = f"{'method':20}{'removed':>10}{'score s':>10}{names}" + f"   {names}" * pictures
+    return f"{first}\n{second}"
+
+
+def _line(method: str, ratio: str, seconds: str, found: Evaluation) -> str:
+    """Return one line of the table."""
+    text = f"{method:20}{ratio:>10}{seconds:>10}" + _numbers(found.renders)
+    return text if found.pictures is None else f"{text}   {_numbers(found.pictures)}"
+
+
+def _numbers(quality: Quality) -> str:
+    digits = {"psnr": 2, "ssim": 4, "flip": 4}
+    return "".join(f"{value:9.{digits[name]}f}" for name, value in quality.mean.items())
+
+
+if __name__ == "__main__":
+    sys.exit(main())

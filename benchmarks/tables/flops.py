@@ -1,0 +1,223 @@
+"""Floating-point operations of scoring, for a splat and a view: by the formulas, and counted.
+
+`ANALYTIC` is the count by hand of what the closed form's code does. `count` runs the code itself
+with arrays that count: every element that an arithmetic function makes is one operation, of
+whatever kind (a root or an exponential counts as one, as does a comparison of two floats); a sum of
+n is n - 1; a matrix product as many as its sums and products. Copies, selections, sorting, integers
+and booleans count nothing. What the core computes once for a splat and what it computes for each
+view are told apart by counting with 16 views and with 32.
+"""
+
+from __future__ import annotations
+
+import sys
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, get_args, get_type_hints
+
+import numpy as np
+
+from refine_addon.core import pipeline
+from refine_addon.core.pipeline import Settings
+from refine_addon.core.scoring.closed_form import ClosedForm
+from refine_addon.core.splats import Splats
+
+from ..renderer import rasterizer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from refine_addon.core.views import ViewSet
+
+ANALYTIC = {
+    "x', y', z: three rows of four products and three sums": {"z": 21, "distance": 21},
+    "abs(x'), abs(y'), their maximum, two comparisons: the frustum": {"z": 5, "distance": 5},
+    "d^2: z z, or three differences, products and sums": {"z": 1, "distance": 9},
+    "+ eta, the division, weight and sum": {"z": 4, "distance": 4},
+}
+"""Term -> operations of a splat and a view, for each reading of the depth."""
+
+PER_HIT = 34
+"""Operations of the reference renderer for a splat in a pixel, least: 16 for alpha (offset 4, form
+7, exponential and its factor, opacity, clamp, cut), 2 for T, 11 for colour, 5 for statistics."""
+
+MOST_SPLATS = 50_000
+"""How many splats are counted at most, at random: counting is slow, and the counts are averages."""
+
+NOT_COUNTED = frozenset(
+    {"logical_and", "logical_or", "logical_not", "isfinite", "isnan", "copyto", "signbit"}
+)
+
+
+class Counting(np.ndarray):
+    """An array whose arithmetic is counted, in `total`."""
+
+    total: ClassVar[int] = 0
+
+    def __array_ufunc__(  # noqa: D105
+        self,
+        ufunc: np.ufunc,
+        method: str,
+        *inputs: Any,  # noqa: ANN401
+        out: Any = None,  # noqa: ANN401
+        **options: Any,  # noqa: ANN401
+    ) -> Any:  # noqa: ANN401
+        plain = [_plain(value) for value in inputs]
+        if out is not None:
+            options["out"] = tuple(_plain(value) for value in out)
+        if "where" in options:
+            options["where"] = _plain(options["where"])
+        result = getattr(ufunc, method)(*plain, **options)
+        if ufunc.__name__ not in NOT_COUNTED and any(map(_floating, [*plain, result])):
+            Counting.total += _operations(ufunc, method, plain, result)
+        return _counting(result) if out is None else out[0] if len(out) == 1 else out
+
+    def __array_function__(self, function: Any, types: Any, args: Any, kwargs: Any) -> Any:  # noqa: ANN401, D105
+        del types
+        if function is np.einsum:
+            operands = [_plain(value) for value in args[1:]]
+            result = np.einsum(args[0], *operands, **kwargs)
+            sizes = {}
+            for letters, operand in zip(args[0].split("->")[0].split(","), operands, strict=True):
+                sizes.update(zip(letters, operand.shape, strict=True))
+            Counting.total += len(operands) * int(np.prod(list(sizes.values()))) - np.size(result)
+            return _counting(result)
+        if function in (np.bincount, np.cumsum, np.interp):
+            Counting.total += np.size(args[0])
+        plain = [_plain(value) for value in args]
+        if function in (np.bincount, np.cumsum, np.interp):
+            return _counting(function(*plain, **{k: _plain(v) for k, v in kwargs.items()}))
+        return super().__array_function__(function, (Counting,), args, kwargs)
+
+    def cumsum(self, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
+        """Count what the C code of `ndarray` would do unseen."""
+        return np.cumsum(self, *args, **kwargs)
+
+
+@dataclass(frozen=True)
+class Count:
+    """Operations of one method: for each splat once, and for each splat and view."""
+
+    method: str
+    per_splat: float
+    per_splat_view: float
+
+
+@dataclass(frozen=True)
+class Counts:
+    """The table.
+
+    Attributes
+    ----------
+    methods : list of Count
+    failed : dict of str to str
+        Method -> why it could not be counted.
+    splats, views : int
+    hits_per_splat_view : float
+        Pixels in which a splat is drawn, over splats and views: what rendering pays for.
+    """
+
+    methods: list[Count]
+    failed: dict[str, str]
+    splats: int
+    views: int
+    hits_per_splat_view: float
+
+
+def measure(splats: Splats, views: ViewSet) -> Counts:
+    """Count every method of the core, and the hits of rendering."""
+    settings = {
+        "refine-z": Settings(views=0, closed_form=ClosedForm.published("z")),
+        "refine-distance": Settings(views=0, closed_form=ClosedForm.published("distance")),
+    }
+    for name in get_args(get_type_hints(Settings)["method"]):
+        if name != "auto":  # runs the others, as often as its probes ask for
+            settings[name] = Settings(views=0, method=name)
+    if len(splats) > MOST_SPLATS:
+        drawn = np.random.default_rng(0).choice(len(splats), MOST_SPLATS, replace=False)
+        sample = splats.take(np.sort(drawn))
+    else:
+        sample = splats
+    few, many = (views.take(np.arange(n) % len(views)) for n in (16, 32))
+    found, failed = [], {}
+    for name, each in settings.items():
+        try:
+            less, more = (count(sample, v, each) / len(sample) for v in (few, many))
+        except (TypeError, ValueError, AttributeError, IndexError) as error:
+            failed[name] = f"{type(error).__name__}: {error}"
+            continue
+        per_view = (more - less) / 16
+        found.append(Count(name, less - 16 * per_view, per_view))
+        print(f"  {name}: {per_view:.1f} operations a splat and view", flush=True)
+    statistics = rasterizer.accumulate_statistics(splats, few)
+    hits = float(np.sum(statistics.hits)) / len(splats) / len(few)
+    return Counts(found, failed, len(splats), len(views), hits)
+
+
+def count(splats: Splats, views: ViewSet, settings: Settings) -> int:
+    """Return how many operations scoring takes."""
+    arrays = {name: np.asarray(value).view(Counting) for name, value in vars(splats).items()}
+    with _counted():
+        Counting.total = 0
+        pipeline.score(Splats(**arrays), views, settings, threads=1)
+        return Counting.total
+
+
+@contextmanager
+def _counted() -> Iterator[None]:
+    """Let every module of the core make arrays that count."""
+    modules = [
+        module
+        for name, module in sys.modules.items()
+        if name.startswith("refine_addon.core") and getattr(module, "np", None) is np
+    ]
+    counting = _CountingNumPy()
+    for module in modules:
+        module.np = counting  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        for module in modules:
+            module.np = np  # type: ignore[attr-defined]
+
+
+class _CountingNumPy:
+    """NumPy, but the arrays it makes count."""
+
+    MAKERS: ClassVar[frozenset[str]] = frozenset(
+        {"ones", "zeros", "empty", "full", "array", "asarray", "ascontiguousarray", "arange",
+         "linspace", "stack", "concatenate", "hstack", "column_stack"}
+    )  # fmt: skip
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401
+        value = getattr(np, name)
+        if name not in self.MAKERS:
+            return value
+        return lambda *args, **kwargs: _counting(value(*args, **kwargs))
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401
+    return value.view(np.ndarray) if isinstance(value, Counting) else value
+
+
+def _counting(value: Any) -> Any:  # noqa: ANN401
+    if isinstance(value, tuple):
+        return tuple(map(_counting, value))
+    return value.view(Counting) if isinstance(value, np.ndarray) else value
+
+
+def _floating(value: Any) -> bool:  # noqa: ANN401
+    return np.issubdtype(getattr(value, "dtype", type(value)), np.inexact)
+
+
+def _operations(ufunc: np.ufunc, method: str, inputs: list[Any], result: Any) -> int:  # noqa: ANN401
+    """Return how many operations one call is."""
+    if isinstance(result, tuple):
+        result = result[0]
+    if ufunc is np.matmul:
+        return (2 * inputs[0].shape[-1] - 1) * int(np.size(result))
+    if method == "reduce":
+        return int(np.size(inputs[0])) - int(np.size(result))
+    if method == "at":
+        return int(np.size(inputs[1]))
+    return int(np.size(result if result is not None else inputs[0]))

@@ -1,0 +1,215 @@
+"""Everything that the trade measures, under one name each: from splats and views to fewer splats.
+
+A method either scores, once for all budgets, or reduces to one budget at a time. What the core
+offers is asked of its `Settings`, so that a method that is added there is measured here.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+
+import numpy as np
+
+from benchmarks.baselines import merging, splat_transform
+from refine_addon.core import pipeline
+from refine_addon.core.formats.ply import read_ply
+from refine_addon.core.pipeline import Settings
+from refine_addon.core.scores import Scores
+from refine_addon.core.scoring.closed_form import ClosedForm
+from refine_addon.core.selection import Budget
+from refine_addon.core.splats import Splats
+
+from ..baselines.rendered import BASELINES, RENDERED
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from refine_addon.core.views import ViewSet
+
+    from ..renderer.rasterizer import Statistics
+
+OURS, LITERATURE, EXTERNAL = "ours", "literature", "external"
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """What every method gets.
+
+    Attributes
+    ----------
+    splats : Splats
+        In memory.
+    views : ViewSet
+        The views that decide.
+    file : Path
+        The splats as a file, for other programs.
+    """
+
+    splats: Splats
+    views: ViewSet
+    file: Path
+
+
+@dataclass(frozen=True, eq=False)
+class Method:
+    """One way to get rid of splats; exactly one of the three functions is set.
+
+    Attributes
+    ----------
+    name : str
+    group : {"ours", "literature", "external"}
+    about : str
+        What it is, in one line.
+    score : callable, optional
+        ``(task, statistics) -> Scores``.
+    reduce : callable, optional
+        ``(task, keep_count, ratio) -> Splats``.
+    run : callable, optional
+        ``(task, keep_count) -> (Splats, Run)``: another program, which is timed by itself.
+    rendered : bool
+        Whether `score` needs the statistics of rendered views, whose time counts as its own.
+    """
+
+    name: str
+    group: str
+    about: str
+    score: Callable[[Task, Statistics | None], Scores] | None = None
+    reduce: Callable[[Task, int, float], Splats] | None = None
+    run: Callable[[Task, int], tuple[Splats, splat_transform.Run]] | None = None
+    rendered: bool = False
+
+
+def everything() -> list[Method]:
+    """Return all methods that can be measured here, in the order of the tables."""
+    return [*_baselines(), *_merging(), *_external(), *_published(), *_core()]
+
+
+ABOUT = {
+    "random": "uniformly at random",
+    "opacity": "lowest opacity first",
+    "lightgaussian": "LightGaussian: sum of opacity T over pixels x (V / V90)^0.1",
+    "mesongs": "MesonGS: sum of alpha T over pixels x (V / V90)^0.1",
+    "radsplat": "RadSplat: largest alpha T of any pixel",
+    "pup-3dgs": "PUP 3D-GS: log det of the Fisher matrix of mean and scale, by rendered gradients",
+    "removal-error": "squared error of the pictures without this one splat, exactly",
+}
+
+
+def _baselines() -> list[Method]:
+    """Return the scores of the literature."""
+    methods = []
+    for name, function in BASELINES.items():
+
+        def score(task: Task, statistics: Statistics | None, function: Any = function) -> Scores:  # noqa: ANN401
+            return as_scores(function(task.splats, task.views, statistics), len(task.views))
+
+        about = ABOUT.get(name, name)
+        methods.append(Method(name, LITERATURE, about, score=score, rendered=name in RENDERED))
+    return methods
+
+
+def _merging() -> list[Method]:
+    """Return GHAP's mixture reduction in both dresses."""
+    about = {
+        "nearest": "GHAP's clusters by blocks; of each the splat nearest to its centre stays",
+        "moments": "GHAP's clusters by blocks; each becomes one splat by matching moments",
+    }
+    methods = []
+    for dress, text in about.items():
+
+        def reduce(task: Task, keep_count: int, ratio: float, dress: Any = dress) -> Splats:  # noqa: ANN401
+            del ratio
+            return merging.reduce(task.splats, keep_count, dress)
+
+        methods.append(Method(f"ghap-{dress}", LITERATURE, text, reduce=reduce))
+    return methods
+
+
+def _external() -> list[Method]:
+    """Return splat-transform's two decimations, where it is installed."""
+    if splat_transform.find() is None:
+        return []
+    methods = []
+    for flag in splat_transform.FLAGS:
+
+        def run(
+            task: Task, keep_count: int, flag: str = flag
+        ) -> tuple[Splats, splat_transform.Run]:
+            with tempfile.TemporaryDirectory() as folder:
+                target = Path(folder) / "decimated.ply"
+                done = splat_transform.decimate(task.file, target, flag, keep_count)
+                return in_memory(read_ply(target).splats()), done
+
+        about = f"PlayCanvas splat-transform {splat_transform.version()} {flag}, file to file"
+        name = f"splat-transform{flag.removeprefix('--decimate')}"
+        methods.append(Method(name, EXTERNAL, about, run=run))
+    return methods
+
+
+def _published() -> list[Method]:
+    """Return both published readings of the closed form."""
+    readings = {"z": "the paper's formulas", "distance": "its authors' public code"}
+    return [
+        _scoring(
+            f"refine-{depth}",
+            LITERATURE,
+            f"REFINE's closed form, {text} (`--published {depth}`)",
+            Settings(views=0, closed_form=ClosedForm.published(depth)),
+        )
+        for depth, text in readings.items()
+    ]
+
+
+CORE_ABOUT = {
+    "closed-form": "closed form with frustum test, free of units: the default",
+    "occlusion": "froxels: transmittance and contrast without rendering, in rounds",
+    "auto": "the cheapest model that agrees with the full one",
+}
+
+
+def _core() -> list[Method]:
+    """Return every method of `Settings`, and absorbing, which is the same for all of them."""
+    methods = []
+    for name in get_args(get_type_hints(Settings)["method"]):
+        about = CORE_ABOUT.get(name, f"method '{name}'")
+        methods.append(_scoring(name, OURS, about, Settings(views=0, method=name)))
+    about = "`--absorb`: survivors absorb what goes, by what the views see of each"
+    return [*methods, Method("occlusion+absorb", OURS, about, reduce=_absorb)]
+
+
+def _absorb(task: Task, keep_count: int, ratio: float) -> Splats:
+    del ratio
+    budget = Budget(keep=keep_count)
+    settings = Settings(views=0, method="occlusion")
+    result = pipeline.prune(task.splats, task.views, budget, settings, absorb=True)
+    return task.splats.take(result.keep) if result.absorbed is None else result.absorbed.splats
+
+
+def _scoring(name: str, group: str, about: str, settings: Settings) -> Method:
+    def score(task: Task, statistics: Statistics | None) -> Scores:
+        del statistics
+        return pipeline.score(task.splats, task.views, settings)
+
+    return Method(name, group, about, score=score)
+
+
+def as_scores(values: np.ndarray[Any, np.dtype[np.float64]], views: int) -> Scores:
+    """Return plain values as `Scores`, by rank: float32 could not tell all of them apart."""
+    places = np.empty(len(values), np.float32)
+    places[np.argsort(values, kind="stable")] = np.arange(len(values))
+    return Scores(places, np.zeros(len(values), np.int32), views, 0)
+
+
+def in_memory(splats: Splats) -> Splats:
+    """Return a copy that no longer lies in a file."""
+    return Splats(
+        **{
+            field.name: np.array(getattr(splats, field.name), order="C").astype(
+                getattr(splats, field.name).dtype.newbyteorder("=")
+            )
+            for field in fields(Splats)
+        }
+    )

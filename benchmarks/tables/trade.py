@@ -1,0 +1,308 @@
+"""The trade between quality, time and memory, measured: writes docs/trade.md and its plots.
+
+    python -m benchmarks.tables.trade [SCENE_DIR ...]
+
+SCENE_DIR is any folder that `benchmarks.evaluate` reads: ``point_cloud.ply``, ``cameras.json``, and
+optionally ``split.json`` and ``images``. Without one, the committed room is measured.
+
+All methods get the same splats in memory and the same scoring views: those that are not held out,
+at most ``--views``, spread evenly. Time is that of scoring and pruning, the median of ``--runs``
+runs (fewer where one takes long), after one on a single view that does not count and compiles what
+is compiled. Memory is what the process had at its peak beyond what it had before.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import statistics
+import sys
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.baselines import splat_transform
+from benchmarks.renderer import rasterizer
+from refine_addon.core.errors import RefineError
+from refine_addon.core.selection import Budget, select
+
+from . import ablation, cheaper, evaluate, flops, hessian, methods, trade_report
+from .methods import Method, Task
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from refine_addon.core.scores import Scores
+    from refine_addon.core.splats import Splats
+    from refine_addon.core.views import ViewSet
+
+    from ..renderer.rasterizer import Statistics
+
+ROOT = Path(__file__).resolve().parents[2]
+ROOM = ROOT / "tests/data/room_small"
+PATIENCE = 40.0
+"""Seconds after which nothing is run once more for the median."""
+PARTS = ("methods", "cheaper", "ablation", "flops", "hessian")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What something took.
+
+    Attributes
+    ----------
+    seconds : float
+        Median of the runs.
+    runs : int
+    peak_bytes : int or None
+        Beyond what was held before; of a program of its own, all it had. None: not to be had here.
+    """
+
+    seconds: float
+    runs: int
+    peak_bytes: int | None
+
+    def plus(self, other: Cost) -> Cost:
+        """Return the cost of doing both, one after the other."""
+        peaks = [peak for peak in (self.peak_bytes, other.peak_bytes) if peak is not None]
+        runs = min(self.runs, other.runs)
+        return Cost(self.seconds + other.seconds, runs, max(peaks, default=None))
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One method at one ratio.
+
+    Attributes
+    ----------
+    kept, asked : int
+        How many splats are left, and how many should be.
+    quality : dict of (views, reference) to dict of str to float
+        Views "held-out" or "scoring", reference "renders" or "pictures" -> metric -> mean.
+    """
+
+    method: Method
+    ratio: float
+    kept: int
+    asked: int
+    cost: Cost
+    quality: dict[tuple[str, str], dict[str, float]]
+
+
+@dataclass(eq=False)
+class Measured:
+    """All that was measured of one scene."""
+
+    name: str
+    facts: dict[str, str]
+    rows: list[Row] = field(default_factory=list)
+    unpruned: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
+    cheaper: list[cheaper.Line] = field(default_factory=list)
+    ablation: list[ablation.Line] = field(default_factory=list)
+    flops: flops.Counts | None = None
+    hessian: hessian.Energies | None = None
+    failed: list[str] = field(default_factory=list)
+
+
+class Judge:
+    """Compares reduced splats from held-out and from scoring views."""
+
+    def __init__(
+        self, scene: evaluate.Scene, scoring: ViewSet, options: argparse.Namespace
+    ) -> None:
+        judged = {"held-out": scene.test, "scoring": scoring.spread(options.judged)}
+        self.evaluators = {
+            name: evaluate.Evaluator(scene.splats, views, scene.pictures, metrics=options.metrics)
+            for name, views in judged.items()
+        }
+
+    def __call__(self, splats: Splats) -> dict[tuple[str, str], dict[str, float]]:
+        """Return the mean of every metric."""
+        found = {}
+        for name, evaluator in self.evaluators.items():
+            evaluation = evaluator.evaluate(splats)
+            found[name, "renders"] = evaluation.renders.mean
+            if evaluation.pictures is not None:
+                found[name, "pictures"] = evaluation.pictures.mean
+        return found
+
+
+def measured(work: Callable[[], Any], runs: int) -> tuple[Any, Cost]:
+    """Do `work` up to `runs` times; return its last result and what it took."""
+    seconds, peak, result = [], None, None
+    while len(seconds) < runs and (not seconds or sum(seconds) < PATIENCE):
+        result = None
+        gc.collect()
+        before = _start_peak()
+        start = time.perf_counter()
+        result = work()
+        seconds.append(time.perf_counter() - start)
+        after = splat_transform.memory("VmHWM")
+        if before is not None and after is not None:
+            peak = max(peak or 0, after - before)
+    return result, Cost(statistics.median(seconds), len(seconds), peak)
+
+
+def _start_peak() -> int | None:
+    """Forget the peak of this process's memory; return what it holds now."""
+    try:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    except OSError:
+        return None
+    return splat_transform.memory("VmRSS")
+
+
+def measure_method(
+    method: Method, task: Task, ratios: Sequence[float], judge: Judge, runs: int,
+    rendering: tuple[Statistics | None, Cost],
+) -> list[Row]:  # fmt: skip
+    """Measure one method at all ratios."""
+    rows = []
+    scores, scoring = None, Cost(0.0, runs, None)
+    if method.score is not None:
+        score = method.score
+        scores, scoring = measured(lambda: score(task, rendering[0]), runs)
+        if method.rendered:
+            scoring = scoring.plus(rendering[1])
+    for ratio in ratios:
+        asked = len(task.splats) - (Budget(ratio=ratio).removals(len(task.splats)) or 0)
+        left, cost = _reduced(method, task, (ratio, asked), scores, runs)
+        cost = cost.plus(scoring) if scores is not None else cost
+        rows.append(Row(method, ratio, len(left), asked, cost, judge(left)))
+        psnr = rows[-1].quality["held-out", "renders"]["psnr"]
+        print(f"  {method.name:28} {ratio:4.0%} {psnr:7.2f} dB {cost.seconds:8.2f} s", flush=True)
+    return rows
+
+
+def _reduced(
+    method: Method,
+    task: Task,
+    goal: tuple[float, int],
+    scores: Scores | None,
+    runs: int,
+) -> tuple[Splats, Cost]:
+    """Return what a method leaves at one ratio, and the cost of that besides its scores."""
+    ratio, keep_count = goal
+    if scores is not None:
+        budget = Budget(ratio=ratio)
+        return measured(lambda: task.splats.take(select(scores, budget)), runs)
+    if method.reduce is not None:
+        reduce = method.reduce
+        return measured(lambda: reduce(task, keep_count, ratio), runs)
+    found = [method.run(task, keep_count) for _ in range(runs)] if method.run else []
+    seconds = statistics.median(run.seconds for _, run in found)
+    return found[-1][0], Cost(seconds, runs, found[-1][1].peak_bytes)
+
+
+def measure(folder: Path, options: argparse.Namespace) -> Measured:
+    """Measure everything of one scene."""
+    scene = evaluate.read_scene(folder)
+    splats = methods.in_memory(scene.splats)
+    scoring = scene.train.spread(options.views)
+    task = Task(splats, scoring, folder / "point_cloud.ply")
+    found = Measured(folder.resolve().name, trade_report.facts(scene, scoring, options.judged))
+    judge = Judge(scene, scoring, options)
+    held_out = judge.evaluators["held-out"]
+    if "methods" in options.parts:
+        found.unpruned = judge(splats)
+        _measure_methods(task, judge, found, options)
+    # An hour's measurements are not lost because one of them fails; it is said, and is an error.
+    if "cheaper" in options.parts:
+        with _noted("cheaper", found.failed):
+            found.cheaper = cheaper.measure(task, held_out, options.ratios)
+    if "ablation" in options.parts:
+        with _noted("ablation", found.failed):
+            found.ablation = ablation.measure(task, held_out, options.ratios)
+    if "flops" in options.parts:
+        with _noted("flops", found.failed):
+            found.flops = flops.measure(splats, scoring)
+    if "hessian" in options.parts:
+        with _noted("hessian", found.failed):
+            found.hessian = hessian.measure(splats, scoring)
+    return found
+
+
+@contextmanager
+def _noted(what: str, failed: list[str]) -> Iterator[None]:
+    """Note what fails and go on."""
+    try:
+        yield
+    except (RefineError, ArithmeticError, LookupError, TypeError, ValueError) as error:
+        failed.append(f"{what}: {type(error).__name__}: {error}")
+        print(f"  {failed[-1]}", file=sys.stderr, flush=True)
+
+
+def _measure_methods(
+    task: Task, judge: Judge, found: Measured, options: argparse.Namespace
+) -> None:
+    """Measure all methods, or those asked for."""
+    chosen = [
+        method
+        for method in methods.everything()
+        if options.methods is None or method.name in options.methods
+    ]
+    _warm_up(task, chosen)
+    rendering: tuple[Statistics | None, Cost] = (None, Cost(0.0, options.runs, None))
+    if any(method.rendered for method in chosen):
+        rendering = measured(
+            lambda: rasterizer.accumulate_statistics(task.splats, task.views), options.runs
+        )
+    for method in chosen:
+        with _noted(method.name, found.failed):
+            found.rows += measure_method(
+                method, task, options.ratios, judge, options.runs, rendering
+            )
+
+
+def _warm_up(task: Task, chosen: Sequence[Method]) -> None:
+    """Compile what is compiled, on one view, so that no method pays for it."""
+    one = Task(task.splats.take(slice(0, 2000)), task.views.spread(1), task.file)
+    rasterizer.render_with_statistics(one.splats, one.views[0])
+    for method in chosen:
+        if method.name == "pup-3dgs" and method.score is not None:
+            method.score(one, None)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure the scenes and write the report; return the exit code."""
+    options = _parse(arguments)
+    if "flip" in options.metrics and not evaluate.flip_installed():
+        print(evaluate.FLIP_MISSING, file=sys.stderr)
+        options.metrics.remove("flip")
+    if splat_transform.find() is None:
+        print(splat_transform.MISSING, file=sys.stderr)
+    scenes = []
+    for folder in options.scenes:
+        print(folder, flush=True)
+        try:
+            scenes.append(measure(folder, options))
+        except (RefineError, ValueError) as error:
+            print(f"{folder}: {error}", file=sys.stderr)
+            return 1
+    trade_report.write(options.output, scenes, options)
+    print(f"wrote {options.output}")
+    return int(any(scene.failed for scene in scenes))
+
+
+def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    summary = (__doc__ or "").split("\n", maxsplit=1)[0]
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.tables.trade", description=summary)
+    parser.add_argument("scenes", type=Path, nargs="*", metavar="SCENE_DIR", default=[ROOM])
+    parser.add_argument("--ratios", type=float, nargs="+", default=[0.3, 0.5, 0.7, 0.9])
+    parser.add_argument("--methods", nargs="+", metavar="NAME", help="default: all")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--metrics", nargs="+", choices=evaluate.METRICS,
+                        default=list(evaluate.METRICS))  # fmt: skip
+    parser.add_argument("--runs", type=int, default=3, help="of which the median counts")
+    parser.add_argument("--views", type=int, default=64, help="that decide, at most; 0: all")
+    parser.add_argument("--judged", type=int, default=16, help="of them that judge, at most")
+    parser.add_argument("--output", type=Path, default=ROOT / "docs/trade.md")
+    options = parser.parse_args(arguments)
+    options.scenes = options.scenes or [ROOM]
+    return options
+
+
+if __name__ == "__main__":
+    sys.exit(main())

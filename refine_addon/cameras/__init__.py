@@ -1,0 +1,1 @@
+"""Blender's cameras as views, and views as Blender's cameras."""

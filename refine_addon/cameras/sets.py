@@ -1,0 +1,198 @@
+"""Sets of cameras: the view sets that a user can choose, and camera files as objects."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import bpy
+import numpy as np
+
+from ..core.errors import RefineError
+from ..core.views import View, ViewSet
+from .objects import SHEAR, camera_from_view, turned, view_from_camera, world_matrix
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+def create_cameras(
+    views: ViewSet, collection: bpy.types.Collection, *, upright: bool = False
+) -> list[bpy.types.Object]:
+    """Make a camera object of each view.
+
+    Parameters
+    ----------
+    views : ViewSet
+    collection : bpy.types.Collection
+        Where to link them.
+    upright : bool
+        See `camera_from_view`.
+
+    Returns
+    -------
+    list of bpy.types.Object
+        In the order of the views.
+    """
+    spread = float(np.sqrt(np.mean(np.var(views.centers, axis=0))))
+    cameras = [camera_from_view(view, upright=upright) for view in views]
+    for camera in cameras:
+        # Small enough to tell neighbours apart; a millimetre at least, to be seen at all.
+        camera.data.display_size = min(max(0.1 * spread, 1e-3), 1.0) if len(views) > 1 else 0.25
+        collection.objects.link(camera)
+    return cameras
+
+
+def visible_views(scene: bpy.types.Scene) -> ViewSet:
+    """Return the views of all visible cameras of a scene: the background command's default."""
+    with bpy.context.temp_override(scene=scene):
+        return views_from_scene(bpy.context, "VISIBLE")
+
+
+def views_from_frames(
+    context: bpy.types.Context,
+    frames: range,
+    splats: bpy.types.Object | None = None,
+) -> ViewSet:
+    """Return the active camera's view at each frame; an animated shot is a view set.
+
+    Cameras bound to timeline markers take over as they do when the shot is rendered. The frame and
+    the active camera are put back.
+
+    Parameters
+    ----------
+    context : bpy.types.Context
+    frames : range
+    splats : bpy.types.Object, optional
+        Object to be scored: where it moves itself (a turntable), the views move against it, so
+        that all see it where it is now.
+
+    Raises
+    ------
+    RefineError
+        If there is no frame, no active camera at one, or the object's scale is animated; and see
+        `view_from_camera`.
+    """
+    scene = context.scene
+    if not len(frames):
+        msg = f"no frames: the range starts at {frames.start} and ends at {frames.stop - 1}"
+        raise RefineError(msg)
+    now = world_matrix(splats, context.evaluated_depsgraph_get()) if splats else None
+    before = (scene.frame_current, scene.frame_subframe, scene.camera)
+    views = []
+    try:
+        for frame in frames:
+            scene.frame_set(frame)
+            depsgraph = context.evaluated_depsgraph_get()
+            view = view_from_camera(_active_camera(scene), scene, depsgraph)
+            if splats:
+                view = _against(view, splats, now, world_matrix(splats, depsgraph))
+            views.append(replace(view, name=f"{view.name}, frame {frame}"))
+    finally:
+        scene.frame_set(before[0], subframe=before[1])
+        scene.camera = before[2]
+    return ViewSet(tuple(views))
+
+
+def views_from_scene(
+    context: bpy.types.Context,
+    source: str,
+    *,
+    collection: bpy.types.Collection | None = None,
+    frames: range | None = None,
+    splats: bpy.types.Object | None = None,
+) -> ViewSet:
+    """Return the view set that a user chose.
+
+    Parameters
+    ----------
+    context : bpy.types.Context
+    source : {"ACTIVE", "SELECTED", "VISIBLE", "COLLECTION", "FRAMES"}
+    collection : bpy.types.Collection, optional
+        For COLLECTION: its cameras and those of the collections in it, hidden or not.
+    frames : range, optional
+        For FRAMES; by default the scene's.
+    splats : bpy.types.Object, optional
+        See `views_from_frames`.
+
+    Raises
+    ------
+    RefineError
+        If there is no such camera; and see `view_from_camera`.
+    """
+    scene = context.scene
+    if source == "FRAMES":
+        if frames is None:
+            frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+        return views_from_frames(context, frames, splats)
+    if source == "COLLECTION" and collection is None:
+        msg = "no cameras: choose the collection that holds them"
+        raise RefineError(msg)
+    context.view_layer.update()  # or the list of objects holds gaps where some were just removed
+    if source == "ACTIVE":
+        cameras = [_active_camera(scene)]
+    else:
+        cameras = chosen_cameras(context, source, collection)
+    if not cameras:
+        where = f"none is visible in scene '{scene.name}'"
+        if source == "SELECTED":
+            where = "none is selected"
+        elif source == "COLLECTION":
+            where = f"none is in collection '{collection.name}'"
+        msg = f"no cameras: {where}; scoring needs at least one"
+        raise RefineError(msg)
+    depsgraph = context.evaluated_depsgraph_get()
+    return ViewSet(tuple(view_from_camera(camera, scene, depsgraph) for camera in cameras))
+
+
+def chosen_cameras(
+    context: bpy.types.Context, source: str, collection: bpy.types.Collection | None
+) -> list[bpy.types.Object]:
+    """Return the cameras that a user chose, of any type; quick enough for drawing.
+
+    Parameters
+    ----------
+    context : bpy.types.Context
+    source : {"ACTIVE", "SELECTED", "VISIBLE", "COLLECTION"}
+    collection : bpy.types.Collection or None
+        See `views_from_scene`.
+    """
+    layer = context.view_layer
+    if source == "ACTIVE":
+        objects = [context.scene.camera]
+    elif source == "COLLECTION":
+        objects = collection.all_objects if collection else []
+    else:
+        objects = layer.objects
+    cameras = [obj for obj in objects if obj and obj.type == "CAMERA"]
+    if source == "SELECTED":
+        return [camera for camera in cameras if camera.select_get(view_layer=layer)]
+    if source == "VISIBLE":
+        return [camera for camera in cameras if camera.visible_get(view_layer=layer)]
+    return cameras
+
+
+def _active_camera(scene: bpy.types.Scene) -> bpy.types.Object:
+    if scene.camera is None:
+        msg = (
+            f"no cameras: scene '{scene.name}' has no active camera at frame "
+            f"{scene.frame_current}; set one, or choose other cameras"
+        )
+        raise RefineError(msg)
+    return scene.camera
+
+
+def _against(
+    view: View, obj: bpy.types.Object, now: NDArray[np.float64], then: NDArray[np.float64]
+) -> View:
+    """Return a view of another frame moved so that it sees the object where that is now."""
+    if np.array_equal(now, then):
+        return view
+    motion = now @ np.linalg.inv(then)
+    if np.abs(motion[:3, :3].T @ motion[:3, :3] - np.eye(3)).max() > SHEAR:
+        msg = (
+            f"object '{obj.name}': its scale is animated; the views of different frames then "
+            "see different splats: choose one frame"
+        )
+        raise RefineError(msg)
+    return turned(view, motion)

@@ -1,0 +1,1 @@
+"""Absorbing: survivors take over the splats that go."""

@@ -1,0 +1,219 @@
+"""What every camera format needs: numbers, lists and JSON checked, with the place in the error.
+
+A `Place` says where one is ("cameras.json: camera 3"), so that each check is one call and each
+error names the file, the place, what was found and what was expected.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NoReturn
+
+import numpy as np
+
+from ..errors import RefineError
+from ..views import View
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+LARGEST_NUMBER = 1e18
+"""No coordinate or focal length is larger: its square still fits 32-bit floating point."""
+
+SMALLEST_LENGTH = 1e-6
+"""No focal length (pixels) or scale is smaller, so that its inverse is a tame number."""
+
+LARGEST_SIDE = 1_000_000
+"""Pixels; no image is wider or higher."""
+
+NEGLIGIBLE = 1e-30
+"""Numbers below this are read as 0: products of two of them must not underflow."""
+
+ORTHONORMAL_TOLERANCE = 1e-3
+"""Largest entry of ``R Rᵀ - I`` that is still the rounding of a text file; as in `View`."""
+
+SNIFFED_BYTES = 4096
+"""How much of a file is read to see whether it can be JSON at all."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """A file and a place in it.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    where : str
+        The place, "" for the whole file.
+    """
+
+    path: Path
+    where: str = ""
+
+    def at(self, where: str) -> Place:
+        """Return a place further in."""
+        return Place(self.path, f"{self.where} {where}" if self.where else where)
+
+    def fail(self, problem: str) -> NoReturn:
+        """Raise the error of this place.
+
+        Raises
+        ------
+        RefineError
+            Always.
+        """
+        where = f"{self.where}: " if self.where else ""
+        msg = f"{self.path}: {where}{problem}"
+        raise RefineError(msg)
+
+    def number(self, value: object) -> float:
+        """Return `value` if it is a finite number of a sensible size."""
+        if not isinstance(value, (int, float)) or isinstance(value, bool):
+            self.fail(f"expected a number, got {described(value)}")
+        if not abs(value) <= LARGEST_NUMBER:  # also catches NaN, and integers beyond any float
+            self.fail(f"expected a finite number up to 1e18, got {described(value)}")
+        return float(value) if abs(value) >= NEGLIGIBLE else 0.0
+
+    def positive(self, value: object, what: str) -> float:
+        """Return `value` if it can be a length, which `what` names: 1e-6 to 1e18."""
+        number = self.number(value)
+        if number < SMALLEST_LENGTH:
+            self.fail(f"expected a positive {what}, got {described(value)}")
+        return number
+
+    def focal(self, value: object) -> float:
+        """Return `value` if it can be a focal length in pixels."""
+        return self.positive(value, "focal length in pixels")
+
+    def side(self, value: object) -> int:
+        """Return `value` if it can be a number of pixels: whole, though it may be written 800.0."""
+        number = self.number(value)
+        if not (number.is_integer() and 1 <= number <= LARGEST_SIDE):
+            self.fail(
+                f"expected a whole number of pixels from 1 to {LARGEST_SIDE}, "
+                f"got {described(value)}"
+            )
+        return int(number)
+
+    def text(self, value: object) -> str:
+        """Return `value` if it is a string."""
+        if not isinstance(value, str):
+            self.fail(f"expected a string, got {described(value)}")
+        return value
+
+    def numbers(self, value: object, count: int) -> list[float]:
+        """Return `value` if it is a list of `count` numbers."""
+        if not isinstance(value, list) or len(value) != count:
+            self.fail(f"expected a list of {count} numbers, got {described(value)}")
+        return [self.at(f"[{index}]").number(item) for index, item in enumerate(value)]
+
+    def matrix(self, value: object, rows: Sequence[int], columns: int) -> NDArray[np.float64]:
+        """Return `value` if it is a list of lists of numbers with one of these sizes."""
+        sizes = " or ".join(f"{count} x {columns}" for count in rows)
+        if not isinstance(value, list) or len(value) not in rows:
+            self.fail(f"expected a {sizes} matrix, got {described(value)}")
+        table = [self.at(f"row {index}").numbers(row, columns) for index, row in enumerate(value)]
+        return np.array(table, np.float64)
+
+    def members(self, value: object, required: Sequence[str] = ()) -> Mapping[str, Any]:
+        """Return `value` if it is a JSON object with these keys."""
+        if not isinstance(value, dict):
+            self.fail(f"expected an object, got {described(value)}")
+        missing = [key for key in required if key not in value]
+        if missing:
+            self.fail(f"missing {missing[0]!r}, expected the keys {', '.join(required)}")
+        return value
+
+    def rotation(self, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return `matrix` (3, 3) if it is orthonormal up to the rounding of a text file."""
+        # Without the first test, squares of large entries could overflow.
+        small = np.abs(matrix).max() <= 2  # noqa: PLR2004
+        if not small or np.abs(matrix @ matrix.T - np.eye(3)).max() > ORTHONORMAL_TOLERANCE:
+            self.fail(f"expected an orthonormal rotation, got {np.round(matrix, 6).tolist()}")
+        return matrix
+
+    def view(
+        self,
+        name: str,
+        rotation: NDArray[np.float64],
+        center: NDArray[np.float64],
+        focal: tuple[float, float],
+        principal: tuple[float, float],
+        size: tuple[int, int],
+    ) -> View:
+        """Return the view; what it refuses is refused with this place.
+
+        Parameters
+        ----------
+        name : str
+            As in the file; halves of surrogate pairs, which cannot be printed, become "?".
+        rotation : (3, 3) float64
+            World to camera (x right, y down, z forward).
+        center : (3,) float64
+            World units.
+        focal, principal : tuple of float
+            fx, fy and cx, cy; pixels.
+        size : tuple of int
+            Width, height; pixels.
+        """
+        if np.abs(center).max() > LARGEST_NUMBER:
+            self.fail(f"the camera's centre is farther than 1e18: {center.tolist()}")
+        printable = name.encode("utf-8", "replace").decode("utf-8")
+        try:
+            return View(rotation, center, *focal, *principal, *size, name=printable)
+        except RefineError as error:
+            self.fail(str(error))
+
+
+def described(value: object) -> str:
+    """Return a short description of a value out of JSON, for messages."""
+    if isinstance(value, dict):
+        return f"an object with {len(value)} keys"
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    text = json.dumps(value)
+    return text if len(text) <= 40 else f"{text[:37]}..."  # noqa: PLR2004
+
+
+def read_json(path: Path) -> object:
+    """Return what a JSON file holds.
+
+    Parameters
+    ----------
+    path : Path
+        UTF-8; a byte order mark is skipped.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be read, is empty or is no JSON; with line and column.
+    """
+    place = Place(path)
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(SNIFFED_BYTES)
+            if head[:1] not in b"{[\xef \t\r\n":  # so that no splat file is read whole
+                place.fail(
+                    "not a camera file: expected JSON (cameras.json, transforms.json) "
+                    f"or a COLMAP model, got a file that starts with {head[:8]!r}"
+                )
+            text = (head + stream.read()).decode("utf-8-sig")
+    except (OSError, ValueError) as error:
+        if isinstance(error, UnicodeDecodeError):
+            place.at(f"byte {error.start}").fail(f"not UTF-8 text ({error.reason})")
+        place.fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
+    if not text.strip():
+        place.fail("the file is empty, expected cameras as JSON")
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        place.at(f"line {error.lineno} column {error.colno}").fail(f"invalid JSON: {error.msg}")
+    except RecursionError:
+        place.fail("invalid JSON: nested too deeply, expected cameras")
+    except ValueError as error:  # an integer of thousands of digits
+        place.fail(f"invalid JSON: {error}")

@@ -1,0 +1,142 @@
+"""Cameras from files: Inria ``cameras.json``, ``transforms.json`` and COLMAP models.
+
+One rule for every format: what the file says is read as it stands, checked, and refused with the
+place where it is wrong. Nothing is guessed that would move a camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..views import View, ViewSet
+from .colmap import MODEL_FILES, SUFFIXES, find_colmap, read_colmap
+from .nerfstudio import read_transforms
+from .place import Place, described, read_json
+
+INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
+"""What a camera of ``cameras.json`` cannot do without."""
+
+JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
+"""Files looked for in a folder, in this order; a COLMAP model comes last."""
+
+
+def read_cameras(path: Path | str) -> ViewSet:
+    """Read the cameras of a scene.
+
+    Parameters
+    ----------
+    path : path-like
+        A ``cameras.json`` as the reference 3DGS implementation writes it, a ``transforms.json`` of
+        nerfstudio or instant-ngp, any file of a COLMAP model (text or binary), or a folder. In a
+        folder, ``cameras.json`` comes before ``transforms.json``, ``transforms_train.json`` and a
+        COLMAP model (in the folder itself, ``sparse/0``, ``sparse`` or ``colmap/sparse/0``);
+        whatever else is there is named in the note. ``~`` is the home folder.
+
+    Returns
+    -------
+    ViewSet
+        In the order of the file; those of COLMAP by name. `ViewSet.note` tells what is not
+        modelled, such as lens distortion.
+
+    Raises
+    ------
+    RefineError
+        If there is no such file or it is wrong; the message names the file, the place, what was
+        found and what was expected.
+    """
+    path = Path(path)
+    try:
+        path = path.expanduser()
+        is_folder, is_file = path.is_dir(), path.is_file()
+    except (OSError, RuntimeError) as error:  # a name too long; a home that is not known
+        Place(path).fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
+    if is_folder:
+        return _read_folder(path)
+    if not is_file:
+        Place(path).fail("no such file or folder, expected cameras")
+    if path.suffix in SUFFIXES and path.stem in MODEL_FILES:
+        return read_colmap(path.parent, path.suffix)
+    return _read_json_cameras(path)
+
+
+def _read_folder(folder: Path) -> ViewSet:
+    files = [folder / name for name in JSON_NAMES if (folder / name).is_file()]
+    colmap = find_colmap(folder)
+    if not files and not colmap:
+        Place(folder).fail(
+            f"no cameras in this folder, expected {', '.join(JSON_NAMES)}, or a COLMAP model "
+            "(cameras and images, both .bin or both .txt) in it, sparse/0 or sparse"
+        )
+    if not files and colmap:
+        return read_colmap(*colmap)
+    views = _read_json_cameras(files[0])
+    others = [file.name for file in files[1:]]
+    if colmap:
+        others.append(f"COLMAP model in {colmap[0].relative_to(folder).as_posix()}")
+    if not others:
+        return views
+    unused = f"read {files[0].name}, not {', '.join(others)}"
+    return replace(views, note="; ".join(filter(None, (views.note, unused))))
+
+
+def _read_json_cameras(path: Path) -> ViewSet:
+    data = read_json(path)
+    if isinstance(data, list):
+        return read_inria(path, data)
+    if not isinstance(data, dict) or "frames" not in data:
+        Place(path).fail(
+            "expected a list of cameras (cameras.json) or an object with 'frames' "
+            f"(transforms.json), got {described(data)}"
+        )
+    return read_transforms(path, data)
+
+
+def read_inria(path: Path, data: list[object]) -> ViewSet:
+    """Return the views of the ``cameras.json`` that the reference 3DGS implementation writes.
+
+    ``rotation`` is camera to world, its columns the camera's x (right), y (down) and z (forward);
+    ``position`` is the camera's centre. The principal point is the image's centre unless ``cx``
+    and ``cy`` (pixels), which some forks add, say otherwise.
+
+    Parameters
+    ----------
+    path : Path
+        For messages.
+    data : list
+        What the file holds.
+
+    Raises
+    ------
+    RefineError
+        If it is empty, or a camera is wrong; with its index and key.
+    """
+    place = Place(path)
+    if not data:
+        place.fail("the list of cameras is empty, expected at least one")
+    return ViewSet(tuple(_inria_view(place, index, item) for index, item in enumerate(data)))
+
+
+def _inria_view(file: Place, index: int, item: object) -> View:
+    place = file.at(f"camera {index}")
+    camera = place.members(item)
+    if "transform" in camera and "position" not in camera:
+        place.fail(
+            "poses of `ns-export cameras` have no focal length; read transforms.json instead"
+        )
+    place.members(item, INRIA_KEYS)
+    at = place.at("'rotation'")
+    axes = at.rotation(at.matrix(camera["rotation"], (3,), 3))
+    if np.linalg.det(axes) < 0:
+        at.fail("expected a rotation, got a reflection (determinant -1)")
+    width, height = (place.at(repr(key)).side(camera[key]) for key in ("width", "height"))
+    fx, fy = (place.at(repr(key)).focal(camera[key]) for key in ("fx", "fy"))
+    cx, cy = (
+        place.at(repr(key)).number(camera.get(key, side / 2))
+        for key, side in (("cx", width), ("cy", height))
+    )
+    center = np.array(place.at("'position'").numbers(camera["position"], 3))
+    name = place.at("'img_name'").text(camera.get("img_name", str(index)))
+    return place.view(name, axes.T, center, (fx, fy), (cx, cy), (width, height))

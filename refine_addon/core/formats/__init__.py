@@ -1,0 +1,1 @@
+"""Splat files: reading and writing; one module a format."""

@@ -1,0 +1,287 @@
+"""3DGS PLY files: read through a memory map, write the kept rows and not a byte else.
+
+Rows of fixed size are mapped, so that a file of any size costs only the columns that are looked
+at; text is read into memory.
+"""
+
+from __future__ import annotations
+
+import mmap
+import stat
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import plyfile
+
+from ..errors import RefineError
+from ..whole_file import expanded, refuse_mapped, whole_file
+from .ply_body import check_counts, read_text, vertex_range
+from .ply_columns import REQUIRED, REST_COUNTS, columns_from_splats, splats_from_columns
+from .ply_header import TEXT, Header, format_of, read_header, shown, with_count, with_properties
+from .ply_write import declarations, write_lines, write_rows
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from ..absorbing.absorb import Absorbed
+    from ..splats import Splats
+
+__all__ = [
+    "REQUIRED",
+    "REST_COUNTS",
+    "SplatFile",
+    "columns_from_splats",
+    "read_ply",
+    "splats_from_columns",
+]
+
+_NAMES_SHOWN = 12
+
+
+@dataclass(frozen=True, eq=False)
+class SplatFile:
+    """A 3DGS PLY file, opened.
+
+    Attributes
+    ----------
+    path : Path
+        Where it was read from.
+    rows : (N,) structured
+        The vertex element, one field a property in file order; read-only and mapped if binary.
+    header : bytes
+        The header as it stands in the file, ``end_header`` and line end included.
+    before, after : (M,) uint8
+        Bytes of the body ahead of and behind the vertex rows.
+    lines : list of bytes or None
+        For ASCII files, the text of each vertex row with its line end.
+    """
+
+    path: Path
+    rows: NDArray[Any]
+    header: bytes
+    before: NDArray[np.uint8]
+    after: NDArray[np.uint8]
+    lines: list[bytes] | None = None
+
+    def __len__(self) -> int:
+        """Return the number of splats."""
+        return len(self.rows)
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes one splat takes; at most, where the rows are text."""
+        if self.lines is not None:
+            return max(map(len, self.lines), default=0)
+        return int(self.rows.dtype.itemsize)
+
+    @property
+    def fixed_bytes(self) -> int:
+        """Bytes that stay however many splats go."""
+        return len(self.header) + len(self.before) + len(self.after)
+
+    @property
+    def format(self) -> str:
+        """What the header's format line says, such as ``binary_little_endian 1.0``."""
+        return format_of(self.header)
+
+    def size(self, keep: NDArray[np.bool_] | None = None) -> int:
+        """Return how many bytes the file takes with the kept rows (all by default)."""
+        count = len(self) if keep is None else int(np.count_nonzero(keep))
+        header = len(with_count(self.header, count))
+        if self.lines is None:
+            rows = count * self.row_bytes
+        else:
+            kept = range(len(self)) if keep is None else np.flatnonzero(keep).tolist()
+            rows = sum(len(self.lines[index]) for index in kept)
+        return header + len(self.before) + rows + len(self.after)
+
+    def splats(self) -> Splats:
+        """Return the rows as splats, as views of the file where its layout permits."""
+        return splats_from_columns(self.rows)
+
+    def write(
+        self,
+        path: Path | str,
+        keep: NDArray[np.bool_] | None = None,
+        *,
+        columns: Mapping[str, NDArray[Any]] | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        """Write the kept rows, in order, byte for byte as they were read.
+
+        Parameters
+        ----------
+        path : path-like
+            The file to make; written whole or not at all. ``~`` is the home folder.
+        keep : (N,) bool, optional
+            Which rows to write; all by default.
+        columns : mapping of str to (N,), optional
+            Properties to set; those the file lacks are appended as the type of their array
+            (float32 -> ``float``), those it has keep their place and type.
+        overwrite : bool
+            Whether an existing file may be replaced; this one too.
+
+        Raises
+        ------
+        RefineError
+            If the file cannot be written, or exists and may not be replaced; if `keep` or a
+            column does not fit.
+        """
+        path, columns = expanded(path), columns or {}
+        if keep is not None and (keep.shape != self.rows.shape or keep.dtype != np.bool_):
+            msg = (
+                f"{self.path}: keep is {keep.dtype} {keep.shape}, "
+                f"expected one bool for each of {len(self)} splats"
+            )
+            raise RefineError(msg)
+        header = with_count(self.header, len(self) if keep is None else int(np.sum(keep)))
+        declared = declarations(self.path, self.rows, columns)
+        if declared:
+            header = with_properties(header, declared)
+        if self.lines is None and not self.rows.flags.writeable:
+            refuse_mapped(path, self.path)
+        with whole_file(path, overwrite=overwrite) as stream:
+            stream.write(header)
+            stream.write(self.before.data)
+            if self.lines is not None:
+                write_lines(stream, self.lines, keep, columns, self.rows.dtype)
+            else:
+                write_rows(stream, self.rows, keep, columns)
+            stream.write(self.after.data)
+
+    def write_survivors(
+        self, path: Path | str, absorbed: Absorbed, *, overwrite: bool = False
+    ) -> None:
+        """Write the survivors of absorbing, in order; those that did not change, as they were.
+
+        Parameters
+        ----------
+        path : path-like
+            The file to make; written whole or not at all.
+        absorbed : Absorbed
+            Of the splats of this file.
+        overwrite : bool
+            Whether an existing file may be replaced.
+
+        Raises
+        ------
+        RefineError
+            See `write`.
+        """
+        rows = self.rows[absorbed.keep]
+        lines = None
+        if self.lines is not None:
+            lines = [self.lines[index] for index in np.flatnonzero(absorbed.keep).tolist()]
+        columns = {
+            name: np.where(absorbed.changed, values, rows[name]).astype(rows[name].dtype)
+            for name, values in columns_from_splats(absorbed.splats).items()
+        }
+        kept = replace(self, rows=rows, lines=lines)
+        kept.write(path, columns=columns, overwrite=overwrite)
+
+
+def read_ply(path: Path | str) -> SplatFile:
+    """Open a 3DGS PLY file: binary of either byte order, or ASCII.
+
+    Parameters
+    ----------
+    path : path-like
+        ``~`` is the home folder.
+
+    Returns
+    -------
+    SplatFile
+        Without a splat, if the file says so.
+
+    Raises
+    ------
+    RefineError
+        If there is no such file, or it is no PLY, truncated, or not made of splats; the message
+        names the file, the place, what was found and what was expected.
+    """
+    path = expanded(path)
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):  # opening a pipe would wait for its other end
+            msg = f"{path}: is a {'folder' if path.is_dir() else 'device'}, expected a PLY file"
+            raise RefineError(msg)
+        with path.open("rb") as stream:
+            header = read_header(path, stream)
+            vertex = _vertex_index(header)
+            _check_properties(header, vertex)
+            whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    except (OSError, ValueError) as error:
+        msg = f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
+        raise RefineError(msg) from error
+    body = np.frombuffer(whole, np.uint8)[len(header.raw) :]
+    check_counts(header, len(body))
+    if header.order == TEXT:
+        rows, lines, beside = read_text(header, vertex, body.tobytes())
+        before, after = (np.frombuffer(part, np.uint8) for part in beside)
+        return SplatFile(path, rows, header.raw, before, after, lines)
+    start, end = vertex_range(header, vertex, body)
+    rows = body[start:end].view(header.elements[vertex].dtype(header.order))
+    return SplatFile(path, rows, header.raw, body[:start], body[end:])
+
+
+def _vertex_index(header: Header) -> int:
+    names = [element.name for element in header.elements]
+    if "vertex" not in names:
+        msg = (
+            f"{header.path}: not a splat file: expected an element 'vertex', "
+            f"got {_first(names) or 'none'}"
+        )
+        raise RefineError(msg)
+    return names.index("vertex")
+
+
+def _first(names: list[str]) -> str:
+    """Return the first of the file's names, none of them endless."""
+    return ", ".join(name[:40] for name in names[:_NAMES_SHOWN])
+
+
+def _check_properties(header: Header, vertex: int) -> None:
+    """Refuse vertices that are no splats, in words for what they seem to be."""
+    kinds = {
+        prop.name: "list" if isinstance(prop, plyfile.PlyListProperty) else prop.val_dtype
+        for prop in header.elements[vertex].properties
+    }
+    if "packed_position" in kinds:
+        msg = f"{header.path}: a compressed splat PLY; expand it to the plain 3DGS layout first"
+        raise RefineError(msg)
+    missing = [name for name in REQUIRED if name not in kinds]
+    if missing:
+        some = _first([*kinds])
+        some += ", ..." if len(kinds) > _NAMES_SHOWN else ""
+        msg = (
+            f"{header.path}: {_guess(header, kinds)}: vertex lacks {', '.join(missing)} "
+            f"(it has {some or 'no property'})"
+        )
+        raise RefineError(msg)
+    rest = [name for name in kinds if name.startswith("f_rest_")]
+    if len(rest) not in REST_COUNTS or any(f"f_rest_{i}" not in kinds for i in range(len(rest))):
+        msg = (
+            f"{header.path}: found {len(rest)} f_rest properties, "
+            "expected f_rest_0 onward, 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
+        )
+        raise RefineError(msg)
+    for name, kind in kinds.items():
+        if kind == "list":
+            msg = f"{header.path}: property {shown(name)} is a list, expected one number a splat"
+            raise RefineError(msg)
+        if kind not in ("f4", "f8") and (name in REQUIRED or name in rest):
+            msg = (
+                f"{header.path}: property {shown(name)} is of type {kind}, expected float or double"
+            )
+            raise RefineError(msg)
+
+
+def _guess(header: Header, kinds: Mapping[str, str]) -> str:
+    if "opacity" in kinds:
+        return "incomplete splats"
+    if any(element.name in ("face", "tristrips") for element in header.elements):
+        return "a mesh, not splats"
+    return "a point cloud, not splats"

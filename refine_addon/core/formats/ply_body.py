@@ -1,0 +1,248 @@
+"""The body of a PLY file: where its splats lie, and that they are all there."""
+
+from __future__ import annotations
+
+import struct
+import warnings
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import plyfile
+
+from ..errors import RefineError
+from .ply_header import TEXT, Header, shown
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+
+def check_counts(header: Header, available: int) -> None:
+    """Refuse counts that the file cannot back, before anything is allocated by them.
+
+    Parameters
+    ----------
+    header : Header
+    available : int
+        Bytes behind the header.
+
+    Raises
+    ------
+    RefineError
+        If even the shortest rows of that number would not fit.
+    """
+    least = 0
+    text = header.order == TEXT
+    for element, count in zip(header.elements, header.counts, strict=True):
+        row = _least_bytes(element, text=text)
+        if not row and count:
+            msg = f"{header.path}: element {shown(element.name)} has {count} rows and no property"
+            raise RefineError(msg)
+        least += row * count
+        if least > available + text:  # the last line of a text may lack its line end
+            msg = (
+                f"{header.path}: truncated: the header announces {count} rows of "
+                f"{shown(element.name)}, at least {least} bytes so far, but only {available} bytes "
+                "follow it"
+            )
+            raise RefineError(msg)
+
+
+def _least_bytes(element: Any, *, text: bool) -> int:  # noqa: ANN401 - plyfile has no types
+    if text:  # a digit and a separator each; of a list, its length
+        return 2 * len(element.properties)
+    return sum(
+        np.dtype(p.len_dtype if isinstance(p, plyfile.PlyListProperty) else p.val_dtype).itemsize
+        for p in element.properties
+    )
+
+
+def vertex_range(header: Header, vertex: int, body: NDArray[np.uint8]) -> tuple[int, int]:
+    """Return where in a binary body the vertex rows begin and end.
+
+    Parameters
+    ----------
+    header : Header
+    vertex : int
+        Index of the vertex element, which has no list.
+    body : (M,) uint8
+        Everything behind the header.
+
+    Raises
+    ------
+    RefineError
+        If the file ends before; with the row.
+    """
+    start = 0
+    for element, count in zip(header.elements[:vertex], header.counts[:vertex], strict=True):
+        if any(isinstance(prop, plyfile.PlyListProperty) for prop in element.properties):
+            start = _behind_lists(header, element, count, body, start)
+        else:
+            start += count * element.dtype(header.order).itemsize
+    count, size = header.counts[vertex], header.elements[vertex].dtype(header.order).itemsize
+    end = start + count * size
+    if end > len(body):
+        row = max(len(body) - start, 0) // size
+        total = len(header.raw)
+        msg = (
+            f"{header.path}: truncated: the file ends in vertex row {row} of {count} "
+            f"({total + len(body)} bytes, expected at least {total + end})"
+        )
+        raise RefineError(msg)
+    return start, end
+
+
+def _behind_lists(
+    header: Header,
+    element: Any,  # noqa: ANN401 - plyfile has no types
+    count: int,
+    body: NDArray[np.uint8],
+    at: int,
+) -> int:
+    """Walk rows that hold lists; return where the last one ends."""
+    # The reader of a list's length (none for a single number) and the bytes a value takes.
+    steps = [
+        (_length_reader(header, element, prop), np.dtype(prop.val_dtype).itemsize)
+        for prop in element.properties
+    ]
+    data = body.data
+    for row in range(count):
+        try:
+            for reader, size in steps:
+                length = 1
+                if reader is not None:
+                    (length,) = reader.unpack_from(data, at)
+                    at += reader.size
+                if length < 0:
+                    msg = (
+                        f"{header.path}: element {shown(element.name)} row {row}: "
+                        f"a list of {length} numbers, expected 0 or more"
+                    )
+                    raise RefineError(msg)
+                at += length * size
+        except struct.error:
+            at = len(data) + 1
+        if at > len(data):
+            msg = (
+                f"{header.path}: truncated: the file ends in row {row} of {count} of "
+                f"{shown(element.name)}"
+            )
+            raise RefineError(msg)
+    return at
+
+
+def _length_reader(header: Header, element: Any, prop: Any) -> struct.Struct | None:  # noqa: ANN401
+    if not isinstance(prop, plyfile.PlyListProperty):
+        return None
+    kind = np.dtype(prop.len_dtype)
+    if kind.kind == "f":
+        msg = (
+            f"{header.path}: element {shown(element.name)}: the length of list "
+            f"{shown(prop.name)} is of type {kind}, expected a whole number"
+        )
+        raise RefineError(msg)
+    return struct.Struct(header.order + kind.char)
+
+
+def read_text(
+    header: Header, vertex: int, body: bytes
+) -> tuple[NDArray[Any], list[bytes], tuple[bytes, bytes]]:
+    """Read the vertex rows of an ASCII body.
+
+    Parameters
+    ----------
+    header : Header
+    vertex : int
+        Index of the vertex element, which has no list.
+    body : bytes
+        Everything behind the header.
+
+    Returns
+    -------
+    rows : (N,) structured
+    lines : list of bytes
+        The text of each row with its line end.
+    beside : tuple of bytes
+        What stands ahead of the rows and behind them.
+
+    Raises
+    ------
+    RefineError
+        If lines are missing, or one of them is not made of the numbers announced; with the row.
+    """
+    lines = body.splitlines(keepends=True)
+    start = sum(header.counts[:vertex])
+    end = start + header.counts[vertex]
+    before = 0
+    for element, count in zip(header.elements, header.counts, strict=True):
+        if len(lines) < before + count:
+            msg = (
+                f"{header.path}: truncated: the file ends in row {len(lines) - before} of {count} "
+                f"of {shown(element.name)}"
+            )
+            raise RefineError(msg)
+        before += count
+    rows = _numbers(header, header.elements[vertex], lines[start:end])
+    return rows, lines[start:end], (b"".join(lines[:start]), b"".join(lines[end:]))
+
+
+def _numbers(header: Header, element: Any, lines: Sequence[bytes]) -> NDArray[Any]:  # noqa: ANN401
+    dtype = element.dtype(TEXT)
+    try:
+        return _parsed(lines, dtype)
+    except _WRONG:
+        row = _first_wrong(lines, dtype)
+    words = lines[row].split()
+    if len(words) != len(dtype):
+        problem = f"expected {len(dtype)} numbers, got {len(words)}"
+    else:
+        index = next(i for i, word in enumerate(words) if not _is_number(word, dtype[i]))
+        problem = (
+            f"property {shown(dtype.names[index])}: expected a number of type {dtype[index]}, "
+            f"got {words[index][:40].decode('ascii', 'backslashreplace')!r}"
+        )
+    msg = f"{header.path}: vertex row {row}: {problem}"
+    raise RefineError(msg)
+
+
+_WRONG = (ValueError, DeprecationWarning)
+"""What NumPy raises of text that is no number of the type."""
+
+_NO_SPACES = bytes.maketrans(b"\x1c\x1d\x1e\x1f", b"????")
+"""Four characters at which text is split, and bytes are not: part of a word, as in the header."""
+
+
+def _parsed(lines: Sequence[bytes], dtype: Any) -> NDArray[Any]:  # noqa: ANN401
+    if not lines:
+        return np.empty(0, dtype)
+    if not all(map(bytes.strip, lines)):
+        msg = "a line without words, which NumPy would skip"
+        raise ValueError(msg)
+    with warnings.catch_warnings():
+        # 1.5 where a whole number belongs is deprecated.
+        warnings.simplefilter("error", DeprecationWarning)
+        text = (line.translate(_NO_SPACES).decode("ascii") for line in lines)
+        return np.loadtxt(text, dtype, comments=None, ndmin=1)
+
+
+def _is_number(word: bytes, dtype: Any) -> bool:  # noqa: ANN401
+    try:
+        _parsed([word], dtype)
+    except _WRONG:
+        return False
+    return True
+
+
+def _first_wrong(lines: Sequence[bytes], dtype: Any) -> int:  # noqa: ANN401
+    """Return the index of the first line that is not of that type, where one is not."""
+    first, beyond = 0, len(lines)
+    while beyond - first > 1:  # one of first..beyond is wrong, and none before them
+        middle = (first + beyond) // 2
+        try:
+            _parsed(lines[first:middle], dtype)
+        except _WRONG:
+            beyond = middle
+        else:
+            first = middle
+    return first

@@ -1,0 +1,98 @@
+"""The properties of a 3DGS PLY by name, and the splats that they make."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..splats import Splats
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+REQUIRED = (
+    *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
+    *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+)
+"""Properties without which a vertex is no splat."""
+
+REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
+"""Number of ``f_rest_*`` properties -> spherical-harmonics degree."""
+
+
+def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> Splats:
+    """Return splats from arrays named as the properties of a 3DGS PLY.
+
+    Parameters
+    ----------
+    columns : structured array or mapping of str to (N,)
+        With everything in `REQUIRED`, and ``f_rest_*`` if there are any: all coefficients of red,
+        then green, then blue, as the reference implementation stores them.
+
+    Returns
+    -------
+    Splats
+        Views of `columns` where the fields of a group lie side by side in a structured array,
+        copies otherwise.
+    """
+    names = columns.dtype.names or () if isinstance(columns, np.ndarray) else tuple(columns)
+    count = sum(name.startswith("f_rest_") for name in names)
+    rest = [f"f_rest_{index}" for index in range(count)]
+    size = len(columns["x"])
+    if rest:
+        planes = _stack(columns, rest).reshape(size, 3, count // 3)
+        sh_rest = planes.transpose(0, 2, 1)
+    else:
+        sh_rest = np.zeros((size, 0, 3), np.float32)
+    return Splats(
+        means=_stack(columns, ["x", "y", "z"]),
+        log_scales=_stack(columns, ["scale_0", "scale_1", "scale_2"]),
+        quaternions=_stack(columns, ["rot_0", "rot_1", "rot_2", "rot_3"]),
+        opacity_logits=columns["opacity"],
+        sh_dc=_stack(columns, ["f_dc_0", "f_dc_1", "f_dc_2"]),
+        sh_rest=sh_rest,
+    )
+
+
+def columns_from_splats(splats: Splats) -> dict[str, NDArray[np.float32]]:
+    """Return the float32 columns that a 3DGS PLY stores, in the reference order, no normals."""
+    columns: dict[str, NDArray[Any]] = {}
+    groups: list[tuple[Sequence[str], NDArray[Any]]] = [
+        (["x", "y", "z"], splats.means),
+        (["f_dc_0", "f_dc_1", "f_dc_2"], splats.sh_dc),
+    ]
+    coefficients = splats.sh_rest.shape[1] * 3
+    rest = splats.sh_rest.transpose(0, 2, 1).reshape(len(splats), coefficients)
+    groups += [
+        ([f"f_rest_{index}" for index in range(coefficients)], rest),
+        (["opacity"], splats.opacity_logits[:, None]),
+        (["scale_0", "scale_1", "scale_2"], splats.log_scales),
+        (["rot_0", "rot_1", "rot_2", "rot_3"], splats.quaternions),
+    ]
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # of double into float
+        for names, values in groups:
+            for index, name in enumerate(names):
+                columns[name] = np.ascontiguousarray(values[:, index], np.float32)
+    return columns
+
+
+def _stack(columns: Any, names: Sequence[str]) -> NDArray[Any]:  # noqa: ANN401
+    """Return the named columns as (N, len(names)): a view if they lie side by side in a row."""
+    first = columns[names[0]]
+    if isinstance(columns, np.ndarray) and columns.dtype.fields and columns.ndim == 1:
+        kinds, offsets = zip(*(columns.dtype.fields[name][:2] for name in names), strict=True)
+        step = kinds[0].itemsize
+        beside = tuple(range(offsets[0], offsets[0] + step * len(names), step))
+        if len(set(kinds)) == 1 and offsets == beside and len(columns):
+            return np.lib.stride_tricks.as_strided(
+                first, (len(first), len(names)), (first.strides[0], step), writeable=False
+            )
+    kind = np.result_type(*(columns[name].dtype for name in names), np.float32)
+    stacked = np.empty((len(first), len(names)), kind)
+    with np.errstate(invalid="ignore"):  # of signalling NaN put among doubles
+        for index, name in enumerate(names):
+            stacked[:, index] = columns[name]
+    return stacked

@@ -1,0 +1,1 @@
+"""Scoring methods: how much the views would miss each splat."""

@@ -1,0 +1,323 @@
+"""REFINE's closed form: the error of removing each splat, with nothing hidden (T = 1).
+
+    D_i   = sum over k of  lambda^k  H_i G_i^k / mean_j(H_j G_j^k)          REFINE, Eq. 20
+    H_i   = alpha_i  mean over views of  inside_iv / (d_iv^2 + eta)         Eq. 13-16
+    G_gem = product of the two largest scales, G_col = luma^2, G_opa = alpha^2
+
+``d`` is the depth along the view's axis (the paper) or the distance to its centre (the authors'
+code). ``inside`` is ours: 1 where the splat's centre lies in the view's frustum. The division by
+the mean of each term is the authors' code's; it makes the terms comparable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from ..errors import RefineError
+from ..scores import Scores
+from ..splats import base_color, drawable, opacity
+from ..work import Progress, for_chunks, part, silent
+from . import adaptive
+from .frustum import Frustums
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..splats import Splats
+    from ..views import ViewSet
+
+LUMA = (0.299, 0.587, 0.114)
+"""Rec. 601 weights of red, green, blue."""
+
+ETA_RELATIVE = 0.005
+"""Default eta over the squared size of the scene: the paper's .05 at a viewing distance of 3 m."""
+
+NEAR_RELATIVE = 0.01
+"""Default near plane over the size of the scene, where a view brings none of its own."""
+
+UNSEEN = 1e-6
+"""Factor on 1 / (squared distance to the views + eta), the weight of splats that no view sees: it
+orders them by distance, practically below all that is seen."""
+
+_CHUNK = 4096
+_VIEW_BLOCK = 64
+_SMALLEST_AREA = -300.0
+
+
+@dataclass(frozen=True)
+class ClosedForm:
+    """Settings of the closed form; the default ranks the same whatever the scene's unit.
+
+    Attributes
+    ----------
+    depth : {"z", "distance"}
+        Depth along the view's axis, or distance to its centre.
+    eta : float or None
+        Added to the squared depth, squared world units; None takes `ETA_RELATIVE` times the squared
+        size of the scene.
+    anisotropy_offset : float or None
+        Added to the shortest axis in F_gem, world units; None compares the axes as they are, a
+        ratio without unit.
+    frustum : bool
+        Whether only views that see a splat's centre count.
+    margin : float
+        How far beyond the image's edge still counts as inside, in half image sizes.
+    visibility, projection, equal_weights : bool
+        The paper's ablations: without alpha, without 1 / (d^2 + eta), with lambda = 1/3 each.
+    """
+
+    depth: Literal["z", "distance"] = "z"
+    eta: float | None = None
+    anisotropy_offset: float | None = None
+    frustum: bool = True
+    margin: float = 0.15
+    visibility: bool = True
+    projection: bool = True
+    equal_weights: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises
+        ------
+        RefineError
+            If one cannot be.
+        """
+        if self.depth not in ("z", "distance"):
+            msg = f"depth is {self.depth!r}, expected 'z' or 'distance'"
+            raise RefineError(msg)
+        for name in ("eta", "anisotropy_offset"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < np.inf:
+                msg = f"{name} is {value}, expected a positive number"
+                raise RefineError(msg)
+        if not 0.0 <= self.margin < np.inf:
+            msg = f"margin is {self.margin}, expected 0 or more"
+            raise RefineError(msg)
+
+    @classmethod
+    def published(cls, depth: Literal["z", "distance"], **changes: Any) -> ClosedForm:  # noqa: ANN401
+        """Return the published reading: the paper's for "z", its authors' code for "distance"."""
+        eta, offset = (0.05, 0.05) if depth == "z" else (0.5, 1e-6)
+        return cls(depth, eta, offset, frustum=False, **changes)
+
+
+def score(
+    splats: Splats,
+    views: ViewSet,
+    settings: ClosedForm = ClosedForm(),
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Scores:
+    """Score splats by the closed form.
+
+    Parameters
+    ----------
+    splats : Splats
+        In the frame and unit of the views.
+    views : ViewSet
+        All of them are used.
+    settings : ClosedForm
+    progress : callable, optional
+        See `refine_addon.core.work.Progress`.
+    threads : int, optional
+
+    Returns
+    -------
+    Scores
+        ``weights`` holds lambda and the statistics it comes from.
+
+    Raises
+    ------
+    RefineError
+        If there is no splat, or no view sees any.
+    Cancelled
+        If `progress` answers ``False``.
+    """
+    if not len(splats):
+        msg = "there are no splats to score"
+        raise RefineError(msg)
+    scene = _Scene(splats, views, settings)
+    tallies = for_chunks(
+        scene.read, len(splats), 4 * _CHUNK,
+        progress=part(progress, 0.0, 0.2), what="reading", threads=threads,
+    )  # fmt: skip
+    if not scene.good.any():
+        msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
+        raise RefineError(msg)
+    scene.measure()
+    sums = for_chunks(
+        scene.weigh, len(splats), _CHUNK,
+        progress=part(progress, 0.2, 0.95), what="scoring", threads=threads,
+    )  # fmt: skip
+    if settings.frustum and not scene.seen.any():
+        msg = (
+            f"no camera sees the splats: none of {len(splats)} lies in the frustum of any of "
+            f"{len(views)} views; check that cameras and splats share their frame and unit"
+        )
+        raise RefineError(msg)
+    statistics = _statistics(np.array(tallies))
+    lambdas = (1 / 3, 1 / 3, 1 / 3)
+    if not settings.equal_weights:
+        lambdas = adaptive.weights(statistics, offset=settings.anisotropy_offset or 0.0)
+    means = np.sum(sums, axis=0) / len(splats)
+    factors = np.divide(lambdas, means, out=np.zeros(3), where=means > 0.0)
+    for_chunks(partial(scene.add, factors), len(splats), 4 * _CHUNK, threads=threads)
+    return Scores(
+        values=scene.values,
+        seen=scene.seen,
+        views_used=len(views),
+        undrawable=len(splats) - int(np.count_nonzero(scene.good)),
+        weights={
+            "lambda": dict(zip(adaptive.TERMS, lambdas, strict=True)),
+            "statistics": vars(statistics).copy(),
+        },
+    )
+
+
+def _statistics(tallies: NDArray[np.float64]) -> adaptive.Statistics:
+    """Return the statistics of a scene from those of its chunks; see `_Scene.read`."""
+    count, ratios, translucency, luma, squares = tallies.T
+    total = count.sum()
+    # Around the mean of each chunk, and of these around that of all: nothing cancels.
+    around = luma - luma @ count / total
+    return adaptive.Statistics(
+        anisotropy=float(ratios.sum() / total),
+        luma_variance=float((squares.sum() + around * around @ count) / total),
+        translucency=float(translucency.sum() / total),
+    )
+
+
+class _Scene:
+    """What the formula needs of N splats, filled chunk by chunk.
+
+    The splats are read once, since they may be a file larger than memory: 57 bytes of each stay.
+    """
+
+    def __init__(self, splats: Splats, views: ViewSet, settings: ClosedForm) -> None:
+        self.splats, self.views, self.settings = splats, views, settings
+        self.weights = views.weights
+        self.origin, self.spread = views.middle()
+        count = len(splats)
+        self.good = np.empty(count, np.bool_)
+        self.means = np.empty((count, 3), splats.means.dtype.newbyteorder("="))
+        self.squared, self.alpha, self.area, self.weight = (np.empty(count) for _ in range(4))
+        self.luma = np.empty(count, np.float32)  # in 0..1, to 6e-8
+        self.values = np.empty(count, np.float32)
+        self.seen = np.zeros(count, np.int32)
+
+    def read(self, piece: slice) -> tuple[float, ...]:
+        """Activate one slice of splats.
+
+        Returns
+        -------
+        count, ratios, translucency, luma, squares : float
+            Of those drawable: how many, the sums of axis ratio and 4 alpha (1 - alpha), the mean
+            of the luma and the sum of its squares around that mean.
+        """
+        chunk = self.splats.take(piece)
+        good = self.good[piece] = drawable(chunk)
+        means = self.means[piece] = np.where(good[:, None], chunk.means, 0.0)
+        offset = means - self.origin
+        # What underflows to 0 is 0 beside everything that counts.
+        with np.errstate(under="ignore"):
+            self.squared[piece] = np.einsum("ij,ij->i", offset, offset) + self.spread
+            alpha = self.alpha[piece] = opacity(np.where(good, chunk.opacity_logits, -np.inf))
+            red, green, blue = base_color(np.where(good[:, None], chunk.sh_dc, 0.0)).T
+            self.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
+            logs = np.where(good[:, None], chunk.log_scales, 0.0).astype(np.float64)
+            self.area[piece], ratio = self._axes(logs)
+            alpha, luma = alpha[good], self.luma[piece][good].astype(np.float64)
+            mean = luma.sum() / max(len(luma), 1)
+            squares = np.sum(np.square(luma - mean))
+        return len(luma), ratio[good].sum(), np.sum(4.0 * alpha * (1.0 - alpha)), mean, squares
+
+    def _axes(self, logs: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the product of the two largest scales, and longest over shortest."""
+        a, b, c = logs.T
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        largest, smallest = np.maximum(high, c), np.minimum(low, c)
+        middle = np.maximum(low, np.minimum(high, c))
+        area = np.exp(np.maximum(largest + middle, _SMALLEST_AREA))
+        offset = self.settings.anisotropy_offset
+        if offset is None:
+            limit = np.log(adaptive.RATIO_LIMIT)
+            return area, np.exp(np.minimum(largest - np.maximum(smallest, -1e300), limit))
+        return area, np.exp(largest) / (np.exp(smallest) + offset)
+
+    def measure(self) -> None:
+        """Derive from the size of the scene what is relative to it.
+
+        The median over splats of their squared distance to the views follows the scene's unit,
+        and not its origin, order or outliers.
+        """
+        good = self.good
+        size = float(np.sqrt(np.median(self.squared if good.all() else self.squared[good]))) or 1.0
+        eta = self.settings.eta
+        self.eta = ETA_RELATIVE * size * size if eta is None else eta
+        self.frustums = Frustums(
+            self.views, self.origin, NEAR_RELATIVE * size, self.settings.margin
+        )
+
+    def weigh(self, piece: slice) -> list[float]:
+        """Compute H of one slice of splats, and in how many views it lies; sum its three terms."""
+        points = np.ones((4, piece.stop - piece.start))
+        points[:3] = (self.means[piece] - self.origin).T
+        total = np.zeros(points.shape[1])
+        seen = np.zeros(points.shape[1], np.int32)
+        with np.errstate(under="ignore"):
+            for start in range(0, len(self.weights), _VIEW_BLOCK):
+                block = slice(start, start + _VIEW_BLOCK)
+                depth, inside = self.frustums.project(points, block)
+                if not self.settings.frustum:
+                    inside[:] = True
+                # A block has fewer views than a byte counts.
+                seen += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.uint8)
+                share = inside
+                if self.settings.projection:
+                    squared = self._squared(points, depth, block)
+                    squared += self.eta
+                    share = np.divide(inside, squared, out=squared)
+                total += np.einsum("v,vn->n", self.weights[block], share)
+            if not seen.all():
+                near = self.squared[piece] + self.eta if self.settings.projection else 1.0
+                total = np.where(seen == 0, UNSEEN / near, total)
+            if self.settings.visibility:
+                total *= self.alpha[piece]
+            weight = self.weight[piece] = total * self.good[piece]
+            sums = [float(np.sum(weight * content)) for content in self._contents(piece)]
+        self.seen[piece] = seen * self.good[piece]
+        return sums
+
+    def _contents(self, piece: slice) -> tuple[NDArray[np.float64], ...]:
+        """Return the three G of one slice of splats."""
+        luma, alpha = self.luma[piece].astype(np.float64), self.alpha[piece]
+        return self.area[piece], luma * luma, alpha * alpha
+
+    def _squared(
+        self, points: NDArray[np.float64], depth: NDArray[np.float64], block: slice
+    ) -> NDArray[np.float64]:
+        """Return d^2, (V, n), in the memory of `depth`."""
+        if self.settings.depth == "z":
+            return np.multiply(depth, depth, out=depth)
+        depth[:] = 0.0
+        for axis in range(3):
+            step = points[axis] - self.frustums.centers[block, axis, None]
+            depth += np.multiply(step, step, out=step)
+        return depth
+
+    def add(self, factors: NDArray[np.float64], piece: slice) -> None:
+        """Sum up the terms of one slice of splats, each times its factor."""
+        weight, good = self.weight[piece], self.good[piece]
+        with np.errstate(under="ignore"):
+            terms = zip(factors, self._contents(piece), strict=True)
+            values = sum(factor * (weight * content) for factor, content in terms)
+            stored = np.asarray(values, np.float32)
+        # A splat that can be drawn must never tie with one that cannot.
+        stored[good] = np.maximum(stored[good], np.finfo(np.float32).tiny)
+        self.values[piece] = stored

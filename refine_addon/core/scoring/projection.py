@@ -1,0 +1,345 @@
+"""Where splats fall in a view: depth, centre and principal axes of their footprints, in pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..splats import SH_C0, drawable, opacity, rotation_matrices
+from ..work import Progress, for_chunks, silent
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..splats import Splats
+    from ..views import View, ViewSet
+
+LOW_PASS = 0.3
+"""Variance every renderer adds to a footprint so that it is not thinner than a pixel, px^2."""
+
+ALPHA_CUT = 1.0 / 255.0
+"""Renderers draw a splat only where its alpha reaches this."""
+
+NEAR_RELATIVE = 0.01
+"""Near plane over the size of the scene, where a view brings none of its own."""
+
+REACH = 3.3
+"""Standard deviations at which alpha = 1 falls to `ALPHA_CUT`: sqrt(2 ln 255) = 3.33."""
+
+_CHUNK = 1 << 14
+_GRID_BITS = 10
+_FARTHEST = 1e6  # beyond so many scene sizes a splat counts as seen by nobody
+_LOG_SCALE_RANGE = (-16.0, 5.0)  # relative to the size of the scene; keeps float32 in range
+_LARGEST_VARIANCE = 1e12  # px^2; a footprint a million pixels wide is flat over any image
+_FARTHEST_VIEW = 1e18  # scene sizes; from there everything is one point
+_LARGEST_LENS = 1e9  # px; beyond these two float32 would not hold what is computed
+_BEYOND = 0.15  # of the image: the projection is linearised no further outside (0.3 half sizes)
+_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """The M splats worth projecting, in units of the scene's size, neighbours near each other.
+
+    Attributes
+    ----------
+    index : (M,) int64
+        Which splat it is.
+    means : (3, M) float32
+        From the middle of the views, in scene sizes.
+    covariances : (6, M) float32
+        xx, xy, xz, yy, yz, zz, squared scene sizes.
+    largest : (M,) float32
+        Longest standard deviation, scene sizes.
+    alphas : (M,) float32
+        Opacity, 0..1.
+    colors : (M, 3) float32
+        View-independent colour, >= 0.
+    """
+
+    index: NDArray[np.int64]
+    means: NDArray[np.float32]
+    covariances: NDArray[np.float32]
+    largest: NDArray[np.float32]
+    alphas: NDArray[np.float32]
+    colors: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        """Return the number of splats."""
+        return len(self.index)
+
+    def take(self, keep: NDArray[Any]) -> Gaussians:
+        """Return the splats at `keep` (a mask or integers)."""
+        return Gaussians(
+            **{field.name: getattr(self, field.name)[..., keep] for field in fields(self)[:-1]},
+            colors=self.colors[keep],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """The frame and unit in which a scene is computed, so that float32 is enough for any scene.
+
+    Attributes
+    ----------
+    origin : (3,) float64
+        Weighted mean of the views' centres, world units.
+    size : float
+        Median over splats of the root mean square distance to the views, world units.
+    """
+
+    origin: NDArray[np.float64]
+    size: float
+
+
+@dataclass(frozen=True, eq=False)
+class Footprints:
+    """The n splats that may touch an image, front to back.
+
+    Attributes
+    ----------
+    index : (n,) int64
+        Place in the `Gaussians`.
+    centers : (2, n) float32
+        Column and row, pixels.
+    major, minor : (2, n) float32
+        Half axes: one standard deviation along each principal direction, pixels.
+    sigmas : (2, n) float32
+        Their lengths, the longer first.
+    """
+
+    index: NDArray[np.int64]
+    centers: NDArray[np.float32]
+    major: NDArray[np.float32]
+    minor: NDArray[np.float32]
+    sigmas: NDArray[np.float32]
+
+    def inside(self, view: View) -> NDArray[np.bool_]:
+        """Which centres lie in the image, (n,)."""
+        u, v = self.centers
+        return np.asarray((u >= 0.0) & (u <= view.width) & (v >= 0.0) & (v <= view.height))
+
+
+def prepare(
+    splats: Splats, views: ViewSet, *, progress: Progress = silent, threads: int | None = None
+) -> tuple[Gaussians, Frame, NDArray[np.bool_]]:
+    """Activate the splats once for all views.
+
+    Returns
+    -------
+    gaussians : Gaussians
+        Only of splats that can be drawn and whose opacity reaches `ALPHA_CUT`.
+    frame : Frame
+    good : (N,) bool
+        Which splats can be drawn.
+    """
+    good = np.empty(len(splats), np.bool_)
+    worth = np.empty(len(splats), np.bool_)
+
+    def judge(piece: slice) -> None:
+        chunk = splats.take(piece)
+        good[piece] = drawable(chunk)
+        logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
+        worth[piece] = opacity(logits) > ALPHA_CUT
+
+    for_chunks(judge, len(splats), 4 * _CHUNK, progress=progress, what="reading", threads=threads)
+    origin, spread = views.middle()
+    means = np.where(good[:, None], splats.means, origin) - origin  # float64
+    frame = Frame(origin, _size(means, good, spread))
+    means /= frame.size
+    worth &= np.max(np.abs(means), axis=1) <= _FARTHEST
+    index = np.flatnonzero(worth)
+    means = means[index]
+    order = np.argsort(_morton(means), kind="stable")
+    return _activate(splats, index[order], means[order], frame, threads), frame, good
+
+
+def _size(means: NDArray[np.float64], good: NDArray[np.bool_], spread: float) -> float:
+    if not good.any():
+        return 1.0
+    squared = np.einsum("ij,ij->i", means, means)
+    return float(np.sqrt(np.median(squared if good.all() else squared[good]) + spread)) or 1.0
+
+
+def _activate(
+    splats: Splats,
+    index: NDArray[np.int64],
+    means: NDArray[np.float64],
+    frame: Frame,
+    threads: int | None,
+) -> Gaussians:
+    count = len(index)
+    result = Gaussians(
+        index,
+        np.ascontiguousarray(means.T, np.float32),
+        np.empty((6, count), np.float32),
+        np.empty(count, np.float32),
+        np.empty(count, np.float32),
+        np.empty((count, 3), np.float32),
+    )
+
+    def fill(piece: slice) -> None:
+        chunk = splats.take(index[piece])
+        relative = np.asarray(chunk.log_scales, np.float64) - np.log(frame.size)
+        scales = np.exp(relative.clip(*_LOG_SCALE_RANGE))
+        axes = rotation_matrices(chunk.quaternions) * scales[:, None, :]
+        for row, (a, b) in enumerate(_PAIRS):
+            result.covariances[row, piece] = np.einsum("ij,ij->i", axes[:, a], axes[:, b])
+        result.largest[piece] = scales.max(axis=1)
+        result.alphas[piece] = opacity(chunk.opacity_logits)
+        colors = SH_C0 * np.asarray(chunk.sh_dc, np.float64) + 0.5
+        result.colors[piece] = colors.clip(0.0, 16.0)  # what is brighter is white all the same
+
+    with np.errstate(under="ignore"):
+        for_chunks(fill, count, _CHUNK, threads=threads)
+    return result
+
+
+def _morton(means: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return a key whose order keeps neighbours together, so that what is read is in the cache."""
+    cells = (1 << _GRID_BITS) - 1
+    # The unit is the scene's size: two of them either way hold nearly all; the rest may be far.
+    place = ((means / 4.0 + 0.5) * cells).clip(0, cells).astype(np.int64)
+    code = np.zeros(len(means), np.int64)
+    for bit in range(_GRID_BITS):
+        for axis in range(3):
+            code |= (place[:, axis] >> bit & 1) << (3 * bit + axis)
+    return code
+
+
+def project(gaussians: Gaussians, frame: Frame, view: View) -> Footprints:
+    """Project what may touch the image of a view.
+
+    The footprint is the Gaussian of covariance ``J W S W' J' + 0.3 I`` (Zwicker et al., "EWA
+    splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean.
+    """
+    if not _computable(frame, view):
+        return _nothing()
+    near, far = clip_planes(frame, view)
+    rotation = _rotation6(view)
+    pieces: list[tuple[NDArray[Any], ...]] = []
+    for start in range(0, len(gaussians), _CHUNK):
+        piece = slice(start, start + _CHUNK)
+        local = _local(gaussians.means[:, piece], frame, view)
+        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, (near, far)))
+        if len(touching):
+            local = np.take(local, touching, axis=1)
+            shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)
+            pieces.append((touching + start, local[2], *_ellipses(local, shape, view)))
+    if not pieces:
+        return _nothing()
+    index, depth, *rest = (np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True))
+    order = _by_depth(depth)
+    return Footprints(index[order], *(np.take(values, order, axis=1) for values in rest))
+
+
+def _nothing() -> Footprints:
+    empty = np.empty((2, 0), np.float32)
+    return Footprints(np.empty(0, np.int64), empty, empty, empty, empty)
+
+
+def _computable(frame: Frame, view: View) -> bool:
+    """Whether float32 holds what the view sees; it shows nothing of the scene where not."""
+    away = float(np.abs(view.center - frame.origin).max())
+    lens = (view.fx, view.fy, abs(view.cx), abs(view.cy), view.width, view.height)
+    known = min(view.fx, view.fy) >= 1.0 / _LARGEST_LENS and max(lens) <= _LARGEST_LENS
+    return known and away <= _FARTHEST_VIEW * frame.size
+
+
+def clip_planes(frame: Frame, view: View) -> tuple[float, float]:
+    """Near and far plane in scene sizes."""
+    near = view.near / frame.size if view.near > 0.0 else NEAR_RELATIVE
+    # Nearer than this a footprint's size leaves float32, and no renderer draws it.
+    return min(max(near, 1e-5), 1e30), min(view.far / frame.size, 1e30)
+
+
+def _local(means: NDArray[np.float32], frame: Frame, view: View) -> NDArray[np.float32]:
+    """Camera coordinates of centres, (3, M), scene sizes."""
+    center = (view.center - frame.origin) / frame.size
+    shift = (view.rotation @ center).astype(np.float32)
+    local: NDArray[np.float32] = view.rotation.astype(np.float32) @ means
+    local -= shift[:, None]
+    return local
+
+
+def _sides(view: View, x: Any, y: Any) -> tuple[tuple[Any, float, float, int], ...]:  # noqa: ANN401
+    """Coordinate, focal length, principal point off the middle and size, across and down."""
+    return (
+        (x, view.fx, view.cx - view.width / 2, view.width),
+        (y, view.fy, view.cy - view.height / 2, view.height),
+    )
+
+
+def _touches(
+    local: NDArray[np.float32],
+    largest: NDArray[np.float32],
+    view: View,
+    planes: tuple[float, float],
+) -> NDArray[np.bool_]:
+    """Which footprints may reach into the image, on the safe side."""
+    x, y, z = local
+    touching: NDArray[np.bool_] = (z > planes[0]) & (z <= planes[1])
+    for coordinate, focal, middle, size in _sides(view, x, y):
+        slope = (abs(middle) + (0.5 + _BEYOND) * size) / focal
+        reach = REACH * focal * float(np.hypot(1.0, slope)) * largest
+        pixels = size / 2 + REACH * LOW_PASS**0.5
+        touching &= np.abs(focal * coordinate + middle * z) <= pixels * z + reach
+    return touching
+
+
+def _rotation6(view: View) -> NDArray[np.float32]:
+    """Return the matrix that takes the 6 numbers of S to those of ``W S W'``."""
+    r = view.rotation
+    return np.array(
+        [
+            [r[a, i] * r[b, j] + (r[a, j] * r[b, i] if i != j else 0.0) for i, j in _PAIRS]
+            for a, b in _PAIRS
+        ],
+        np.float32,
+    )
+
+
+def _ellipses(
+    local: NDArray[np.float32], shape: NDArray[np.float32], view: View
+) -> tuple[NDArray[np.float32], ...]:
+    """Return centres, half axes and their lengths, each (2, n), pixels."""
+    x, y, z = local
+    across, down = x / z, y / z
+    centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
+    beyond = _BEYOND * view.width / view.fx, _BEYOND * view.height / view.fy
+    across = across.clip(
+        -view.cx / view.fx - beyond[0], (view.width - view.cx) / view.fx + beyond[0]
+    )
+    down = down.clip(-view.cy / view.fy - beyond[1], (view.height - view.cy) / view.fy + beyond[1])
+    fx, fy = view.fx / z, view.fy / z
+    xx = fx * fx * (shape[0] + across * (across * shape[5] - 2 * shape[2]))
+    yy = fy * fy * (shape[3] + down * (down * shape[5] - 2 * shape[4]))
+    xy = fx * fy * (shape[1] + across * (down * shape[5] - shape[4]) - down * shape[2])
+    factor = np.minimum(1.0, _LARGEST_VARIANCE / np.maximum(xx + yy, 1.0))
+    xx, yy, xy = xx * factor, yy * factor, xy * factor
+    middle, half = (xx + yy) / 2, (xx - yy) / 2
+    root = np.sqrt(half * half + xy * xy)
+    first = np.sqrt(np.maximum(middle + root, 0.0) + LOW_PASS)
+    # The smaller eigenvalue from the determinant: the difference would cancel.
+    second = np.maximum(xx * yy - xy * xy, 0.0) / np.maximum(middle + root, 1e-30)
+    second = np.sqrt(second + LOW_PASS)
+    # Direction of the major axis: (xx - yy + 2 root, 2 xy), or its turned twin where that is 0.
+    wide = half >= 0.0
+    c, s = np.where(wide, half + root, np.abs(xy)), np.where(wide, xy, root - half)
+    s = np.where(wide | (xy >= 0.0), s, -s)
+    length = np.hypot(c, s)
+    c = np.where(length > 0.0, c / np.maximum(length, 1e-30), 1.0)
+    s = np.where(length > 0.0, s / np.maximum(length, 1e-30), 0.0)
+    axes = np.stack([c, s]), np.stack([-s, c])
+    return centers, first * axes[0], second * axes[1], np.stack([first, second])
+
+
+def _by_depth(depth: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Order of positive float32 numbers; their bits sort as they do, by two radix passes."""
+    bits = np.ascontiguousarray(depth).view(np.uint32)
+    order = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable")
+    high = (bits >> 16).astype(np.uint16)
+    second = np.argsort(high[order], kind="stable")
+    return np.asarray(order[second])

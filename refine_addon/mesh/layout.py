@@ -1,0 +1,307 @@
+"""Which attribute of a mesh holds which property of a 3DGS PLY: one table, checked here."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..core.errors import RefineError
+from ..core.formats.ply import REQUIRED, REST_COUNTS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import bpy
+
+LAYOUT = "refine_layout"
+"""Custom property of the mesh: how the file it came from was laid out, as JSON."""
+
+PREFIX = "refine_"
+"""What the names of our own attributes and custom properties begin with."""
+
+
+class Kind(NamedTuple):
+    """How an attribute type of Blender is read and written."""
+
+    field: str
+    dtype: type
+    width: int
+
+
+KINDS = {
+    "FLOAT": Kind("value", np.float32, 1),
+    "INT": Kind("value", np.int32, 1),
+    "INT8": Kind("value", np.int8, 1),
+    "BOOLEAN": Kind("value", np.bool_, 1),
+    "FLOAT_VECTOR": Kind("vector", np.float32, 3),
+    "BYTE_COLOR": Kind("color_srgb", np.float32, 4),
+}
+"""Attribute type -> field for `foreach_get`, element type, numbers in an element."""
+
+STORAGE = {
+    "i1": "INT8",
+    "u1": "INT",
+    "i2": "INT",
+    "u2": "INT",
+    "i4": "INT",
+    "u4": "INT",
+    "f4": "FLOAT",
+    "f8": "FLOAT",
+}
+"""Type of a PLY property -> type of the attribute that holds it; u4 by its bits, f8 rounded."""
+
+PLACES = {"x": ("position", 0), "y": ("position", 1), "z": ("position", 2)}
+"""Properties that Blender keeps as components of a vector."""
+
+NORMAL_PLACES = {"nx": ("normal", 0), "ny": ("normal", 1), "nz": ("normal", 2)}
+"""Where Blender's own PLY importer puts a file's normals."""
+
+_COUNT = rb"([\r\n]element[ \t]+vertex[ \t]+)[0-9]+"
+_TAKEN = {
+    *("position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"),
+    *("refine_score", "refine_rank", "refine_seen"),
+    *("refine_heat", "refine_color", "refine_remove"),
+}
+
+
+@dataclass(frozen=True)
+class Column:
+    """One property of the file and where the mesh holds it.
+
+    Attributes
+    ----------
+    name : str
+        Name of the PLY property.
+    dtype : str
+        Its type in the file, as in ``"<f4"``.
+    attribute : str
+        Name of the attribute.
+    component : int
+        Which number of a vector attribute; 0 for plain ones.
+    """
+
+    name: str
+    dtype: str
+    attribute: str
+    component: int = 0
+
+    @property
+    def kind(self) -> str:
+        """Type that the attribute must have."""
+        if self.attribute in ("position", "normal"):
+            return "FLOAT_VECTOR"
+        return STORAGE[self.dtype[1:]]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The columns of a splat mesh in the order of its file, and the file's header."""
+
+    columns: tuple[Column, ...]
+    header: bytes
+
+    @property
+    def row_dtype(self) -> np.dtype[Any]:
+        """Type of one row of the file."""
+        return np.dtype([(column.name, column.dtype) for column in self.columns])
+
+
+def looks_like_splats(obj: bpy.types.Object | None) -> bool:
+    """Tell whether an object is worth offering to the splat tools; cheap enough for a poll."""
+    return (
+        obj is not None
+        and obj.type == "MESH"
+        and "opacity" in obj.data.attributes
+        and "f_dc_0" in obj.data.attributes
+    )
+
+
+def check(obj: bpy.types.Object) -> Layout:
+    """Return the layout of a splat object.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+
+    Returns
+    -------
+    Layout
+        The one remembered from the import, or the standard one with all scalar attributes.
+
+    Raises
+    ------
+    RefineError
+        If the object is no mesh, is in edit mode, holds four vertices a splat, or lacks an
+        attribute; also if an attribute has the wrong type or lies on the wrong domain.
+    """
+    label = f"object '{obj.name}'"
+    if obj.type != "MESH":
+        msg = f"{label}: is of type {obj.type}, expected a mesh whose vertices are splats"
+        raise RefineError(msg)
+    if obj.mode == "EDIT":
+        msg = f"{label}: is in edit mode; leave edit mode first"
+        raise RefineError(msg)
+    if obj.get("3DGS_Mesh_Type") == "face":
+        msg = (
+            f"{label}: KIRI's 'face' form has four vertices a splat, expected one; "
+            "use its 'vert' form, or import the PLY file here"
+        )
+        raise RefineError(msg)
+    if not len(obj.data.vertices):
+        msg = f"{label}: has no vertices, expected one a splat"
+        raise RefineError(msg)
+    layout = _remembered(obj.data) or _standard(obj)
+    _check_attributes(obj, layout)
+    return layout
+
+
+def sh_degree(mesh: bpy.types.Mesh) -> int:
+    """Return the spherical-harmonics degree of a splat mesh, 0 to 4."""
+    return REST_COUNTS.get(rest_count(mesh), 0)
+
+
+def export_bytes(obj: bpy.types.Object) -> int | None:
+    """Return how large the exported file is, None if there can be none; cheap enough to draw."""
+    try:
+        layout = _remembered(obj.data) or _standard(obj)
+    except RefineError:
+        return None
+    return len(layout.header) + layout.row_dtype.itemsize * len(obj.data.vertices)
+
+
+def rest_count(mesh: bpy.types.Mesh) -> int:
+    """Return how many ``f_rest_*`` attributes a mesh has."""
+    return sum(f"f_rest_{index}" in mesh.attributes for index in range(max(REST_COUNTS)))
+
+
+def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
+    """Return the layout that the import noted, None if there is none that can be read."""
+    try:
+        noted = json.loads(mesh[LAYOUT])
+        columns = tuple(Column(*column) for column in noted["columns"])
+        # Splats come and go; the count is the mesh's.
+        count = rb"\g<1>%d" % len(mesh.vertices)
+        header = re.sub(_COUNT, count, noted["header"].encode("latin-1"), count=1)
+        layout = Layout(columns, header)
+        described = layout.row_dtype.itemsize > 0
+    except (AttributeError, KeyError, TypeError, ValueError):
+        # Somebody else may have written there: what does not describe a file is no layout.
+        return None
+    return layout if described else None
+
+
+def _standard(obj: bpy.types.Object) -> Layout:
+    """Return the layout of the reference implementation for what the object has."""
+    attributes = obj.data.attributes
+    rest = [f"f_rest_{index}" for index in range(rest_count(obj.data))]
+    if len(rest) not in REST_COUNTS:
+        msg = (
+            f"object '{obj.name}': has {len(rest)} attributes f_rest_*, "
+            "expected 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
+        )
+        raise RefineError(msg)
+    normals = dict.fromkeys(("nx", "ny", "nz")) if "nx" in attributes else {}
+    places = dict(PLACES)
+    if not normals and _is(attributes.get("normal"), "FLOAT_VECTOR"):
+        normals = NORMAL_PLACES
+        places.update(NORMAL_PLACES)
+    names = [*PLACES, *normals, *REQUIRED[3:6], *rest, *REQUIRED[6:]]
+    columns = [Column(name, "<f4", *places.get(name, (name, 0))) for name in names]
+    dtypes = {"FLOAT": "<f4", "INT": "<i4", "INT8": "<i1"}
+    for attribute in attributes:
+        kind = dtypes.get(attribute.data_type)
+        plain = re.fullmatch(r"(?!refine_|KIRI)[!-~]+", attribute.name) and attribute.name[0] != "."
+        if kind and plain and attribute.domain == "POINT" and attribute.name not in names:
+            columns.append(Column(attribute.name, kind, attribute.name))
+    return Layout(tuple(columns), _new_header(columns, len(obj.data.vertices)))
+
+
+def _check_attributes(obj: bpy.types.Object, layout: Layout) -> None:
+    attributes = obj.data.attributes
+    present = {column.name for column in layout.columns}
+    absent = [name for name in REQUIRED if name not in present]
+    absent += [column.attribute for column in layout.columns if column.attribute not in attributes]
+    if absent:
+        there = [a.name for a in attributes if a.domain == "POINT" and a.name[0] != "."]
+        more = ", ..." if len(there) > 8 else ""  # noqa: PLR2004 - a line of names
+        msg = (
+            f"object '{obj.name}': has no attribute {', '.join(dict.fromkeys(absent))}; expected "
+            f"the properties of a 3DGS file on its points (it has {', '.join(there[:8])}{more})"
+        )
+        raise RefineError(msg)
+    for column in layout.columns:
+        attribute = attributes[column.attribute]
+        if not _is(attribute, column.kind):
+            msg = (
+                f"object '{obj.name}': attribute '{attribute.name}' is {attribute.data_type} on "
+                f"{attribute.domain}, expected {column.kind} on POINT"
+            )
+            raise RefineError(msg)
+
+
+def _is(attribute: bpy.types.Attribute | None, data_type: str) -> bool:
+    return bool(attribute and attribute.data_type == data_type and attribute.domain == "POINT")
+
+
+def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> tuple[Column, ...]:
+    """Add an attribute for each property of a file to a mesh, and note the file's layout on it.
+
+    Parameters
+    ----------
+    mesh : bpy.types.Mesh
+    rows : numpy.dtype
+        Type of the file's rows.
+    header : bytes
+        The file's header.
+
+    Returns
+    -------
+    tuple of Column
+        Where each property is to go, in the order of the file.
+    """
+    columns = []
+    for index, name in enumerate(rows.names or ()):
+        kind = rows[name].str
+        if name in PLACES:
+            columns.append(Column(name, kind, *PLACES[name]))
+            continue
+        # Blender keeps some names for itself, we others, and none has more than 63 bytes.
+        plain = name not in _TAKEN and len(name.encode()) < 64 and name[0] != "."  # noqa: PLR2004
+        place = name if plain else f"ply_{index}"
+        attribute = mesh.attributes.new(place, STORAGE[kind[1:]], "POINT")
+        attribute = attribute or mesh.attributes.new(f"ply_{index}", STORAGE[kind[1:]], "POINT")
+        columns.append(Column(name, kind, attribute.name))
+    mesh[LAYOUT] = json.dumps(
+        {
+            "header": vertex_header(header).decode("latin-1"),
+            "columns": [[c.name, c.dtype, c.attribute, c.component] for c in columns],
+        }
+    )
+    return tuple(columns)
+
+
+def vertex_header(header: bytes) -> bytes:
+    """Return a header without the elements other than ``vertex``, and binary."""
+    lines = re.findall(rb"[^\r\n]*(?:\r\n|\n|\r)", header)
+    kept, wanted = [], True
+    for line in lines:
+        words = line.split()
+        if words[:1] == [b"element"]:
+            wanted = words[1] == b"vertex"
+        elif words[:1] in ([b"comment"], [b"obj_info"], [b"end_header"]):
+            kept.append(line)
+            continue
+        if wanted:
+            kept.append(line.replace(b" ascii ", b" binary_little_endian ", 1))
+    return b"".join(kept)
+
+
+def _new_header(columns: Sequence[Column], count: int) -> bytes:
+    types = {"f4": "float", "i4": "int", "i1": "char"}
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {types[column.dtype[1:]]} {column.name}" for column in columns]
+    return ("\n".join([*lines, "end_header"]) + "\n").encode()

@@ -1,0 +1,125 @@
+"""Scores on a mesh: attributes to look at and select by, and a note of how they came to be."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..core.errors import RefineError
+from ..core.scores import Scores
+from ..core.selection import rank
+from . import attributes as mesh_attributes
+from . import edit as mesh_edit
+from . import heat_map
+from .layout import check
+
+if TYPE_CHECKING:
+    import bpy
+
+    from ..core.pipeline import Settings
+    from ..core.views import ViewSet
+
+SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
+"""Point attributes: the score, its place from 0 (goes first) to 1, in how many views it lies."""
+
+RECORD = "refine_scores"
+"""Custom property of the mesh: how its scores came to be, as JSON."""
+
+
+def store(
+    obj: bpy.types.Object,
+    scores: Scores,
+    views: ViewSet,
+    settings: Settings,
+    origin: dict[str, Any] | None = None,
+) -> None:
+    """Write scores to the attributes of an object's mesh, and note how they came to be.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+    scores, views, settings
+        What `core.pipeline.score` gave, and was given.
+    origin : dict, optional
+        See `staleness.origin`.
+
+    Raises
+    ------
+    RefineError
+        If the object cannot be written to, or no longer has as many splats.
+    """
+    mesh_edit.check_writable(obj)
+    check(obj)
+    mesh = obj.data
+    if len(mesh.vertices) != len(scores.values):
+        msg = (
+            f"object '{obj.name}': has {len(mesh.vertices)} splats, was scored with "
+            f"{len(scores.values)}; score it again"
+        )
+        raise RefineError(msg)
+    ranks = rank(scores.values)
+    mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
+    mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
+    mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
+    heat_map.write(mesh, ranks)
+    mesh[RECORD] = json.dumps(
+        {
+            "splats": len(scores.values),
+            "settings": asdict(settings),
+            "views_given": len(views),
+            "views_used": scores.views_used,
+            "undrawable": scores.undrawable,
+            "weights": scores.weights,
+            "notes": [*scores.notes, *([views.note] if views.note else [])],
+            "origin": origin,
+        }
+    )
+    mesh.update()
+
+
+def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
+    """Return how a mesh was scored, None if it was not."""
+    try:
+        noted = json.loads(mesh[RECORD])
+        complete = noted.keys() >= {"splats", "settings", "views_given", "views_used"}
+    except (KeyError, TypeError, ValueError, AttributeError):
+        return None
+    return noted if complete else None
+
+
+def stored_scores(obj: bpy.types.Object) -> Scores:
+    """Return the scores that an object's mesh holds.
+
+    Raises
+    ------
+    RefineError
+        If it was not scored, or is in a state in which it cannot be read.
+    """
+    check(obj)
+    noted = record(obj.data)
+    kinds = {SCORE: "FLOAT", SEEN: "INT"}
+    for name, kind in kinds.items():
+        attribute = obj.data.attributes.get(name)
+        if noted is None or not attribute or attribute.data_type != kind:
+            msg = f"object '{obj.name}': has no scores; score it first"
+            raise RefineError(msg)
+    values = mesh_attributes.read_attribute(obj.data, SCORE)
+    # Splats joined or added since hold a score of 0, as those do that no renderer can draw.
+    unscored = int(np.count_nonzero(values == 0.0)) - noted.get("undrawable", 0)
+    if len(values) > noted["splats"] or unscored > 0:
+        msg = (
+            f"object '{obj.name}': scored with {noted['splats']} splats, has {len(values)} now, "
+            f"{max(unscored, 0)} of them without a score; score it again"
+        )
+        raise RefineError(msg)
+    return Scores(
+        values=values,
+        seen=mesh_attributes.read_attribute(obj.data, SEEN),
+        views_used=noted["views_used"],
+        undrawable=noted.get("undrawable", 0),
+        weights=noted.get("weights", {}),
+        notes=tuple(noted.get("notes", ())),
+    )

@@ -1,0 +1,1 @@
+"""Panel, operators, settings and preview: what the artist sees and clicks."""

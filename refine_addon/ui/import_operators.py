@@ -1,0 +1,178 @@
+"""Operators that bring splat and camera files into the scene, and dropping files on the view."""
+
+# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import mathutils
+import numpy as np
+from bpy.props import BoolProperty, CollectionProperty, StringProperty
+from bpy_extras.io_utils import ImportHelper
+
+from ..cameras.objects import UPRIGHT
+from ..cameras.sets import create_cameras
+from ..core.cameras.read import read_cameras
+from ..core.errors import RefineError
+from ..core.formats.ply import read_ply
+from ..mesh import attributes as mesh_attributes
+from ..mesh import layout as mesh_layout
+from .operators import Answer, fail
+
+UPRIGHT_TEXT = (
+    "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "
+    "z-up world of Blender"
+)
+
+
+class _InObjectMode:
+    """An operator that adds objects."""
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run, and if not, why."""
+        if context.mode != "OBJECT":
+            cls.poll_message_set("Go to object mode first")
+            return False
+        return True
+
+
+class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
+    """Import 3DGS PLY files: a vertex a splat, a point attribute a property"""
+
+    bl_idname = "refine.import_ply"
+    bl_label = "Import Splats"
+    bl_options = {"REGISTER", "UNDO"}
+
+    filename_ext = ".ply"
+    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+    files: CollectionProperty(
+        type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"}
+    )
+    directory: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
+    upright: BoolProperty(name="Upright", description=UPRIGHT_TEXT)
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
+        """Ask for the files, or only for the options where files were dropped."""
+        return self.invoke_popup(context)
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Import the files; one that cannot be read does not stop the others."""
+        errors, imported = [], []
+        for path in self._paths():
+            try:
+                imported.append(self._import(context, path))
+            except RefineError as error:
+                errors.append(error)
+        if not imported:
+            return fail(self, errors[0] if len(errors) == 1 else RefineError(_joined(errors)))
+        for error in errors:
+            self.report({"WARNING"}, str(error))
+        for obj in context.selected_objects:
+            obj.select_set(False)
+        for obj in imported:
+            obj.select_set(True)
+        context.view_layer.objects.active = imported[-1]
+        count = sum(len(obj.data.vertices) for obj in imported)
+        self.report({"INFO"}, f"Imported {count:,} splats from {len(imported)} file(s)")
+        return {"FINISHED"}
+
+    def _paths(self) -> list[Path]:
+        names = [item.name for item in self.files if item.name]
+        if names and self.directory:
+            return [Path(bpy.path.abspath(self.directory)) / name for name in names]
+        return [Path(bpy.path.abspath(self.filepath))]
+
+    def _import(self, context: bpy.types.Context, path: Path) -> bpy.types.Object:
+        file = read_ply(path)
+        if not len(file):
+            msg = f"{path}: holds no splats"
+            raise RefineError(msg)
+        mesh = mesh_attributes.mesh_from_file(file)
+        obj = bpy.data.objects.new(mesh.name, mesh)
+        if self.upright:
+            obj.matrix_world = mathutils.Matrix(UPRIGHT.tolist())
+        _target(context).objects.link(obj)
+        for note in mesh_attributes.import_notes(file):
+            self.report({"WARNING"}, note)
+        return obj
+
+
+class REFINE_OT_import_cameras(_InObjectMode, bpy.types.Operator, ImportHelper):
+    """Import cameras as objects: Inria cameras.json, nerfstudio transforms.json or COLMAP"""
+
+    bl_idname = "refine.import_cameras"
+    bl_label = "Import Cameras"
+    bl_options = {"REGISTER", "UNDO"}
+
+    filename_ext = ".json"
+    filter_glob: StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})
+    upright: BoolProperty(
+        name="Upright",
+        description=UPRIGHT_TEXT + ". Choose what you chose for the splats",
+    )
+    set_resolution: BoolProperty(
+        name="Set Render Size",
+        description="Give the scene the image size of the first camera, so that renders show what "
+        "the cameras saw",
+    )
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
+        """Ask for the file; upright by default where the active splats are."""
+        obj = context.object
+        if mesh_layout.looks_like_splats(obj) and not self.properties.is_property_set("upright"):
+            self.upright = np.allclose(np.array(obj.matrix_world)[:3, :3], UPRIGHT[:3, :3])
+        return self.invoke_popup(context)
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Import the cameras into a collection of their own."""
+        path = Path(bpy.path.abspath(self.filepath))
+        try:
+            views = read_cameras(_model_folder(path))
+        except RefineError as error:
+            return fail(self, error)
+        scene = context.scene
+        collection = bpy.data.collections.new(f"Cameras {path.stem}")
+        _target(context).children.link(collection)
+        cameras = create_cameras(views, collection, upright=self.upright)
+        scene.refine.collection = collection
+        scene.refine.source = "COLLECTION"
+        scene.camera = scene.camera or cameras[0]
+        if self.set_resolution:
+            scene.render.resolution_x = views[0].width
+            scene.render.resolution_y = views[0].height
+            scene.render.resolution_percentage = 100
+        if views.note:
+            self.report({"WARNING"}, views.note)
+        self.report({"INFO"}, f"Imported {len(views)} cameras into '{collection.name}'")
+        return {"FINISHED"}
+
+
+class REFINE_FH_ply(bpy.types.FileHandler):
+    """Lets splat files be dropped on the 3D view."""
+
+    bl_idname = "REFINE_FH_ply"
+    bl_label = "Gaussian Splats (REFINE)"
+    bl_import_operator = "refine.import_ply"
+    bl_file_extensions = ".ply"
+
+    @classmethod
+    def poll_drop(cls, context: bpy.types.Context) -> bool:
+        """Tell whether files can be dropped here."""
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+
+def _target(context: bpy.types.Context) -> bpy.types.Collection:
+    """Return the active collection, or the scene's where that one belongs to a library."""
+    active = context.collection
+    return context.scene.collection if active is None or active.library else active
+
+
+def _model_folder(path: Path) -> Path:
+    """Return what to read: a COLMAP model is a folder, of which the user picked one file."""
+    return path.parent if path.suffix in {".bin", ".txt"} else path
+
+
+def _joined(errors: list[RefineError]) -> str:
+    return "; ".join(str(error) for error in errors)

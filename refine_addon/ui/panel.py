@@ -1,0 +1,215 @@
+"""The panel REFINE in the 3D view's sidebar: draws settings and stored results."""
+
+# ruff: noqa: N801, RUF012 - Blender's way to name classes and set options
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import bpy
+
+from ..cameras.sets import chosen_cameras
+from ..mesh import layout as mesh_layout
+from ..mesh import scores as mesh_scores
+from . import plans, preview, staleness
+
+if TYPE_CHECKING:
+    from .properties import RefineSettings
+
+
+class _InSidebar:
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "REFINE"
+
+
+class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
+    """What is to be pruned."""
+
+    bl_label = "1 Splats"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the import and what the active object holds."""
+        layout = self.layout
+        layout.operator("refine.import_ply", icon="IMPORT")
+        obj = context.object
+        if not mesh_layout.looks_like_splats(obj):
+            layout.label(text="Select an object that holds splats", icon="INFO")
+            return
+        count = len(obj.data.vertices)
+        layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
+        layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
+        size = mesh_layout.export_bytes(obj)
+        if size is not None:
+            layout.label(text=f"{size / 1e6:,.1f} MB")
+
+
+class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
+    """Who decides."""
+
+    bl_label = "2 Cameras"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the choice of cameras."""
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        settings = context.scene.refine
+        layout.operator("refine.import_cameras", icon="IMPORT")
+        layout.prop(settings, "source")
+        if settings.source == "COLLECTION":
+            layout.prop(settings, "collection")
+        if settings.source == "FRAMES":
+            _draw_frames(layout, settings, context.scene)
+        elif settings.source != "ACTIVE":
+            cameras = chosen_cameras(context, settings.source, settings.collection)
+            layout.label(text=f"{len(cameras)} cameras", icon="CAMERA_DATA")
+
+
+class REFINE_PT_score(_InSidebar, bpy.types.Panel):
+    """The scoring."""
+
+    bl_label = "3 Score"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the method, the button and what came of it."""
+        layout = self.layout
+        settings = context.scene.refine
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        column.prop(settings, "method")
+        if settings.method == "auto":
+            column.prop(settings, "tolerance")
+        progress = context.window_manager.refine_progress
+        if progress >= 0.0:
+            layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
+            return
+        layout.operator("refine.score", icon="CAMERA_DATA")
+        obj = context.object
+        record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        if record:
+            layout.label(
+                text=f"Scored by {record['views_used']} of {record['views_given']} views",
+                icon="CHECKMARK",
+            )
+            changed = staleness.changes(context, obj)
+            if changed:
+                layout.label(text=f"Score again: {', '.join(changed)}", icon="ERROR")
+        elif mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes:
+            layout.label(text="Applied: score again for more", icon="INFO")
+
+
+class REFINE_PT_advanced(_InSidebar, bpy.types.Panel):
+    """Settings of the scoring that seldom need a change."""
+
+    bl_label = "Advanced"
+    bl_parent_id = "REFINE_PT_score"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the settings of the method."""
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        settings = context.scene.refine
+        layout.prop(settings, "views")
+        if settings.method == "occlusion":
+            return  # the others are settings of the closed form
+        layout.prop(settings, "depth")
+        layout.prop(settings, "published")
+        column = layout.column()
+        column.enabled = not settings.published
+        column.prop(settings, "frustum")
+        row = column.row()
+        row.enabled = settings.frustum
+        row.prop(settings, "margin")
+
+
+class REFINE_PT_preview(_InSidebar, bpy.types.Panel):
+    """Looking before deleting."""
+
+    bl_label = "4 Preview"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the ways to look at the splats."""
+        layout = self.layout
+        obj = context.object
+        splats = mesh_layout.looks_like_splats(obj)
+        mode, hidden = preview.shown(obj) if splats else ("", False)
+        row = layout.row(align=True)
+        for choice, text in (("HEAT", "Heat Map"), ("COLOR", "Colour")):
+            cell = row.row(align=True)
+            cell.enabled = choice == "COLOR" or (splats and preview.has_heat(obj))
+            button = cell.operator("refine.preview", text=text, depress=mode == choice)
+            button.mode = "OFF" if mode == choice else choice
+            button.hide_removed = hidden
+        row = layout.row()
+        row.enabled = bool(mode)
+        icon = "HIDE_ON" if hidden else "HIDE_OFF"
+        button = row.operator("refine.preview", text="Hide What Goes", depress=hidden, icon=icon)
+        button.mode = mode or "HEAT"
+        button.hide_removed = not hidden
+
+
+class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
+    """How much goes."""
+
+    bl_label = "5 Apply"
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the budget, what it would do, and the button."""
+        layout = self.layout
+        settings = context.scene.refine
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        column.prop(settings, "budget")
+        column.prop(settings, settings.budget)
+        column.prop(settings, "protect")
+        column.prop(settings, "absorb")
+        obj = context.object
+        if mesh_layout.looks_like_splats(obj) and mesh_scores.record(obj.data):
+            _draw_plan(layout, obj, settings)
+        progress = context.window_manager.refine_progress
+        if progress >= 0.0:
+            layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
+            return
+        layout.operator("refine.apply", icon="TRASH")
+
+
+class REFINE_PT_export(_InSidebar, bpy.types.Panel):
+    """The way out."""
+
+    bl_label = "6 Export"
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        """Draw the button."""
+        self.layout.operator("refine.export_ply", icon="EXPORT")
+
+
+def _draw_frames(
+    layout: bpy.types.UILayout, settings: RefineSettings, scene: bpy.types.Scene
+) -> None:
+    layout.prop(settings, "scene_frames")
+    if not settings.scene_frames:
+        column = layout.column(align=True)
+        column.prop(settings, "frame_start")
+        column.prop(settings, "frame_end")
+    layout.prop(settings, "frame_step")
+    layout.label(text=f"{len(settings.to_frames(scene))} frames", icon="CAMERA_DATA")
+
+
+def _draw_plan(layout: bpy.types.UILayout, obj: bpy.types.Object, settings: RefineSettings) -> None:
+    plan = plans.stored(obj, settings)
+    if plan is None:
+        layout.operator("refine.plan", icon="FILE_REFRESH")
+    elif "error" in plan:
+        layout.label(text=plan["error"], icon="ERROR")
+    else:
+        gone = plan["bytes_before"] - plan["bytes_after"]
+        column = layout.column(align=True)
+        column.label(
+            text=f"Stay: {plan['kept']:,} splats, {plan['bytes_after'] / 1e6:,.1f} MB",
+            icon="CHECKMARK",
+        )
+        column.label(text=f"Go: {plan['removed']:,} splats, {gone / 1e6:,.1f} MB", icon="TRASH")

@@ -1,0 +1,221 @@
+"""What the user sets in the panel, and its conversion to the settings of core."""
+
+# ruff: noqa: TC002 - Blender runs the annotations
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import bpy
+import numpy as np
+from bpy.props import (
+    BoolProperty,
+    EnumProperty,
+    FloatProperty,
+    IntProperty,
+    PointerProperty,
+    StringProperty,
+)
+
+from ..core.pipeline import Settings
+from ..core.scoring.closed_form import ClosedForm
+from ..core.selection import Budget
+from . import plans
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+METHODS = (
+    ("closed-form", "Closed Form", "REFINE's closed form: fast; takes nothing as hidden"),
+    ("occlusion", "Occlusion", "Knows what hides what: better, and takes longer"),
+    ("auto", "Auto", "The cheapest that keeps nearly the same splats as Occlusion"),
+)
+"""Methods of scoring, by the names that core gives them."""
+
+BUDGETS = (
+    ("ratio", "Share", "Remove this share of the splats"),
+    ("keep", "Count", "Keep this many splats"),
+    ("max_mb", "File Size", "Keep as many splats as fit in a file of this size"),
+    ("threshold", "Score", "Remove splats that score below this"),
+    ("min_seen", "Views", "Remove splats that lie in fewer than this share of the views"),
+)
+"""Kinds of budget, by the names that core gives them."""
+
+SOURCES = (
+    ("VISIBLE", "Visible", "All cameras that are visible in the scene"),
+    ("ACTIVE", "Active", "The scene's active camera, at the current frame"),
+    ("SELECTED", "Selected", "The cameras that are selected"),
+    ("COLLECTION", "Collection", "The cameras of a collection, hidden ones too"),
+    ("FRAMES", "Frames", "The active camera at each frame of a range: an animated shot"),
+)
+
+
+def _plan_again(_settings: RefineSettings, context: bpy.types.Context) -> None:
+    plans.refresh(context)
+
+
+def _protectable(
+    _settings: RefineSettings, context: bpy.types.Context, _text: str
+) -> Iterator[str]:
+    """Suggest what the active object has that can protect splats."""
+    obj = context.object
+    if obj and obj.type == "MESH":
+        yield from (group.name for group in obj.vertex_groups)
+        for attribute in obj.data.attributes:
+            kind = (attribute.data_type, attribute.domain)
+            if kind == ("BOOLEAN", "POINT") and not attribute.name.startswith((".", "refine_")):
+                yield attribute.name
+
+
+def decimal(value: float) -> float:
+    """Return the number that the user typed: Blender keeps 0.29 as 0.28999999165534973.
+
+    Without this, the panel would remove another number of splats than the command.
+
+    Examples
+    --------
+    >>> decimal(0.28999999165534973)
+    0.29
+    """
+    return float(str(np.float32(value)))
+
+
+class RefineSettings(bpy.types.PropertyGroup):
+    """Settings of the panel, at ``scene.refine``."""
+
+    method: EnumProperty(name="Method", description="How splats are scored", items=METHODS)
+    depth: EnumProperty(
+        name="Depth",
+        description="What counts as the distance between a splat and a view",
+        items=(
+            ("z", "Along Axis", "Depth along the camera's axis, as in the paper"),
+            ("distance", "Distance", "Distance to the camera, as in the authors' code"),
+        ),
+    )
+    published: BoolProperty(
+        name="Published Constants",
+        description="Use the constants of the paper or its code as they are; they assume a scene "
+        "in metres and count splats that lie outside the frame",
+    )
+    frustum: BoolProperty(
+        name="Only in Frame",
+        description="Count a view only for the splats that lie in its frame",
+        default=True,
+    )
+    margin: FloatProperty(
+        name="Margin",
+        description="How far beyond the edge of the image still counts, in half image sizes",
+        default=0.15,
+        min=0.0,
+        soft_max=1.0,
+    )
+    views: IntProperty(
+        name="Views",
+        description="Use at most this many views, spread out evenly; 0 uses all",
+        default=64,
+        min=0,
+    )
+    tolerance: FloatProperty(
+        name="Tolerance",
+        description="Share of the kept splats that may differ from those of Occlusion",
+        default=0.01,
+        min=0.0,
+        max=1.0,
+    )
+    source: EnumProperty(name="Cameras", description="Which cameras decide", items=SOURCES)
+    collection: PointerProperty(
+        name="Collection", description="The collection of the cameras", type=bpy.types.Collection
+    )
+    scene_frames: BoolProperty(
+        name="Scene Range", description="Use the frame range of the scene", default=True
+    )
+    frame_start: IntProperty(name="Start", description="First frame", default=1)
+    frame_end: IntProperty(name="End", description="Last frame", default=250)
+    frame_step: IntProperty(name="Step", description="Every how many frames", default=10, min=1)
+    budget: EnumProperty(
+        name="Budget",
+        description="What says how much is removed",
+        items=BUDGETS,
+        update=_plan_again,
+    )
+    ratio: FloatProperty(
+        name="Remove",
+        description="Share of the splats to remove",
+        subtype="FACTOR",
+        default=0.5,
+        min=0.0,
+        max=0.9999,
+        update=_plan_again,
+    )
+    keep: IntProperty(
+        name="Keep",
+        description="How many splats stay",
+        default=100_000,
+        min=1,
+        update=_plan_again,
+    )
+    max_mb: FloatProperty(
+        name="MB",
+        description="Size of the exported file, in megabytes of a million bytes",
+        default=100.0,
+        min=1e-6,
+        update=_plan_again,
+    )
+    threshold: FloatProperty(
+        name="Score",
+        description="Splats that score below this are removed",
+        default=0.01,
+        precision=5,
+        update=_plan_again,
+    )
+    min_seen: FloatProperty(
+        name="Seen by",
+        description="Splats that lie in fewer than this share of the views are removed",
+        subtype="PERCENTAGE",
+        default=1.0,
+        min=0.0,
+        max=100.0,
+        update=_plan_again,
+    )
+    absorb: BoolProperty(
+        name="Absorb",
+        description="Survivors take over what is removed, by what the cameras see of it: far "
+        "better when much is removed, and slower; the survivors change",
+    )
+    protect: StringProperty(
+        name="Protect",
+        description="Vertex group or boolean point attribute: the splats in it stay",
+        search=_protectable,
+        search_options={"SORT", "SUGGESTION"},
+        update=_plan_again,
+    )
+
+    def to_settings(self) -> Settings:
+        """Return the settings of core.
+
+        Raises
+        ------
+        RefineError
+            If they cannot be.
+        """
+        if self.published:
+            form = ClosedForm.published(self.depth)
+        else:
+            form = ClosedForm(self.depth, frustum=self.frustum, margin=decimal(self.margin))
+        return Settings(self.method, self.views, form, tolerance=decimal(self.tolerance))
+
+    def to_budget(self) -> Budget:
+        """Return the budget of core.
+
+        Raises
+        ------
+        RefineError
+            If it cannot be.
+        """
+        value = getattr(self, self.budget)
+        return Budget(**{self.budget: value if self.budget == "keep" else decimal(value)})
+
+    def to_frames(self, scene: bpy.types.Scene) -> range:
+        """Return the frames whose views count."""
+        if self.scene_frames:
+            return range(scene.frame_start, scene.frame_end + 1, self.frame_step)
+        return range(self.frame_start, self.frame_end + 1, self.frame_step)

@@ -1,0 +1,114 @@
+"""What scores were made with, and what of it has changed since: asked while the panel is drawn.
+
+Only what a few numbers tell is compared: where the object stands, the cameras and their lenses,
+the settings. What was done to the splats themselves is not looked for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..cameras.objects import SOURCE, WEIGHT, render_size
+from ..cameras.sets import chosen_cameras
+from ..mesh import scores as mesh_scores
+
+if TYPE_CHECKING:
+    import bpy
+
+_NOISE = 1e-6
+"""Relative: what another machine or version of Blender may make of the same matrices."""
+
+_FITS = ("AUTO", "HORIZONTAL", "VERTICAL")
+_AXES, _PLACE = [0, 1, 2, 4, 5, 6, 8, 9, 10], [3, 7, 11]  # in the rows of a matrix
+
+
+def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
+    """Return where an object and the cameras that the panel names are, as values for JSON."""
+    return {
+        "matrix": np.array(obj.matrix_world).tolist(),
+        "frame": context.scene.frame_current,
+        **_cameras(context),
+    }
+
+
+def changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
+    """Return what changed since an object was scored, in two words each.
+
+    Parameters
+    ----------
+    context : bpy.types.Context
+        Evaluated: matrices are read as they stand.
+    obj : bpy.types.Object
+        Without scores, or scored by a script that noted no origin, it has no changes.
+    """
+    record = mesh_scores.record(obj.data) or {}
+    try:
+        then, settings = record["origin"], record["settings"]
+        found = {
+            "object moved": _moved(then, context.scene, obj),
+            "cameras changed": _other_cameras(then, _cameras(context)),
+            "settings changed": _deciding(settings)
+            != _deciding(asdict(context.scene.refine.to_settings())),
+        }
+    except (KeyError, TypeError, ValueError):  # whoever wrote there, these are no scores of ours
+        return []
+    return [words for words, so in found.items() if so]
+
+
+def _moved(then: dict[str, Any], scene: bpy.types.Scene, obj: bpy.types.Object) -> bool:
+    if "frames" in then and then["frame"] != scene.frame_current:
+        return False  # in a shot the views follow the object, which may stand elsewhere by now
+    before, now = np.array(then["matrix"]), np.array(obj.matrix_world)
+    return bool(np.abs(now - before).max() > _NOISE * np.abs(before).max())
+
+
+def _deciding(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return those settings of core that a method looks at, as far as the panel has them."""
+    more = {"closed-form": ["closed_form"], "auto": ["closed_form", "tolerance"]}
+    return {name: settings[name] for name in ("method", "views", *more.get(settings["method"], ()))}
+
+
+def _cameras(context: bpy.types.Context) -> dict[str, Any]:
+    """Return a note of the cameras that decide; of a shot, which frames of which camera."""
+    scene, settings = context.scene, context.scene.refine
+    if settings.source == "FRAMES":
+        frames = settings.to_frames(scene)
+        camera = scene.camera.name if scene.camera else ""
+        return {"frames": [frames.start, frames.stop, frames.step, camera]}
+    cameras = chosen_cameras(context, settings.source, settings.collection)
+    (width, height), aspect = render_size(scene)
+    frame = (width, height, aspect)
+    numbers = np.array([_numbers(camera, frame) for camera in cameras])
+    # In any order, and short however many there are.
+    sums = [numbers.sum(axis=0).tolist(), (numbers**2).sum(axis=0).tolist()]
+    return {"source": settings.source, "cameras": len(cameras), "sums": sums}
+
+
+def _numbers(camera: bpy.types.Object, frame: tuple[int, int, float]) -> tuple[float, ...]:
+    """Return what makes the view of a camera: its matrix row by row, its lens, its weight."""
+    matrix, data = camera.matrix_world, camera.data
+    weight = camera.get(WEIGHT, 1.0)
+    return (
+        *(*matrix[0], *matrix[1], *matrix[2]),
+        *(data.lens, data.sensor_width, data.sensor_height, data.shift_x, data.shift_y),
+        *(data.clip_start, data.clip_end, _FITS.index(data.sensor_fit)),
+        *((0, 0, 0) if SOURCE in camera else frame),  # imported ones keep the size of their file
+        weight if isinstance(weight, (int, float)) else -1.0,
+    )
+
+
+def _other_cameras(then: dict[str, Any], now: dict[str, Any]) -> bool:
+    if "frames" in then or "frames" in now:
+        return then.get("frames") != now.get("frames")
+    if now["source"] == then["source"] == "SELECTED" and not now["cameras"]:
+        return False  # selecting the splats deselects them; those meant are not known
+    if now["cameras"] != then["cameras"]:
+        return True
+    before, after = np.array(then["sums"]), np.array(now["sums"])
+    scale = np.array([np.sqrt(then["cameras"] * before[1]), before[1]])  # bounds the sums
+    for group in (_AXES, _PLACE):
+        scale[:, group] = scale[:, group].max(axis=1, keepdims=True)
+    return bool((np.abs(after - before) > _NOISE * scale).any())

@@ -1,0 +1,67 @@
+"""Long work on a thread: arrays only, Blender's data is not safe to touch from there."""
+
+from __future__ import annotations
+
+import threading
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ..core.work import Progress
+
+Result = TypeVar("Result")
+
+
+class Worker(Generic[Result]):
+    """A call that runs while the window stays alive.
+
+    Parameters
+    ----------
+    work : callable
+        ``work(progress)``; its result, or what it raises, is handed out by `result`.
+
+    Attributes
+    ----------
+    fraction : float
+        How much is done, 0 to 1.
+    """
+
+    def __init__(self, work: Callable[[Progress], Result]) -> None:
+        self.fraction = 0.0
+        self._cancelled = False
+        self._result: Result | None = None
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, args=(work,), name="refine", daemon=True)
+        self._thread.start()
+
+    def running(self) -> bool:
+        """Tell whether it still works."""
+        return self._thread.is_alive()
+
+    def cancel(self) -> None:
+        """Ask it to stop; `result` raises `Cancelled` then."""
+        self._cancelled = True
+
+    def result(self) -> Result:
+        """Wait for the result and return it.
+
+        Raises
+        ------
+        RefineError, Cancelled
+            What the work raised.
+        """
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return self._result
+
+    def _run(self, work: Callable[[Progress], Result]) -> None:
+        try:
+            self._result = work(self._progress)
+        except BaseException as error:  # noqa: BLE001 - handed to the other thread by `result`
+            self._error = error
+
+    def _progress(self, fraction: float, _what: str) -> bool:
+        self.fraction = fraction
+        return not self._cancelled

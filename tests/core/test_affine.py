@@ -1,0 +1,162 @@
+"""Splats and harmonics moved by matrices."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from refine_addon.core import RefineError, Splats
+from refine_addon.core.affine import quaternion, transformed
+from refine_addon.core.spherical_harmonics import basis, rotate
+from refine_addon.core.splats import rotation_matrices
+
+RNG = np.random.default_rng(7)
+
+
+def some(count: int = 50, coefficients: int = 15) -> Splats:
+    return Splats(
+        means=RNG.normal(size=(count, 3)).astype(np.float32),
+        log_scales=RNG.normal(-2, 1, size=(count, 3)).astype(np.float32),
+        quaternions=RNG.normal(size=(count, 4)).astype(np.float32),
+        opacity_logits=RNG.normal(size=count).astype(np.float32),
+        sh_dc=RNG.normal(size=(count, 3)).astype(np.float32),
+        sh_rest=RNG.normal(size=(count, coefficients, 3)).astype(np.float32),
+    )
+
+
+def covariances(splats: Splats) -> np.ndarray:
+    axes = rotation_matrices(splats.quaternions) * np.exp(splats.log_scales.astype(float))[:, None]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def directions(count: int = 40) -> np.ndarray:
+    points = RNG.normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+def affine(linear, shift=(0, 0, 0)) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = linear
+    matrix[:3, 3] = shift
+    return matrix
+
+
+ROTATION = np.linalg.qr(RNG.normal(size=(3, 3)))[0]
+
+
+def test_the_basis_is_orthonormal_over_the_sphere():
+    """A Gauss-Legendre x equidistant rule of 12 x 24 points integrates degree 8 exactly."""
+    z, weight = np.polynomial.legendre.leggauss(12)
+    phi = np.arange(24) * 2 * np.pi / 24
+    ring = np.sqrt(1 - z * z)[:, None]
+    points = np.stack([ring * np.cos(phi), ring * np.sin(phi), np.tile(z[:, None], 24)], axis=-1)
+    values = basis(points.reshape(-1, 3), 4)
+
+    gram = values.T @ (np.repeat(weight * 2 * np.pi / 24, 24)[:, None] * values)
+
+    np.testing.assert_allclose(gram, np.eye(25), atol=1e-14)
+
+
+def test_the_basis_has_the_signs_of_the_reference_implementation():
+    """At (1, 2, 2) / 3, with the constants as printed in 3DGS code, degree 1 and 2."""
+    x, y, z = 1 / 3, 2 / 3, 2 / 3
+    c1 = 0.4886025119029199
+    c2 = [1.0925484305920792, -1.0925484305920792, 0.31539156525252005]
+    c2 += [-1.0925484305920792, 0.5462742152960396]
+    expected = [0.28209479177387814, -c1 * y, c1 * z, -c1 * x]
+    expected += [c2[0] * x * y, c2[1] * y * z, c2[2] * (2 * z * z - x * x - y * y)]
+    expected += [c2[3] * x * z, c2[4] * (x * x - y * y)]
+
+    np.testing.assert_allclose(basis(np.array([x, y, z]), 2), expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("matrix", [ROTATION, -ROTATION, np.diag([1, 1, -1]), np.eye(3)])
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
+def test_rotated_harmonics_show_the_old_colour_along_the_rotated_direction(matrix, degree):
+    """Colour'(R d) = colour(d), for rotations and reflections."""
+    rest = RNG.normal(size=(5, (degree + 1) ** 2 - 1, 3))
+    where = directions()
+    expected = np.einsum("dk,nkc->ndc", basis(where, degree)[:, 1:], rest)
+
+    turned = rotate(rest, matrix)
+
+    there = np.einsum("dk,nkc->ndc", basis(where @ matrix.T, degree)[:, 1:], turned)
+    np.testing.assert_allclose(there, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 250.0])
+@pytest.mark.parametrize("sign", [1, -1], ids=["turned", "mirrored"])
+def test_a_uniform_transform_moves_means_covariances_and_colours(scale, sign):
+    """M mean + t and M covariance M', with M = scale times a rotation."""
+    splats = some()
+    matrix = affine(sign * scale * ROTATION, [1, -2, 3])
+    linear = matrix[:3, :3]
+
+    moved = transformed(splats, matrix)
+
+    np.testing.assert_allclose(moved.means, splats.means @ linear.T + [1, -2, 3], rtol=1e-9)
+    expected = linear @ covariances(splats) @ linear.T
+    np.testing.assert_allclose(
+        covariances(moved), expected, atol=2e-5 * np.abs(expected).max((1, 2)).min(), rtol=1e-4
+    )
+    where = directions()
+    before = np.einsum("dk,nkc->ndc", basis(where, 3)[:, 1:], splats.sh_rest)
+    turned = basis(sign * where @ ROTATION.T, 3)[:, 1:]
+    np.testing.assert_allclose(np.einsum("dk,nkc->ndc", turned, moved.sh_rest), before, atol=1e-5)
+
+
+def test_a_stretch_is_exact_for_the_shape_and_refused_for_the_colours():
+    """Covariance' = M covariance M' has other axes; harmonics have no such map."""
+    splats = some()
+    matrix = affine(np.array([[2, 0.3, 0], [0, 1, 0], [0, 0, 0.5]]))
+    linear = matrix[:3, :3]
+
+    moved = transformed(splats, matrix, rotate_sh=False)
+
+    expected = linear @ covariances(splats) @ linear.T
+    scale = np.abs(expected).max((1, 2), keepdims=True)
+    np.testing.assert_allclose(covariances(moved) / scale, expected / scale, atol=1e-6)
+    with pytest.raises(RefineError, match="scales directions differently"):
+        transformed(splats, matrix)
+
+
+@pytest.mark.parametrize("log", [-104.0, -np.inf, 88.0])
+def test_a_stretch_keeps_splats_of_extreme_size(log):
+    """Scales are stretched relative to the longest axis, so nothing leaves the range."""
+    splats = some(4, 0)
+    logs = np.tile(np.array([log, 0.0, 88.0 if log > 0 else -1.0], np.float32), (4, 1))
+    matrix = affine(np.diag([2.0, 1.0, 1.0]))
+
+    with np.errstate(all="raise"):
+        moved = transformed(
+            Splats(splats.means, logs, np.tile(np.float32([1, 0, 0, 0]), (4, 1)),
+                   splats.opacity_logits, splats.sh_dc, splats.sh_rest),
+            matrix, rotate_sh=False,
+        )  # fmt: skip
+
+    expected = np.sort(logs[0] + np.array([math.log(2), 0, 0]))[::-1]
+    if np.isfinite(log) and log > -100:
+        np.testing.assert_allclose(moved.log_scales[0], expected, atol=1e-4)
+    assert not np.isnan(moved.log_scales).any()
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [np.eye(3), affine(np.diag([1, 1, 0])), affine(np.eye(3) * np.nan), np.diag([1, 1, 1, 2])],
+    ids=["3 x 3", "flat", "NaN", "projective"],
+)
+def test_a_matrix_that_cannot_be_applied_is_refused(matrix):
+    """Each would lose the splats."""
+    with pytest.raises(RefineError, match=r"matrix|flat or not affine"):
+        transformed(some(3), matrix)
+
+
+def test_the_quaternion_of_a_rotation_gives_it_back_even_at_half_a_turn():
+    """Signs differ, matrices do not."""
+    turns = [ROTATION * np.linalg.det(ROTATION), np.diag([1.0, -1, -1]), np.diag([-1.0, -1, 1])]
+
+    matrices = rotation_matrices(quaternion(np.array(turns)))
+
+    np.testing.assert_allclose(matrices, turns, atol=1e-14)
