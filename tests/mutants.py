@@ -125,7 +125,7 @@ MUTANTS = {
         ),
         ("errors = errors * share /", "errors = errors /", "outside counts"),
         (
-            "_points_needed(footprints, side, density) > MAX_POINTS",
+            "_points_needed(footprints, side, density) > limit",
             "side > MAX_POINTS",
             "memory without bound",
         ),

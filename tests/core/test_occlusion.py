@@ -685,6 +685,24 @@ def test_cells_grow_until_the_points_of_a_view_fit_the_memory(monkeypatch):
     assert len(froxels.scatter(footprints, view, side, 3.2).owners) <= 2 * 20_000
 
 
+@pytest.mark.parametrize(("large", "steps"), [(0.05, 0), (0.1, 1), (0.3, 3)])
+def test_cells_stop_growing_where_each_footprint_needs_a_point_of_its_own(large, steps):
+    """4.3 million footprints are more than the 2^22 points of a view: 1.25 a footprint are allowed.
+
+    Cells of 4 px, 2 points per standard deviation of that length: sigma .5 has one point and sigma
+    4 has 2 x 2. A share p of the latter needs 1 + 3 p a footprint: 1.15, 1.3 and 1.9. Cells grow by
+    2^(1/4), each step divides the 4 by sqrt 2: after one 1.18 at p = .1, after three 1.12 at .3.
+    """
+    count = 4_300_000
+    sigmas = np.where(np.arange(count) < large * count, 4.0, 0.5).astype(np.float32)
+    both = np.broadcast_to(sigmas, (2, count))
+    footprints = projection.Footprints(np.arange(count), both, both, both, both)
+
+    side = froxels.cell_size(footprints, look_along_z(), 4.0, 2.0)
+
+    assert side == pytest.approx(4.0 * 2.0 ** (steps / 4))
+
+
 def test_an_image_of_any_shape_has_few_enough_cells():
     """16 bits number the cells, of an image of 50 Mpx as of one a pixel high."""
     splats = cloud(50)

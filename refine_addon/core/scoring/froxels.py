@@ -41,7 +41,12 @@ MAX_CELLS = 65535
 """Cells are numbered by 16 bits: such numbers sort by counting, in linear time."""
 
 MAX_POINTS = 1 << 22
-"""Points in one view, at most; cells grow until they suffice. About 100 bytes each."""
+"""Points that a view may have, as estimated: cells grow until they suffice. About 100 bytes each.
+"""
+
+LEAST_POINTS = 1.25
+"""Points that a footprint may have on average in a view of so many that `MAX_POINTS` are too few:
+each needs one at least, whatever the size of the cells."""
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """How many points a lattice may have along an axis."""
@@ -158,7 +163,9 @@ def cell_size(footprints: Footprints, view: View, cell: float, density: float) -
     side = max(cell, math.sqrt(view.width * view.height / MAX_CELLS) * 1.01)
     while math.ceil(view.width / side) * math.ceil(view.height / side) > MAX_CELLS:
         side *= _GROWTH  # an image a few pixels thin
-    while _points_needed(footprints, side, density) > MAX_POINTS:
+    # As cells grow the points needed fall to one a footprint: always below this limit.
+    limit = max(MAX_POINTS, LEAST_POINTS * len(footprints.index))
+    while _points_needed(footprints, side, density) > limit:
         side *= _GROWTH
     return side
 

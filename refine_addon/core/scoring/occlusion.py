@@ -118,8 +118,8 @@ def score(
     Notes
     -----
     Memory: about 300 bytes a splat, a third more for each thread beyond the first; where a view
-    has many points, 100 bytes for each of them and thread, of which
-    there are at most 4 million (`froxels.MAX_POINTS`).
+    has many points, 100 bytes for each of them and thread. A view has about 4 million points at
+    most (`froxels.MAX_POINTS`), and more only where it shows more than 3 million splats.
     """
     return _scored(splats, views, settings, progress, threads)[0]
 
