@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from refine_addon.core import RefineError, Splats, View, ViewSet
+from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet, work
 from refine_addon.core.affine import transformed
 from refine_addon.core.scoring import coverage, froxels, occlusion, projection
 from refine_addon.core.scoring.occlusion import Measured, Occlusion
@@ -683,6 +683,37 @@ def test_cells_grow_until_the_points_of_a_view_fit_the_memory(monkeypatch):
 
     assert free == 4.0
     assert len(froxels.scatter(footprints, view, side, 3.2).owners) <= 2 * 20_000
+
+
+def test_a_view_of_many_splats_is_cancelled_within(monkeypatch):
+    """300 splats, 50 at a time: between six projections, then between lattices, then cells.
+
+    No time need pass between two reports here, so each of these steps reports: there are more than
+    1 + 6 of them, and whichever answers ``False`` is the last.
+    """
+    monkeypatch.setattr(projection, "_CHUNK", 50)
+    monkeypatch.setattr(froxels, "_BLOCK", 50)
+    monkeypatch.setattr(work, "_PATIENCE", 0.0)
+    steps = []
+
+    def scoring(last=10**6):
+        steps.clear()
+
+        def progress(_fraction, what):
+            if what == "scoring":
+                steps.append(what)
+            return len(steps) < last
+
+        occlusion.measure(cloud(300), ring(1), progress=progress, threads=1)
+
+    scoring()
+    total = len(steps)
+
+    assert total > 1 + 6
+    for last in (1, 2, 8, total):
+        with pytest.raises(Cancelled):
+            scoring(last)
+        assert len(steps) == last
 
 
 @pytest.mark.parametrize(("large", "steps"), [(0.05, 0), (0.1, 1), (0.3, 3)])

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..work import checkpoint
 from .projection import ALPHA_CUT
 
 if TYPE_CHECKING:
@@ -143,6 +144,7 @@ class Points:
     def pieces(self) -> Iterator[tuple[slice, Points]]:
         """Cut into whole columns, about `_BLOCK` points at a time: (place, points) in turn."""
         for cells, place in _runs(self.columns):
+            checkpoint()
             columns = self.columns[cells]
             yield place, Points(self.owners[place], self.weights[place], columns, self.area)
 
@@ -194,6 +196,7 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
     cells = np.empty(int(counts.sum()), np.uint16)
     weights = np.empty(len(cells), np.float32)
     for row, place in _runs(counts):
+        checkpoint()
         cells[place], weights[place] = _laid(footprints, row, kinds[row], view, side)
     # Few, if any: theirs are laid again, over the image.
     vast = np.flatnonzero(kinds == len(sizes) - 1)

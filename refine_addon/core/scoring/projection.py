@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..splats import SH_C0, drawable, opacity, rotation_matrices
-from ..work import Progress, for_chunks, silent
+from ..work import Progress, checkpoint, for_chunks, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -221,6 +221,7 @@ def project(gaussians: Gaussians, frame: Frame, view: View) -> Footprints:
     rotation = _rotation6(view)
     pieces: list[tuple[NDArray[Any], ...]] = []
     for start in range(0, len(gaussians), _CHUNK):
+        checkpoint()
         piece = slice(start, start + _CHUNK)
         local = _local(gaussians.means[:, piece], frame, view)
         touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, (near, far)))
