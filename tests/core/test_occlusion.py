@@ -215,7 +215,9 @@ def test_light_is_the_mean_of_exp_of_a_gamma_distributed_thickness(side):
 def test_a_splat_as_narrow_as_a_cell_is_half_even():
     """By its narrow side: sigma 4 px on cells of 16 px^2; a third of it is a tenth, thrice .9."""
     sigmas = np.array([[50.0, 5.0, 12.0], [4.0, 4 / 3, 12.0]], np.float32)
-    footprints = projection.Footprints(np.arange(3), sigmas, sigmas, sigmas, sigmas)
+    footprints = projection.Footprints(
+        np.arange(3), sigmas, sigmas, sigmas, sigmas, np.ones(3, bool)
+    )
 
     found = froxels.evenness(footprints, 16.0)
 
@@ -386,6 +388,14 @@ def test_near_and_far_planes_are_lengths_of_the_world(unit):
 
     assert (found.contribution > 0).tolist() == [False, True, True, False]
     assert found.seen.tolist() == [0, 1, 1, 0]
+
+
+def test_the_near_plane_belongs_to_the_inside():
+    """As the far plane and the image's edges do, docs/conventions.md; .5 and 1 are exact."""
+    splats = splats_of([[0, 0, 0.5], [0, 0, 1]])
+
+    assert measured(splats, look_along_z(near=1.0)).seen.tolist() == [0, 1]
+    assert measured(splats, look_along_z(far=0.5)).seen.tolist() == [1, 0]
 
 
 def test_without_planes_what_is_nearer_than_a_hundredth_of_the_scene_is_not_seen():
@@ -727,7 +737,9 @@ def test_cells_stop_growing_where_each_footprint_needs_a_point_of_its_own(large,
     count = 4_300_000
     sigmas = np.where(np.arange(count) < large * count, 4.0, 0.5).astype(np.float32)
     both = np.broadcast_to(sigmas, (2, count))
-    footprints = projection.Footprints(np.arange(count), both, both, both, both)
+    footprints = projection.Footprints(
+        np.arange(count), both, both, both, both, np.ones(count, bool)
+    )
 
     side = froxels.cell_size(footprints, look_along_z(), 4.0, 2.0)
 

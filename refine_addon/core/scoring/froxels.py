@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..rendering import ALPHA_CUT, ALPHA_MAX
 from ..work import checkpoint
-from .projection import ALPHA_CUT
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -30,9 +30,6 @@ if TYPE_CHECKING:
 
     from ..views import View
     from .projection import Footprints
-
-ALPHA_MAX = 0.99
-"""Renderers let no single splat hide more than this."""
 
 DOUBT = 12.0
 """What lies loosely in front is believed to be gamma distributed, its shape this over the side of a

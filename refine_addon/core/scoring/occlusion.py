@@ -406,7 +406,7 @@ def measure_view(
         count = len(footprints.index)
         if not count:
             return
-        total.seen[footprints.index[footprints.inside(view)]] += 1
+        total.seen[footprints.index[footprints.inside]] += 1
         side = froxels.cell_size(footprints, view, settings.cell, settings.density)
         points = froxels.scatter(footprints, view, side, settings.density)
         alphas = gaussians.alphas[footprints.index]

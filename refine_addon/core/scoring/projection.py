@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .. import frustum
+from ..rendering import ALPHA_CUT, LOW_PASS, NEAR_RELATIVE
 from ..splats import SH_C0, drawable, opacity, rotation_matrices
 from ..work import Progress, checkpoint, for_chunks, silent
 
@@ -15,15 +17,6 @@ if TYPE_CHECKING:
 
     from ..splats import Splats
     from ..views import View, ViewSet
-
-LOW_PASS = 0.3
-"""Variance every renderer adds to a footprint so that it is not thinner than a pixel, px^2."""
-
-ALPHA_CUT = 1.0 / 255.0
-"""Renderers draw a splat only where its alpha reaches this."""
-
-NEAR_RELATIVE = 0.01
-"""Near plane over the size of the scene, where a view brings none of its own."""
 
 REACH = 3.3
 """Standard deviations at which alpha = 1 falls to `ALPHA_CUT`: sqrt(2 ln 255) = 3.33."""
@@ -108,6 +101,8 @@ class Footprints:
         Half axes: one standard deviation along each principal direction, pixels.
     sigmas : (2, n) float32
         Their lengths, the longer first.
+    inside : (n,) bool
+        Which centres lie in the view's frustum; see `frustum`.
     """
 
     index: NDArray[np.int64]
@@ -115,11 +110,7 @@ class Footprints:
     major: NDArray[np.float32]
     minor: NDArray[np.float32]
     sigmas: NDArray[np.float32]
-
-    def inside(self, view: View) -> NDArray[np.bool_]:
-        """Which centres lie in the image, (n,)."""
-        u, v = self.centers
-        return np.asarray((u >= 0.0) & (u <= view.width) & (v >= 0.0) & (v <= view.height))
+    inside: NDArray[np.bool_]
 
 
 def prepare(
@@ -217,28 +208,29 @@ def project(gaussians: Gaussians, frame: Frame, view: View) -> Footprints:
     """
     if not _computable(frame, view):
         return _nothing()
-    near, far = clip_planes(frame, view)
+    planes = clip_planes(frame, view)
     rotation = _rotation6(view)
     pieces: list[tuple[NDArray[Any], ...]] = []
     for start in range(0, len(gaussians), _CHUNK):
         checkpoint()
         piece = slice(start, start + _CHUNK)
         local = _local(gaussians.means[:, piece], frame, view)
-        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, (near, far)))
+        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, planes))
         if len(touching):
             local = np.take(local, touching, axis=1)
             shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)
-            pieces.append((touching + start, local[2], *_ellipses(local, shape, view)))
+            inside = frustum.contains(view, local, planes)
+            pieces.append((touching + start, local[2], *_ellipses(local, shape, view), inside))
     if not pieces:
         return _nothing()
     index, depth, *rest = (np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True))
     order = _by_depth(depth)
-    return Footprints(index[order], *(np.take(values, order, axis=1) for values in rest))
+    return Footprints(index[order], *(np.take(values, order, axis=-1) for values in rest))
 
 
 def _nothing() -> Footprints:
     empty = np.empty((2, 0), np.float32)
-    return Footprints(np.empty(0, np.int64), empty, empty, empty, empty)
+    return Footprints(np.empty(0, np.int64), empty, empty, empty, empty, np.empty(0, np.bool_))
 
 
 def _computable(frame: Frame, view: View) -> bool:
@@ -250,10 +242,10 @@ def _computable(frame: Frame, view: View) -> bool:
 
 
 def clip_planes(frame: Frame, view: View) -> tuple[float, float]:
-    """Near and far plane in scene sizes."""
-    near = view.near / frame.size if view.near > 0.0 else NEAR_RELATIVE
+    """Return near and far plane in scene sizes."""
+    near, far = frustum.clip_planes(view, NEAR_RELATIVE * frame.size)
     # Nearer than this a footprint's size leaves float32, and no renderer draws it.
-    return min(max(near, 1e-5), 1e30), min(view.far / frame.size, 1e30)
+    return min(max(near / frame.size, 1e-5), 1e30), min(far / frame.size, 1e30)
 
 
 def _local(means: NDArray[np.float32], frame: Frame, view: View) -> NDArray[np.float32]:
@@ -265,28 +257,24 @@ def _local(means: NDArray[np.float32], frame: Frame, view: View) -> NDArray[np.f
     return local
 
 
-def _sides(view: View, x: Any, y: Any) -> tuple[tuple[Any, float, float, int], ...]:  # noqa: ANN401
-    """Coordinate, focal length, principal point off the middle and size, across and down."""
-    return (
-        (x, view.fx, view.cx - view.width / 2, view.width),
-        (y, view.fy, view.cy - view.height / 2, view.height),
-    )
-
-
 def _touches(
     local: NDArray[np.float32],
     largest: NDArray[np.float32],
     view: View,
     planes: tuple[float, float],
 ) -> NDArray[np.bool_]:
-    """Which footprints may reach into the image, on the safe side."""
+    """Return which footprints may reach into the image, (M,): at least all that do.
+
+    It is `frustum.contains` with the image widened by how far each footprint may reach.
+    """
     x, y, z = local
-    touching: NDArray[np.bool_] = (z > planes[0]) & (z <= planes[1])
-    for coordinate, focal, middle, size in _sides(view, x, y):
-        slope = (abs(middle) + (0.5 + _BEYOND) * size) / focal
-        reach = REACH * focal * float(np.hypot(1.0, slope)) * largest
-        pixels = size / 2 + REACH * LOW_PASS**0.5
-        touching &= np.abs(focal * coordinate + middle * z) <= pixels * z + reach
+    touching: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
+    for coordinate, (focal, offset, half) in zip((x, y), frustum.image_sides(view), strict=True):
+        # The steepest ray at which the projection is linearised bounds how long a footprint is.
+        slope = (abs(offset) + (1.0 + 2.0 * _BEYOND) * half) / focal
+        reach = REACH * focal * float(np.hypot(1.0, slope)) * largest  # (M,), px times depth
+        pixels = half + REACH * LOW_PASS**0.5
+        touching &= np.abs(focal * coordinate + offset * z) <= pixels * z + reach
     return touching
 
 
