@@ -84,8 +84,8 @@ MUTANTS = {
             "the same views in every block",
         ),
         (
-            "total.contribution[footprints.index] += weight * (mass * shown)",
-            "total.contribution[footprints.index] += mass * shown",
+            "total.contribution[footprints.index] += weight * (mass * visible)",
+            "total.contribution[footprints.index] += mass * visible",
             "weight of views forgotten",
         ),
         ('ClosedForm("distance", frustum=False)', 'ClosedForm("distance")', "prior with a frustum"),
@@ -98,7 +98,7 @@ MUTANTS = {
         ("    values[~good] = 0.0\n", "", "undrawable not lowest"),
     ],
     "scoring/froxels.py": [
-        ("    np.log(share, out=share)\n", "", "thickness of a thin point"),
+        ("    np.log(covered, out=covered)\n", "", "thickness of a thin point"),
         (
             "np.minimum(alphas, np.float32(ALPHA_MAX)).take(points.owners)",
             "np.float32(ALPHA_MAX)",
@@ -111,13 +111,13 @@ MUTANTS = {
             "one cell hides the next",
         ),
         (
-            "squares * light * light * contrast",
-            "squares * light * contrast",
+            "squares * transmittance * transmittance * squared_contrast",
+            "squares * transmittance * squared_contrast",
             "transmittance not squared",
         ),
         (
-            "(through * color)[::-1], points.columns[::-1])[::-1]",
-            "through * color, points.columns)",
+            "(shown * color)[::-1], points.columns[::-1])[::-1]",
+            "shown * color, points.columns)",
             "colour in front for behind",
         ),
         (
@@ -125,7 +125,7 @@ MUTANTS = {
             "number *= math.ceil(view.height / side)",
             "rows of another length",
         ),
-        ("errors = errors * share /", "errors = errors /", "outside counts"),
+        ("errors = errors * inside /", "errors = errors /", "outside counts"),
         (
             "_points_needed(footprints, side, density) > limit",
             "side > MAX_POINTS",

@@ -195,18 +195,18 @@ def test_what_has_the_colour_of_what_is_behind_it_has_no_contrast():
 
 
 @pytest.mark.parametrize("side", [2.0, 4.0, 8.0])
-def test_light_is_the_mean_of_exp_of_a_gamma_distributed_thickness(side):
+def test_transmittance_is_the_mean_of_exp_of_a_gamma_distributed_thickness(side):
     """Numerically: exp(-tau) over many draws of mean 0, .5 and 3; shape 12 over the side.
 
     What is even before it takes its exact share of that.
     """
-    shape = froxels.DOUBT / side
+    shape = froxels.GAMMA_SHAPE / side
     draws = np.random.default_rng(1).gamma(shape, size=400_000) / shape
     mean = np.array([0.0, 0.5, 3.0], np.float32)
     even = np.array([0.0, 0.5, 1.0], np.float32)
 
-    loose = froxels.light(mean, np.zeros_like(mean), side * side)
-    partly = froxels.light(mean + even, even, side * side)
+    loose = froxels.transmittance(mean, np.zeros_like(mean), side * side)
+    partly = froxels.transmittance(mean + even, even, side * side)
 
     np.testing.assert_allclose(loose, [np.exp(-m * draws).mean() for m in mean], atol=2e-3)
     np.testing.assert_allclose(partly, loose * np.exp(-even), rtol=1e-5)
@@ -225,13 +225,13 @@ def test_a_splat_as_narrow_as_a_cell_is_half_even():
 
 
 def test_every_lattice_has_the_moments_of_the_normal_distribution():
-    """Weights sum to 1, means are 0, variances 1, or 0 of a single point."""
+    """Shares sum to 1, means are 0, variances 1, or 0 of a single point."""
     for lattice in froxels.lattices()[:-1]:
-        points, weights = lattice.points.astype(float), lattice.weights.astype(float)
+        points, shares = lattice.points.astype(float), lattice.shares.astype(float)
 
-        assert weights.sum() == pytest.approx(1.0, abs=1e-5)
-        np.testing.assert_allclose(points @ weights, 0.0, atol=1e-4)
-        variances = (points * points) @ weights
+        assert shares.sum() == pytest.approx(1.0, abs=1e-5)
+        np.testing.assert_allclose(points @ shares, 0.0, atol=1e-4)
+        variances = (points * points) @ shares
         assert all(abs(v - 1) < 1e-4 or v == 0.0 for v in variances)
 
 
@@ -286,8 +286,8 @@ def test_the_contrast_of_each_veil_is_to_what_lies_behind_it():
         alone = measured(veils(alphas[one], grays[one], [1]), square())
         expected = (passed[index] * (grays[index] - behind[index]) / grays[index]) ** 2
         assert found.contrast[index] / alone.contrast[0] == pytest.approx(expected, rel=1e-3)
-        light = found.contribution[index] / alone.contribution[0]
-        assert light == pytest.approx(passed[index], rel=1e-4)
+        visible = found.contribution[index] / alone.contribution[0]
+        assert visible == pytest.approx(passed[index], rel=1e-4)
 
 
 @pytest.mark.parametrize(("x", "y"), [(0, 0), (40, 0), (0, -40), (-30, 35)])
@@ -519,7 +519,7 @@ def test_the_floor_weighs_what_loses_least_of_what_the_left_out_views_saw():
     assert min(coverage.floor_weights([(wrong, right, errors)])) == max(coverage.WEIGHTS)
     assert coverage.floor_weights([]) == [1.0] * len(coverage.SHARES)
     assert coverage.floor_weights([(right, wrong, dark)]) == [1.0] * len(coverage.SHARES)
-    plain, glare = (np.vstack([errors, wrong * light]) for light in (1.0, 1e6))
+    plain, glare = (np.vstack([errors, wrong * bright]) for bright in (1.0, 1e6))
     assert coverage.floor_weights([(right, wrong, plain)]) == coverage.floor_weights(
         [(right, wrong, glare)]
     )

@@ -411,16 +411,16 @@ def measure_view(
         points = froxels.scatter(footprints, view, side, settings.density)
         alphas = gaussians.alphas[footprints.index]
         red, green, blue = gaussians.colors[footprints.index].T
-        colors = (red + np.complex64(1j) * green, blue.copy())
+        colors = (froxels.paired(red, green), blue.copy())
         mass, mass_squared = froxels.masses(footprints, alphas)
         evenness = froxels.evenness(footprints, points.area)
-        light = np.empty(len(points.owners), np.float32)
-        contrast = np.empty(len(points.owners), np.float32)
+        transmittance = np.empty(len(points.owners), np.float32)
+        squared_contrast = np.empty(len(points.owners), np.float32)
         for place, piece in points.pieces():
             thick = froxels.thickness(piece, alphas, mass)
             front, even = froxels.in_front(piece, thick, thick * evenness.take(piece.owners))
-            light[place] = froxels.light(front, even, points.area)
-            contrast[place] = froxels.contrast(piece, front, thick, colors)
-        shown, errors = froxels.mean_light(points, light, contrast, count)
-        total.contribution[footprints.index] += weight * (mass * shown)
+            transmittance[place] = froxels.transmittance(front, even, points.area)
+            squared_contrast[place] = froxels.squared_contrast(piece, front, thick, colors)
+        visible, errors = froxels.mean_visible(points, transmittance, squared_contrast, count)
+        total.contribution[footprints.index] += weight * (mass * visible)
         total.contrast[footprints.index] += weight * (mass_squared * errors)
