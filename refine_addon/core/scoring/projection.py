@@ -293,10 +293,40 @@ def _rotation6(view: View) -> NDArray[np.float32]:
 def _ellipses(
     local: NDArray[np.float32], shape: NDArray[np.float32], view: View
 ) -> tuple[NDArray[np.float32], ...]:
-    """Return centres, half axes and their lengths, each (2, n), pixels."""
+    """Return centres, major and minor half axes and their lengths, each (2, n), pixels.
+
+    Parameters
+    ----------
+    local : (3, n) float32
+        Camera coordinates of the centres, scene sizes.
+    shape : (6, n) float32
+        Covariances in camera coordinates, squared scene sizes.
+    view : View
+    """
     x, y, z = local
     across, down = x / z, y / z
     centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
+    return centers, *_half_axes(*_image_covariance((across, down, z), shape, view))
+
+
+def _image_covariance(
+    ray: tuple[NDArray[np.float32], ...], shape: NDArray[np.float32], view: View
+) -> tuple[NDArray[np.float32], ...]:
+    """Return xx, xy, yy, (n,) each, of ``J S J'`` in pixels, without the low-pass.
+
+    J is the Jacobian of the projection at ``(x, y, z)``: rows ``(fx / z, 0, -fx x / z^2)`` and
+    ``(0, fy / z, -fy y / z^2)``.
+
+    Parameters
+    ----------
+    ray : (across, down, z)
+        ``x / z``, ``y / z`` and z of the centres, (n,) each. Where a centre lies far beside the
+        image, J is taken nearer to it (`_BEYOND`), for it grows without bound.
+    shape : (6, n) float32
+        S: xx, xy, xz, yy, yz, zz.
+    view : View
+    """
+    across, down, z = ray
     beyond = _BEYOND * view.width / view.fx, _BEYOND * view.height / view.fy
     across = across.clip(
         -view.cx / view.fx - beyond[0], (view.width - view.cx) / view.fx + beyond[0]
@@ -307,26 +337,49 @@ def _ellipses(
     yy = fy * fy * (shape[3] + down * (down * shape[5] - 2 * shape[4]))
     xy = fx * fy * (shape[1] + across * (down * shape[5] - shape[4]) - down * shape[2])
     factor = np.minimum(1.0, _LARGEST_VARIANCE / np.maximum(xx + yy, 1.0))
-    xx, yy, xy = xx * factor, yy * factor, xy * factor
+    return xx * factor, xy * factor, yy * factor
+
+
+def _half_axes(
+    xx: NDArray[np.float32], xy: NDArray[np.float32], yy: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], ...]:
+    """Return the half axes of ``C + LOW_PASS I`` and their lengths, (2, n) each, the longer first.
+
+    With ``m = (xx + yy) / 2`` and ``r = hypot((xx - yy) / 2, xy)`` the eigenvalues of C are m + r
+    and m - r; the latter is computed as ``det C / (m + r)``, since the difference would cancel.
+    """
     middle, half = (xx + yy) / 2, (xx - yy) / 2
     root = np.sqrt(half * half + xy * xy)
     first = np.sqrt(np.maximum(middle + root, 0.0) + LOW_PASS)
-    # The smaller eigenvalue from the determinant: the difference would cancel.
     second = np.maximum(xx * yy - xy * xy, 0.0) / np.maximum(middle + root, 1e-30)
     second = np.sqrt(second + LOW_PASS)
-    # Direction of the major axis: (xx - yy + 2 root, 2 xy), or its turned twin where that is 0.
+    c, s = _major_direction(half, xy, root)
+    return first * np.stack([c, s]), second * np.stack([-s, c]), np.stack([first, second])
+
+
+def _major_direction(
+    half: NDArray[np.float32], xy: NDArray[np.float32], root: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the unit vector along the major axis, (n,) across and down; (1, 0) of a circle.
+
+    ``(half + root, xy)`` and ``(xy, root - half)`` both point along it, half being (xx - yy) / 2
+    and root that of `_half_axes`. The one whose sum does not cancel is taken, turned to the right.
+    """
     wide = half >= 0.0
     c, s = np.where(wide, half + root, np.abs(xy)), np.where(wide, xy, root - half)
     s = np.where(wide | (xy >= 0.0), s, -s)
     length = np.hypot(c, s)
     c = np.where(length > 0.0, c / np.maximum(length, 1e-30), 1.0)
     s = np.where(length > 0.0, s / np.maximum(length, 1e-30), 0.0)
-    axes = np.stack([c, s]), np.stack([-s, c])
-    return centers, first * axes[0], second * axes[1], np.stack([first, second])
+    return c, s
 
 
 def _by_depth(depth: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Order of positive float32 numbers; their bits sort as they do, by two radix passes."""
+    """Return the order of positive float32 numbers, (n,), nearest first.
+
+    The bits of positive floats, read as integers, sort as the floats do; NumPy sorts 16 bits at a
+    time by radix, in linear time.
+    """
     bits = np.ascontiguousarray(depth).view(np.uint32)
     order = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable")
     high = (bits >> 16).astype(np.uint16)
