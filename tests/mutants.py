@@ -18,12 +18,14 @@ from pathlib import Path
 PROJECT = Path(__file__).resolve().parent.parent
 
 MUTANTS = {
-    "scoring/frustum.py": [
+    "frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
         ("(near if np.ptp(near) > 0.0 else near[0, 0])", "0.0", "near plane ignored"),
         ("inside &= depth <= far", "inside &= depth < far", "far plane excluded"),
-        ("(view.cx - view.width / 2)", "(view.width / 2 - view.cx)", "shift mirrored"),
-        ("half_height = view.height", "half_height = view.width", "axes swapped"),
+        ("view.cx - view.width / 2", "view.width / 2 - view.cx", "shift mirrored"),
+        ("view.height / 2)", "view.width / 2)", "axes swapped"),
+        ("<= side.half * z", "<= side.half", "image of another depth"),
+        ("(z >= planes[0]) &", "(z > planes[0]) &", "near plane excluded"),
     ],
     "scoring/closed_form.py": [
         ("total *= self.alpha[piece]", "total *= self.alpha[piece] ** 2", "opacity twice"),
@@ -82,8 +84,8 @@ MUTANTS = {
             "the same views in every block",
         ),
         (
-            "total.contribution[footprints.index] += weight * (mass * shown)",
-            "total.contribution[footprints.index] += mass * shown",
+            "total.contribution[footprints.index] += weight * (mass * visible)",
+            "total.contribution[footprints.index] += mass * visible",
             "weight of views forgotten",
         ),
         ('ClosedForm("distance", frustum=False)', 'ClosedForm("distance")', "prior with a frustum"),
@@ -92,11 +94,11 @@ MUTANTS = {
             "going = going.copy()",
             "hopeless in file order",
         ),
-        ("footprints.index[footprints.inside(view)]", "footprints.index", "seen beside the image"),
+        ("footprints.index[footprints.inside]", "footprints.index", "seen beside the image"),
         ("    values[~good] = 0.0\n", "", "undrawable not lowest"),
     ],
     "scoring/froxels.py": [
-        ("    np.log(share, out=share)\n", "", "thickness of a thin point"),
+        ("    np.log(covered, out=covered)\n", "", "thickness of a thin point"),
         (
             "np.minimum(alphas, np.float32(ALPHA_MAX)).take(points.owners)",
             "np.float32(ALPHA_MAX)",
@@ -109,13 +111,13 @@ MUTANTS = {
             "one cell hides the next",
         ),
         (
-            "squares * light * light * contrast",
-            "squares * light * contrast",
+            "squares * transmittance * transmittance * squared_contrast",
+            "squares * transmittance * squared_contrast",
             "transmittance not squared",
         ),
         (
-            "(through * color)[::-1], points.columns[::-1])[::-1]",
-            "through * color, points.columns)",
+            "(shown * color)[::-1], points.columns[::-1])[::-1]",
+            "shown * color, points.columns)",
             "colour in front for behind",
         ),
         (
@@ -123,9 +125,9 @@ MUTANTS = {
             "number *= math.ceil(view.height / side)",
             "rows of another length",
         ),
-        ("errors = errors * share /", "errors = errors /", "outside counts"),
+        ("errors = errors * inside /", "errors = errors /", "outside counts"),
         (
-            "_points_needed(footprints, side, density) > MAX_POINTS",
+            "_points_needed(footprints, side, density) > limit",
             "side > MAX_POINTS",
             "memory without bound",
         ),
@@ -143,11 +145,11 @@ MUTANTS = {
             "(across * shape[5] + 2 * shape[2])",
             "sign in the Jacobian across",
         ),
-        ("view.near / frame.size if", "view.near if", "near plane in another unit"),
-        ("(z > planes[0]) & (z <= planes[1])", "(z > planes[0])", "far plane ignored"),
+        ("max(near / frame.size, 1e-5)", "max(near, 1e-5)", "near plane in another unit"),
+        ("(z >= planes[0]) & (z <= planes[1])", "(z >= planes[0])", "far plane ignored"),
         (
-            "np.abs(focal * coordinate + middle * z) <=",
-            "np.abs(focal * coordinate - middle * z) <=",
+            "np.abs(focal * coordinate + offset * z) <=",
+            "np.abs(focal * coordinate - offset * z) <=",
             "principal point mirrored",
         ),
         (
@@ -216,7 +218,6 @@ MUTANTS = {
         ("/ (1.0 + inside)", "", "as likely after many views"),
         ("shown = inside @ worth", "shown = worth.sum()", "all seen once"),
         ("np.where(inside, share, share * BESIDE)", "share", "views beside count"),
-        ("<= view.height / 2 * z", "<= view.width / 2 * z", "image by its width"),
         (
             "np.where(inside, share, share * BESIDE) / squared",
             "np.where(inside, share, share * BESIDE)",
@@ -337,7 +338,7 @@ MUTANTS = {
 """Module of core -> lines to change, what they become, and what is wrong then."""
 
 TESTS = {
-    "closed_form": ["scoring/frustum.py", "scoring/adaptive.py"],
+    "closed_form": ["frustum.py", "scoring/adaptive.py"],
     "occlusion": ["scoring/froxels.py", "scoring/projection.py", "scoring/coverage.py"],
     "absorb": ["absorbing/merge_field.py", "absorbing/merging.py", "absorbing/merge_graph.py"],
     "affine": ["spherical_harmonics.py"],

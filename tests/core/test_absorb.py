@@ -1,6 +1,7 @@
 """Merging and absorbing: the moments by hand, the laws, and what must not happen."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from refine_addon.core.absorbing.merge_graph import MergeGraph
 from refine_addon.core.absorbing.merging import Field, Seen
 from refine_addon.core.affine import transformed
 from refine_addon.core.errors import Cancelled
+from refine_addon.core.rendering import ALPHA_MAX
 from refine_addon.core.splats import Splats, opacity, rotation_matrices
 from refine_addon.core.views import View, ViewSet
 
@@ -229,7 +231,7 @@ def test_no_mass_is_created_and_none_is_lost_but_the_overlap():
     after, before = mass(merged), whole[first] + whole[second]
     assert (after <= before * (1 + 1e-9)).all()
     assert (after >= np.maximum(whole[first], whole[second]) * (1 - 1e-9)).all()
-    assert merged.opacity.max() <= merging.OPACITY_MAX * (1 + 1e-12)
+    assert merged.opacity.max() <= ALPHA_MAX * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1e-3, 1e-9, 0.0])
@@ -402,6 +404,18 @@ def test_a_view_beside_whose_image_a_splat_lies_hardly_counts(aside):
 
     expected = np.add([0, 0, 1], aside) - [-3, 0, 1]
     np.testing.assert_allclose(found.direction, [expected / np.linalg.norm(expected)], atol=1e-4)
+
+
+def test_a_view_between_whose_planes_a_splat_does_not_lie_hardly_counts():
+    """At depth 1, before the near plane of a view and beyond the far plane of another."""
+    far_off = looking([0, 0, 1], [-3, 0, 1.0])
+    for planes in ({"near": 1.1}, {"far": 0.9}):
+        views = ViewSet((replace(looking([0, 0, 1], [0, 0, 0]), **planes), far_off))
+
+        found = merge_field.look(np.array([[0.0, 0, 1]]), views)
+
+        np.testing.assert_allclose(found.direction, [[1, 0, 0]], atol=1e-4)
+        assert found.inside.tolist() == [1]
 
 
 def test_colour_is_that_seen_along_the_mean_direction_and_blur_a_third_of_a_pixel():

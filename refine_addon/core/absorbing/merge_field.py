@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .. import spherical_harmonics
+from .. import frustum, spherical_harmonics
+from ..rendering import LOW_PASS
 from ..splats import SH_C0, opacity, rotation_matrices
 from ..work import for_chunks
 
@@ -20,9 +21,6 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
     Index = NDArray[np.int64] | NDArray[np.int32]
     Footprint = tuple[Array, Array, Array]
-
-LOW_PASS = 0.3
-"""Variance that renderers add to every footprint, pixels squared."""
 
 NEAREST = 0.01
 """Share of the scene's size below which a camera comes no nearer to a splat."""
@@ -157,9 +155,8 @@ def _look(points: Array, looks: list[tuple[View, float]], closest: float) -> Loo
     toward, second = np.zeros((3, points.shape[1])), np.zeros((6, points.shape[1]))
     for view, share in looks:
         ray = points - view.center[:, None]
-        x, y, z = view.rotation @ ray
-        inside = np.abs(view.fx * x + (view.cx - view.width / 2) * z) <= view.width / 2 * z
-        inside &= np.abs(view.fy * y + (view.cy - view.height / 2) * z) <= view.height / 2 * z
+        planes = frustum.clip_planes(view, closest**0.5)
+        inside = frustum.contains(view, view.rotation @ ray, planes)
         seen += inside
         squared = np.maximum(np.einsum("ij,ij->j", ray, ray), closest)
         weight = np.where(inside, share, share * BESIDE) / squared

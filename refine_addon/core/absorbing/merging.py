@@ -17,7 +17,7 @@ products ``<f, g>`` of Gaussians in closed form::
 
 The merged splat has the mean and covariance of both (weights: mass), their colour (weights:
 contribution) and, by its opacity, their mass less the overlap, which the eye counts once:
-``A_m = A_i + A_j - <f_i, f_j>``. Where that would take an opacity above `OPACITY_MAX`, the splat
+``A_m = A_i + A_j - <f_i, f_j>``. Where that would take an opacity above `ALPHA_MAX`, the splat
 grows instead.
 
 What lies one behind the other along the mean direction would merge for nothing, but other views
@@ -31,15 +31,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..affine import quaternion
+from ..rendering import ALPHA_MAX
 from .merge_field import Field, Seen, across, footprint, normalized
 
 if TYPE_CHECKING:
     from .merge_field import Array, Footprint, Index
 
 __all__ = ["Field", "Pairs", "Seen", "axes", "costs", "merge", "price"]
-
-OPACITY_MAX = 0.99
-"""Largest opacity of a merged splat; renderers show no more."""
 
 FLATTEST = 1e-14
 """Least eigenvalue of a covariance over their sum: rounding leaves no less."""
@@ -151,7 +149,7 @@ def _price(ends: _Ends, tilt: float) -> Pairs:
     merged = _mixed(one, two, position, (spread * x * x, spread * x * y, spread * y * y))
     # For nearly opaque splats the second order takes off more than one can hide of the other.
     mass = mass_1 + mass_2 - np.minimum(overlap, np.minimum(mass_1, mass_2))
-    growth = np.maximum(mass / (_area(merged) * OPACITY_MAX), 1.0)
+    growth = np.maximum(mass / (_area(merged) * ALPHA_MAX), 1.0)
     merged = (merged[0] * growth, merged[1] * growth, merged[2] * growth)
     area = _area(merged)
     tau = (first.contribution + second.contribution) / (mass_1 + mass_2)

@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ..errors import RefineError
+from ..frustum import Frustums
+from ..rendering import NEAR_RELATIVE
 from ..scene import median_size
 from ..scores import Scores
 from ..splats import base_color, drawable, opacity
 from ..work import Progress, for_chunks, part, silent
 from . import adaptive
-from .frustum import Frustums
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,9 +37,6 @@ LUMA = (0.299, 0.587, 0.114)
 
 ETA_RELATIVE = 0.005
 """Default eta over the squared size of the scene: the paper's .05 at a viewing distance of 3 m."""
-
-NEAR_RELATIVE = 0.01
-"""Default near plane over the size of the scene, where a view brings none of its own."""
 
 UNSEEN = 1e-6
 """Factor on 1 / (squared distance to the views + eta), the weight of splats that no view sees: it

@@ -119,8 +119,8 @@ def score(
     Notes
     -----
     Memory: about 300 bytes a splat, a third more for each thread beyond the first; where a view
-    has many points, 100 bytes for each of them and thread, of which
-    there are at most 4 million (`froxels.MAX_POINTS`).
+    has many points, 100 bytes for each of them and thread. A view has about 4 million points at
+    most (`froxels.MAX_POINTS`), and more only where it shows more than 3 million splats.
     """
     return _scored(splats, views, settings, progress, threads)[0]
 
@@ -463,21 +463,21 @@ def measure_view(
         count = len(footprints.index)
         if not count:
             return
-        total.seen[footprints.index[footprints.inside(view)]] += 1
+        total.seen[footprints.index[footprints.inside]] += 1
         side = froxels.cell_size(footprints, view, settings.cell, settings.density)
         points = froxels.scatter(footprints, view, side, settings.density)
         alphas = gaussians.alphas[footprints.index]
         red, green, blue = gaussians.colors[footprints.index].T
-        colors = (red + np.complex64(1j) * green, blue.copy())
+        colors = (froxels.paired(red, green), blue.copy())
         mass, mass_squared = froxels.masses(footprints, alphas)
         evenness = froxels.evenness(footprints, points.area)
-        light = np.empty(len(points.owners), np.float32)
-        contrast = np.empty(len(points.owners), np.float32)
+        transmittance = np.empty(len(points.owners), np.float32)
+        squared_contrast = np.empty(len(points.owners), np.float32)
         for place, piece in points.pieces():
             thick = froxels.thickness(piece, alphas, mass)
             front, even = froxels.in_front(piece, thick, thick * evenness.take(piece.owners))
-            light[place] = froxels.light(front, even, points.area)
-            contrast[place] = froxels.contrast(piece, front, thick, colors)
-        shown, errors = froxels.mean_light(points, light, contrast, count)
-        total.contribution[footprints.index] += weight * (mass * shown)
+            transmittance[place] = froxels.transmittance(front, even, points.area)
+            squared_contrast[place] = froxels.squared_contrast(piece, front, thick, colors)
+        visible, errors = froxels.mean_visible(points, transmittance, squared_contrast, count)
+        total.contribution[footprints.index] += weight * (mass * visible)
         total.contrast[footprints.index] += weight * (mass_squared * errors)

@@ -7,24 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .. import frustum
+from ..rendering import ALPHA_CUT, LOW_PASS, NEAR_RELATIVE
 from ..scene import Scene, scene_of, spatial_order
 from ..splats import SH_C0, drawable, opacity, rotation_matrices
-from ..work import Progress, for_chunks, silent
+from ..work import Progress, checkpoint, for_chunks, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..splats import Splats
     from ..views import View, ViewSet
-
-LOW_PASS = 0.3
-"""Variance every renderer adds to a footprint so that it is not thinner than a pixel, px^2."""
-
-ALPHA_CUT = 1.0 / 255.0
-"""Renderers draw a splat only where its alpha reaches this."""
-
-NEAR_RELATIVE = 0.01
-"""Near plane over the size of the scene, where a view brings none of its own."""
 
 REACH = 3.3
 """Standard deviations at which alpha = 1 falls to `ALPHA_CUT`: sqrt(2 ln 255) = 3.33."""
@@ -92,6 +85,8 @@ class Footprints:
         Half axes: one standard deviation along each principal direction, pixels.
     sigmas : (2, n) float32
         Their lengths, the longer first.
+    inside : (n,) bool
+        Which centres lie in the view's frustum; see `frustum`.
     """
 
     index: NDArray[np.int64]
@@ -99,11 +94,7 @@ class Footprints:
     major: NDArray[np.float32]
     minor: NDArray[np.float32]
     sigmas: NDArray[np.float32]
-
-    def inside(self, view: View) -> NDArray[np.bool_]:
-        """Which centres lie in the image, (n,)."""
-        u, v = self.centers
-        return np.asarray((u >= 0.0) & (u <= view.width) & (v >= 0.0) & (v <= view.height))
+    inside: NDArray[np.bool_]
 
 
 def prepare(
@@ -180,27 +171,29 @@ def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
     """
     if not _computable(scene, view):
         return _nothing()
-    near, far = clip_planes(scene, view)
+    planes = clip_planes(scene, view)
     rotation = _rotation6(view.rotation @ scene.axes.T)
     pieces: list[tuple[NDArray[Any], ...]] = []
     for start in range(0, len(gaussians), _CHUNK):
+        checkpoint()
         piece = slice(start, start + _CHUNK)
         local = _local(gaussians.means[:, piece], scene, view)
-        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, (near, far)))
+        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, planes))
         if len(touching):
             local = np.take(local, touching, axis=1)
             shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)
-            pieces.append((touching + start, local[2], *_ellipses(local, shape, view)))
+            inside = frustum.contains(view, local, planes)
+            pieces.append((touching + start, local[2], *_ellipses(local, shape, view), inside))
     if not pieces:
         return _nothing()
     index, depth, *rest = (np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True))
     order = _by_depth(depth)
-    return Footprints(index[order], *(np.take(values, order, axis=1) for values in rest))
+    return Footprints(index[order], *(np.take(values, order, axis=-1) for values in rest))
 
 
 def _nothing() -> Footprints:
     empty = np.empty((2, 0), np.float32)
-    return Footprints(np.empty(0, np.int64), empty, empty, empty, empty)
+    return Footprints(np.empty(0, np.int64), empty, empty, empty, empty, np.empty(0, np.bool_))
 
 
 def _computable(scene: Scene, view: View) -> bool:
@@ -212,10 +205,10 @@ def _computable(scene: Scene, view: View) -> bool:
 
 
 def clip_planes(scene: Scene, view: View) -> tuple[float, float]:
-    """Near and far plane in scene sizes."""
-    near = view.near / scene.size if view.near > 0.0 else NEAR_RELATIVE
+    """Return near and far plane in scene sizes."""
+    near, far = frustum.clip_planes(view, NEAR_RELATIVE * scene.size)
     # Nearer than this a footprint's size leaves float32, and no renderer draws it.
-    return min(max(near, 1e-5), 1e30), min(view.far / scene.size, 1e30)
+    return min(max(near / scene.size, 1e-5), 1e30), min(far / scene.size, 1e30)
 
 
 def _local(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.float32]:
@@ -226,28 +219,24 @@ def _local(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.f
     return local
 
 
-def _sides(view: View, x: Any, y: Any) -> tuple[tuple[Any, float, float, int], ...]:  # noqa: ANN401
-    """Coordinate, focal length, principal point off the middle and size, across and down."""
-    return (
-        (x, view.fx, view.cx - view.width / 2, view.width),
-        (y, view.fy, view.cy - view.height / 2, view.height),
-    )
-
-
 def _touches(
     local: NDArray[np.float32],
     largest: NDArray[np.float32],
     view: View,
     planes: tuple[float, float],
 ) -> NDArray[np.bool_]:
-    """Which footprints may reach into the image, on the safe side."""
+    """Return which footprints may reach into the image, (M,): at least all that do.
+
+    It is `frustum.contains` with the image widened by how far each footprint may reach.
+    """
     x, y, z = local
-    touching: NDArray[np.bool_] = (z > planes[0]) & (z <= planes[1])
-    for coordinate, focal, middle, size in _sides(view, x, y):
-        slope = (abs(middle) + (0.5 + _BEYOND) * size) / focal
-        reach = REACH * focal * float(np.hypot(1.0, slope)) * largest
-        pixels = size / 2 + REACH * LOW_PASS**0.5
-        touching &= np.abs(focal * coordinate + middle * z) <= pixels * z + reach
+    touching: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
+    for coordinate, (focal, offset, half) in zip((x, y), frustum.image_sides(view), strict=True):
+        # The steepest ray at which the projection is linearised bounds how long a footprint is.
+        slope = (abs(offset) + (1.0 + 2.0 * _BEYOND) * half) / focal
+        reach = REACH * focal * float(np.hypot(1.0, slope)) * largest  # (M,), px times depth
+        pixels = half + REACH * LOW_PASS**0.5
+        touching &= np.abs(focal * coordinate + offset * z) <= pixels * z + reach
     return touching
 
 
@@ -266,10 +255,40 @@ def _rotation6(rotation: NDArray[np.float64]) -> NDArray[np.float32]:
 def _ellipses(
     local: NDArray[np.float32], shape: NDArray[np.float32], view: View
 ) -> tuple[NDArray[np.float32], ...]:
-    """Return centres, half axes and their lengths, each (2, n), pixels."""
+    """Return centres, major and minor half axes and their lengths, each (2, n), pixels.
+
+    Parameters
+    ----------
+    local : (3, n) float32
+        Camera coordinates of the centres, scene sizes.
+    shape : (6, n) float32
+        Covariances in camera coordinates, squared scene sizes.
+    view : View
+    """
     x, y, z = local
     across, down = x / z, y / z
     centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
+    return centers, *_half_axes(*_image_covariance((across, down, z), shape, view))
+
+
+def _image_covariance(
+    ray: tuple[NDArray[np.float32], ...], shape: NDArray[np.float32], view: View
+) -> tuple[NDArray[np.float32], ...]:
+    """Return xx, xy, yy, (n,) each, of ``J S J'`` in pixels, without the low-pass.
+
+    J is the Jacobian of the projection at ``(x, y, z)``: rows ``(fx / z, 0, -fx x / z^2)`` and
+    ``(0, fy / z, -fy y / z^2)``.
+
+    Parameters
+    ----------
+    ray : (across, down, z)
+        ``x / z``, ``y / z`` and z of the centres, (n,) each. Where a centre lies far beside the
+        image, J is taken nearer to it (`_BEYOND`), for it grows without bound.
+    shape : (6, n) float32
+        S: xx, xy, xz, yy, yz, zz.
+    view : View
+    """
+    across, down, z = ray
     beyond = _BEYOND * view.width / view.fx, _BEYOND * view.height / view.fy
     across = across.clip(
         -view.cx / view.fx - beyond[0], (view.width - view.cx) / view.fx + beyond[0]
@@ -280,26 +299,49 @@ def _ellipses(
     yy = fy * fy * (shape[3] + down * (down * shape[5] - 2 * shape[4]))
     xy = fx * fy * (shape[1] + across * (down * shape[5] - shape[4]) - down * shape[2])
     factor = np.minimum(1.0, _LARGEST_VARIANCE / np.maximum(xx + yy, 1.0))
-    xx, yy, xy = xx * factor, yy * factor, xy * factor
+    return xx * factor, xy * factor, yy * factor
+
+
+def _half_axes(
+    xx: NDArray[np.float32], xy: NDArray[np.float32], yy: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], ...]:
+    """Return the half axes of ``C + LOW_PASS I`` and their lengths, (2, n) each, the longer first.
+
+    With ``m = (xx + yy) / 2`` and ``r = hypot((xx - yy) / 2, xy)`` the eigenvalues of C are m + r
+    and m - r; the latter is computed as ``det C / (m + r)``, since the difference would cancel.
+    """
     middle, half = (xx + yy) / 2, (xx - yy) / 2
     root = np.sqrt(half * half + xy * xy)
     first = np.sqrt(np.maximum(middle + root, 0.0) + LOW_PASS)
-    # The smaller eigenvalue from the determinant: the difference would cancel.
     second = np.maximum(xx * yy - xy * xy, 0.0) / np.maximum(middle + root, 1e-30)
     second = np.sqrt(second + LOW_PASS)
-    # Direction of the major axis: (xx - yy + 2 root, 2 xy), or its turned twin where that is 0.
+    c, s = _major_direction(half, xy, root)
+    return first * np.stack([c, s]), second * np.stack([-s, c]), np.stack([first, second])
+
+
+def _major_direction(
+    half: NDArray[np.float32], xy: NDArray[np.float32], root: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the unit vector along the major axis, (n,) across and down; (1, 0) of a circle.
+
+    ``(half + root, xy)`` and ``(xy, root - half)`` both point along it, half being (xx - yy) / 2
+    and root that of `_half_axes`. The one whose sum does not cancel is taken, turned to the right.
+    """
     wide = half >= 0.0
     c, s = np.where(wide, half + root, np.abs(xy)), np.where(wide, xy, root - half)
     s = np.where(wide | (xy >= 0.0), s, -s)
     length = np.hypot(c, s)
     c = np.where(length > 0.0, c / np.maximum(length, 1e-30), 1.0)
     s = np.where(length > 0.0, s / np.maximum(length, 1e-30), 0.0)
-    axes = np.stack([c, s]), np.stack([-s, c])
-    return centers, first * axes[0], second * axes[1], np.stack([first, second])
+    return c, s
 
 
 def _by_depth(depth: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Order of positive float32 numbers; their bits sort as they do, by two radix passes."""
+    """Return the order of positive float32 numbers, (n,), nearest first.
+
+    The bits of positive floats, read as integers, sort as the floats do; NumPy sorts 16 bits at a
+    time by radix, in linear time.
+    """
     bits = np.ascontiguousarray(depth).view(np.uint32)
     order = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable")
     high = (bits >> 16).astype(np.uint16)
