@@ -13,8 +13,11 @@ from refine_addon.core.absorbing.merging import Field, Seen
 from refine_addon.core.affine import transformed
 from refine_addon.core.errors import Cancelled
 from refine_addon.core.rendering import ALPHA_MAX
-from refine_addon.core.splats import Splats, opacity, rotation_matrices
+from refine_addon.core.scene import Scene, scene_of
+from refine_addon.core.splats import Splats, drawable, opacity, rotation_matrices
 from refine_addon.core.views import View, ViewSet
+
+SCENE = Scene(np.zeros(3), 1.0, np.eye(3))
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
 
@@ -38,6 +41,15 @@ def flat(opacities, means, variances, *, colors=None, error=None):
         np.full((count, 3), 0.5) if colors is None else np.array(colors, float),
         np.zeros(count),
     )
+
+
+def look(means, views):
+    return merge_field.look(means, views, scene_of(means, np.ones(len(means), bool), views))
+
+
+def field_of(splats, views, seen):
+    scene = scene_of(splats.means, drawable(splats), views)
+    return merge_field.field(splats, np.arange(len(splats)), views, scene, seen)
 
 
 def merged_of(field, first=0, second=1):
@@ -313,9 +325,9 @@ def test_a_survivor_has_the_colours_of_all_it_absorbed_by_what_is_seen_of_each(o
     assert result.keep.tolist() == [index > 1 for index in order]
     (survivor,) = np.flatnonzero(result.changed)
     assert np.flatnonzero(result.keep)[survivor] == place[2]
-    look = merge_field.look(splats.means[place], around())
-    mass = 0.01 * (np.exp(-4.0) + 0.3 * look.pixel) / look.pixel
-    floor = mass * 26 / (look.inside @ mass) / (look.inside + 1)
+    looked = look(splats.means[place], around())
+    mass = 0.01 * (np.exp(-4.0) + 0.3 * looked.pixel) / looked.pixel
+    floor = mass * 26 / (looked.inside @ mass) / (looked.inside + 1)
     shares = np.array([1, 2, 5]) + floor[:3]
     shares /= shares.sum()
     for name in ("sh_dc", "sh_rest"):
@@ -377,7 +389,7 @@ def test_a_splat_is_looked_at_along_the_mean_direction_of_what_sees_it():
     """From 45 degrees either side: along the bisector, with a spread of sin 45 to the side."""
     views = ViewSet((looking([0, 0, 0], [2, 0, -2]), looking([0, 0, 0], [-2, 0, -2])))
 
-    found = merge_field.look(np.zeros((1, 3)), views)
+    found = look(np.zeros((1, 3)), views)
 
     np.testing.assert_allclose(found.direction, [[0, 0, 1]], atol=1e-12)
     np.testing.assert_allclose(np.abs(found.spread), [[np.sqrt(0.5), 0, 0]], atol=1e-12)
@@ -388,7 +400,7 @@ def test_a_nearer_view_counts_by_its_pixels():
     """At distances 1 and 2 as 4 to 1."""
     views = ViewSet((looking([0, 0, 0], [1, 0, 0]), looking([0, 0, 0], [0, 0, -2])))
 
-    found = merge_field.look(np.zeros((1, 3)), views)
+    found = look(np.zeros((1, 3)), views)
 
     np.testing.assert_allclose(found.direction, [np.array([-4, 0, 1]) / np.sqrt(17)], atol=1e-12)
 
@@ -400,7 +412,7 @@ def test_a_view_beside_whose_image_a_splat_lies_hardly_counts(aside):
         (looking([0, 0, 1], [0, 0, 0]), looking(np.add([0, 0, 1], aside), [-3, 0, 1.0]))
     )
 
-    found = merge_field.look(np.add([[0.0, 0, 1]], aside), views)
+    found = look(np.add([[0.0, 0, 1]], aside), views)
 
     expected = np.add([0, 0, 1], aside) - [-3, 0, 1]
     np.testing.assert_allclose(found.direction, [expected / np.linalg.norm(expected)], atol=1e-4)
@@ -412,7 +424,7 @@ def test_a_view_between_whose_planes_a_splat_does_not_lie_hardly_counts():
     for planes in ({"near": 1.1}, {"far": 0.9}):
         views = ViewSet((replace(looking([0, 0, 1], [0, 0, 0]), **planes), far_off))
 
-        found = merge_field.look(np.array([[0.0, 0, 1]]), views)
+        found = look(np.array([[0.0, 0, 1]]), views)
 
         np.testing.assert_allclose(found.direction, [[1, 0, 0]], atol=1e-4)
         assert found.inside.tolist() == [1]
@@ -425,7 +437,7 @@ def test_colour_is_that_seen_along_the_mean_direction_and_blur_a_third_of_a_pixe
     splats.sh_rest[:, 1] = [[0.3, 0.3, 0.3], [-3, -3, -3]]
     views = ViewSet((looking([0, 0, 0], [0, 0, -2]),))
 
-    field = merge_field.field(splats, np.arange(2), views, measure(splats))
+    field = field_of(splats, views, measure(splats))
 
     expected = 0.5 + 0.28209479 * 0.2 + 0.48860251 * 0.3
     np.testing.assert_allclose(field.color, [[expected] * 3, [0.0] * 3], rtol=1e-6)
@@ -490,7 +502,7 @@ def test_what_these_views_do_not_show_is_worth_what_another_may_see():
     splats = cloud(1).take(np.array([0, 0]))
     seen = Seen(np.array([8.0, 0.0]), np.array([4.0, 0.0]))
 
-    field = merge_field.field(splats, np.arange(2), around(), seen)
+    field = field_of(splats, around(), seen)
 
     np.testing.assert_allclose(field.contribution, [8.2, 0.2], rtol=1e-12)
     np.testing.assert_allclose(field.error, [4.1, 0.1], rtol=1e-12)
@@ -504,7 +516,7 @@ def test_black_and_white_on_grey_are_not_merged():
     field.error *= 0.75
 
     pairs, _ = merged_of(field)
-    graph = MergeGraph(field, 1.0)
+    graph = MergeGraph(field, SCENE, 1.0)
     graph.reduce(1)
 
     np.testing.assert_allclose(pairs.cost, field.error.sum(), rtol=1e-6)
@@ -514,7 +526,7 @@ def test_black_and_white_on_grey_are_not_merged():
 def test_no_merge_is_carried_out_that_costs_more_than_deleting():
     """Every pair merged in the first round was cheaper than either of its splats."""
     splats, views = cloud(2000), around()
-    graph = MergeGraph(merge_field.field(splats, np.arange(2000), views, measure(splats)), 2.0)
+    graph = MergeGraph(field_of(splats, views, measure(splats)), SCENE, 2.0)
     before = graph.field.take(np.arange(2000))
 
     graph.reduce(1950)
@@ -556,7 +568,7 @@ def test_the_cheapest_of_all_operations_is_next_each_time(seed):
         colors=rng.uniform(size=(9, 3)),
     )  # fmt: skip
     field.error *= rng.uniform(0.02, 1.0, 9)
-    graph = MergeGraph(field.take(np.arange(9)), 1.0)
+    graph = MergeGraph(field.take(np.arange(9)), SCENE, 1.0)
 
     graph.reduce(2)
 
@@ -575,7 +587,7 @@ def test_neighbours_of_what_is_absorbed_are_neighbours_of_what_absorbed_it(monke
     monkeypatch.setattr(merge_graph, "NEIGHBOURS", 1)
     places = [0.0, 0.001, 1.5, 50, 100, 200, 400, 800]
     field = flat([0.03, 0.02, 0.01] + [0.5] * 5, np.outer(places, [1, 0, 0]), np.ones((8, 3)))
-    graph = MergeGraph(field, 1.0)
+    graph = MergeGraph(field, SCENE, 1.0)
 
     graph.reduce(6)
 
@@ -588,7 +600,7 @@ def test_neighbours_of_what_is_absorbed_are_neighbours_of_what_absorbed_it(monke
 def test_when_half_have_gone_neighbours_are_found_anew():
     """Two heaps of a dozen: each has its neighbours in its own, and one is left of both."""
     places = np.outer(np.r_[np.arange(12) * 1e-4, 0.3 + np.arange(12) * 1e-4], [1, 0, 0])
-    graph = MergeGraph(flat([0.01] * 24, places, np.ones((24, 3))), 1.0)
+    graph = MergeGraph(flat([0.01] * 24, places, np.ones((24, 3))), SCENE, 1.0)
 
     graph.reduce(1)
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..scene import scene_of, spatial_order
 from ..splats import Splats, drawable
 from ..work import Progress, part, report, silent
 from . import merge_field, merging
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..scene import Scene
     from ..views import ViewSet
     from .merge_field import Array, Index
 
@@ -129,6 +131,7 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
     count = len(splats)
     spared = np.zeros(count, np.bool_) if protected is None else np.array(protected, np.bool_)
     goal = max(keep_count, int(np.count_nonzero(spared)), 0)
+    scene = scene_of(splats.means, drawable(splats), views)
     origin, members = np.arange(count), np.ones(count, np.int64)
     factor = patience(1.0 - goal / max(count, 1))
     stages = math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE)) if goal < count else 0
@@ -137,7 +140,7 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
         left = round(count * (goal / count) ** ((stage + 1) / stages))
         seen = measure(splats, part(ahead, 0.0, 0.5))
         splats, kept, taken = _absorb_once(
-            splats, views, seen, max(left, goal), protected=spared[origin],
+            splats, views, scene, seen, max(left, goal), protected=spared[origin],
             factor=factor, progress=part(ahead, 0.5, 1.0), threads=threads,
         )  # fmt: skip
         # A survivor stands for all that those it took stood for.
@@ -152,6 +155,7 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
 def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     splats: Splats,
     views: ViewSet,
+    scene: Scene,
     seen: Seen,
     keep_count: int,
     *,
@@ -183,9 +187,10 @@ def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     report(progress, 0.0, "absorbing")
     if excess <= 0:
         return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1)
-    graph = MergeGraph(
-        merge_field.field(splats, rows, views, seen, threads=threads), factor, threads=threads
-    )
+    # In an order of the scene's own, so that ties do not depend on that of the file.
+    rows = rows[spatial_order(scene.place(splats.means[rows]))]
+    found = merge_field.field(splats, rows, views, scene, seen, threads=threads)
+    graph = MergeGraph(found, scene, factor, threads=threads)
     graph.reduce(len(rows) - excess, part(progress, 0.1, 0.95))
     keep[rows[~graph.alive]] = False
     return _written(splats, keep, rows, graph)

@@ -15,6 +15,7 @@ from ..work import for_chunks
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ..scene import Scene
     from ..splats import Splats
     from ..views import View, ViewSet
 
@@ -110,7 +111,7 @@ class Look(NamedTuple):
     inside: Array
 
 
-def look(means: NDArray[Any], views: ViewSet, *, threads: int | None = None) -> Look:
+def look(means: NDArray[Any], views: ViewSet, scene: Scene, *, threads: int | None = None) -> Look:
     """Return how the views look at splats.
 
     A view weighs what its pixels see of the splat, 1 / distance^2, and next to nothing where the
@@ -122,14 +123,15 @@ def look(means: NDArray[Any], views: ViewSet, *, threads: int | None = None) -> 
         Of drawable splats.
     views : ViewSet
         At most `LOOKS` of them are used.
+    scene : Scene
+        Its size says how near is too near.
     threads : int, optional
     """
     count = len(means)
     result = Look(np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count))
     some = views.spread(LOOKS)
     looks = [(view, share) for view, share in zip(some, some.weights, strict=True) if share]
-    offset = np.median(means, axis=0) - views.centers if count else np.ones((1, 3))
-    closest = NEAREST**2 * float(np.median(np.sum(offset * offset, axis=1))) or 1.0
+    closest = (NEAREST * scene.size) ** 2
 
     def measure(piece: slice) -> None:
         points = np.asarray(means[piece], np.float64).T
@@ -177,7 +179,13 @@ def _look(points: Array, looks: list[tuple[View, float]], closest: float) -> Loo
 
 
 def field(
-    splats: Splats, rows: Index, views: ViewSet, seen: Seen, *, threads: int | None = None
+    splats: Splats,
+    rows: Index,
+    views: ViewSet,
+    scene: Scene,
+    seen: Seen,
+    *,
+    threads: int | None = None,
 ) -> Field:
     """Return some splats as merging sees them.
 
@@ -191,13 +199,15 @@ def field(
     rows : (M,) int
         Which of them; drawable ones.
     views : ViewSet
+    scene : Scene
+        Of splats and views.
     seen : Seen
         Of all splats.
     threads : int, optional
     """
     count = len(rows)
     covariances, color = np.empty((count, 6)), np.empty((count, 3))
-    seen_from = look(splats.means[rows], views, threads=threads)
+    seen_from = look(splats.means[rows], views, scene, threads=threads)
     upper = np.triu_indices(3)
 
     def fill(piece: slice) -> None:
