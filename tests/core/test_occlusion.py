@@ -505,9 +505,10 @@ def test_the_floor_falls_with_the_views_that_might_have_shown_a_splat():
 
 
 def test_the_floor_weighs_what_loses_least_of_what_the_left_out_views_saw():
-    """Least where the scores are right, most where the floor is, 1 where nothing was left out.
+    """So little that the scores decide where they are right, most where the floor is.
 
-    A view that sees nothing says nothing, and one that is bright says no more than others.
+    And 1 where nothing was left out. A view that sees nothing says nothing, and one that is bright
+    says no more than others.
     """
     rng = np.random.default_rng(7)
     right, wrong = rng.random(200), rng.random(200)
@@ -515,8 +516,11 @@ def test_the_floor_weighs_what_loses_least_of_what_the_left_out_views_saw():
     errors = np.stack([right * rng.uniform(0.9, 1.1, 200) for _ in range(4)])
 
     found = coverage.floor_weights([(right, wrong, errors), (right, wrong, dark)])
-    assert found == list(coverage.LEAST_WEIGHTS)
-    assert min(coverage.floor_weights([(wrong, right, errors)])) == max(coverage.WEIGHTS)
+    tenth = np.argsort(coverage.with_floor(right, wrong, found[0]))[:20]
+    np.testing.assert_array_equal(np.sort(tenth), np.sort(np.argsort(right)[:20]))
+    assert found[2:] == list(coverage.LEAST_WEIGHTS)[2:]
+    most = coverage.floor_weights([(wrong, right, errors)])
+    assert min(most) == pytest.approx(max(coverage.WEIGHTS))
     assert coverage.floor_weights([]) == [1.0] * len(coverage.SHARES)
     assert coverage.floor_weights([(right, wrong, dark)]) == [1.0] * len(coverage.SHARES)
     plain, glare = (np.vstack([errors, wrong * bright]) for bright in (1.0, 1e6))
@@ -546,8 +550,7 @@ def test_each_share_has_the_weight_that_is_right_up_to_there():
 
     found = coverage.floor_weights([(scores, floors, errors)])
 
-    assert found[0] == 0.0
-    assert min(found[1:3]) > 0.0
+    assert found[0] < 0.002 < min(found[1:3])
 
 
 def test_splats_go_by_the_weight_of_the_floor_that_holds_up_to_each_stop():
@@ -775,3 +778,15 @@ def test_views_that_see_nothing_are_an_error():
 def test_settings_that_cannot_be_are_refused(name):
     with pytest.raises(RefineError, match=name):
         Occlusion(**{name: 0})
+
+
+def test_weights_that_are_nearly_as_good_do_not_jump():
+    """A last digit of one error changes the weight in its last digits: it is a smooth mean."""
+    rng = np.random.default_rng(9)
+    scores, floors = rng.random(300), rng.random(300)
+    errors = rng.random((4, 300))
+
+    found = coverage.floor_weights([(scores, floors, errors)])
+    again = coverage.floor_weights([(scores, floors, errors * (1.0 + 1e-7 * rng.random((4, 300))))])
+
+    np.testing.assert_allclose(again, found, rtol=1e-3)

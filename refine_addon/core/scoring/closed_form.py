@@ -20,6 +20,7 @@ import numpy as np
 from ..errors import RefineError
 from ..frustum import Frustums
 from ..rendering import NEAR_RELATIVE
+from ..scene import median_size
 from ..scores import Scores
 from ..splats import base_color, drawable, opacity
 from ..work import Progress, for_chunks, part, silent
@@ -254,8 +255,7 @@ class _Scene:
         The median over splats of their squared distance to the views follows the scene's unit,
         and not its origin, order or outliers.
         """
-        good = self.good
-        size = float(np.sqrt(np.median(self.squared if good.all() else self.squared[good]))) or 1.0
+        size = median_size(self.squared, self.good)
         eta = self.settings.eta
         self.eta = ETA_RELATIVE * size * size if eta is None else eta
         self.frustums = Frustums(

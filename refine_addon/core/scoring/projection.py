@@ -9,6 +9,7 @@ import numpy as np
 
 from .. import frustum
 from ..rendering import ALPHA_CUT, LOW_PASS, NEAR_RELATIVE
+from ..scene import Scene, scene_of, spatial_order
 from ..splats import SH_C0, drawable, opacity, rotation_matrices
 from ..work import Progress, checkpoint, for_chunks, silent
 
@@ -22,7 +23,6 @@ REACH = 3.3
 """Standard deviations at which alpha = 1 falls to `ALPHA_CUT`: sqrt(2 ln 255) = 3.33."""
 
 _CHUNK = 1 << 14
-_GRID_BITS = 10
 _FARTHEST = 1e6  # beyond so many scene sizes a splat counts as seen by nobody
 _LOG_SCALE_RANGE = (-16.0, 5.0)  # relative to the size of the scene; keeps float32 in range
 _LARGEST_VARIANCE = 1e12  # px^2; a footprint a million pixels wide is flat over any image
@@ -41,9 +41,9 @@ class Gaussians:
     index : (M,) int64
         Which splat it is.
     means : (3, M) float32
-        From the middle of the views, in scene sizes.
+        In the scene's frame, in scene sizes.
     covariances : (6, M) float32
-        xx, xy, xz, yy, yz, zz, squared scene sizes.
+        xx, xy, xz, yy, yz, zz in the scene's frame, squared scene sizes.
     largest : (M,) float32
         Longest standard deviation, scene sizes.
     alphas : (M,) float32
@@ -69,22 +69,6 @@ class Gaussians:
             **{field.name: getattr(self, field.name)[..., keep] for field in fields(self)[:-1]},
             colors=self.colors[keep],
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """The frame and unit in which a scene is computed, so that float32 is enough for any scene.
-
-    Attributes
-    ----------
-    origin : (3,) float64
-        Weighted mean of the views' centres, world units.
-    size : float
-        Median over splats of the root mean square distance to the views, world units.
-    """
-
-    origin: NDArray[np.float64]
-    size: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,14 +99,14 @@ class Footprints:
 
 def prepare(
     splats: Splats, views: ViewSet, *, progress: Progress = silent, threads: int | None = None
-) -> tuple[Gaussians, Frame, NDArray[np.bool_]]:
+) -> tuple[Gaussians, Scene, NDArray[np.bool_]]:
     """Activate the splats once for all views.
 
     Returns
     -------
     gaussians : Gaussians
         Only of splats that can be drawn and whose opacity reaches `ALPHA_CUT`.
-    frame : Frame
+    scene : Scene
     good : (N,) bool
         Which splats can be drawn.
     """
@@ -136,35 +120,26 @@ def prepare(
         worth[piece] = opacity(logits) > ALPHA_CUT
 
     for_chunks(judge, len(splats), 4 * _CHUNK, progress=progress, what="reading", threads=threads)
-    origin, spread = views.middle()
-    means = np.where(good[:, None], splats.means, origin) - origin  # float64
-    frame = Frame(origin, _size(means, good, spread))
-    means /= frame.size
-    worth &= np.max(np.abs(means), axis=1) <= _FARTHEST
+    scene = scene_of(splats.means, good, views)
     index = np.flatnonzero(worth)
-    means = means[index]
-    order = np.argsort(_morton(means), kind="stable")
-    return _activate(splats, index[order], means[order], frame, threads), frame, good
-
-
-def _size(means: NDArray[np.float64], good: NDArray[np.bool_], spread: float) -> float:
-    if not good.any():
-        return 1.0
-    squared = np.einsum("ij,ij->i", means, means)
-    return float(np.sqrt(np.median(squared if good.all() else squared[good]) + spread)) or 1.0
+    place = scene.place(splats.means[index])
+    near = np.max(np.abs(place), axis=1, initial=0.0) <= _FARTHEST
+    index, place = index[near], place[near]
+    order = spatial_order(place)
+    return _activate(splats, index[order], place[order], scene, threads), scene, good
 
 
 def _activate(
     splats: Splats,
     index: NDArray[np.int64],
-    means: NDArray[np.float64],
-    frame: Frame,
+    place: NDArray[np.float64],
+    scene: Scene,
     threads: int | None,
 ) -> Gaussians:
     count = len(index)
     result = Gaussians(
         index,
-        np.ascontiguousarray(means.T, np.float32),
+        np.ascontiguousarray(place.T, np.float32),
         np.empty((6, count), np.float32),
         np.empty(count, np.float32),
         np.empty(count, np.float32),
@@ -173,9 +148,9 @@ def _activate(
 
     def fill(piece: slice) -> None:
         chunk = splats.take(index[piece])
-        relative = np.asarray(chunk.log_scales, np.float64) - np.log(frame.size)
+        relative = np.asarray(chunk.log_scales, np.float64) - np.log(scene.size)
         scales = np.exp(relative.clip(*_LOG_SCALE_RANGE))
-        axes = rotation_matrices(chunk.quaternions) * scales[:, None, :]
+        axes = scene.axes @ rotation_matrices(chunk.quaternions) * scales[:, None, :]
         for row, (a, b) in enumerate(_PAIRS):
             result.covariances[row, piece] = np.einsum("ij,ij->i", axes[:, a], axes[:, b])
         result.largest[piece] = scales.max(axis=1)
@@ -188,33 +163,21 @@ def _activate(
     return result
 
 
-def _morton(means: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return a key whose order keeps neighbours together, so that what is read is in the cache."""
-    cells = (1 << _GRID_BITS) - 1
-    # The unit is the scene's size: two of them either way hold nearly all; the rest may be far.
-    place = ((means / 4.0 + 0.5) * cells).clip(0, cells).astype(np.int64)
-    code = np.zeros(len(means), np.int64)
-    for bit in range(_GRID_BITS):
-        for axis in range(3):
-            code |= (place[:, axis] >> bit & 1) << (3 * bit + axis)
-    return code
-
-
-def project(gaussians: Gaussians, frame: Frame, view: View) -> Footprints:
+def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
     """Project what may touch the image of a view.
 
     The footprint is the Gaussian of covariance ``J W S W' J' + 0.3 I`` (Zwicker et al., "EWA
     splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean.
     """
-    if not _computable(frame, view):
+    if not _computable(scene, view):
         return _nothing()
-    planes = clip_planes(frame, view)
-    rotation = _rotation6(view)
+    planes = clip_planes(scene, view)
+    rotation = _rotation6(view.rotation @ scene.axes.T)
     pieces: list[tuple[NDArray[Any], ...]] = []
     for start in range(0, len(gaussians), _CHUNK):
         checkpoint()
         piece = slice(start, start + _CHUNK)
-        local = _local(gaussians.means[:, piece], frame, view)
+        local = _local(gaussians.means[:, piece], scene, view)
         touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, planes))
         if len(touching):
             local = np.take(local, touching, axis=1)
@@ -233,26 +196,25 @@ def _nothing() -> Footprints:
     return Footprints(np.empty(0, np.int64), empty, empty, empty, empty, np.empty(0, np.bool_))
 
 
-def _computable(frame: Frame, view: View) -> bool:
+def _computable(scene: Scene, view: View) -> bool:
     """Whether float32 holds what the view sees; it shows nothing of the scene where not."""
-    away = float(np.abs(view.center - frame.origin).max())
+    away = float(np.abs(view.center - scene.origin).max())
     lens = (view.fx, view.fy, abs(view.cx), abs(view.cy), view.width, view.height)
     known = min(view.fx, view.fy) >= 1.0 / _LARGEST_LENS and max(lens) <= _LARGEST_LENS
-    return known and away <= _FARTHEST_VIEW * frame.size
+    return known and away <= _FARTHEST_VIEW * scene.size
 
 
-def clip_planes(frame: Frame, view: View) -> tuple[float, float]:
+def clip_planes(scene: Scene, view: View) -> tuple[float, float]:
     """Return near and far plane in scene sizes."""
-    near, far = frustum.clip_planes(view, NEAR_RELATIVE * frame.size)
+    near, far = frustum.clip_planes(view, NEAR_RELATIVE * scene.size)
     # Nearer than this a footprint's size leaves float32, and no renderer draws it.
-    return min(max(near / frame.size, 1e-5), 1e30), min(far / frame.size, 1e30)
+    return min(max(near / scene.size, 1e-5), 1e30), min(far / scene.size, 1e30)
 
 
-def _local(means: NDArray[np.float32], frame: Frame, view: View) -> NDArray[np.float32]:
+def _local(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.float32]:
     """Camera coordinates of centres, (3, M), scene sizes."""
-    center = (view.center - frame.origin) / frame.size
-    shift = (view.rotation @ center).astype(np.float32)
-    local: NDArray[np.float32] = view.rotation.astype(np.float32) @ means
+    shift = (view.rotation @ ((view.center - scene.origin) / scene.size)).astype(np.float32)
+    local: NDArray[np.float32] = (view.rotation @ scene.axes.T).astype(np.float32) @ means
     local -= shift[:, None]
     return local
 
@@ -278,9 +240,9 @@ def _touches(
     return touching
 
 
-def _rotation6(view: View) -> NDArray[np.float32]:
-    """Return the matrix that takes the 6 numbers of S to those of ``W S W'``."""
-    r = view.rotation
+def _rotation6(rotation: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the matrix that takes the 6 numbers of S to those of ``R S R'``, R a rotation."""
+    r = rotation
     return np.array(
         [
             [r[a, i] * r[b, j] + (r[a, j] * r[b, i] if i != j else 0.0) for i, j in _PAIRS]
