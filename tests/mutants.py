@@ -145,7 +145,7 @@ MUTANTS = {
             "(across * shape[5] + 2 * shape[2])",
             "sign in the Jacobian across",
         ),
-        ("max(near / frame.size, 1e-5)", "max(near, 1e-5)", "near plane in another unit"),
+        ("max(near / scene.size, 1e-5)", "max(near, 1e-5)", "near plane in another unit"),
         ("(z >= planes[0]) & (z <= planes[1])", "(z >= planes[0])", "far plane ignored"),
         (
             "np.abs(focal * coordinate + offset * z) <=",
