@@ -18,6 +18,10 @@ from pathlib import Path
 PROJECT = Path(__file__).resolve().parent.parent
 
 MUTANTS = {
+    "work.py": [
+        ("            cancelled.set()\n", "", "what runs is not told"),
+        ("time.monotonic() - told >= _PATIENCE", "False", "one thread not asked"),
+    ],
     "frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
         ("(near if np.ptp(near) > 0.0 else near[0, 0])", "0.0", "near plane ignored"),
