@@ -18,6 +18,10 @@ from pathlib import Path
 PROJECT = Path(__file__).resolve().parent.parent
 
 MUTANTS = {
+    "work.py": [
+        ("            cancelled.set()\n", "", "what runs is not told"),
+        ("time.monotonic() - told >= _PATIENCE", "False", "one thread not asked"),
+    ],
     "frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
         ("(near if np.ptp(near) > 0.0 else near[0, 0])", "0.0", "near plane ignored"),
@@ -145,7 +149,7 @@ MUTANTS = {
             "(across * shape[5] + 2 * shape[2])",
             "sign in the Jacobian across",
         ),
-        ("max(near / frame.size, 1e-5)", "max(near, 1e-5)", "near plane in another unit"),
+        ("max(near / scene.size, 1e-5)", "max(near, 1e-5)", "near plane in another unit"),
         ("(z >= planes[0]) & (z <= planes[1])", "(z >= planes[0])", "far plane ignored"),
         (
             "np.abs(focal * coordinate + offset * z) <=",
@@ -215,8 +219,8 @@ MUTANTS = {
         ),
     ],
     "absorbing/merge_field.py": [
-        ("/ (1.0 + inside)", "", "as likely after many views"),
-        ("shown = inside @ worth", "shown = worth.sum()", "all seen once"),
+        ("/ (1.0 + seen)\n", "\n", "as likely after many views"),
+        ("unhidden = seen @ worth", "unhidden = worth.sum()", "all seen once"),
         ("np.where(inside, share, share * BESIDE)", "share", "views beside count"),
         (
             "np.where(inside, share, share * BESIDE) / squared",
@@ -226,7 +230,7 @@ MUTANTS = {
         (
             "np.sqrt(np.maximum(0.5 * (xx + yy) + half, 0.0))",
             "np.maximum(0.5 * (xx + yy) + half, 0.0)",
-            "root of spread forgotten",
+            "root of deviation forgotten",
         ),
         ("color[piece] += np.einsum", "color[piece] -= np.einsum", "sign of harmonics"),
     ],
@@ -236,7 +240,7 @@ MUTANTS = {
             "mass_1 + mass_2",
             "overlap counted twice",
         ),
-        ("    spread = position * other\n", "    spread = position\n", "spread of the mixture"),
+        ("    between = position * other\n", "    between = position\n", "variance of the mixture"),
         ("covariances * pairs.growth[:, None]", "covariances", "growth forgotten"),
         (
             "one.means + (1.0 - position) * step",
@@ -244,8 +248,8 @@ MUTANTS = {
             "mean on the wrong side",
         ),
         (
-            "contrast_1 + contrast_2 - ends.apart",
-            "contrast_1 + contrast_2 + ends.apart",
+            "one + two - ends.apart",
+            "one + two + ends.apart",
             "sign of the colours",
         ),
         ("    both = np.clip(both, -limit, limit)\n", "", "contrasts beyond 1"),

@@ -15,7 +15,7 @@ import numpy as np
 
 from . import selection
 from .absorbing import absorb as absorbing
-from .absorbing.merging import Seen
+from .absorbing.merging import ViewSums
 from .errors import RefineError
 from .formats.ply import read_ply
 from .scoring import auto, closed_form, occlusion
@@ -294,14 +294,14 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
     # What no renderer draws scores lowest, so it is among these, or all of these are such.
     rest = selection.select(scores, Budget(keep=total - first), protected=protected)
     # What goes first hid and showed next to nothing: what was measured with it still holds.
-    at_first = [Seen(measured.contribution[rest], measured.contrast[rest])]
+    at_first = [ViewSums(measured.contribution[rest], measured.contrast[rest])]
     del known, scores, measured
 
-    def seen(now: Splats, ahead: Progress) -> Seen:
+    def seen(now: Splats, ahead: Progress) -> ViewSums:
         if at_first:
             return at_first.pop()
         found = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
-        return Seen(found.contribution, found.contrast)
+        return ViewSums(found.contribution, found.contrast)
 
     with np.errstate(under="ignore"):  # as for scores
         absorbed = absorbing.absorb(

@@ -9,7 +9,7 @@ import pytest
 from refine_addon.core.absorbing import merge_field, merge_graph, merging
 from refine_addon.core.absorbing.absorb import absorb, patience
 from refine_addon.core.absorbing.merge_graph import MergeGraph
-from refine_addon.core.absorbing.merging import Field, Seen
+from refine_addon.core.absorbing.merging import Field, ViewSums
 from refine_addon.core.affine import transformed
 from refine_addon.core.errors import Cancelled
 from refine_addon.core.rendering import ALPHA_MAX
@@ -93,7 +93,7 @@ def measure(splats, _progress=None):
     logs = np.asarray(splats.log_scales, np.float64)
     size = np.exp(2 / 3 * np.sum(logs - np.median(logs), axis=1))
     alpha = opacity(splats.opacity_logits)
-    return Seen(alpha * size, 0.05 * alpha**2 * size)
+    return ViewSums(alpha * size, 0.05 * alpha**2 * size)
 
 
 def same(one, other):
@@ -192,7 +192,7 @@ def test_a_merge_along_the_line_of_sight_costs_what_views_from_aside_see():
     """One behind the other: alike from the front; from the side as two that lie side by side."""
     field = flat([0.01, 0.01], [[0.0, 0, 0], [0, 0, 4]], [[1.0, 1, 1]] * 2)
     turned = flat([0.01, 0.01], [[0.0, 0, 0], [4, 0, 0]], [[1.0, 1, 1]] * 2)
-    field.spread[:] = [1e9, 0, 0]
+    field.deviation[:] = [1e9, 0, 0]
     pair = np.array([0]), np.array([1])
 
     front, aside = (merging.price(field, *pair, tilt).cost for tilt in (0.0, 1.0))
@@ -214,15 +214,15 @@ def test_splats_that_do_not_stand_out_cost_nothing_to_merge_whatever_their_colou
 
 
 def test_splats_seen_from_opposite_sides_do_not_lose_their_direction():
-    """The mean of opposites is none, and a spread to the left is one to the right."""
+    """The mean of opposites is none, and a deviation to the left is one to the right."""
     field = flat([0.3, 0.3], [[0.0, 0, 0], [1, 0, 0]], [[1.0, 1, 1]] * 2)
     field.direction[:] = [[0, 0, 1], [0, 0, -1]]
-    field.spread[:] = [[0.5, 0, 0], [-0.5, 0, 0]]
+    field.deviation[:] = [[0.5, 0, 0], [-0.5, 0, 0]]
 
     _, merged = merged_of(field)
 
     np.testing.assert_allclose(np.abs(merged.direction), [[0, 0, 1]])
-    np.testing.assert_allclose(np.abs(merged.spread), [[0.5, 0, 0]])
+    np.testing.assert_allclose(np.abs(merged.deviation), [[0.5, 0, 0]])
 
 
 def test_no_mass_is_created_and_none_is_lost_but_the_overlap():
@@ -305,7 +305,7 @@ def three_of_five(order=(0, 1, 2, 3, 4)):
     splats.sh_rest[:] = np.arange(5)[:, None, None] * 0.1
     splats = splats.take(np.array(order))
     contribution = np.array([1.0, 2, 5, 9, 9])[list(order)]
-    return splats, lambda _splats, _progress: Seen(contribution, contribution * 0.005)
+    return splats, lambda _splats, _progress: ViewSums(contribution, contribution * 0.005)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (2, 4, 1, 0, 3), (1, 3, 2, 0, 4)])
@@ -327,8 +327,8 @@ def test_a_survivor_has_the_colours_of_all_it_absorbed_by_what_is_seen_of_each(o
     assert np.flatnonzero(result.keep)[survivor] == place[2]
     looked = look(splats.means[place], around())
     mass = 0.01 * (np.exp(-4.0) + 0.3 * looked.pixel) / looked.pixel
-    floor = mass * 26 / (looked.inside @ mass) / (looked.inside + 1)
-    shares = np.array([1, 2, 5]) + floor[:3]
+    allowance = mass * 26 / (looked.seen @ mass) / (looked.seen + 1)
+    shares = np.array([1, 2, 5]) + allowance[:3]
     shares /= shares.sum()
     for name in ("sh_dc", "sh_rest"):
         expected = np.tensordot(shares, getattr(splats, name)[place[:3]].astype(float), 1)
@@ -386,13 +386,13 @@ def looking(at, center, **changes):
 
 
 def test_a_splat_is_looked_at_along_the_mean_direction_of_what_sees_it():
-    """From 45 degrees either side: along the bisector, with a spread of sin 45 to the side."""
+    """From 45 degrees either side: along the bisector, with a deviation of sin 45 to the side."""
     views = ViewSet((looking([0, 0, 0], [2, 0, -2]), looking([0, 0, 0], [-2, 0, -2])))
 
     found = look(np.zeros((1, 3)), views)
 
     np.testing.assert_allclose(found.direction, [[0, 0, 1]], atol=1e-12)
-    np.testing.assert_allclose(np.abs(found.spread), [[np.sqrt(0.5), 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(np.abs(found.deviation), [[np.sqrt(0.5), 0, 0]], atol=1e-12)
     np.testing.assert_allclose(found.pixel, [8 / (200 * 250)])
 
 
@@ -427,7 +427,7 @@ def test_a_view_between_whose_planes_a_splat_does_not_lie_hardly_counts():
         found = look(np.array([[0.0, 0, 1]]), views)
 
         np.testing.assert_allclose(found.direction, [[1, 0, 0]], atol=1e-4)
-        assert found.inside.tolist() == [1]
+        assert found.seen.tolist() == [1]
 
 
 def test_colour_is_that_seen_along_the_mean_direction_and_blur_a_third_of_a_pixel():
@@ -486,7 +486,7 @@ def test_where_nothing_is_seen_absorbing_is_deleting_the_lowest_errors():
     table = {tuple(mean): value for mean, value in zip(splats.means, error, strict=True)}
 
     def unseen(left, _progress):
-        return Seen(np.zeros(len(left)), np.array([table[tuple(mean)] for mean in left.means]))
+        return ViewSums(np.zeros(len(left)), np.array([table[tuple(mean)] for mean in left.means]))
 
     result = absorb(splats, around(), unseen, 120)
 
@@ -500,7 +500,7 @@ def test_what_these_views_do_not_show_is_worth_what_another_may_see():
     Of the two in four views 8 was seen, 1 a splat and view: the floor is 1 / (4 + 1).
     """
     splats = cloud(1).take(np.array([0, 0]))
-    seen = Seen(np.array([8.0, 0.0]), np.array([4.0, 0.0]))
+    seen = ViewSums(np.array([8.0, 0.0]), np.array([4.0, 0.0]))
 
     field = field_of(splats, around(), seen)
 
@@ -614,7 +614,7 @@ def test_undrawable_splats_go_first():
 
     def careful(left, _progress):
         seen = measure(left)
-        return Seen(*(np.nan_to_num(values, nan=0.0, posinf=0.0) for values in seen))
+        return ViewSums(*(np.nan_to_num(values, nan=0.0, posinf=0.0) for values in seen))
 
     assert not absorb(splats, around(), careful, 98).keep[[7, 11]].any()
     assert absorb(splats, around(), careful, 99).keep.sum() == 99
@@ -694,12 +694,12 @@ def test_extreme_splats_raise_no_warning_and_stay_drawable():
     splats.quaternions[::7] = 0.0
 
     def wild(left, _progress):
-        return Seen(
+        return ViewSums(
             np.exp(np.linspace(-300, 300, len(left))), np.exp(np.linspace(300, -300, len(left)))
         )
 
     with np.errstate(all="raise"):
-        for seen in (wild, lambda left, _: Seen(np.ones(len(left)), np.ones(len(left)))):
+        for seen in (wild, lambda left, _: ViewSums(np.ones(len(left)), np.ones(len(left)))):
             result = absorb(splats, around(), seen, 150)
 
             changed = result.splats.take(result.changed)

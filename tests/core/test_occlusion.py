@@ -729,6 +729,26 @@ def test_a_view_of_many_splats_is_cancelled_within(monkeypatch):
         assert len(steps) == last
 
 
+@pytest.mark.parametrize("last", [1, 3, 5, 6])
+def test_scoring_is_cancelled_while_the_floor_is_weighed(monkeypatch, last):
+    """Five views are five folds, one call of `floor` each; the sixth orders the splats.
+
+    When that many calls have begun the next report answers ``False``: no other follows.
+    """
+    calls = []
+
+    def counted(*arguments, floor=coverage.floor):
+        calls.append(1)
+        return floor(*arguments)
+
+    monkeypatch.setattr(coverage, "floor", counted)
+
+    with pytest.raises(Cancelled):
+        occlusion.score(cloud(), ring(), progress=lambda *_: len(calls) < last)
+
+    assert len(calls) == last
+
+
 @pytest.mark.parametrize(("large", "steps"), [(0.05, 0), (0.1, 1), (0.3, 3)])
 def test_cells_stop_growing_where_each_footprint_needs_a_point_of_its_own(large, steps):
     """4.3 million footprints are more than the 2^22 points of a view: 1.25 a footprint are allowed.

@@ -18,7 +18,7 @@ from ..scene import scene_of, spatial_order
 from ..splats import Splats, drawable
 from ..work import Progress, part, report, silent
 from . import merge_field, merging
-from .merge_field import Seen
+from .merge_field import ViewSums
 from .merge_graph import MergeGraph
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from ..views import ViewSet
     from .merge_field import Array, Index
 
-Measure = Callable[[Splats, Progress], Seen]
+Measure = Callable[[Splats, Progress], ViewSums]
 """Called with splats, as they are by then; says what the views see of each."""
 
 STAGE = 0.6
@@ -110,7 +110,7 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
     views : ViewSet
         They tell from where each splat is looked at.
     measure : callable
-        ``measure(splats, progress)`` returns a `Seen`; called once a stage.
+        ``measure(splats, progress)`` returns a `ViewSums`; called once a stage.
     keep_count : int
         How many survive; more where more are protected. Splats that no renderer can draw go first.
     protected : (N,) bool, optional
@@ -138,9 +138,9 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
     for stage in range(stages):
         ahead = part(progress, stage / stages, (stage + 1) / stages)
         left = round(count * (goal / count) ** ((stage + 1) / stages))
-        seen = measure(splats, part(ahead, 0.0, 0.5))
+        sums = measure(splats, part(ahead, 0.0, 0.5))
         splats, kept, taken = _absorb_once(
-            splats, views, scene, seen, max(left, goal), protected=spared[origin],
+            splats, views, scene, sums, max(left, goal), protected=spared[origin],
             factor=factor, progress=part(ahead, 0.5, 1.0), threads=threads,
         )  # fmt: skip
         # A survivor stands for all that those it took stood for.
@@ -156,7 +156,7 @@ def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     splats: Splats,
     views: ViewSet,
     scene: Scene,
-    seen: Seen,
+    sums: ViewSums,
     keep_count: int,
     *,
     protected: NDArray[np.bool_],
@@ -175,7 +175,7 @@ def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     taken : (N,) int64
         Into which survivor each splat went; -1 where it was deleted.
     """
-    seen = Seen(np.asarray(seen.contribution, np.float64), np.asarray(seen.error, np.float64))
+    sums = ViewSums(np.asarray(sums.contribution, np.float64), np.asarray(sums.error, np.float64))
     good, free = drawable(splats), ~protected
     keep = np.ones(len(splats), np.bool_)
     excess = max(len(splats) - keep_count, 0)
@@ -189,7 +189,7 @@ def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
         return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1)
     # In an order of the scene's own, so that ties do not depend on that of the file.
     rows = rows[spatial_order(scene.place(splats.means[rows]))]
-    found = merge_field.field(splats, rows, views, scene, seen, threads=threads)
+    found = merge_field.field(splats, rows, views, scene, sums, threads=threads)
     graph = MergeGraph(found, scene, factor, threads=threads)
     graph.reduce(len(rows) - excess, part(progress, 0.1, 0.95))
     keep[rows[~graph.alive]] = False

@@ -311,6 +311,7 @@ def _merged(
     filled = filled[filled > 0]  # (C,), points of each cell before merging
     # The sort is stable, so each cell stays front to back; `_OUTSIDE` sorts last.
     order = np.argsort(cells, kind="stable")[: filled.sum()]
+    checkpoint()
     if not len(order):
         return Points(order, shares[:0], order, area)
     owners = owners.take(order)
@@ -475,6 +476,7 @@ def mean_visible(
     count : int
         Number of footprints.
     """
+    checkpoint()
     owners, shares = points.owners, points.shares
     squares = shares * shares
     visible = np.bincount(owners, shares * transmittance, count)

@@ -25,7 +25,7 @@ import numpy as np
 
 from ..errors import RefineError
 from ..scores import Scores
-from ..work import Progress, for_chunks, part, silent
+from ..work import Progress, for_chunks, part, report, silent
 from . import closed_form, coverage, froxels, projection
 
 if TYPE_CHECKING:
@@ -259,6 +259,7 @@ class _Run:
                 seen[left.index] = measured.seen
             else:
                 measured = self.measure(left, ahead)
+            report(ahead, 1.0, "scoring")
             go = max(len(left) - stay, 0)
             order = self._order(measured, prior[left.index], removal.gone, count, go)
             removal.add(left.index[order[:go]])
@@ -301,6 +302,7 @@ class _Run:
 
         def folds() -> Iterator[tuple[NDArray[np.float64], ...]]:
             for block, errors in blocks if len(blocks) > 1 else ():
+                report(progress, 1.0, "scoring")
                 others = Measured(
                     # What is left of a sum may be negative by rounding.
                     np.maximum(measured.contribution[sample] - block.contribution[sample], 0.0),

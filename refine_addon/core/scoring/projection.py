@@ -11,7 +11,7 @@ from .. import frustum
 from ..rendering import ALPHA_CUT, LOW_PASS, NEAR_RELATIVE
 from ..scene import Scene, scene_of, spatial_order
 from ..splats import SH_C0, drawable, opacity, rotation_matrices
-from ..work import Progress, checkpoint, for_chunks, silent
+from ..work import Progress, checkpoint, for_chunks, part, report, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -119,14 +119,20 @@ def prepare(
         logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
         worth[piece] = opacity(logits) > ALPHA_CUT
 
-    for_chunks(judge, len(splats), 4 * _CHUNK, progress=progress, what="reading", threads=threads)
+    for_chunks(
+        judge, len(splats), 4 * _CHUNK,
+        progress=part(progress, 0.0, 0.4), what="reading", threads=threads,
+    )  # fmt: skip
     scene = scene_of(splats.means, good, views)
+    report(progress, 0.4, "reading")
     index = np.flatnonzero(worth)
     place = scene.place(splats.means[index])
     near = np.max(np.abs(place), axis=1, initial=0.0) <= _FARTHEST
     index, place = index[near], place[near]
+    report(progress, 0.4, "reading")
     order = spatial_order(place)
-    return _activate(splats, index[order], place[order], scene, threads), scene, good
+    ahead = part(progress, 0.4, 1.0)
+    return _activate(splats, index[order], place[order], scene, ahead, threads), scene, good
 
 
 def _activate(
@@ -134,8 +140,10 @@ def _activate(
     index: NDArray[np.int64],
     place: NDArray[np.float64],
     scene: Scene,
+    progress: Progress,
     threads: int | None,
 ) -> Gaussians:
+    """Return the splats at `index` as Gaussians, `place` being their positions in the scene."""
     count = len(index)
     result = Gaussians(
         index,
@@ -159,7 +167,7 @@ def _activate(
         result.colors[piece] = colors.clip(0.0, 16.0)  # what is brighter is white all the same
 
     with np.errstate(under="ignore"):
-        for_chunks(fill, count, _CHUNK, threads=threads)
+        for_chunks(fill, count, _CHUNK, progress=progress, what="reading", threads=threads)
     return result
 
 
@@ -187,6 +195,7 @@ def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
     if not pieces:
         return _nothing()
     index, depth, *rest = (np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True))
+    checkpoint()
     order = _by_depth(depth)
     return Footprints(index[order], *(np.take(values, order, axis=-1) for values in rest))
 
