@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from refine_addon.core import RefineError, ViewSet, read_cameras, read_ply
 from refine_addon.core.cameras.place import Place
+from tests.users import closed_folder
 
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 
@@ -320,6 +321,35 @@ def test_a_file_that_may_not_be_read_says_why(tmp_path, monkeypatch):
 
     with pytest.raises(RefineError, match=r"cameras\.json: cannot be read \(Permission denied\)"):
         read_cameras(path)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs permissions")
+def test_a_folder_that_may_not_be_entered_says_why():
+    """The folder itself, and one that a name leads through."""
+    with closed_folder({"cameras.json": json.dumps([INRIA])}) as folder:
+        for path in (folder, folder / "cameras.json"):
+            with pytest.raises(RefineError) as caught:
+                read_cameras(path)
+
+            expected = f"{folder / 'cameras.json'}: cannot be read (Permission denied)"
+            assert str(caught.value) == expected
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "dataparser_transforms.json"])
+def test_files_beside_that_may_not_be_looked_for_say_why(tmp_path, monkeypatch, name):
+    """Simulated: the folder is closed once the cameras have been read."""
+    write(tmp_path / "transforms.json", TRANSFORMS)
+    asking = Path.stat
+
+    def refuse(path, **how):
+        if path.name == name:
+            raise PermissionError(13, "Permission denied")
+        return asking(path, **how)
+
+    monkeypatch.setattr(Path, "stat", refuse)
+
+    with pytest.raises(RefineError, match=rf"{name}: cannot be read \(Permission denied\)"):
+        read_cameras(tmp_path / "transforms.json")
 
 
 def test_what_a_view_refuses_is_refused_with_the_place():

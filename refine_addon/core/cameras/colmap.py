@@ -20,7 +20,7 @@ import numpy as np
 
 from ..views import View, ViewSet
 from .lenses import MODELS, MODELS_BY_NAME, Model, lens_note
-from .place import Place
+from .place import Place, is_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -79,7 +79,7 @@ def find_colmap(folder: Path) -> tuple[Path, str] | None:
     """
     for place in (".", "sparse/0", "sparse", "colmap/sparse/0"):
         for suffix in SUFFIXES:
-            if all((folder / place / f"{stem}{suffix}").is_file() for stem in MODEL_FILES[:2]):
+            if all(is_file(folder / place / f"{stem}{suffix}") for stem in MODEL_FILES[:2]):
                 return folder / place, suffix
     return None
 

@@ -7,6 +7,7 @@ error names the file, the place, what was found and what was expected.
 from __future__ import annotations
 
 import json
+import stat
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from ..errors import RefineError
 from ..views import View
+from ..whole_file import mode_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -168,6 +170,29 @@ class Place:
             return View(rotation, center, *focal, *principal, *size, name=printable)
         except RefineError as error:
             self.fail(str(error))
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file.
+
+    Raises
+    ------
+    RefineError
+        If the system does not say: a name too long, a folder that may not be entered.
+    """
+    return stat.S_ISREG(_mode(path))
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is such a folder; see `is_file`."""
+    return stat.S_ISDIR(_mode(path))
+
+
+def _mode(path: Path) -> int:
+    try:
+        return mode_of(path)
+    except (OSError, ValueError) as error:
+        Place(path).fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
 
 
 def described(value: object) -> str:
