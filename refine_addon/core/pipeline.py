@@ -374,6 +374,7 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
     columns = survivor_columns(file.rows, result.absorbed) if result.absorbed else {}
     if target is not None:
         file.write(target, result.keep, columns=columns, overwrite=overwrite)
+    result.report["notes"] += file.notes(result.keep)
     timings = result.report["timings"]
     timings["read_s"] = opened - start
     timings["write_s"] = time.perf_counter() - decided

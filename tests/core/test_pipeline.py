@@ -107,6 +107,29 @@ def test_the_pruned_file_holds_the_kept_rows_and_the_report_is_json(file, views,
     assert json.loads(json.dumps(result.report, allow_nan=False))["splats"]["before"] == 39755
 
 
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+def test_faces_that_count_splats_are_noted_once_splats_go(small, views, tmp_path, form):
+    """They are kept byte for byte, and the third corner is then no splat any more."""
+    rows = read_ply(small).rows
+    faces = b"element face 1\nproperty list uchar int vertex_indices\n"
+    header = plain_header(len(rows), list(rows.dtype.names), form)
+    texts = b"".join(b" ".join(b"%.9g" % value for value in row.tolist()) + b"\n" for row in rows)
+    body, face = (
+        (texts, b"3 0 1 1987\n") if form == "ascii" else (rows.tobytes(), b"\x03" + bytes(12))
+    )
+    path = tmp_path / "in.ply"
+    path.write_bytes(header.replace(b"end_header", faces + b"end_header") + body + face)
+
+    fewer = prune_file(path, tmp_path / "out.ply", views, Budget(ratio=0.5)).report["notes"]
+    same = prune_file(path, None, views, Budget(ratio=0.0)).report["notes"]
+
+    expected = (
+        "element 'face' beside the splats is kept as it is; its indices may point past the end"
+    )
+    assert (fewer, same) == ([expected], [])
+    assert (tmp_path / "out.ply").read_bytes().endswith(face)
+
+
 def test_no_output_writes_nothing(views, tmp_path):
     """A dry run decides and reports."""
     result = prune_file(PLY, None, views, Budget(ratio=0.5))

@@ -38,6 +38,9 @@ __all__ = [
     "splats_from_columns",
 ]
 
+INDEXING = ("edge", "face", "tristrips")
+"""Elements that, by a PLY's convention, hold numbers of vertices."""
+
 _NAMES_SHOWN = 12
 
 
@@ -57,6 +60,8 @@ class SplatFile:
         Bytes of the body ahead of and behind the vertex rows.
     lines : list of bytes or None
         For ASCII files, the text of each vertex row with its line end.
+    indexing : tuple of str
+        Names of other elements whose rows hold numbers of splats.
     """
 
     path: Path
@@ -65,6 +70,7 @@ class SplatFile:
     before: NDArray[np.uint8]
     after: NDArray[np.uint8]
     lines: list[bytes] | None = None
+    indexing: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of splats."""
@@ -116,6 +122,14 @@ class SplatFile:
         else:
             rows = sum(map(len, text_lines(self.rows, self.lines, keep, columns)))
         return len(self._new_header(keep, columns)) + len(self.before) + rows + len(self.after)
+
+    def notes(self, keep: NDArray[np.bool_]) -> list[str]:
+        """Return what the user should know of a file of the kept rows, in sentences."""
+        return [
+            f"element '{name}' beside the splats is kept as it is; "
+            "its indices may point past the end"
+            for name in ([] if keep.all() else self.indexing)
+        ]
 
     def splats(self) -> Splats:
         """Return the rows as splats, as views of the file where its layout permits."""
@@ -212,13 +226,15 @@ def read_ply(path: Path | str) -> SplatFile:
         raise RefineError(msg) from error
     body = np.frombuffer(whole, np.uint8)[len(header.raw) :]
     check_counts(header, len(body))
+    filled = [e.name for e, count in zip(header.elements, header.counts, strict=True) if count]
+    indexing = tuple(name for name in filled if name in INDEXING)
     if header.order == TEXT:
         rows, lines, beside = read_text(header, vertex, body.tobytes())
         before, after = (np.frombuffer(part, np.uint8) for part in beside)
-        return SplatFile(path, rows, header.raw, before, after, lines)
+        return SplatFile(path, rows, header.raw, before, after, lines, indexing)
     start, end = vertex_range(header, vertex, body)
     rows = body[start:end].view(header.elements[vertex].dtype(header.order))
-    return SplatFile(path, rows, header.raw, body[:start], body[end:])
+    return SplatFile(path, rows, header.raw, body[:start], body[end:], indexing=indexing)
 
 
 def _vertex_index(header: Header) -> int:
@@ -276,6 +292,6 @@ def _check_properties(header: Header, vertex: int) -> None:
 def _guess(header: Header, kinds: Mapping[str, str]) -> str:
     if "opacity" in kinds:
         return "incomplete splats"
-    if any(element.name in ("face", "tristrips") for element in header.elements):
+    if any(element.name in INDEXING for element in header.elements):
         return "a mesh, not splats"
     return "a point cloud, not splats"
