@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from ..views import View, ViewSet
-from .lenses import MODELS, MODELS_BY_NAME, Model, lens_note
+from .lenses import MODELS, MODELS_BY_NAME, Model, counted, lens_note
 from .place import Place, is_file
 
 if TYPE_CHECKING:
@@ -213,6 +213,14 @@ class _Binary:
             )
         return int(count)
 
+    def end(self, what: str, count: int) -> None:
+        """Refuse bytes behind the last of so many things, which would be more of them."""
+        left = self.size - self.offset
+        if left:
+            self.file.at(f"byte {self.offset}").fail(
+                f"expected the end of the file behind {counted(count, what)}, got {left} more bytes"
+            )
+
     def truncated(self, what: str, expected: str) -> NoReturn:
         """Raise the error of a file that ends early."""
         left = self.size - self.offset
@@ -231,6 +239,7 @@ def _binary_cameras(path: Path) -> dict[int, Lens]:
             model = MODELS[model_id]
             values = data.take(f"{model.count}d", f"parameters of camera row {row}")
             _add(lenses, place, camera_id, _lens(place, model, size, values))
+        data.end("camera", len(lenses))
         return lenses
 
 
@@ -245,6 +254,7 @@ def _binary_images(path: Path) -> list[Image]:
             (points,) = data.take("Q", f"number of points of image row {row}")
             data.skip(points * POINT_BYTES, f"{points} points of image row {row}")
             images.append(_image(place, image_id, pose, camera_id, name))
+        data.end("image", len(images))
         return images
 
 
