@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from ..foreign_files import refuse_pointer
 from ..views import View, ViewSet
 from .lenses import MODELS, MODELS_BY_NAME, Model, counted, lens_note
 from .place import Place, is_file
@@ -178,6 +179,7 @@ class _Binary:
                     self.file.fail("the file is empty, expected a COLMAP model")
                 # Mapped: most of images.bin is observations, which are skipped.
                 self.data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+                refuse_pointer(path, self.data[:SHORT_LINE])
         except (OSError, ValueError) as error:
             self.file.fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
 
@@ -268,6 +270,7 @@ def _lines(path: Path) -> list[tuple[Place, bytes]]:
         file.fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
     if not any(lines):
         file.fail("the file is empty, expected a COLMAP model")
+    refuse_pointer(path, lines[0])
     lines[0] = lines[0].removeprefix(codecs.BOM_UTF8)
     return [
         (file.at(f"line {number}"), line)

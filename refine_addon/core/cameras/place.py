@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from ..errors import RefineError
+from ..foreign_files import refuse_pointer
 from ..views import View
 from ..whole_file import mode_of
 
@@ -222,6 +223,7 @@ def read_json(path: Path) -> object:
     try:
         with path.open("rb") as stream:
             head = stream.read(SNIFFED_BYTES)
+            refuse_pointer(path, head)
             if head[:1] not in b"{[\xef \t\r\n":  # so that no splat file is read whole
                 place.fail(
                     "not a camera file: expected JSON (cameras.json, transforms.json) "
