@@ -676,5 +676,6 @@ def test_what_is_no_file_is_refused(tmp_path):
         str(tmp_path / ("a" * 300)): "cannot be read (File name too long)",
         "~nobody-of-that-name/in.ply": "cannot be found (",
     }.items():
-        with pytest.raises(RefineError, match=re.escape(f"{path}: {expected}")):
+        named = path.replace("\0", r"\x00")
+        with pytest.raises(RefineError, match=re.escape(f"{named}: {expected}")):
             read_ply(path)
