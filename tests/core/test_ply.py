@@ -222,6 +222,7 @@ def test_a_new_property_comes_last_and_all_else_stays(folder, case, data, kind):
     line = b"property %s refine_score" % declared.encode()
     written = (folder / "out.ply").read_bytes()
     assert written.count(case.line_end + line + case.line_end) == 1
+    assert len(written) == file.size(keep, {"refine_score": values})
     again = read_ply(folder / "out.ply")
     np.testing.assert_array_equal(values[keep], again.rows["refine_score"])
     assert again.rows.dtype.names[-1] == "refine_score"
@@ -244,6 +245,7 @@ def test_a_property_that_is_there_is_set_in_place(folder, case):
     again = read_ply(folder / "out.ply")
 
     assert case.data[: len(file.header)] == again.header
+    assert (folder / "out.ply").stat().st_size == file.size(columns={"opacity": third})
     expected = case.rows.copy()
     expected["opacity"] = 1 / 3
     assert expected.dtype == again.rows.dtype
