@@ -358,8 +358,7 @@ TESTS = {
     "occlusion": ["scoring/froxels.py", "scoring/projection.py", "scoring/coverage.py"],
     "absorb": ["absorbing/merge_field.py", "absorbing/merging.py", "absorbing/merge_graph.py"],
     "affine": ["spherical_harmonics.py"],
-    "ply": ["formats/ply_columns.py"],
-    "survivors": ["formats/ply_write.py"],
+    "ply": ["formats/ply_columns.py", "formats/ply_write.py"],
 }
 """Modules whose tests are not in the file of their own name; those run first."""
 

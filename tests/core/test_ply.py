@@ -17,7 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core import RefineError, read_ply
-from refine_addon.core.formats.ply import columns_from_splats, splats_from_columns
+from refine_addon.core.formats.ply import REQUIRED, columns_from_splats, splats_from_columns
+from refine_addon.core.formats.ply_write import longest_line, text_lines
 from tests.strategies import (
     LINE_ENDS,
     TYPES,
@@ -266,6 +267,48 @@ def test_the_words_of_a_text_row_stay_when_one_is_set(tmp_path):
 
     expected = b" +1.50\t2 3e0  0 0 0 0.5 0 0 0 1 0 0 0 9 \r\n"
     assert expected == (tmp_path / "out.ply").read_bytes()[-len(expected) :]
+
+
+def test_the_text_of_a_number_stays_where_it_is_set_to_itself(tmp_path):
+    """Of 1/3 there are many spellings; -0 is another number than 0, and not a number is one."""
+    row = b"0.333333343 0 nan  0 0 0 7 0 0 0 1 0 0 0\n"
+    file = opened(tmp_path, plain_header(1, splat_names(0), "ascii") + row)
+    same = {"x": np.array([1 / 3]), "z": np.array([np.nan])}
+    file.write(tmp_path / "out.ply", columns={**same, "y": np.array([-0.0])})
+
+    expected = row.replace(b" 0 nan", b" -0.0 nan")
+    assert expected == (tmp_path / "out.ply").read_bytes()[-len(expected) :]
+
+
+@given(
+    bits=st.integers(0, 2**64 - 1),
+    kind=st.sampled_from(["f4", "f8"]),
+    own=st.sampled_from([b"1", b"-0.1000000000000000055511151231257827"]),
+)
+def test_no_number_makes_a_line_longer_than_the_longest(bits, kind, own):
+    """Whatever becomes of x, y or both; the tag is not ours and keeps its 20 digits."""
+    dtype = np.dtype([("x", kind), ("tag", "f8"), ("y", kind)])
+    line = b" %s\t12345678901234567890  %s \n" % (own, own)
+    rows = np.zeros(1, dtype)
+    width = dtype["x"].itemsize
+    value = np.array([bits % 2 ** (8 * width)], f"u{width}").view(kind)
+    longest = longest_line(dtype, [line], REQUIRED)
+
+    for columns in ({"x": value}, {"y": value}, {"x": value, "y": value}):
+        assert len(next(text_lines(rows, [line], None, columns))) <= longest
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"), [("f4", -1.2345679e15), ("f8", -1.2345678901234567e-308)]
+)
+def test_the_longest_line_can_be_reached(kind, value):
+    """The bound is no larger than it must be: one of these numbers fills it."""
+    dtype = np.dtype([("x", kind)])
+    longest = longest_line(dtype, [b"7\n"], REQUIRED)
+
+    (line,) = text_lines(np.zeros(1, dtype), [b"7\n"], None, {"x": np.array([value], kind)})
+
+    assert len(line) == longest
 
 
 @pytest.mark.parametrize("end", LINE_ENDS)

@@ -7,14 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from refine_addon.core import Splats, read_ply, survivor_columns
 from refine_addon.core.absorbing.absorb import Absorbed
 from refine_addon.core.affine import transformed
-from refine_addon.core.formats.ply_columns import REQUIRED, values_by_name
-from refine_addon.core.formats.ply_write import longest_line, text_lines
+from refine_addon.core.formats.ply_columns import values_by_name
 from tests.strategies import plain_ply
 
 CORE = Path(__file__).parents[2] / "refine_addon/core"
@@ -111,34 +108,3 @@ def test_a_format_knows_nothing_of_what_is_done_with_splats():
             nodes = ast.walk(ast.parse(path.read_text()))
             found = [n.module or "" for n in nodes if isinstance(n, ast.ImportFrom)]
             assert not [name for name in found if above & {*name.split(".")}], path.name
-
-
-@given(
-    bits=st.integers(0, 2**64 - 1),
-    kind=st.sampled_from(["f4", "f8"]),
-    own=st.sampled_from([b"1", b"-0.1000000000000000055511151231257827"]),
-)
-def test_no_number_makes_a_line_longer_than_the_longest(bits, kind, own):
-    """Whatever becomes of x, y or both; the tag is not ours and keeps its 20 digits."""
-    dtype = np.dtype([("x", kind), ("tag", "f8"), ("y", kind)])
-    line = b" %s\t12345678901234567890  %s \n" % (own, own)
-    rows = np.zeros(1, dtype)
-    width = dtype["x"].itemsize
-    value = np.array([bits % 2 ** (8 * width)], f"u{width}").view(kind)
-    longest = longest_line(dtype, [line], REQUIRED)
-
-    for columns in ({"x": value}, {"y": value}, {"x": value, "y": value}):
-        assert len(next(text_lines(rows, [line], None, columns))) <= longest
-
-
-@pytest.mark.parametrize(
-    ("kind", "value"), [("f4", -1.2345679e15), ("f8", -1.2345678901234567e-308)]
-)
-def test_the_longest_line_can_be_reached(kind, value):
-    """The bound is no larger than it must be: one of these numbers fills it."""
-    dtype = np.dtype([("x", kind)])
-    longest = longest_line(dtype, [b"7\n"], REQUIRED)
-
-    (line,) = text_lines(np.zeros(1, dtype), [b"7\n"], None, {"x": np.array([value], kind)})
-
-    assert len(line) == longest
