@@ -270,7 +270,7 @@ def test_the_words_of_a_text_row_stay_when_one_is_set(tmp_path):
 
 
 def test_the_text_of_a_number_stays_where_it_is_set_to_itself(tmp_path):
-    """Of 1/3 there are many spellings; -0 is another number than 0, and not a number is one."""
+    """One third has many spellings and keeps its own, as NaN does; -0 is another number than 0."""
     row = b"0.333333343 0 nan  0 0 0 7 0 0 0 1 0 0 0\n"
     file = opened(tmp_path, plain_header(1, splat_names(0), "ascii") + row)
     same = {"x": np.array([1 / 3]), "z": np.array([np.nan])}

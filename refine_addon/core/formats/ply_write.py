@@ -135,7 +135,7 @@ def longest_line(dtype: np.dtype[Any], lines: Sequence[bytes], names: Collection
 
 
 def _differs(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return where two columns of one type differ in their bits: 0 and -0 do, two NaN do not."""
+    """Return where two columns of one type differ in their bits, as 0 and -0 do."""
     bits = f"u{one.dtype.itemsize}"
     differs: NDArray[np.bool_] = one.view(bits) != np.ascontiguousarray(other).view(bits)
     return differs
