@@ -19,6 +19,7 @@ from .core.affine import transformed
 from .core.errors import RefineError
 from .core.formats.ply import columns_from_splats
 from .core.selection import select
+from .core.survivors import survivor_columns
 from .core.whole_file import refuse_existing
 from .core.work import Progress, part, silent
 from .mesh import attributes as mesh_attributes
@@ -190,15 +191,7 @@ def _reduce(
 def absorbed_columns(obj: bpy.types.Object, absorbed: Absorbed) -> dict[str, NDArray[Any]]:
     """Return an object's columns with the survivors as they became, in the object's frame."""
     matrix = world_matrix(obj, bpy.context.evaluated_depsgraph_get())
-    changed = np.flatnonzero(absorbed.changed)
-    survivors = absorbed.splats.take(changed)
-    if not np.array_equal(matrix, np.eye(4)):
-        survivors = transformed(survivors, np.linalg.inv(matrix))
-    index = np.flatnonzero(absorbed.keep)[changed]
-    columns = mesh_attributes.stored_columns(obj, columns_from_splats(survivors))
-    for name, values in columns_from_splats(survivors).items():
-        columns[name][index] = values
-    return columns
+    return survivor_columns(mesh_attributes.stored_columns(obj), absorbed, np.linalg.inv(matrix))
 
 
 def export_object(

@@ -75,6 +75,23 @@ MUTANTS = {
             "SH channel order",
         ),
     ],
+    "formats/ply_write.py": [
+        (
+            "one.view(bits) != np.ascontiguousarray(other).view(bits)",
+            "one.view(bits) == one.view(bits)",
+            "every word of a text row rewritten",
+        ),
+        ("most - len(word)", "most - 1 - len(word)", "a longest line that is not"),
+    ],
+    "survivors.py": [
+        (
+            "columns[name] = stored[name].copy()",
+            "columns[name] = stored[name].astype(np.float32)",
+            "doubles rounded to floats",
+        ),
+        ("np.flatnonzero(absorbed.keep)[changed]", "changed", "survivors in other rows"),
+    ],
+    "cameras/colmap.py": [("if left:", "if left < 0:", "what is not announced skipped")],
     "scoring/occlusion.py": [
         ("return 0.25 + 0.5 * gone", "return 0.25", "what has gone forgotten"),
         (
@@ -346,7 +363,7 @@ TESTS = {
     "occlusion": ["scoring/froxels.py", "scoring/projection.py", "scoring/coverage.py"],
     "absorb": ["absorbing/merge_field.py", "absorbing/merging.py", "absorbing/merge_graph.py"],
     "affine": ["spherical_harmonics.py"],
-    "ply": ["formats/ply_columns.py"],
+    "ply": ["formats/ply_columns.py", "formats/ply_write.py"],
 }
 """Modules whose tests are not in the file of their own name; those run first."""
 

@@ -20,6 +20,7 @@ from .errors import RefineError
 from .formats.ply import read_ply
 from .scoring import auto, closed_form, occlusion
 from .selection import Budget
+from .survivors import survivor_columns
 from .whole_file import expanded, refuse_existing, refuse_mapped
 from .work import Progress, part, report, silent
 
@@ -363,18 +364,17 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
         budget,
         settings,
         absorb=absorb,
-        row_bytes=file.row_bytes,
+        row_bytes=file.changed_row_bytes if absorb else file.row_bytes,
         fixed_bytes=file.fixed_bytes,
         progress=part(progress, 0.0, 0.8),
         threads=threads,
     )
     decided = time.perf_counter()
     report(progress, 0.8, "writing")
+    columns = survivor_columns(file.rows, result.absorbed) if result.absorbed else {}
     if target is not None:
-        if result.absorbed:
-            file.write_survivors(target, result.absorbed, overwrite=overwrite)
-        else:
-            file.write(target, result.keep, overwrite=overwrite)
+        file.write(target, result.keep, columns=columns, overwrite=overwrite)
+    result.report["notes"] += file.notes(result.keep)
     timings = result.report["timings"]
     timings["read_s"] = opened - start
     timings["write_s"] = time.perf_counter() - decided
@@ -383,7 +383,7 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
         "input": str(file.path),
         "output": None if target is None else str(target),
         "input_bytes": file.size(),
-        "output_bytes": file.size(result.keep),
+        "output_bytes": file.size(result.keep, columns),
     }
     return result
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..core.survivors import Columns
+
 _GROUP = 16  # float32 columns in a cache line
 _ROWS = 4096  # of 16 columns: what stays in the first-level caches while it is turned
 
@@ -154,10 +156,9 @@ def file_from_object(
     return SplatFile(Path(obj.name), rows, layout.header, nothing, nothing)
 
 
-def stored_columns(obj: bpy.types.Object, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """Return the named columns of a splat object, copies of (N,) each."""
-    read = _Reader(obj.data, check(obj))
-    return {name: read.stored(name).copy() for name in names}
+def stored_columns(obj: bpy.types.Object) -> Columns:
+    """Return the columns of a splat object by their names, each read when it is asked for."""
+    return _Reader(obj.data, check(obj))
 
 
 def write_columns(obj: bpy.types.Object, columns: Mapping[str, NDArray[Any]]) -> None:
@@ -235,6 +236,8 @@ class _Reader:
             return self.vectors[column.attribute][:, column.component]
         values = read_attribute(self.mesh, column.attribute)
         return values.view(np.uint32) if column.dtype[1:] == "u4" else values
+
+    __getitem__ = stored
 
     def planes(self, names: Sequence[str]) -> NDArray[np.float32]:
         """Return float columns as (len(names), N)."""
