@@ -6,7 +6,6 @@ import json
 import math
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -549,50 +548,6 @@ def test_the_exit_code_is_that_of_the_process(arguments, code):
     assert code == done.returncode
     assert (code == 0) == (done.stderr == b"")
     assert b"Traceback" not in done.stderr
-
-
-STOPPED = """
-import sys, time
-from refine_addon import command
-from refine_addon.core.formats import ply
-
-write = ply.write_rows
-
-def slow(stream, *arguments):
-    write(stream, *arguments)
-    stream.flush()
-    print("halfway", flush=True)
-    time.sleep(60)
-
-ply.write_rows = slow
-sys.exit(command.main(sys.argv[1:]))
-"""
-
-
-@pytest.mark.skipif(os.name != "posix", reason="needs signals")
-@pytest.mark.parametrize("overwrite", [False, True])
-def test_interrupted_in_the_middle_of_a_write_it_leaves_what_was_there(folder, overwrite):
-    """A real SIGINT, as of Ctrl-C, while the rows are in the temporary file: code 130."""
-    if overwrite:
-        (folder / "out.ply").write_bytes(b"old")
-    arguments = [*PRUNE, "-o", "out.ply", *(["--overwrite"] if overwrite else [])]
-    with subprocess.Popen(
-        [sys.executable, "-c", STOPPED, *arguments],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        # Whoever runs the tests in the background has Ctrl-C ignored, and programs inherit that.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
-    ) as process:
-        assert process.stdout.readline() == b"halfway\n"
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=30)
-
-    assert process.returncode == 130
-    assert errors == b"refine: error: cancelled; nothing was left half-written\n"
-    if overwrite:
-        assert (folder / "out.ply").read_bytes() == b"old"
-    assert names(folder) == ({"out.ply"} if overwrite else set())
 
 
 @pytest.mark.parametrize("stage", ["score", "write_rows"])
