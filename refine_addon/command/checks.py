@@ -70,8 +70,8 @@ def _check_report(parser: argparse.ArgumentParser, given: argparse.Namespace) ->
         # Unlike pathlib's, these two never fail, whatever the name.
         if os.path.realpath(os.path.expanduser(other)) == path:  # noqa: PTH111
             parser.error(f"--report {given.report} is {other}, expected a file of its own")
-    beginning = _beginning(given.report)
-    if given.overwrite and beginning is not None and not is_report(beginning):
+    beginning = _beginning(given.report) if given.overwrite else None
+    if beginning is not None and not is_report(beginning):
         parser.error(f"{given.report} exists and is no report: write to another name")
 
 
@@ -94,7 +94,7 @@ def _beginning(path: Path) -> bytes | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
-        msg = f"{path}: cannot be read ({error.strerror or error})"
+        msg = f"{path}: cannot be looked into ({error.strerror or error}); nothing was changed"
         raise RefineError(msg) from error
 
 
