@@ -204,7 +204,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
             "expected 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
         )
         raise RefineError(msg)
-    normals = dict.fromkeys(("nx", "ny", "nz")) if "nx" in attributes else {}
+    normals: dict[str, Any] = dict.fromkeys(("nx", "ny", "nz")) if "nx" in attributes else {}
     places = dict(PLACES)
     if not normals and _is(attributes.get("normal"), "FLOAT_VECTOR"):
         normals = NORMAL_PLACES
