@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 LAYOUT = "refine_layout"
 """Custom property of the mesh: how the file it came from was laid out, as JSON."""
 
-PREFIX = "refine_"
-"""What the names of our own attributes and custom properties begin with."""
-
 
 class Kind(NamedTuple):
     """How an attribute type of Blender is read and written."""
