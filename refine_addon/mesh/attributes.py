@@ -146,10 +146,10 @@ def file_from_object(
     rows = np.empty(len(obj.data.vertices), layout.row_dtype)
     read = _Reader(obj.data, layout)
     for names in _groups([column.name for column in layout.columns], rows.dtype):
-        planes = [columns.get(name) for name in names]
+        given = [columns.get(name) for name in names]
         planes = [
             read.stored(name) if plane is None else plane
-            for name, plane in zip(names, planes, strict=True)
+            for name, plane in zip(names, given, strict=True)
         ]
         _interleave(rows, names, planes)
     nothing = np.empty(0, np.uint8)
@@ -196,7 +196,7 @@ def read_attribute(mesh: bpy.types.Mesh, name: str) -> NDArray[Any]:
     """Return a point attribute as (N,), or (N, width) for vectors and colours."""
     attribute = mesh.attributes[name]
     kind = KINDS[attribute.data_type]
-    values = np.empty(len(attribute.data) * kind.width, kind.dtype)
+    values: NDArray[Any] = np.empty(len(attribute.data) * kind.width, kind.dtype)
     attribute.data.foreach_get(kind.field, values)
     return values if kind.width == 1 else values.reshape(-1, kind.width)
 

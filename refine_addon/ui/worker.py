@@ -30,7 +30,7 @@ class Worker(Generic[Result]):
     def __init__(self, work: Callable[[Progress], Result]) -> None:
         self.fraction = 0.0
         self._cancelled = False
-        self._result: Result | None = None
+        self._result: Result  # once the work ended well
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, args=(work,), name="refine", daemon=True)
         self._thread.start()

@@ -265,6 +265,7 @@ def test_covariances_become_axes_and_back(ratio):
 # Many
 
 
+@pytest.mark.slow
 def test_exactly_as_many_survive_as_asked():
     splats = cloud(500)
 
@@ -656,6 +657,7 @@ def test_the_order_of_the_views_does_not_matter():
         )
 
 
+@pytest.mark.slow
 def test_threads_change_nothing():
     splats = cloud(3000)
 
@@ -665,6 +667,7 @@ def test_threads_change_nothing():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 def test_moved_turned_and_scaled_scenes_absorb_alike(unit):
     """Splats and views under one similarity: the same survivors, moved likewise."""
@@ -683,6 +686,7 @@ def test_moved_turned_and_scaled_scenes_absorb_alike(unit):
     assert np.mean(apart < 1e-4 * unit) > 0.95
 
 
+@pytest.mark.slow
 def test_extreme_splats_raise_no_warning_and_stay_drawable():
     """Needles, dust, walls, opacity 0 and 1, all at one place or far away."""
     rng = np.random.default_rng(7)

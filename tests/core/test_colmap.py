@@ -391,6 +391,7 @@ def test_no_image_at_all_is_refused(tmp_path, suffix):
     assert "no registered image, expected at least one" in refused(tmp_path, f"images{suffix}")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("file", ["cameras", "images"])
 def test_a_binary_cut_off_at_any_byte_is_refused(tmp_path, file):
     """The message tells the byte where the missing part should have started."""

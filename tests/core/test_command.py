@@ -254,6 +254,7 @@ def test_one_bad_file_does_not_stop_the_others(folder, capsys):
     assert results[1]["error"].startswith("bad.ply: header without end")
 
 
+@pytest.mark.slow
 def test_a_batch_of_files_leaves_none_of_them_open_or_mapped(folder):
     """300 files: as many are open and mapped at the end as at the start."""
     if not Path("/proc/self/fd").is_dir():
@@ -372,6 +373,7 @@ def test_a_dry_run_says_the_same_and_writes_nothing(folder, capsys):
     assert capsys.readouterr().out.count("in.ply: would keep 30 of 60 splats (50.0% removed)") == 4
 
 
+@pytest.mark.slow
 def test_a_name_that_the_terminal_cannot_show_is_no_error(folder):
     """As bytes that are no UTF-8, and on a terminal that knows ASCII alone."""
     try:
@@ -595,6 +597,7 @@ def run(*arguments: str, environment: dict[str, str] | None = None, **options):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "code"),
     [([*PRUNE, "-o", "out.ply"], 0), ([*PRUNE, "-o", "none/out.ply"], 1), (["prune"], 2)],
@@ -625,6 +628,7 @@ def test_cancelled_anywhere_it_is_code_130(folder, monkeypatch, capsys, stage):
     assert set() == names(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("folder")
 def test_progress_is_drawn_on_a_terminal_and_wiped_away():
     """On a pseudo-terminal: lines that overwrite each other, the last of them empty."""

@@ -11,6 +11,8 @@ import pytest
 from refine_addon.core import Budget, Settings, ViewSet, prune, read_cameras, read_ply, select
 from refine_addon.core.affine import transformed
 
+pytestmark = pytest.mark.slow
+
 ROOM = Path(__file__).parents[1] / "data/room_small"
 QUARTER = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # about x, as *Upright* turns
 

@@ -215,6 +215,7 @@ def in_doubles(splats: Splats, views: ViewSet) -> Scores:
     return Scores(values, seen, len(views), 0)
 
 
+@pytest.mark.slow
 def test_closed_form_of_floats_keeps_the_splats_that_doubles_keep(file, views):
     """At every tenth: against the same numbers as doubles, and against the formula in doubles."""
     splats = file.splats()
@@ -237,6 +238,7 @@ class Doubles:
         return getattr(np, name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rounds", "every"), [(1, 4), (3, 8)])
 def test_occlusion_in_floats_keeps_the_splats_that_doubles_keep(
     file, views, monkeypatch, rounds, every
@@ -280,6 +282,7 @@ def small(file, tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_absorbing_file_to_file_writes_the_changed_survivors_and_the_rest_bit_for_bit(
     small, views, tmp_path
 ):
@@ -373,6 +376,7 @@ def test_a_size_in_megabytes_holds_for_text_whose_rows_grow(text, views, tmp_pat
     assert 0.1e6 < (tmp_path / "out.ply").stat().st_size <= 0.3e6
 
 
+@pytest.mark.slow
 def test_a_budget_that_only_scores_can_tell_says_how_many_survivors_absorb(small, views):
     """The threshold is the median score: half survive, by whatever costs least."""
     splats = read_ply(small).splats()
@@ -391,6 +395,7 @@ def test_without_the_frustum_test_no_number_of_views_is_counted(small, views):
         prune(read_ply(small).splats(), views, Budget(min_seen=3), published)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["closed-form", "occlusion"])
 def test_a_report_of_absorbing_says_what_decided_and_what_was_asked(small, views, method):
     """Occlusion's measure decides; a method that had nothing to decide is said not to have."""
@@ -406,6 +411,7 @@ def test_a_report_of_absorbing_says_what_decided_and_what_was_asked(small, views
     assert said == (method == "closed-form")
 
 
+@pytest.mark.slow
 def test_protected_splats_stay_as_they_are_while_others_absorb(small, views):
     """Every third is protected, and six of ten go."""
     splats = read_ply(small).splats()

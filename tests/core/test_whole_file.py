@@ -478,6 +478,7 @@ def test_many_writers_of_one_name_leave_one_whole_file(tmp_path, overwrite):
     assert (0 if overwrite else 7) == len(refused)
 
 
+@pytest.mark.slow
 @posix
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # of fork, with threads
 @pytest.mark.parametrize("exists", [False, True])
