@@ -170,8 +170,11 @@ def _remove_lowest(
     keep[ties[: count - int(np.count_nonzero(below))]] = False
 
 
-def rank(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def rank(values: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return each splat's place in the order of removal, 0 (goes first) to 1 (goes last).
+
+    To look at, and to select by in Blender, whose attributes round it to float32: above 2^24 splats
+    neighbours then share a rank. Nothing here decides by it; `select` goes by score and row.
 
     Parameters
     ----------
@@ -179,12 +182,12 @@ def rank(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
     Returns
     -------
-    (N,) float32
+    (N,) float64
         A single splat has rank 1.
     """
     count = len(values)
     if count == 1:
-        return np.ones(1, np.float32)
-    ranks = np.empty(count, np.float32)
-    ranks[np.argsort(values, kind="stable")] = np.linspace(0.0, 1.0, count, dtype=np.float32)
+        return np.ones(1)
+    ranks = np.empty(count)
+    ranks[np.argsort(values, kind="stable")] = np.linspace(0.0, 1.0, count)
     return ranks

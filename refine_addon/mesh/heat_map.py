@@ -50,7 +50,7 @@ def ramp() -> NDArray[np.float64]:
     return np.where(linear > _KNEE, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
 
 
-def write(mesh: bpy.types.Mesh, ranks: NDArray[np.float32]) -> None:
+def write(mesh: bpy.types.Mesh, ranks: NDArray[np.float64]) -> None:
     """Store the heat map of ranks in 0..1 as the colour attribute `HEAT`."""
     colors = np.ones((_STEPS, 4), np.float32)
     colors[:, :3] = ramp()

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import RefineError
-from ..scores import Scores
+from ..scores import Scores, shares_gone
 from ..work import Progress, for_chunks, part, silent
 from . import closed_form, coverage, froxels, projection
 
@@ -253,7 +253,7 @@ class _Run:
         going = going[np.argsort(prior[going], kind="stable")]
         gone, start = 0, 0.0
         for number in range(rounds):
-            values[going] = np.arange(gone + 1, gone + len(going) + 1) / count
+            values[going] = shares_gone(np.arange(gone + 1, gone + len(going) + 1), count)
             gone += len(going)
             # Each round has the views times what is left to do; all of them about thrice the first.
             end = start + (1.0 - start) * max(1.0 / (rounds - number), 0.25)
@@ -277,7 +277,7 @@ class _Run:
             )
             going = left.index[order[:go]]
             left = left.take(np.sort(order[go:]))
-        values[going] = np.arange(gone + 1, gone + len(going) + 1) / count
+        values[going] = shares_gone(np.arange(gone + 1, gone + len(going) + 1), count)
         return values, seen
 
     def _weigh(
