@@ -29,7 +29,7 @@ from .core import (
     read_ply,
     score,
 )
-from .core.pipeline import scoring_notes
+from .core.report import scoring_notes
 from .core.splats import drawable
 from .core.whole_file import expanded, refuse_existing, whole_file
 from .version import VERSION
@@ -480,7 +480,7 @@ def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     file.write(output, columns={"refine_score": scores.values}, overwrite=options.overwrite)
     run.clear_line()
     run.say(f"{source}: scored {len(file):,} splats by {scores.views_used} views -> {output}")
-    notes = scoring_notes(scores, views)
+    notes = scoring_notes(scores)
     for note in notes:
         run.say(f"  note: {note}")
     return {

@@ -314,7 +314,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     if target is not None:
         export_object(obj, target, keep=result.keep, columns=columns, overwrite=overwrite)
     if save and not dry_run:
-        store(obj, result.scores, views, settings)
+        store(obj, result.scores, settings)
         _reduce(obj, result.keep, columns)
         _save()
     timings = result.report["timings"]

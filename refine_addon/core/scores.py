@@ -32,6 +32,13 @@ class Scores:
         The method's weights, for the report.
     notes : tuple of str
         What the user should know about how the scores came to be.
+    method : str
+        Name of the method asked for, as in `Settings.method`; "" where it is not known.
+    frustum : bool
+        Whether `seen` counts only the views in whose image the centre lies; without, all views see
+        all splats.
+    views_given : int
+        How many views there were to choose those used from.
     """
 
     values: NDArray[np.float32]
@@ -40,6 +47,9 @@ class Scores:
     undrawable: int
     weights: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    method: str = ""
+    frustum: bool = True
+    views_given: int = 0
 
 
 def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:

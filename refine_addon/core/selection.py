@@ -79,6 +79,29 @@ class Budget:
         """Name of the value given."""
         return next(item.name for item in fields(self) if getattr(self, item.name) is not None)
 
+    @property
+    def needs_scores(self) -> bool:
+        """Whether only the scores can tell how many splats go, not their number alone."""
+        return self.threshold is not None or self.min_seen is not None
+
+    def refuse_meaningless(self, method: str, *, frustum: bool = True) -> None:
+        """Raise `RefineError` if this budget has no fixed meaning for the scores of a method.
+
+        Parameters
+        ----------
+        method, frustum
+            See `Scores`.
+        """
+        if method == "auto" and self.needs_scores:
+            msg = (
+                f"method auto may score by any model, and {self.kind} means something else to "
+                "each: choose closed-form or occlusion, or another budget"
+            )
+            raise RefineError(msg)
+        if self.min_seen is not None and not frustum:
+            msg = "without the frustum test every view sees every splat: min_seen would remove none"
+            raise RefineError(msg)
+
     def removals(self, count: int, row_bytes: float = 0.0, fixed_bytes: int = 0) -> int | None:
         """Return how many of `count` splats go, or None where only the scores can tell.
 
@@ -137,7 +160,14 @@ def select(
     Returns
     -------
     (N,) bool
+
+    Raises
+    ------
+    RefineError
+        If the budget means nothing to these scores (`Budget.refuse_meaningless`), or nothing would
+        stay.
     """
+    budget.refuse_meaningless(scores.method, frustum=scores.frustum)
     values = scores.values
     keep = np.ones(len(values), np.bool_)
     free = np.ones(len(values), np.bool_) if protected is None else ~protected

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     import bpy
 
     from ..core.pipeline import Settings
-    from ..core.views import ViewSet
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
 """Point attributes: the score, its place from 0 (goes first) to 1, in how many views it lies."""
@@ -32,7 +31,6 @@ RECORD = "refine_scores"
 def store(
     obj: bpy.types.Object,
     scores: Scores,
-    views: ViewSet,
     settings: Settings,
     origin: dict[str, Any] | None = None,
 ) -> None:
@@ -41,7 +39,7 @@ def store(
     Parameters
     ----------
     obj : bpy.types.Object
-    scores, views, settings
+    scores, settings
         What `core.pipeline.score` gave, and was given.
     origin : dict, optional
         See `staleness.origin`.
@@ -69,11 +67,13 @@ def store(
         {
             "splats": len(scores.values),
             "settings": asdict(settings),
-            "views_given": len(views),
+            "method": scores.method,
+            "frustum": scores.frustum,
+            "views_given": scores.views_given,
             "views_used": scores.views_used,
             "undrawable": scores.undrawable,
             "weights": scores.weights,
-            "notes": [*scores.notes, *([views.note] if views.note else [])],
+            "notes": scores.notes,
             "origin": origin,
         }
     )
@@ -122,4 +122,7 @@ def stored_scores(obj: bpy.types.Object) -> Scores:
         undrawable=noted.get("undrawable", 0),
         weights=noted.get("weights", {}),
         notes=tuple(noted.get("notes", ())),
+        method=noted.get("method", ""),
+        frustum=noted.get("frustum", True),
+        views_given=noted["views_given"],
     )

@@ -13,6 +13,7 @@ from .. import splat_object
 from ..cameras.sets import views_from_scene
 from ..core import pipeline
 from ..core.errors import Cancelled, RefineError
+from ..core.report import scoring_notes
 from ..core.work import Progress, silent
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
@@ -170,17 +171,15 @@ class REFINE_OT_score(_OnThread, _OnSplats, bpy.types.Operator):
 
     def finish(self, context: bpy.types.Context, obj: bpy.types.Object, scores: Scores) -> Answer:
         """Store the scores on the mesh and say what came of it."""
-        views = self._views
-        mesh_scores.store(obj, scores, views, self._settings, self._origin)
+        mesh_scores.store(obj, scores, self._settings, self._origin)
         plans.refresh(context)
         unseen = int((scores.seen == 0).sum())
         self.report(
             {"INFO"},
-            f"Scored {len(scores.values):,} splats by {scores.views_used} of {len(views)} views; "
-            f"{unseen:,} lie in none",
+            f"Scored {len(scores.values):,} splats by {scores.views_used} of "
+            f"{scores.views_given} views; {unseen:,} lie in none",
         )
-        notes = [*scores.notes, *([views.note] if views.note else [])]
-        for note in (*notes, *splat_object.modifier_notes(obj)):
+        for note in (*scoring_notes(scores), *splat_object.modifier_notes(obj)):
             self.report({"WARNING"}, note)
         return {"FINISHED"}
 
@@ -242,7 +241,7 @@ class REFINE_OT_apply(_OnThread, _OnScored, bpy.types.Operator):
         budget = settings.to_budget()
         context.view_layer.update()
         changed = staleness.changes(context, obj)
-        if absorbed and budget.removals(len(absorbed.keep), 1.0) is not None:
+        if absorbed and not budget.needs_scores:
             changed = []  # nothing went by the scores
         done = splat_object.apply_object(obj, budget, settings.protect, absorbed)
         plans.forget(obj.data)

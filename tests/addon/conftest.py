@@ -102,7 +102,7 @@ def score(addon):
         settings = addon.core.Settings()
         addon.splat_object.check_scorable(obj)
         scores = addon.core.score(addon.splat_object.gather(obj), views, settings)
-        addon.mesh.scores.store(obj, scores, views, settings)
+        addon.mesh.scores.store(obj, scores, settings)
 
     return score
 

@@ -217,6 +217,38 @@ def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(
     unchanged()
 
 
+@pytest.mark.parametrize(
+    "case",
+    [({"method": "auto"}, "threshold", "method auto may score by any model"),
+     ({"method": "auto"}, "min_seen", "method auto may score by any model"),
+     ({"frustum": False}, "min_seen", "min_seen would remove none")],
+)  # fmt: skip
+@pytest.mark.parametrize("absorb", [False, True])
+def test_a_budget_that_means_nothing_to_the_scores_is_refused(
+    addon,
+    room,
+    room_cameras,  # noqa: ARG001
+    unchanged,
+    case,
+    absorb,
+):
+    """As the command refuses it, by the method that made the scores, not by the panel's now."""
+    scoring, kind, reason = case
+    settings = bpy.context.scene.refine
+    settings.views, settings.absorb = 4, absorb
+    for name, value in scoring.items():
+        setattr(settings, name, value)
+    bpy.ops.refine.score()
+    settings.method, settings.frustum = "closed-form", True
+    settings.budget = kind
+    unchanged.start()
+
+    assert reason in addon.ui.plans.stored(room, settings)["error"]
+    with pytest.raises(RuntimeError, match=reason):
+        bpy.ops.refine.apply()
+    unchanged()
+
+
 def test_upright_turns_the_object_and_the_cameras_but_not_the_data(addon, tmp_path):
     """The same rows go as without: a rigid motion of the whole scene changes no score."""
     masks = []

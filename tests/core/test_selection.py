@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -193,6 +194,36 @@ def test_a_number_that_cannot_be_is_refused_with_its_name(name, values, expected
     for value in values:
         with pytest.raises(RefineError, match=re.escape(f"{name} is {value}, {expected}")):
             Budget(**{name: value})
+
+
+def test_only_a_threshold_and_a_number_of_views_need_scores_to_count_what_goes():
+    """The others say a number: `removals` is one exactly where no scores are needed."""
+    for kind, value in (("ratio", 0.5), ("keep", 2), ("max_mb", 1.0), ("threshold", 0.1),
+                        ("min_seen", 3.0)):  # fmt: skip
+        budget = Budget(**{kind: value})
+
+        assert budget.needs_scores == (kind in ("threshold", "min_seen"))
+        assert budget.needs_scores == (budget.removals(10, 248) is None)
+
+
+@pytest.mark.parametrize("budget", [Budget(threshold=0.0), Budget(min_seen=0.0)])
+def test_scores_of_auto_are_refused_a_meaning_that_they_have_not(budget):
+    """Wherever the scores come from, as long as they say that auto made them."""
+    scores = replace(scored([1, 2]), method="auto")
+
+    with pytest.raises(RefineError, match=f"method auto may score by any.* {budget.kind} means"):
+        select(scores, budget)
+    assert select(replace(scores, method="occlusion"), budget).all()
+    assert np.count_nonzero(select(scores, Budget(ratio=0.5))) == 1
+
+
+def test_views_that_see_all_count_nothing():
+    """Without the frustum test `seen` is the number of views for every splat."""
+    scores = replace(scored([1, 2], [64, 64]), frustum=False)
+
+    with pytest.raises(RefineError, match="min_seen would remove none"):
+        select(scores, Budget(min_seen=50.0))
+    assert np.count_nonzero(select(scores, Budget(threshold=1.5))) == 1
 
 
 def test_whole_numbers_of_any_kind_are_taken():

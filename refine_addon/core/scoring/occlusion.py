@@ -180,7 +180,14 @@ def _scored(
         )
         raise RefineError(msg)
     values[~good] = 0.0
-    scores = Scores(values, seen, len(views), int(np.count_nonzero(~good)), {"floor": run.weights})
+    scores = Scores(
+        values=values,
+        seen=seen,
+        views_used=len(views),
+        undrawable=int(np.count_nonzero(~good)),
+        weights={"floor": run.weights},
+        method="occlusion",
+    )
     return scores, run
 
 
