@@ -66,13 +66,13 @@ def show(
     RefineError
         If the object holds no splats or cannot be changed; for the heat map, if it was not scored.
     """
-    check(obj)
+    checked = check(obj)
     mesh_edit.check_writable(obj)
     if mode == "HEAT" and not has_heat(obj):
         msg = f"object '{obj.name}': has no heat map; score it first"
         raise RefineError(msg)
     if mode == "COLOR" and heat_map.COLOR not in obj.data.attributes:
-        heat_map.write_base_color(obj)
+        heat_map.write_base_color(checked)
     tree = _tree(mode, style, hide_removed=hide_removed)
     modifier = obj.modifiers.get(MODIFIER) or obj.modifiers.new(MODIFIER, "NODES")
     modifier.node_group = tree
