@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..core import RefineError, prune_file, read_cameras, read_ply, score
-from ..core.pipeline import scoring_notes
+from ..core.errors import printable
+from ..core.report import scoring_notes
 from ..core.whole_file import refuse_existing
 from . import report
 from .info import describe
@@ -58,7 +59,7 @@ class _Run:
             message = str(error) if isinstance(error, RefineError) else described(error)
             # What is wrong with the splats is said without the file.
             files = (Path(label), getattr(self.options, "output", None))
-            if not any(file and file.name in message for file in files):
+            if not any(file and printable(file.name) in message for file in files):
                 message = f"{label}: {message}"
             self.entries.append({"status": "failed", "input": label, "error": message})
             self.terminal.clear()
@@ -176,7 +177,7 @@ def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     run.terminal.say(
         f"{source}: scored {len(file):,} splats by {scores.views_used} views -> {output}"
     )
-    notes = scoring_notes(scores, views)
+    notes = scoring_notes(scores)
     for note in notes:
         run.terminal.say(f"  note: {note}")
     return {

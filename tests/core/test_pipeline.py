@@ -29,6 +29,7 @@ from refine_addon.core import (
     score,
     select,
 )
+from refine_addon.core.pipeline import Task, decide
 from refine_addon.core.scoring import froxels, projection
 from refine_addon.core.scoring.adaptive import Statistics, weights
 from refine_addon.core.scoring.closed_form import LUMA
@@ -393,6 +394,43 @@ def test_without_the_frustum_test_no_number_of_views_is_counted(small, views):
 
     with pytest.raises(RefineError, match="min_seen would remove none"):
         prune(read_ply(small).splats(), views, Budget(min_seen=3), published)
+
+
+@pytest.mark.parametrize("budget", [Budget(threshold=0.5), Budget(min_seen=3)])
+def test_what_autos_scores_cannot_mean_is_refused_before_the_work(small, views, budget):
+    """Nothing is scored first: the first report of progress would fail the test."""
+
+    def never(_fraction, what):
+        raise AssertionError(what)
+
+    for absorb in (False, True):
+        with pytest.raises(RefineError, match="method auto may score by any model"):
+            prune(
+                read_ply(small).splats(), views, budget, Settings("auto"),
+                absorb=absorb, progress=never,
+            )  # fmt: skip
+
+
+@pytest.mark.parametrize("absorb", [False, True])
+def test_scores_that_are_there_already_decide_as_new_ones_would(small, views, absorb):
+    """The panel scores once and applies later: the same splats, and the same report of them."""
+    splats, budget = read_ply(small).splats(), Budget(threshold=0.5)
+    at_once = prune(splats, views, budget, absorb=absorb)
+    scores = score(splats, views)
+    scene = {"splats": splats, "views": views} if absorb else {}
+
+    later = decide(Task(budget, scores=scores, absorb=absorb, **scene))
+
+    np.testing.assert_array_equal(at_once.keep, later.keep)
+    for report in (at_once.report, later.report):
+        del report["timings"]
+    assert at_once.report == later.report
+
+
+def test_splats_without_scores_need_views_to_decide(small):
+    """And absorbing needs both."""
+    with pytest.raises(RefineError, match="need views to be scored"):
+        decide(Task(Budget(ratio=0.5), splats=read_ply(small).splats()))
 
 
 @pytest.mark.slow

@@ -176,6 +176,8 @@ def score(
             "lambda": dict(zip(adaptive.TERMS, lambdas, strict=True)),
             "statistics": vars(statistics).copy(),
         },
+        method="closed-form",
+        frustum=settings.frustum,
     )
 
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import RefineError
-from ..scores import Scores
+from ..scores import Scores, shares_gone
 from ..work import Progress, for_chunks, part, report, silent
 from . import closed_form, coverage, froxels, projection
 
@@ -182,7 +182,12 @@ def _scored(
         raise RefineError(msg)
     values[~good] = 0.0
     scores = Scores(
-        values, seen, len(views), int(np.count_nonzero(~good)), {"floor": run.floor_weights}
+        values=values,
+        seen=seen,
+        views_used=len(views),
+        undrawable=int(np.count_nonzero(~good)),
+        weights={"floor": run.floor_weights},
+        method="occlusion",
     )
     return scores, run
 
@@ -368,7 +373,7 @@ class _Removal:
     def add(self, splats: NDArray[np.int64]) -> None:
         """Append splats in their order."""
         end = self.gone + len(splats)
-        self.values[splats] = np.arange(self.gone + 1, end + 1) / len(self.values)
+        self.values[splats] = shares_gone(np.arange(self.gone + 1, end + 1), len(self.values))
         self.gone = end
 
 
