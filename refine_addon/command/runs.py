@@ -13,7 +13,7 @@ from ..core.whole_file import refuse_existing
 from . import report
 from .info import describe
 from .options import budget, settings
-from .terminal import Terminal, complain, described
+from .terminal import Terminal, complain, described, shown
 
 if TYPE_CHECKING:
     import argparse
@@ -58,10 +58,9 @@ class _Run:
             message = str(error) if isinstance(error, RefineError) else described(error)
             # What is wrong with the splats is said without the file.
             files = (Path(label), getattr(self.options, "output", None))
-            if not any(file and file.name in message for file in files):
+            if not any(file and shown(file.name) in shown(message) for file in files):
                 message = f"{label}: {message}"
             self.entries.append({"status": "failed", "input": label, "error": message})
-            self.terminal.clear()
             complain(message)
 
     def finish(self) -> None:
