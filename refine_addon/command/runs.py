@@ -62,7 +62,6 @@ class _Run:
             if not any(file and printable(file.name) in message for file in files):
                 message = f"{label}: {message}"
             self.entries.append({"status": "failed", "input": label, "error": message})
-            self.terminal.clear()
             complain(message)
 
     def finish(self) -> None:

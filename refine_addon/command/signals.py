@@ -46,9 +46,11 @@ class Listener:
         """Listen, to what is not ignored; on the main thread, where Python delivers signals."""
         if threading.current_thread() is threading.main_thread():
             for number in (getattr(signal, name, None) for name in REASONS):
-                # None: not set from Python, so Python could not set it again.
-                if number and signal.getsignal(number) not in (signal.SIG_IGN, None):
-                    self._before[number] = signal.signal(number, self._arrive)
+                if number and signal.getsignal(number) is not signal.SIG_IGN:
+                    before = signal.signal(number, self._arrive)
+                    # None: Blender's own for Ctrl-C, which Python cannot set again. It only asks
+                    # for a second Ctrl-C to end Blender, as the default does at the first.
+                    self._before[number] = signal.SIG_DFL if before is None else before
         return self
 
     def __exit__(self, *_: object) -> None:

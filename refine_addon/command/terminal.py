@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
+import unicodedata
 from typing import TYPE_CHECKING, Literal, TextIO
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-_UNSAFE = re.compile("[\0-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff]")
-"""What moves the cursor, ends the line, turns the direction of writing, or is no character."""
+_OBEYED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+"""Categories of characters that a terminal obeys, or cannot show, and nobody reads."""
 
 _CLEAR = "\r\x1b[K"
 
@@ -24,7 +24,10 @@ def shown(text: str) -> str:
     >>> print(shown("a\x1b[2J\nb"))
     a\x1b[2J\nb
     """
-    return _UNSAFE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+    return "".join(
+        char.encode("unicode_escape").decode() if unicodedata.category(char) in _OBEYED else char
+        for char in text
+    )
 
 
 def described(error: OSError | MemoryError) -> str:
@@ -35,8 +38,9 @@ def described(error: OSError | MemoryError) -> str:
 
 
 def complain(text: str) -> None:
-    """Print an error."""
-    _write("stderr", f"refine: error: {shown(text)}\n")
+    """Print an error, in place of the progress that may stand there."""
+    start = _CLEAR if _is_terminal(sys.stderr) else ""
+    _write("stderr", f"{start}refine: error: {shown(text)}\n")
 
 
 def flush() -> None:
@@ -55,7 +59,7 @@ class Terminal:
 
     def __init__(self, *, quiet: bool) -> None:
         self._quiet = quiet
-        self._draws = not quiet and sys.stderr is not None and sys.stderr.isatty()
+        self._draws = not quiet and _is_terminal(sys.stderr)
 
     def say(self, text: str) -> None:
         """Print a line, unless quiet."""
@@ -77,6 +81,10 @@ class Terminal:
         """Wipe away what was drawn."""
         if self._draws:
             _write("stderr", _CLEAR)
+
+
+def _is_terminal(stream: TextIO | None) -> bool:
+    return stream is not None and stream.isatty()
 
 
 def _write(name: Literal["stdout", "stderr"], text: str) -> None:

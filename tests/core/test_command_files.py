@@ -260,12 +260,16 @@ def test_control_characters_are_escaped_in_what_is_drawn(folder):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code"), [(["--help"], 0), (["info", "in.ply"], 0), (["info", "none.ply"], 1)]
+    ("arguments", "stream", "code"),
+    [
+        (["--help"], "stdout", 0),
+        (["info", "in.ply"], "stdout", 0),
+        (["info", "none.ply"], "stderr", 1),
+    ],
 )
-@pytest.mark.parametrize("stream", ["stdout", "stderr"])
 @pytest.mark.parametrize("how", ["gone", "full", "closed"])
 @pytest.mark.usefixtures("folder")
-def test_a_stream_that_takes_nothing_changes_no_exit_code(arguments, code, stream, how):
+def test_a_stream_that_takes_nothing_changes_no_exit_code(arguments, stream, code, how):
     """A pager that was left, a full disk, ``2>&-``: Python would exit with 120."""
     other = "stderr" if stream == "stdout" else "stdout"
     number = {"stdout": 1, "stderr": 2}[stream]
