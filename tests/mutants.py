@@ -95,8 +95,8 @@ MUTANTS = {
     "scoring/occlusion.py": [
         ("return 0.25 + 0.5 * gone", "return 0.25", "what has gone forgotten"),
         (
-            "LEAST ** ((number + 1) / (rounds - 1))",
             "LEAST ** (number / (rounds - 1))",
+            "LEAST ** ((number - 1) / (rounds - 1))",
             "a round late",
         ),
         (
@@ -111,8 +111,8 @@ MUTANTS = {
         ),
         ('ClosedForm("distance", frustum=False)', 'ClosedForm("distance")', "prior with a frustum"),
         (
-            'going = going[np.argsort(prior[going], kind="stable")]',
-            "going = going.copy()",
+            'removal.add(undrawn[np.argsort(prior[undrawn], kind="stable")])',
+            "removal.add(undrawn)",
             "hopeless in file order",
         ),
         ("footprints.index[footprints.inside]", "footprints.index", "seen beside the image"),
@@ -206,7 +206,7 @@ MUTANTS = {
             "best go first",
         ),
         ("return [1.0] * len(SHARES)", "return [0.0] * len(SHARES)", "trust in what nobody judges"),
-        ("table.argmin(axis=0)", "table.argmax(axis=0)", "the worst weight"),
+        ("table.min(axis=0) - table", "table - table.max(axis=0)", "the worst weight"),
     ],
     "absorbing/absorb.py": [
         ("members[taken >= 0]", "1 + 0 * taken[taken >= 0]", "members of the last stage alone"),
