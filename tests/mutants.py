@@ -389,9 +389,9 @@ def outcome(module: str, old: str, new: str) -> str:
     """
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
-        for name in ("refine_addon", "tests", "benchmarks", ".ci"):
+        for name in ("refine_addon", "tests", "benchmarks", ".ci", "docs"):
             shutil.copytree(PROJECT / name, copy / name, ignore=shutil.ignore_patterns("e2e"))
-        for name in ("pyproject.toml", "blender_manifest.toml"):
+        for name in ("pyproject.toml", "blender_manifest.toml", "README.md", "CONTRIBUTING.md"):
             shutil.copy(PROJECT / name, copy / name)
         path = copy / "refine_addon/core" / module
         text = path.read_text("utf-8")
