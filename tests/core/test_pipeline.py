@@ -350,7 +350,7 @@ def test_absorbing_text_changes_the_words_of_what_changed_and_no_other(text, vie
     own = [line == before.lines[index] for line, index in zip(after.lines, kept, strict=True)]
     np.testing.assert_array_equal(own, ~changed)
     for item in fields(Splats):
-        wanted = getattr(result.absorbed.splats, item.name)
+        wanted = getattr(result.absorbed.splats, item.name).astype(np.float32)
         np.testing.assert_array_equal(getattr(after.splats(), item.name), wanted)
     for index in np.flatnonzero(changed):
         words = zip(after.lines[index].split(), after.rows[index], strict=True)

@@ -47,7 +47,7 @@ class Absorbed:
     Attributes
     ----------
     splats : Splats
-        The K survivors, in their old order.
+        The K survivors, in their old order, in float64.
     keep : (N,) bool
         Which they are.
     changed : (K,) bool
@@ -131,6 +131,10 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
     count = len(splats)
     spared = np.zeros(count, np.bool_) if protected is None else np.array(protected, np.bool_)
     goal = max(keep_count, int(np.count_nonzero(spared)), 0)
+    # Merged splats merge again. Rounding them to float32 in between would depend on the frame.
+    splats = Splats(
+        **{name: np.asarray(values, np.float64) for name, values in vars(splats).items()}
+    )
     scene = scene_of(splats.means, drawable(splats), views)
     origin, members = np.arange(count), np.ones(count, np.int64)
     factor = patience(1.0 - goal / max(count, 1))
