@@ -10,17 +10,20 @@ BENCH := .venv/.bench
 demo: $(DEV)          ## the main job: the committed room, its cameras, half of it pruned, into out/
 	$(PY) docs/demo.py
 
-test: $(BENCH)        ## core and add-on tests
+test: $(BENCH)        ## core, add-on and benchmark tests, all of them
 	$(PY) -m pytest
 
-test-core: $(DEV)     ## without Blender, seconds
-	$(PY) -m pytest tests/core
+test-core: $(DEV)     ## core alone, in seconds: without slow tests, few random examples
+	$(PY) -m pytest tests/core -m "not slow" --hypothesis-profile=quick
 
 test-numpy: $(DEV)    ## core on the oldest and the newest NumPy that a supported Blender carries
 	$(PY) .ci/numpy_ends.py
 
 test-e2e: $(DEV) build ## the installed zip in real Blenders; skips, with the reason, those not to be had
-	$(PY) -m pytest tests/e2e
+	$(PY) -m pytest tests/e2e --ignore tests/e2e/test_window.py
+	# Mouse clicks against a software renderer fail now and then on a busy machine: a test that
+	# fails gets one more try, and failing twice fails the build.
+	$(PY) -m pytest tests/e2e/test_window.py || $(PY) -m pytest tests/e2e/test_window.py --last-failed
 
 check: $(DEV)         ## lint, format, types
 	.venv/bin/ruff check && .venv/bin/ruff format --check && .venv/bin/mypy

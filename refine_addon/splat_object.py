@@ -20,6 +20,7 @@ from .core.affine import transformed
 from .core.errors import RefineError
 from .core.formats.ply import columns_from_splats
 from .core.report import Clock, Files, complete_report
+from .core.survivors import survivor_columns
 from .core.task import DEFAULTS, Result, Settings, Task
 from .core.whole_file import refuse_existing
 from .core.work import Progress, part, silent
@@ -207,15 +208,8 @@ def _reduce(
 def absorbed_columns(checked: SplatObject, absorbed: Absorbed) -> dict[str, NDArray[Any]]:
     """Return an object's columns with the survivors as they became, in the object's frame."""
     matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
-    changed = np.flatnonzero(absorbed.changed)
-    survivors = absorbed.splats.take(changed)
-    if not np.array_equal(matrix, np.eye(4)):
-        survivors = transformed(survivors, np.linalg.inv(matrix))
-    index = np.flatnonzero(absorbed.keep)[changed]
-    columns = mesh_attributes.stored_columns(checked, columns_from_splats(survivors))
-    for name, values in columns_from_splats(survivors).items():
-        columns[name][index] = values
-    return columns
+    stored = mesh_attributes.stored_columns(checked)
+    return survivor_columns(stored, absorbed, np.linalg.inv(matrix))
 
 
 def export_object(

@@ -32,9 +32,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.baselines import splat_transform
 from refine_addon.core import Budget, read_ply
 from refine_addon.core.formats.ply_header import with_count
+
+from ..baselines import splat_transform
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

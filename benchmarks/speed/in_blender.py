@@ -25,10 +25,11 @@ os.environ["BLENDER_USER_RESOURCES"] = tempfile.mkdtemp(prefix="refine-bench-")
 import bpy
 
 import refine_addon
-from benchmarks.speed.file_to_file import make_input
 from refine_addon.core import read_ply
 from refine_addon.mesh import attributes as mesh_attributes
 from refine_addon.mesh import edit as mesh_edit
+
+from .file_to_file import make_input
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -16,8 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.speed.file_to_file import ROOM, make_input, run
 from refine_addon.command import main as refine
+
+from .file_to_file import ROOM, make_input, run
 
 LARGE = 10_000_000
 FILES = 2_000

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 import numpy as np
 
-from benchmarks.baselines import merging, splat_transform
 from refine_addon.core import pipeline
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.pipeline import Settings
@@ -22,6 +21,7 @@ from refine_addon.core.scoring.closed_form import ClosedForm
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import Splats
 
+from ..baselines import merging, splat_transform
 from ..baselines.rendered import BASELINES, RENDERED
 
 if TYPE_CHECKING:

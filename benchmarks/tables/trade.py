@@ -2,8 +2,8 @@
 
     python -m benchmarks.tables.trade [SCENE_DIR ...]
 
-SCENE_DIR is any folder that `benchmarks.evaluate` reads: ``point_cloud.ply``, ``cameras.json``, and
-optionally ``split.json`` and ``images``. Without one, the committed room is measured.
+SCENE_DIR is any folder that `evaluate` reads: ``point_cloud.ply``, ``cameras.json``, and optionally
+``split.json`` and ``images``. Without one, the committed room is measured.
 
 All methods get the same splats in memory and the same scoring views: those that are not held out,
 at most ``--views``, spread evenly. Time is that of scoring and pruning, the median of ``--runs``
@@ -19,17 +19,17 @@ import statistics
 import sys
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.baselines import splat_transform
-from benchmarks.renderer import rasterizer
 from refine_addon.core.errors import RefineError
 from refine_addon.core.selection import Budget, select
 
-from . import ablation, cheaper, evaluate, flops, hessian, methods, trade_report
+from ..baselines import splat_transform
+from ..renderer import rasterizer
+from . import evaluate, flops, hessian, methods, trade_report, variants
 from .methods import Method, Task
+from .results import Cost, Measured, Row
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -45,65 +45,6 @@ ROOM = ROOT / "tests/data/room_small"
 PATIENCE = 40.0
 """Seconds after which nothing is run once more for the median."""
 PARTS = ("methods", "cheaper", "ablation", "flops", "hessian")
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What something took.
-
-    Attributes
-    ----------
-    seconds : float
-        Median of the runs.
-    runs : int
-    peak_bytes : int or None
-        Beyond what was held before; of a program of its own, all it had. None: not to be had here.
-    """
-
-    seconds: float
-    runs: int
-    peak_bytes: int | None
-
-    def plus(self, other: Cost) -> Cost:
-        """Return the cost of doing both, one after the other."""
-        peaks = [peak for peak in (self.peak_bytes, other.peak_bytes) if peak is not None]
-        runs = min(self.runs, other.runs)
-        return Cost(self.seconds + other.seconds, runs, max(peaks, default=None))
-
-
-@dataclass(frozen=True, eq=False)
-class Row:
-    """One method at one ratio.
-
-    Attributes
-    ----------
-    kept, asked : int
-        How many splats are left, and how many should be.
-    quality : dict of (views, reference) to dict of str to float
-        Views "held-out" or "scoring", reference "renders" or "pictures" -> metric -> mean.
-    """
-
-    method: Method
-    ratio: float
-    kept: int
-    asked: int
-    cost: Cost
-    quality: dict[tuple[str, str], dict[str, float]]
-
-
-@dataclass(eq=False)
-class Measured:
-    """All that was measured of one scene."""
-
-    name: str
-    facts: dict[str, str]
-    rows: list[Row] = field(default_factory=list)
-    unpruned: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
-    cheaper: list[cheaper.Line] = field(default_factory=list)
-    ablation: list[ablation.Line] = field(default_factory=list)
-    flops: flops.Counts | None = None
-    hessian: hessian.Energies | None = None
-    failed: list[str] = field(default_factory=list)
 
 
 class Judge:
@@ -211,10 +152,10 @@ def measure(folder: Path, options: argparse.Namespace) -> Measured:
     # An hour's measurements are not lost because one of them fails; it is said, and is an error.
     if "cheaper" in options.parts:
         with _noted("cheaper", found.failed):
-            found.cheaper = cheaper.measure(task, held_out, options.ratios)
+            found.cheaper = variants.measure(variants.CHEAPER, task, held_out, options.ratios)
     if "ablation" in options.parts:
         with _noted("ablation", found.failed):
-            found.ablation = ablation.measure(task, held_out, options.ratios)
+            found.ablation = variants.measure(variants.ABLATION, task, held_out, options.ratios)
     if "flops" in options.parts:
         with _noted("flops", found.failed):
             found.flops = flops.measure(splats, scoring)

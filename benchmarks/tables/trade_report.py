@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 import numba
 import numpy as np
 
-from benchmarks.baselines import splat_transform
-
+from ..baselines import splat_transform
 from . import flops
 from .evaluate import HELD_OUT
 from .methods import EXTERNAL, LITERATURE, OURS
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from refine_addon.core.views import ViewSet
 
     from .evaluate import Scene
-    from .trade import Measured, Row
+    from .results import Measured, Row
 
 DIGITS = {"psnr": 1, "ssim": 3, "flip": 3}
 MEGABYTE = 1e6
@@ -204,7 +203,7 @@ def _cheaper_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
     if not scene.cheaper:
         return []
     body = [
-        [line.way, *(f"{value:.1f}" for value in line.psnr), f"{line.seconds:.2f}"]
+        [line.name, *(f"{value:.1f}" for value in line.psnr), f"{line.seconds:.2f}"]
         for line in scene.cheaper
     ]
     return ["", f"### {scene.name}: speed for accuracy within occlusion", "",
@@ -216,10 +215,7 @@ def _cheaper_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
 def _ablation_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
     if not scene.ablation:
         return []
-    body = [
-        [f"{line.reading}: {line.change}", *(f"{value:.1f}" for value in line.psnr)]
-        for line in scene.ablation
-    ]
+    body = [[line.name, *(f"{value:.1f}" for value in line.psnr)] for line in scene.ablation]
     return ["", f"### {scene.name}: the closed form without its parts", "",
             ("PSNR on held-out views against renders of the unpruned splats. Visibility is alpha, "
             "projection 1 / (d^2 + eta), equal weights lambda = 1/3."), "",

@@ -173,9 +173,7 @@ def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
     return obj
 
 
-def _intrinsics(
-    data: bpy.types.Camera, size: tuple[int, int], aspect: float
-) -> dict[str, float | int]:
+def _intrinsics(data: bpy.types.Camera, size: tuple[int, int], aspect: float) -> dict[str, Any]:
     """Return focal lengths and principal point in pixels, as Blender frames its renders."""
     width, height = size
     fit = data.sensor_fit

@@ -85,7 +85,7 @@ def views_from_frames(
             scene.frame_set(frame)
             depsgraph = context.evaluated_depsgraph_get()
             view = view_from_camera(_active_camera(scene), scene, depsgraph)
-            if splats:
+            if now is not None:
                 view = _against(view, splats, now, world_matrix(splats, depsgraph))
             views.append(replace(view, name=f"{view.name}, frame {frame}"))
     finally:

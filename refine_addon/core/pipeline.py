@@ -15,11 +15,12 @@ import numpy as np
 
 from . import selection
 from .absorbing import absorb as absorbing
-from .absorbing.merging import Seen
+from .absorbing.merging import ViewSums
 from .formats.ply import read_ply
 from .report import Clock, Files, complete_report, make_report
 from .scoring import auto, closed_form, occlusion
 from .selection import Budget
+from .survivors import survivor_columns
 from .task import DEFAULTS, Result, Settings, Task
 from .whole_file import expanded, refuse_existing, refuse_mapped
 from .work import Progress, part, report, silent
@@ -279,14 +280,14 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
     # What no renderer draws scores lowest, so it is among these, or all of these are such.
     rest = selection.select(scores, Budget(keep=total - first), protected=protected)
     # What goes first hid and showed next to nothing: what was measured with it still holds.
-    at_first = [Seen(measured.contribution[rest], measured.contrast[rest])]
+    at_first = [ViewSums(measured.contribution[rest], measured.contrast[rest])]
     del known, scores, measured
 
-    def seen(now: Splats, ahead: Progress) -> Seen:
+    def seen(now: Splats, ahead: Progress) -> ViewSums:
         if at_first:
             return at_first.pop()
         found = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
-        return Seen(found.contribution, found.contrast)
+        return ViewSums(found.contribution, found.contrast)
 
     with np.errstate(under="ignore"):  # as for scores
         absorbed = absorbing.absorb(
@@ -347,19 +348,18 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
         splats=file.splats(),
         views=views,
         absorb=absorb,
-        row_bytes=file.row_bytes,
+        row_bytes=file.changed_row_bytes if absorb else file.row_bytes,
         fixed_bytes=file.fixed_bytes,
     )
     clock.lap("read_s")
     result = decide(task, clock=clock, progress=part(progress, 0.0, 0.8), threads=threads)
     report(progress, 0.8, "writing")
+    columns = survivor_columns(file.rows, result.absorbed) if result.absorbed else {}
     if target is not None:
-        if result.absorbed:
-            file.write_survivors(target, result.absorbed, overwrite=overwrite)
-        else:
-            file.write(target, result.keep, overwrite=overwrite)
+        file.write(target, result.keep, columns=columns, overwrite=overwrite)
     clock.lap("write_s")
+    result.report["notes"] += file.notes(result.keep)
     made = None if target is None else str(target)
-    sizes = (file.size(), file.size(result.keep))
+    sizes = (file.size(), file.size(result.keep, columns))
     complete_report(result.report, clock, Files(str(file.path), made, *sizes))
     return result

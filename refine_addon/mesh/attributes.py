@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..core.survivors import Columns
+
 _GROUP = 16  # float32 columns in a cache line
 _ROWS = 4096  # of 16 columns: what stays in the first-level caches while it is turned
 
@@ -132,20 +134,19 @@ def file_from_object(
     rows = np.empty(len(checked), layout.row_dtype)
     read = _Reader(checked)
     for names in _groups([column.name for column in layout.columns], rows.dtype):
-        planes = [columns.get(name) for name in names]
+        given = [columns.get(name) for name in names]
         planes = [
             read.stored(name) if plane is None else plane
-            for name, plane in zip(names, planes, strict=True)
+            for name, plane in zip(names, given, strict=True)
         ]
         _interleave(rows, names, planes)
     nothing = np.empty(0, np.uint8)
     return SplatFile(Path(checked.obj.name), rows, layout.header, nothing, nothing)
 
 
-def stored_columns(checked: SplatObject, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """Return the named columns of a splat object, copies of (N,) each."""
-    read = _Reader(checked)
-    return {name: read.stored(name).copy() for name in names}
+def stored_columns(checked: SplatObject) -> Columns:
+    """Return the columns of a splat object by their names, each read when it is asked for."""
+    return _Reader(checked)
 
 
 def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> None:
@@ -184,7 +185,7 @@ def read_attribute(mesh: bpy.types.Mesh, name: str) -> NDArray[Any]:
     """Return a point attribute as (N,), or (N, width) for vectors and colours."""
     attribute = mesh.attributes[name]
     kind = KINDS[attribute.data_type]
-    values = np.empty(len(attribute.data) * kind.width, kind.dtype)
+    values: NDArray[Any] = np.empty(len(attribute.data) * kind.width, kind.dtype)
     attribute.data.foreach_get(kind.field, values)
     return values if kind.width == 1 else values.reshape(-1, kind.width)
 
@@ -224,6 +225,8 @@ class _Reader:
             return self.vectors[column.attribute][:, column.component]
         values = read_attribute(self.mesh, column.attribute)
         return values.view(np.uint32) if column.dtype[1:] == "u4" else values
+
+    __getitem__ = stored
 
     def planes(self, names: Sequence[str]) -> NDArray[np.float32]:
         """Return float columns as (len(names), N)."""

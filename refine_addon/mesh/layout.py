@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 LAYOUT = "refine_layout"
 """Custom property of the mesh: how the file it came from was laid out, as JSON."""
 
-PREFIX = "refine_"
-"""What the names of our own attributes and custom properties begin with."""
-
 
 class Kind(NamedTuple):
     """How an attribute type of Blender is read and written."""
@@ -231,7 +228,7 @@ def _standard(obj: bpy.types.Object) -> Layout:
             "expected 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
         )
         raise RefineError(msg)
-    normals = dict.fromkeys(("nx", "ny", "nz")) if "nx" in attributes else {}
+    normals: dict[str, Any] = dict.fromkeys(("nx", "ny", "nz")) if "nx" in attributes else {}
     places = dict(PLACES)
     if not normals and _is(attributes.get("normal"), "FLOAT_VECTOR"):
         normals = NORMAL_PLACES

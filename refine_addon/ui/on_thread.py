@@ -90,7 +90,10 @@ class OnThread:
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Wait for the thread, and write what it found."""
-        worker = self._running.worker
+        running = self._running
+        if running is None:
+            return {"CANCELLED"}
+        worker = running.worker
         if event.type == "ESC":
             worker.cancel()
         if event.type != "TIMER":
@@ -98,7 +101,7 @@ class OnThread:
         if worker.running():
             _show_progress(context, self.doing, worker.fraction)
             return {"RUNNING_MODAL"}
-        running = self._over(context)
+        self._over(context, running)
         try:
             result = worker.result()
             checked = mesh_layout.check(splat_object.find(running.name))
@@ -111,15 +114,15 @@ class OnThread:
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Stop the thread where Blender ends the operator."""
-        if self._running is not None:
-            self._over(context).worker.cancel()
+        if (running := self._running) is not None:
+            self._over(context, running)
+            running.worker.cancel()
 
-    def _over(self, context: bpy.types.Context) -> _Running:
-        """Clear the bar and let go of what ran; return it to whoever ends it."""
-        running, self._running = self._running, None
+    def _over(self, context: bpy.types.Context, running: _Running) -> None:
+        """Clear the bar and let go of what ran."""
+        self._running = None
         context.window_manager.event_timer_remove(running.timer)
         _show_progress(context, self.doing, None)
-        return running
 
 
 def _show_progress(context: bpy.types.Context, doing: str, fraction: float | None) -> None:

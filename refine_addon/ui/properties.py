@@ -3,7 +3,7 @@
 # ruff: noqa: TC002 - Blender runs the annotations
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
@@ -212,7 +212,8 @@ class RefineSettings(bpy.types.PropertyGroup):
             If it cannot be.
         """
         value = getattr(self, self.budget)
-        return Budget(**{self.budget: value if self.budget == "keep" else decimal(value)})
+        amount: dict[str, Any] = {self.budget: value if self.budget == "keep" else decimal(value)}
+        return Budget(**amount)
 
     def to_frames(self, scene: bpy.types.Scene) -> range:
         """Return the frames whose views count."""

@@ -32,7 +32,7 @@ class Worker(Generic[Result]):
     def __init__(self, work: Callable[[Progress], Result]) -> None:
         self.fraction = 0.0
         self._cancelled = False
-        self._result: Result | None = None
+        self._outcome: list[Result] = []  # one, once the work ended well
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, args=(work,), name="refine", daemon=True)
         self._thread.start()
@@ -54,10 +54,10 @@ class Worker(Generic[Result]):
             What the work raised.
         """
         self._thread.join()
-        result, self._result = self._result, None
+        outcome, self._outcome = self._outcome, []
         error, self._error = self._error, None
         if error is None:
-            return result
+            return outcome[0]
         try:
             raise error
         finally:
@@ -65,7 +65,7 @@ class Worker(Generic[Result]):
 
     def _run(self, work: Callable[[Progress], Result]) -> None:
         try:
-            self._result = work(self._progress)
+            self._outcome.append(work(self._progress))
         except BaseException as error:  # noqa: BLE001 - handed to the other thread by `result`
             # Whoever cancels asks for no reason, and a traceback would keep what was worked on.
             self._error = Cancelled() if self._cancelled else error

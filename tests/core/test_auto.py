@@ -54,6 +54,7 @@ def test_disagreement_is_the_share_of_the_kept_set_that_changes():
     assert auto.disagreement(one, one) == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [0.0, 0.15, 0.3, 1.0])
 def test_the_kept_set_differs_from_the_full_models_by_no_more_than_the_tolerance(scene, tolerance):
     """The full model is occlusion in rounds with all views."""
@@ -65,6 +66,7 @@ def test_the_kept_set_differs_from_the_full_models_by_no_more_than_the_tolerance
     assert scores.weights["auto"]["estimate"] <= tolerance
 
 
+@pytest.mark.slow
 def test_on_the_whole_committed_scene_auto_keeps_its_tolerance_too():
     """All splats and cameras, the full model as it is by default."""
     splats = read_ply(ROOM / "point_cloud.ply").splats()
@@ -76,6 +78,7 @@ def test_on_the_whole_committed_scene_auto_keeps_its_tolerance_too():
         assert auto.disagreement(full, scores) <= tolerance
 
 
+@pytest.mark.slow
 def test_no_tolerance_is_the_full_model_to_the_bit(scene):
     """Nothing cheaper agrees wholly, so that runs."""
     expected = occlusion.score(*scene, CHEAP[1]).values
@@ -219,6 +222,7 @@ def test_views_of_no_weight_are_not_waited_for(scene):
     assert list(scores.weights["auto"]["tried"]) == NAMES[:3]
 
 
+@pytest.mark.slow
 def test_probes_that_see_nothing_leave_it_to_the_full_model(scene, monkeypatch):
     """The one probe is the view farthest from the others: far behind the room, looking away."""
     splats, views = scene
@@ -264,6 +268,7 @@ def test_a_tolerance_is_a_share(tolerance):
         Settings("auto", tolerance=tolerance)
 
 
+@pytest.mark.slow
 def test_progress_never_goes_back(scene):
     """Whatever models and views are tried."""
     told = []

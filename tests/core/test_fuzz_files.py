@@ -27,6 +27,7 @@ def traced():
     tracemalloc.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TARGETS)
 def test_files_broken_by_chance_end_in_an_error_or_a_result(name):
     """400 of each format, the same on every run; some of each kind of end, or it tests little.
@@ -51,6 +52,7 @@ def test_the_fuzzer_notices_what_is_wrong(tmp_path):
             attempt({"in.ply": b""}, use, tmp_path)
 
 
+@pytest.mark.slow
 def test_the_longer_run_prints_how_many_inputs_it_tried(capsys, tmp_path):
     """And ends in time, with code 0."""
     assert main(["--seconds", "0.5", "--seed", "1", "--keep", str(tmp_path / "kept")]) == 0
@@ -64,6 +66,7 @@ def test_the_longer_run_prints_how_many_inputs_it_tried(capsys, tmp_path):
 ANY_BITS = st.tuples(st.sampled_from(splat_names(1)), st.integers(0, 19), st.integers(0, 2**32 - 1))
 
 
+@pytest.mark.slow
 @settings(max_examples=100)
 @given(cells=st.lists(ANY_BITS, max_size=40), wide=st.booleans())
 def test_splats_of_any_bits_are_pruned_without_a_warning(views, cells, wide):
@@ -111,6 +114,7 @@ def views(tmp_path_factory):
     return read_cameras(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "data"),
     [
@@ -156,6 +160,7 @@ def test_a_colmap_model_that_lies_about_a_count_is_refused(tmp_path, traced, whe
     assert traced() < 2_000_000
 
 
+@pytest.mark.slow
 def test_a_colmap_model_cut_at_every_byte_is_refused(tmp_path):
     """Binary and text alike never end in anything but a sentence; text may lack its last points."""
     for name in ("colmap binary", "colmap text"):

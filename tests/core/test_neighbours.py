@@ -30,6 +30,7 @@ def test_neighbours_do_not_depend_on_the_unit(unit):
     np.testing.assert_array_equal(nearest(points * unit, 5), nearest(points, 5))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flatness", [1.0, 0.01])
 def test_neighbours_in_a_large_cloud_are_nearly_all_those_of_brute_force(flatness):
     """A ball and a surface; the share of the true ones that is found."""
@@ -74,6 +75,7 @@ def test_there_are_no_neighbours_of_one_point():
     assert nearest(np.zeros((0, 3)), 8).shape == (0, 0)
 
 
+@pytest.mark.slow
 def test_threads_change_nothing():
     points = np.random.default_rng(3).normal(size=(60_000, 3))
 

@@ -121,6 +121,7 @@ def with_first(name: str, value: object, kind: type = np.float32) -> Splats:
 # ----- one extreme at a time
 
 
+@pytest.mark.slow
 @by_method_and_reading
 @pytest.mark.parametrize("name", [item.name for item in fields(Splats)])
 def test_one_extreme_splat_spoils_neither_itself_nor_the_others(name, settings):
@@ -134,6 +135,7 @@ def test_one_extreme_splat_spoils_neither_itself_nor_the_others(name, settings):
             check_the_others(splats, scores, settings)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [METHODS["closed form"], METHODS["occlusion"]])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_property_that_is_not_finite_makes_its_splat_the_lowest(value, settings):
@@ -167,6 +169,7 @@ def test_splats_that_cannot_be_drawn_go_first_and_are_counted(settings):
     assert "5 splats cannot be drawn; they rank lowest" in result.report["notes"]
 
 
+@pytest.mark.slow
 @by_method
 @pytest.mark.parametrize("axes", [[0], [1], [2], [0, 1], [1, 2], [2, 0]])
 def test_a_scale_of_zero_along_one_axis_or_two_is_a_disk_or_a_needle(axes, settings):
@@ -192,6 +195,7 @@ def test_a_scale_of_zero_along_every_axis_cannot_be_drawn(settings):
     assert np.flatnonzero(scores.values == 0).tolist() == [0]
 
 
+@pytest.mark.slow
 @by_method
 @pytest.mark.parametrize("length", [1e-300, 1e-30, 3.7, 1e30, 1e300])
 def test_the_length_of_quaternions_does_not_matter(length, settings):
@@ -215,6 +219,7 @@ def test_a_quaternion_of_zero_is_the_identity(settings):
     np.testing.assert_array_equal(values, expected)
 
 
+@pytest.mark.slow
 @by_method
 @pytest.mark.parametrize("depth", [0.0, 1e-30, -1e-30, 1e-3, -1e-3, 0.0299, 0.0301, 1e30, -1e30])
 def test_depths_at_before_and_behind_the_camera_plane(depth, settings):
@@ -286,6 +291,7 @@ def test_ten_thousand_views_are_one_mean():
     np.testing.assert_allclose(values, scored(splats, ViewSet((view(),))).values, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [METHODS["occlusion"], replace(METHODS["auto"], views=0)])
 def test_of_ten_thousand_views_as_many_are_used_as_it_takes(settings):
     """Along a line of 10 cm: as told, 64, or until more of them change nothing, and no other."""
@@ -310,6 +316,7 @@ def test_any_focal_length(focal, settings):
     check(splats, scored(splats, views, settings))
 
 
+@pytest.mark.slow
 @by_method
 @pytest.mark.parametrize(
     "changes",
@@ -477,6 +484,7 @@ def check_absorbed(splats, result, count):
         )
 
 
+@pytest.mark.slow
 @examples(max_examples=25)
 @given(data=st.data(), count=st.integers(1, 8))
 def test_any_values_at_once_absorb_each_other_and_stay_splats(data, count):
@@ -498,6 +506,7 @@ def test_any_values_at_once_absorb_each_other_and_stay_splats(data, count):
         check_absorbed(splats, result, count)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [item.name for item in fields(Splats)])
 def test_one_extreme_splat_among_good_ones_absorbs_and_is_absorbed(name):
     """Any attribute, any value; half of the splats go."""
@@ -513,6 +522,7 @@ def test_one_extreme_splat_among_good_ones_absorbs_and_is_absorbed(name):
 # ----- what must not matter
 
 
+@pytest.mark.slow
 @by_method
 @pytest.mark.parametrize("exponent", [-30, -12, -6, -3, 0, 3, 6, 12, 30])
 def test_the_ranking_is_the_same_in_nanometres_and_in_light_years(exponent, settings):
@@ -554,6 +564,7 @@ def test_detail_of_a_millimetre_survives_a_million_metres_from_the_origin(settin
     check_alike(scores, expected)
 
 
+@pytest.mark.slow
 def test_the_size_of_the_pieces_of_work_changes_nothing_with_occlusion(monkeypatch):
     """Splats and points a few at a time, on one thread or on three: whole columns, so no sum."""
     splats, views = cloud(300), ViewSet(tuple(view([x, 0, 0]) for x in (-0.2, 0.0, 0.1, 0.3)))

@@ -53,7 +53,7 @@ def weights(statistics: Statistics, *, offset: float = 0.0) -> tuple[float, floa
     Examples
     --------
     >>> [round(value, 3) for value in weights(Statistics(10.73, 0.05, 0.5))]
-    [0.275, 0.111, 0.614]
+    [0.274, 0.111, 0.615]
     """
     geometry = statistics.anisotropy + offset
     raw = [

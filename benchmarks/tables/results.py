@@ -1,0 +1,71 @@
+"""What `trade` measures and `trade_report` writes down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .flops import Counts
+    from .hessian import Energies
+    from .methods import Method
+    from .variants import Line
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What something took.
+
+    Attributes
+    ----------
+    seconds : float
+        Median of the runs.
+    runs : int
+    peak_bytes : int or None
+        Beyond what was held before; of a program of its own, all it had. None: not to be had here.
+    """
+
+    seconds: float
+    runs: int
+    peak_bytes: int | None
+
+    def plus(self, other: Cost) -> Cost:
+        """Return the cost of doing both, one after the other."""
+        peaks = [peak for peak in (self.peak_bytes, other.peak_bytes) if peak is not None]
+        runs = min(self.runs, other.runs)
+        return Cost(self.seconds + other.seconds, runs, max(peaks, default=None))
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One method at one ratio.
+
+    Attributes
+    ----------
+    kept, asked : int
+        How many splats are left, and how many should be.
+    quality : dict of (views, reference) to dict of str to float
+        Views "held-out" or "scoring", reference "renders" or "pictures" -> metric -> mean.
+    """
+
+    method: Method
+    ratio: float
+    kept: int
+    asked: int
+    cost: Cost
+    quality: dict[tuple[str, str], dict[str, float]]
+
+
+@dataclass(eq=False)
+class Measured:
+    """All that was measured of one scene."""
+
+    name: str
+    facts: dict[str, str]
+    rows: list[Row] = field(default_factory=list)
+    unpruned: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
+    cheaper: list[Line] = field(default_factory=list)
+    ablation: list[Line] = field(default_factory=list)
+    flops: Counts | None = None
+    hessian: Energies | None = None
+    failed: list[str] = field(default_factory=list)

@@ -1,0 +1,73 @@
+"""What the documents name is there: files, links, tests."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = sorted(
+    path
+    for folder in (ROOT, ROOT / "docs", ROOT / "benchmarks", ROOT / "tests/e2e")
+    for path in folder.glob("*.md")
+)
+FILES = [
+    "/" + path.relative_to(ROOT).as_posix()
+    for folder in ("refine_addon", "benchmarks", "tests", "docs", ".ci")
+    for path in (ROOT / folder).rglob("*")
+    if path.is_file()
+] + ["/" + path.name for path in ROOT.iterdir() if path.is_file()]
+TESTS = {
+    name
+    for path in (ROOT / "tests").rglob("test_*.py")
+    for name in re.findall(r"^def (test_\w+)", path.read_text(encoding="utf-8"), re.MULTILINE)
+}
+
+
+@pytest.fixture(params=DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+def text(request):
+    """Give a document."""
+    return request.param.read_text(encoding="utf-8")
+
+
+def test_every_python_file_and_folder_that_is_named_exists(text):
+    """In backquotes, from any folder on: ``core/views.py`` is ``refine_addon/core/views.py``."""
+    named = re.findall(r"`([\w./-]+\.py|(?:refine_addon|benchmarks|tests)/[\w/]*)(?:::\w+)?`", text)
+
+    missing = [name for name in named if not any(_names(name, file) for file in FILES)]
+
+    assert missing == []
+
+
+def _names(name: str, file: str) -> bool:
+    return file.endswith("/" + name) or (not name.endswith(".py") and file.startswith("/" + name))
+
+
+def test_every_test_that_is_named_exists(text):
+    """``test_x_...`` stands for a name that begins so."""
+    named = re.findall(r"`(?:test_\w+\.py::)?(test_\w+?)(_\.\.\.)?`", text)
+
+    missing = [
+        name
+        for name, cut in named
+        if name not in TESTS and not (cut and any(test.startswith(name) for test in TESTS))
+    ]
+
+    assert missing == []
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_every_link_leads_somewhere(document):
+    """To a file, and to a heading of it where one is named."""
+    for target in re.findall(r"\]\(([^)]+)\)", document.read_text(encoding="utf-8")):
+        if re.match(r"https?:", target):
+            continue
+        path, _, heading = target.partition("#")
+        file = document.parent / path if path else document
+        assert file.exists(), target
+        if heading:
+            lines = file.read_text(encoding="utf-8").splitlines()
+            headings = [line.lstrip("# ").lower() for line in lines if line.startswith("#")]
+            assert heading in [re.sub(r"[^\w -]", "", line).replace(" ", "-") for line in headings]

@@ -1,0 +1,53 @@
+"""Find what documents promise: examples in docstrings, and fenced blocks in Markdown."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+PROMPT = ">>> "
+
+_BLOCK = re.compile(r"(<!-- not run: [^\n]+ -->\n)?^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+class Block(NamedTuple):
+    """A fenced block of a document.
+
+    Attributes
+    ----------
+    place : str
+        File and line.
+    language : str
+        What follows the fence, or "".
+    text : str
+    excused : bool
+        Whether ``<!-- not run: REASON -->`` stands on the line before.
+    """
+
+    place: str
+    language: str
+    text: str
+    excused: bool
+
+
+def modules_with_examples(package: Path, name: str) -> list[str]:
+    """Return the modules of a package folder whose docstrings have examples, by full name."""
+    return sorted(
+        ".".join((name, *path.relative_to(package).with_suffix("").parts))
+        for path in package.rglob("*.py")
+        if PROMPT in path.read_text(encoding="utf-8")
+    )
+
+
+def blocks(document: Path) -> list[Block]:
+    """Return the fenced blocks of a Markdown file, in order."""
+    text = document.read_text(encoding="utf-8")
+    return [
+        Block(
+            f"{document.name}:{text.count(chr(10), 0, at.start(2)) + 1}", at[2], at[3], bool(at[1])
+        )
+        for at in _BLOCK.finditer(text)
+    ]
