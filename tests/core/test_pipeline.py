@@ -29,11 +29,12 @@ from refine_addon.core import (
     score,
     select,
 )
-from refine_addon.core.pipeline import Task, decide
+from refine_addon.core.pipeline import decide
 from refine_addon.core.scoring import froxels, projection
 from refine_addon.core.scoring.adaptive import Statistics, weights
 from refine_addon.core.scoring.closed_form import LUMA
 from refine_addon.core.selection import rank
+from refine_addon.core.task import Task
 from tests.strategies import plain_header, ply_of
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
