@@ -1,7 +1,30 @@
-"""``python -m refine_addon``: the command without Blender."""
+"""``python -m refine_addon``, and what ``pip`` installs as ``refine``: the command alone."""
 
 import sys
 
-from .command import main
 
-sys.exit(main(sys.argv[1:]))
+def main() -> int:
+    """Run the command on this process's arguments.
+
+    Returns
+    -------
+    int
+        Exit code, see `refine_addon.command.main`.
+    """
+    try:
+        # Only here: Ctrl-C may come while these load.
+        import signal  # noqa: PLC0415
+
+        from . import command  # noqa: PLC0415
+
+        code = command.main(sys.argv[1:])
+        # Done, and said: from here on it would only break into Python's own tidying up.
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    except KeyboardInterrupt:  # when the command does not listen yet, or no more
+        print("refine: error: cancelled; nothing was left half-written", file=sys.stderr)
+        return 130
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

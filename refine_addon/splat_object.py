@@ -1,11 +1,12 @@
-"""What the panel and the command do to an object: score, store, plan, apply, export.
+"""What the panel and the command do to an object: score, plan, apply, export.
 
-Every function either does all it says or raises `RefineError` and leaves the scene as it was.
+An operation begins with `mesh.layout.check`, which finds out that an object holds splats, and hands
+what it found to all functions here. Each either does all it says, or raises `RefineError` and
+leaves the scene as it was.
 """
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,13 +19,15 @@ from .core import pipeline
 from .core.affine import transformed
 from .core.errors import RefineError
 from .core.formats.ply import columns_from_splats
-from .core.selection import select
+from .core.pipeline import Result, Settings, Task
+from .core.report import Clock, Files, complete_report
+from .core.survivors import survivor_columns
 from .core.whole_file import refuse_existing
 from .core.work import Progress, part, silent
 from .mesh import attributes as mesh_attributes
 from .mesh import edit as mesh_edit
 from .mesh import layout as mesh_layout
-from .mesh.layout import check
+from .mesh.layout import SplatObject, check
 from .mesh.scores import RECORD, store, stored_scores
 
 if TYPE_CHECKING:
@@ -32,7 +35,6 @@ if TYPE_CHECKING:
 
     from .core.absorbing.absorb import Absorbed
     from .core.formats.ply import SplatFile
-    from .core.pipeline import Settings
     from .core.selection import Budget
     from .core.splats import Splats
     from .core.views import ViewSet
@@ -56,25 +58,24 @@ class Plan:
     bytes_after: int
 
 
-def gather(obj: bpy.types.Object, *, whole: bool = False) -> Splats:
+def gather(checked: SplatObject, *, whole: bool = False) -> Splats:
     """Return an object's splats as they stand in the world, for scoring.
 
     Modifiers are not looked at: what is scored is what is exported.
 
     Parameters
     ----------
-    obj : bpy.types.Object
+    checked : SplatObject
     whole : bool
         Whether to bring view-dependent colour along, for absorbing; the scale must be uniform then.
 
     Raises
     ------
     RefineError
-        If the object holds no splats, or its matrix cannot be applied.
+        If the object's matrix cannot be applied.
     """
-    check(obj)
-    matrix = world_matrix(obj, bpy.context.evaluated_depsgraph_get())
-    splats = mesh_attributes.splats_from_object(obj, sh_rest=whole)
+    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
+    splats = mesh_attributes.splats_from_object(checked, sh_rest=whole)
     if np.array_equal(matrix, np.eye(4)):
         return splats
     return transformed(splats, matrix, rotate_sh=whole)
@@ -93,67 +94,82 @@ def modifier_notes(obj: bpy.types.Object) -> list[str]:
     return [note]
 
 
-def check_scorable(obj: bpy.types.Object) -> None:
-    """Raise `RefineError` if scores could not be stored on an object, before they are computed."""
-    check(obj)
-    mesh_edit.check_writable(obj)
-
-
-def keep_mask(obj: bpy.types.Object, budget: Budget, protect: str = "") -> NDArray[np.bool_]:
-    """Return which splats of a scored object stay.
+def stored_task(
+    checked: SplatObject,
+    budget: Budget,
+    protect: str = "",
+    *,
+    settings: Settings | None = None,
+    views: ViewSet | None = None,
+) -> Task:
+    """Return what Apply decides: by the scores that the object holds, which splats stay.
 
     Parameters
     ----------
-    obj : bpy.types.Object
+    checked : SplatObject
     budget : Budget
     protect : str
         Name of a boolean point attribute or a vertex group: what is in it stays.
+    settings : Settings, optional
+        For absorbing.
+    views : ViewSet, optional
+        With them, survivors absorb what goes.
+
+    Returns
+    -------
+    Task
+        For `refine_addon.core.pipeline.decide`.
 
     Raises
     ------
     RefineError
-        If the object was not scored, has nothing named `protect`, or nothing would stay.
+        If the object was not scored, or has nothing named `protect`; also see `gather`.
     """
-    row_bytes, fixed_bytes = mesh_attributes.file_size(obj)
-    return select(
-        stored_scores(obj),
-        budget,
-        protected=protected(obj, protect),
+    row_bytes, fixed_bytes = mesh_attributes.file_size(checked)
+    return Task(
+        budget=budget,
+        settings=settings or Settings(),
+        splats=None if views is None else gather(checked, whole=True),
+        views=views,
+        scores=stored_scores(checked),
+        protected=mesh_edit.protected_mask(checked.obj, protect) if protect else None,
+        absorb=views is not None,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
     )
 
 
-def protected(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
-    """Return what the named attribute or vertex group protects; None for no name."""
-    return mesh_edit.protected_mask(obj, name) if name else None
+def keep_mask(checked: SplatObject, budget: Budget, protect: str = "") -> NDArray[np.bool_]:
+    """Return which splats of a scored object stay; see `stored_task`."""
+    return pipeline.decide(stored_task(checked, budget, protect)).keep
 
 
-def plan(obj: bpy.types.Object, budget: Budget, protect: str = "") -> Plan:
-    """Return what `apply_object` would do, and mark the splats that would go."""
-    keep = keep_mask(obj, budget, protect)
-    mesh_edit.check_writable(obj)
-    mesh_attributes.write_attribute(obj.data, mesh_edit.REMOVE, "BOOLEAN", ~keep)
-    obj.data.update()
-    return _plan(obj, keep)
+def plan(checked: SplatObject, budget: Budget, protect: str = "") -> Plan:
+    """Return what Apply without Absorb would do, and mark the splats that would go.
+
+    Raises
+    ------
+    RefineError
+        See `stored_task`; also if nothing would stay, or the object is linked from a library.
+    """
+    keep = keep_mask(checked, budget, protect)
+    mesh_edit.check_writable(checked.obj)
+    mesh_attributes.write_attribute(checked.mesh, mesh_edit.REMOVE, "BOOLEAN", ~keep)
+    checked.mesh.update()
+    return _plan(checked, keep)
 
 
-def apply_object(
-    obj: bpy.types.Object, budget: Budget, protect: str = "", absorbed: Absorbed | None = None
-) -> Plan:
-    """Delete the splats that a budget does not keep, by the scores that the object holds.
+def apply_object(checked: SplatObject, result: Result) -> Plan:
+    """Delete the splats that do not stay, and set what the others became: all of it or nothing.
 
     Everything else of the object and its mesh stays: attributes, vertex groups, custom properties,
     materials, modifiers. The scores stay to be looked at, but the next apply asks for new ones.
 
     Parameters
     ----------
-    obj : bpy.types.Object
-    budget : Budget
-    protect : str
-        See `keep_mask`.
-    absorbed : Absorbed, optional
-        What became of the object's splats, in the world: decides in place of budget and scores.
+    checked : SplatObject
+    result : Result
+        What was decided of the object's splats.
 
     Returns
     -------
@@ -163,46 +179,41 @@ def apply_object(
     Raises
     ------
     RefineError
-        See `keep_mask` and `mesh_edit.check_deletable`.
+        See `mesh_edit.check_deletable`; also if there are no longer as many splats.
     """
-    mesh_edit.check_deletable(obj)
-    keep = absorbed.keep if absorbed else keep_mask(obj, budget, protect)
-    if len(keep) != len(obj.data.vertices):
+    mesh_edit.check_deletable(checked.obj)
+    if len(result.keep) != len(checked):
         msg = (
-            f"object '{obj.name}': has {len(obj.data.vertices)} splats and had {len(keep)} when "
-            "absorbing began; apply again"
+            f"object '{checked.obj.name}': has {len(checked)} splats and had {len(result.keep)} "
+            "when it was decided which stay; apply again"
         )
         raise RefineError(msg)
-    done = _plan(obj, keep)
-    _reduce(obj, keep, absorbed_columns(obj, absorbed) if absorbed else {})
+    done = _plan(checked, result.keep)
+    columns = absorbed_columns(checked, result.absorbed) if result.absorbed else {}
+    with mesh_edit.all_or_nothing(checked.obj):
+        _reduce(checked, result.keep, columns)
     return done
 
 
 def _reduce(
-    obj: bpy.types.Object, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
+    checked: SplatObject, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
 ) -> None:
-    """Set what the survivors became, delete the others, and ask for new scores from here on."""
-    mesh_attributes.write_columns(obj, columns)
-    mesh_edit.delete_vertices(obj, ~keep)
-    del obj.data[RECORD]
+    """Delete what does not stay, set what the others became, and ask for new scores from here."""
+    mesh_edit.delete_vertices(checked.obj, ~keep)
+    columns = {name: values[keep] for name, values in columns.items()}
+    mesh_attributes.write_columns(checked, columns)
+    del checked.mesh[RECORD]
 
 
-def absorbed_columns(obj: bpy.types.Object, absorbed: Absorbed) -> dict[str, NDArray[Any]]:
+def absorbed_columns(checked: SplatObject, absorbed: Absorbed) -> dict[str, NDArray[Any]]:
     """Return an object's columns with the survivors as they became, in the object's frame."""
-    matrix = world_matrix(obj, bpy.context.evaluated_depsgraph_get())
-    changed = np.flatnonzero(absorbed.changed)
-    survivors = absorbed.splats.take(changed)
-    if not np.array_equal(matrix, np.eye(4)):
-        survivors = transformed(survivors, np.linalg.inv(matrix))
-    index = np.flatnonzero(absorbed.keep)[changed]
-    columns = mesh_attributes.stored_columns(obj, columns_from_splats(survivors))
-    for name, values in columns_from_splats(survivors).items():
-        columns[name][index] = values
-    return columns
+    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
+    stored = mesh_attributes.stored_columns(checked)
+    return survivor_columns(stored, absorbed, np.linalg.inv(matrix))
 
 
 def export_object(
-    obj: bpy.types.Object,
+    checked: SplatObject,
     path: Path | str,
     *,
     keep: NDArray[np.bool_] | None = None,
@@ -214,7 +225,7 @@ def export_object(
 
     Parameters
     ----------
-    obj : bpy.types.Object
+    checked : SplatObject
     path : path-like
     keep : (N,) bool, optional
         Which splats to write; all by default.
@@ -233,14 +244,13 @@ def export_object(
     Raises
     ------
     RefineError
-        If the object holds no splats, its scale is uneven and is to be applied, or the file cannot
-        be written; nothing is written then.
+        If the object's scale is uneven and is to be applied, or the file cannot be written; nothing
+        is written then.
     """
     target = Path(path).expanduser()
-    check(obj)
     refuse_existing(target, overwrite=overwrite)
     file = mesh_attributes.file_from_object(
-        obj, _world_columns(obj) if apply_transform else columns
+        checked, _world_columns(checked) if apply_transform else columns
     )
     file.write(target, keep, overwrite=overwrite)
     return file
@@ -285,54 +295,47 @@ def prune_object(  # noqa: PLR0913 - the command's options
     ------
     RefineError
         See `gather`, `apply_object`, `export_object` and `refine_addon.core.pipeline.prune`; also
-        if there is no such object, or the .blend cannot be saved.
+        if there is no such object, or the .blend cannot be saved. What was exported by then stays;
+        the object is as it was.
     """
-    start = time.perf_counter()
-    obj = find(name)
-    check(obj)
+    clock = Clock()
+    checked = check(find(name))
     target = None if output is None or dry_run else Path(output).expanduser()
     if target is not None:
         refuse_existing(target, overwrite=overwrite)
     if save and not dry_run:
-        _check_savable(obj)
-    row_bytes, fixed_bytes = mesh_attributes.file_size(obj)
-    splats = gather(obj, whole=absorb)
-    read = time.perf_counter()
-    result = pipeline.prune(
-        splats,
-        views,
-        budget,
-        settings,
+        _check_savable(checked.obj)
+    row_bytes, fixed_bytes = mesh_attributes.file_size(checked)
+    task = Task(
+        budget=budget,
+        settings=settings,
+        splats=gather(checked, whole=absorb),
+        views=views,
         absorb=absorb,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
-        progress=part(progress, 0.0, 0.8),
     )
-    decided = time.perf_counter()
-    sizes = _plan(obj, result.keep)
-    columns = absorbed_columns(obj, result.absorbed) if result.absorbed and not dry_run else {}
+    clock.lap("read_s")
+    result = pipeline.decide(task, clock=clock, progress=part(progress, 0.0, 0.8))
+    sizes = _plan(checked, result.keep)
+    columns = absorbed_columns(checked, result.absorbed) if result.absorbed and not dry_run else {}
     if target is not None:
-        export_object(obj, target, keep=result.keep, columns=columns, overwrite=overwrite)
+        export_object(checked, target, keep=result.keep, columns=columns, overwrite=overwrite)
     if save and not dry_run:
-        store(obj, result.scores, views, settings)
-        _reduce(obj, result.keep, columns)
-        _save()
-    timings = result.report["timings"]
-    timings["read_s"] = read - start
-    timings["write_s"] = time.perf_counter() - decided
-    timings["total_s"] = time.perf_counter() - start
-    result.report["notes"] += modifier_notes(obj)
-    result.report["files"] = {
-        "input": f"{bpy.data.filepath}#{name}",
-        "output": None if target is None else str(target),
-        "input_bytes": sizes.bytes_before,
-        "output_bytes": sizes.bytes_after,
-    }
+        with mesh_edit.all_or_nothing(checked.obj):
+            store(checked, result.scores, settings)
+            _reduce(checked, result.keep, columns)
+            _save(target)
+    clock.lap("write_s")
+    result.report["notes"] += modifier_notes(checked.obj)
+    source, made = f"{bpy.data.filepath}#{name}", None if target is None else str(target)
+    files = Files(source, made, sizes.bytes_before, sizes.bytes_after)
+    complete_report(result.report, clock, files)
     return result.report
 
 
-def _plan(obj: bpy.types.Object, keep: NDArray[np.bool_]) -> Plan:
-    row_bytes, fixed_bytes = mesh_attributes.file_size(obj)
+def _plan(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:
+    row_bytes, fixed_bytes = mesh_attributes.file_size(checked)
     kept = int(np.count_nonzero(keep))
     # The header says how many splats follow, in as many digits as that takes.
     shorter = len(str(len(keep))) - len(str(kept))
@@ -340,16 +343,15 @@ def _plan(obj: bpy.types.Object, keep: NDArray[np.bool_]) -> Plan:
     return Plan(kept, len(keep) - kept, *sizes)
 
 
-def _world_columns(obj: bpy.types.Object) -> dict[str, NDArray[Any]]:
+def _world_columns(checked: SplatObject) -> dict[str, NDArray[Any]]:
     """Return the columns that the object's matrix changes, as they are in the world."""
-    matrix = world_matrix(obj, bpy.context.evaluated_depsgraph_get())
+    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
     if np.array_equal(matrix, np.eye(4)):
         return {}
-    moved = transformed(mesh_attributes.splats_from_object(obj), matrix)
+    moved = transformed(mesh_attributes.splats_from_object(checked), matrix)
     columns: dict[str, NDArray[Any]] = dict(columns_from_splats(moved))
-    layout = check(obj)
-    if {"nx", "ny", "nz"} <= {column.name for column in layout.columns}:
-        normals = mesh_attributes.normals(obj, layout) @ np.linalg.inv(matrix[:3, :3])
+    if {"nx", "ny", "nz"} <= {column.name for column in checked.layout.columns}:
+        normals = mesh_attributes.normals(checked) @ np.linalg.inv(matrix[:3, :3])
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         normals = normals / np.where(lengths > 0.0, lengths, 1.0)  # most files store zeros
         columns.update(zip(("nx", "ny", "nz"), normals.T, strict=True))
@@ -374,9 +376,11 @@ def _check_savable(obj: bpy.types.Object) -> None:
         raise RefineError(msg)
 
 
-def _save() -> None:
+def _save(exported: Path | None) -> None:
     try:
         bpy.ops.wm.save_mainfile()
     except RuntimeError as error:
-        msg = f"{bpy.data.filepath}: cannot be saved ({str(error).strip()})"
+        msg = f"{bpy.data.filepath}: cannot be saved ({str(error).strip()}); nothing was removed"
+        if exported is not None:
+            msg += f", {exported} was written"
         raise RefineError(msg) from error

@@ -30,7 +30,7 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
-from refine_addon.command import describe  # noqa: E402 - from this checkout, installed or not
+from refine_addon.command.info import describe  # noqa: E402 - from this checkout, installed or not
 from refine_addon.core import Occlusion, RefineError, Settings, read_cameras, read_ply, score  # noqa: E402
 from refine_addon.core.formats.ply import splats_from_columns  # noqa: E402
 

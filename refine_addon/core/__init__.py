@@ -16,6 +16,7 @@ from .scoring.closed_form import ClosedForm
 from .scoring.occlusion import Occlusion
 from .selection import Budget, rank, select
 from .splats import Splats
+from .survivors import survivor_columns
 from .views import View, ViewSet
 
 __all__ = [
@@ -39,4 +40,5 @@ __all__ = [
     "read_ply",
     "score",
     "select",
+    "survivor_columns",
 ]

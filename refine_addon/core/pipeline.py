@@ -1,25 +1,27 @@
-"""The one use case: views and splats in, scores and a keep mask out.
+"""The one way through: splats, views and a budget in; what stays, and what becomes of it, out.
 
-The panel, the command and Python code all come through here, so that they keep the same splats.
+The panel's buttons, the command and Python code all come through `decide`, in two steps: the
+budget, asked of scores, says which splats stay; where they are to absorb the others, what the views
+see says which ones stay instead, and as what. So all of them keep the same splats.
 """
 
 from __future__ import annotations
 
 import math
-import platform
-import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from . import selection
 from .absorbing import absorb as absorbing
-from .absorbing.merging import Seen
+from .absorbing.merging import ViewSums
 from .errors import RefineError
 from .formats.ply import read_ply
+from .report import Clock, Files, complete_report, make_report
 from .scoring import auto, closed_form, occlusion
 from .selection import Budget
+from .survivors import survivor_columns
 from .whole_file import expanded, refuse_existing, refuse_mapped
 from .work import Progress, part, report, silent
 
@@ -83,6 +85,60 @@ class Settings:
             msg = f"views is {self.views}, expected 0 (all) or more"
             raise RefineError(msg)
 
+    @property
+    def frustum(self) -> bool:
+        """Whether the scores will count the views in whose image a splat lies; see `Scores`."""
+        return self.method != "closed-form" or self.closed_form.frustum
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """All that deciding needs, as arrays: nothing of it is a file, or Blender's.
+
+    Attributes
+    ----------
+    budget : Budget
+        How much to remove.
+    settings : Settings
+        How to score.
+    splats : Splats or None
+        In the frame of the views; None where they are scored already and nothing absorbs.
+    views : ViewSet or None
+        None as for `splats`.
+    scores : Scores or None
+        Those that the splats have already; None scores them.
+    protected : (N,) bool or None
+        Splats never to remove, nor to change.
+    absorb : bool
+        Whether survivors absorb what is removed. The budget then says how many survive; which ones
+        do, and as what, is found by what the views see of each, whatever the method.
+    row_bytes, fixed_bytes : float, int
+        See `Budget.removals`.
+    """
+
+    budget: Budget
+    settings: Settings = field(default_factory=Settings)
+    splats: Splats | None = None
+    views: ViewSet | None = None
+    scores: Scores | None = None
+    protected: NDArray[np.bool_] | None = None
+    absorb: bool = False
+    row_bytes: float = 0.0
+    fixed_bytes: int = 0
+
+    def scene(self) -> tuple[Splats, ViewSet]:
+        """Return splats and views.
+
+        Raises
+        ------
+        RefineError
+            If they were not given.
+        """
+        if self.splats is None or self.views is None:
+            msg = "splats without scores need views to be scored, and absorbing needs both"
+            raise RefineError(msg)
+        return self.splats, self.views
+
 
 @dataclass(frozen=True, eq=False)
 class Result:
@@ -93,7 +149,8 @@ class Result:
     keep : (N,) bool
         Which splats stay.
     scores : Scores
-        What decided; with `absorbed`, what decided how many, or which tenth went first.
+        What decided; with `absorbed`, the scores that set how many survive, or which tenth is
+        deleted first.
     absorbed : Absorbed or None
         The survivors, changed by what they absorbed.
     report : dict
@@ -137,21 +194,29 @@ def score(
     Cancelled
         If `progress` answers ``False``.
     """
+    used = views.spread(settings.views)
     # What is too small for a float is nothing beside what counts: it may underflow to 0.
     with np.errstate(under="ignore"):
-        used = views.spread(settings.views)
         if settings.method == "occlusion":
-            return occlusion.score(
+            scores = occlusion.score(
                 splats, used, settings.occlusion, progress=progress, threads=threads
             )
-        if settings.method == "auto":
+        elif settings.method == "auto":
             models = (settings.closed_form, settings.occlusion)
-            return auto.score(
+            scores = auto.score(
                 splats, used, settings.tolerance, models, progress=progress, threads=threads
             )
-        return closed_form.score(
-            splats, used, settings.closed_form, progress=progress, threads=threads
-        )
+        else:
+            scores = closed_form.score(
+                splats, used, settings.closed_form, progress=progress, threads=threads
+            )
+    return _with_views(scores, views)
+
+
+def _with_views(scores: Scores, views: ViewSet) -> Scores:
+    """Return scores that know of all the views there were, not only of those used."""
+    notes = (*scores.notes, views.note) if views.note else scores.notes
+    return replace(scores, views_given=len(views), notes=notes)
 
 
 def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
@@ -192,65 +257,105 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
     RefineError, Cancelled
         See `score`; also if the budget would leave nothing.
     """
-    start = time.perf_counter()
-    _refuse_meaningless(budget, settings)
-    ahead = part(progress, 0.0, 0.2 if absorb else 0.95)
-    known = None
-    if absorb and budget.removals(len(splats), row_bytes or 1.0, fixed_bytes) is not None:
-        # How many go does not depend on the scores, so those that absorbing needs will do.
-        known = _score_once(splats, views, settings, ahead, threads)
-        scores = known[0]
-    else:
-        scores = score(splats, views, settings, progress=ahead, threads=threads)
-    scored = time.perf_counter()
-    report(progress, 0.2 if absorb else 0.95, "selecting")
-    keep = selection.select(
-        scores, budget, protected=protected, row_bytes=row_bytes, fixed_bytes=fixed_bytes
+    task = Task(
+        budget=budget,
+        settings=settings,
+        splats=splats,
+        views=views,
+        protected=protected,
+        absorb=absorb,
+        row_bytes=row_bytes,
+        fixed_bytes=fixed_bytes,
     )
-    timings = {"score_s": scored - start, "select_s": time.perf_counter() - scored}
+    return decide(task, progress=progress, threads=threads)
+
+
+def decide(
+    task: Task,
+    *,
+    clock: Clock | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Result:
+    """Decide which splats stay; with `absorb`, what becomes of them. Changes and writes nothing.
+
+    Parameters
+    ----------
+    task : Task
+    clock : Clock, optional
+        Takes the times of the steps, in a row with what is timed before and after.
+    progress, threads
+        See `score`.
+
+    Returns
+    -------
+    Result
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `score` and `selection.select`.
+    """
+    clock = clock or Clock()
+    scored = 0.2 if task.absorb else 0.95
+    scores, known = _scores_of(task, part(progress, 0.0, scored), threads)
+    clock.lap("score_s")
+    report(progress, scored, "selecting")
+    keep = selection.select(
+        scores,
+        task.budget,
+        protected=task.protected,
+        row_bytes=task.row_bytes,
+        fixed_bytes=task.fixed_bytes,
+    )
+    clock.lap("select_s")
     absorbed = None
-    if absorb:
+    if task.absorb:
+        splats, views = task.scene()
         absorbed = absorb_removed(
-            splats, views, int(np.count_nonzero(keep)), settings, known=known,
-            protected=protected, progress=part(progress, 0.2, 1.0), threads=threads,
+            splats, views, int(np.count_nonzero(keep)), task.settings, known=known,
+            protected=task.protected, progress=part(progress, 0.2, 1.0), threads=threads,
         )  # fmt: skip
         keep = absorbed.keep
-        timings["absorb_s"] = time.perf_counter() - scored - timings["select_s"]
-    facts = make_report(scores, keep, views, budget, settings, timings)
+        clock.lap("absorb_s")
+    facts = make_report(scores, keep, task.budget, task.settings, clock)
     if absorbed:
         facts["absorbed"] = absorbed.facts()
         facts["notes"].append(absorbed.note())
-        if known and settings.method != "occlusion":
-            name = settings.method
+        if known and task.settings.method != "occlusion":
+            name = task.settings.method
             facts["notes"].append(f"absorbing measures by occlusion: {name} had nothing to decide")
     return Result(keep, scores, facts, absorbed)
+
+
+def _scores_of(
+    task: Task, progress: Progress, threads: int | None
+) -> tuple[Scores, tuple[Scores, Measured] | None]:
+    """Return the scores that decide and, where absorbing asked for them, what it needs of them."""
+    if task.scores is not None:
+        return task.scores, None
+    splats, views = task.scene()
+    if task.absorb and not task.budget.needs_scores:
+        # How many go does not depend on the scores, so those that absorbing needs will do.
+        known = _score_once(splats, views, task.settings, progress, threads)
+        return known[0], known
+    # `select` would refuse it as well, but only after the work.
+    task.budget.refuse_meaningless(task.settings.method, frustum=task.settings.frustum)
+    return score(splats, views, task.settings, progress=progress, threads=threads), None
 
 
 def _score_once(
     splats: Splats, views: ViewSet, settings: Settings, progress: Progress, threads: int | None
 ) -> tuple[Scores, Measured]:
     with np.errstate(under="ignore"):  # as for scores
-        return occlusion.score_once(
+        scores, measured = occlusion.score_once(
             splats,
             views.spread(settings.views),
             settings.occlusion,
             progress=progress,
             threads=threads,
         )
-
-
-def _refuse_meaningless(budget: Budget, settings: Settings) -> None:
-    """Refuse budgets that the method gives no fixed meaning."""
-    if settings.method == "auto" and budget.kind in ("threshold", "min_seen"):
-        msg = (
-            f"method auto may score by any model, and {budget.kind} means something else to each: "
-            "choose closed-form or occlusion, or another budget"
-        )
-        raise RefineError(msg)
-    uncounted = settings.method == "closed-form" and not settings.closed_form.frustum
-    if uncounted and budget.kind == "min_seen":
-        msg = "without the frustum test every view sees every splat: min_seen would remove none"
-        raise RefineError(msg)
+    return _with_views(scores, views), measured
 
 
 def absorb_removed(  # noqa: PLR0913 - the use case, the other one
@@ -294,14 +399,14 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
     # What no renderer draws scores lowest, so it is among these, or all of these are such.
     rest = selection.select(scores, Budget(keep=total - first), protected=protected)
     # What goes first hid and showed next to nothing: what was measured with it still holds.
-    at_first = [Seen(measured.contribution[rest], measured.contrast[rest])]
+    at_first = [ViewSums(measured.contribution[rest], measured.contrast[rest])]
     del known, scores, measured
 
-    def seen(now: Splats, ahead: Progress) -> Seen:
+    def seen(now: Splats, ahead: Progress) -> ViewSums:
         if at_first:
             return at_first.pop()
         found = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
-        return Seen(found.contribution, found.contrast)
+        return ViewSums(found.contribution, found.contrast)
 
     with np.errstate(under="ignore"):  # as for scores
         absorbed = absorbing.absorb(
@@ -350,75 +455,30 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
     RefineError, Cancelled
         See `prune`, `read_ply` and `SplatFile.write`; nothing is written then.
     """
-    start = time.perf_counter()
+    clock = Clock()
     target = None if output is None else expanded(output)
     if target is not None:
         refuse_existing(target, overwrite=overwrite)
         refuse_mapped(target, expanded(source))
     file = read_ply(source)
-    opened = time.perf_counter()
-    result = prune(
-        file.splats(),
-        views,
-        budget,
-        settings,
+    task = Task(
+        budget=budget,
+        settings=settings,
+        splats=file.splats(),
+        views=views,
         absorb=absorb,
-        row_bytes=file.row_bytes,
+        row_bytes=file.changed_row_bytes if absorb else file.row_bytes,
         fixed_bytes=file.fixed_bytes,
-        progress=part(progress, 0.0, 0.8),
-        threads=threads,
     )
-    decided = time.perf_counter()
+    clock.lap("read_s")
+    result = decide(task, clock=clock, progress=part(progress, 0.0, 0.8), threads=threads)
     report(progress, 0.8, "writing")
+    columns = survivor_columns(file.rows, result.absorbed) if result.absorbed else {}
     if target is not None:
-        if result.absorbed:
-            file.write_survivors(target, result.absorbed, overwrite=overwrite)
-        else:
-            file.write(target, result.keep, overwrite=overwrite)
-    timings = result.report["timings"]
-    timings["read_s"] = opened - start
-    timings["write_s"] = time.perf_counter() - decided
-    timings["total_s"] = time.perf_counter() - start
-    result.report["files"] = {
-        "input": str(file.path),
-        "output": None if target is None else str(target),
-        "input_bytes": file.size(),
-        "output_bytes": file.size(result.keep),
-    }
+        file.write(target, result.keep, columns=columns, overwrite=overwrite)
+    clock.lap("write_s")
+    result.report["notes"] += file.notes(result.keep)
+    made = None if target is None else str(target)
+    sizes = (file.size(), file.size(result.keep, columns))
+    complete_report(result.report, clock, Files(str(file.path), made, *sizes))
     return result
-
-
-def scoring_notes(scores: Scores, views: ViewSet) -> list[str]:
-    """Return what the user should know of a scoring, in sentences."""
-    notes = [*scores.notes, *([views.note] if views.note else [])]
-    if scores.undrawable:
-        notes.append(f"{scores.undrawable} splats cannot be drawn; they rank lowest")
-    return notes
-
-
-def make_report(
-    scores: Scores,
-    keep: NDArray[np.bool_],
-    views: ViewSet,
-    budget: Budget,
-    settings: Settings,
-    timings: dict[str, float],
-) -> dict[str, Any]:
-    """Return everything a pipeline wants to know about a prune, as plain JSON values."""
-    kept = int(np.count_nonzero(keep))
-    return {
-        "splats": {
-            "before": len(keep),
-            "kept": kept,
-            "removed": len(keep) - kept,
-            "undrawable": scores.undrawable,
-            "unseen": int(np.count_nonzero(scores.seen == 0)),
-        },
-        "views": {"given": len(views), "used": scores.views_used},
-        "budget": {budget.kind: getattr(budget, budget.kind)},
-        "settings": asdict(settings),
-        "weights": scores.weights,
-        "timings": timings,
-        "notes": scoring_notes(scores, views),
-        "versions": {"python": platform.python_version(), "numpy": np.__version__},
-    }

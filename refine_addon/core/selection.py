@@ -79,6 +79,29 @@ class Budget:
         """Name of the value given."""
         return next(item.name for item in fields(self) if getattr(self, item.name) is not None)
 
+    @property
+    def needs_scores(self) -> bool:
+        """Whether only the scores can tell how many splats go, not their number alone."""
+        return self.threshold is not None or self.min_seen is not None
+
+    def refuse_meaningless(self, method: str, *, frustum: bool = True) -> None:
+        """Raise `RefineError` if this budget has no fixed meaning for the scores of a method.
+
+        Parameters
+        ----------
+        method, frustum
+            See `Scores`.
+        """
+        if method == "auto" and self.needs_scores:
+            msg = (
+                f"method auto may score by any model, and {self.kind} means something else to "
+                "each: choose closed-form or occlusion, or another budget"
+            )
+            raise RefineError(msg)
+        if self.min_seen is not None and not frustum:
+            msg = "without the frustum test every view sees every splat: min_seen would remove none"
+            raise RefineError(msg)
+
     def removals(self, count: int, row_bytes: float = 0.0, fixed_bytes: int = 0) -> int | None:
         """Return how many of `count` splats go, or None where only the scores can tell.
 
@@ -137,7 +160,14 @@ def select(
     Returns
     -------
     (N,) bool
+
+    Raises
+    ------
+    RefineError
+        If the budget means nothing to these scores (`Budget.refuse_meaningless`), or nothing would
+        stay.
     """
+    budget.refuse_meaningless(scores.method, frustum=scores.frustum)
     values = scores.values
     keep = np.ones(len(values), np.bool_)
     free = np.ones(len(values), np.bool_) if protected is None else ~protected
@@ -170,8 +200,11 @@ def _remove_lowest(
     keep[ties[: count - int(np.count_nonzero(below))]] = False
 
 
-def rank(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def rank(values: NDArray[np.float32]) -> NDArray[np.float64]:
     """Return each splat's place in the order of removal, 0 (goes first) to 1 (goes last).
+
+    To look at, and to select by in Blender, whose attributes round it to float32: above 2^24 splats
+    neighbours then share a rank. Nothing here decides by it; `select` goes by score and row.
 
     Parameters
     ----------
@@ -179,12 +212,12 @@ def rank(values: NDArray[np.float32]) -> NDArray[np.float32]:
 
     Returns
     -------
-    (N,) float32
+    (N,) float64
         A single splat has rank 1.
     """
     count = len(values)
     if count == 1:
-        return np.ones(1, np.float32)
-    ranks = np.empty(count, np.float32)
-    ranks[np.argsort(values, kind="stable")] = np.linspace(0.0, 1.0, count, dtype=np.float32)
+        return np.ones(1)
+    ranks = np.empty(count)
+    ranks[np.argsort(values, kind="stable")] = np.linspace(0.0, 1.0, count)
     return ranks

@@ -201,7 +201,7 @@ class ViewSet:
         -------
         middle : (3,) float64
             Weighted geometric median of the centres (Weiszfeld's iteration).
-        spread : float
+        variance : float
             Weighted median of the centres' squared distances to it.
         """
         centers, weights = self.centers, self.weights
@@ -223,8 +223,9 @@ class ViewSet:
     def spread(self, count: int) -> ViewSet:
         """Return at most `count` views that cover the set evenly, in their old order.
 
-        Farthest-point sampling over position and viewing direction, from the view farthest from
-        the middle of the set. Deterministic, and independent of the order and the unit of the set.
+        Farthest-point sampling over position, in units of the root of `middle`'s variance, and
+        viewing direction, from the view farthest from the middle of the set. Deterministic, and
+        independent of the order and the unit of the set; a stray view takes one place, no more.
 
         Parameters
         ----------
@@ -234,10 +235,9 @@ class ViewSet:
         usable = np.array([index for index, view in enumerate(self.views) if view.weight > 0])
         if count <= 0 or len(usable) <= count:
             return self if len(usable) == len(self) else self.take(usable)
-        centers = self.centers[usable]
-        offset = centers - centers.mean(axis=0)
-        scale = np.sqrt(np.mean(np.sum(offset * offset, axis=1)))
-        place = np.hstack([offset / (scale or 1.0), self.rotations[usable][:, 2]])
+        middle, variance = self.middle()
+        offset = self.centers[usable] - middle
+        place = np.hstack([offset / (np.sqrt(variance) or 1.0), self.rotations[usable][:, 2]])
         # Equal distances are decided by place, never by index, so the order of views is nothing.
         order = np.lexsort(place.T)
         place = place[order]

@@ -21,7 +21,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 REPLACES_MAPPED = os.name != "nt"
 """Whether the system lets go of a file's name while a program still maps it; Windows does not."""
@@ -48,27 +48,43 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
     Called before the long work starts, so that a mistyped output costs nothing.
     """
     try:
-        if path.is_dir():
-            msg = f"{path}: is a folder, expected a file name to write to"
-            raise RefineError(msg)
-        if path.exists() and not path.is_file():
-            msg = f"{path}: is a device, expected the name of a file"
-            raise RefineError(msg)
-        if path.exists() and not overwrite:
-            msg = f"{path}: exists already; choose another name or overwrite it (--overwrite)"
-            raise RefineError(msg)
-        if not path.parent.is_dir():
-            msg = f"{path}: cannot be written, there is no folder {path.parent}"
-            raise RefineError(msg)
-    except OSError as error:  # a name too long, a folder that may not be looked into
+        mode, folder = mode_of(path), mode_of(path.parent)
+    except (OSError, ValueError) as error:  # a name too long, a folder that may not be looked into
         raise RefineError(_explain(path, error)) from error
+    if stat.S_ISDIR(mode):
+        msg = f"{path}: is a folder, expected a file name to write to"
+        raise RefineError(msg)
+    if mode and not stat.S_ISREG(mode):
+        msg = f"{path}: is a device, expected the name of a file"
+        raise RefineError(msg)
+    if mode and not overwrite:
+        msg = f"{path}: exists already; choose another name or overwrite it (--overwrite)"
+        raise RefineError(msg)
+    if not stat.S_ISDIR(folder):
+        msg = f"{path}: cannot be written, there is no folder {path.parent}"
+        raise RefineError(msg)
+
+
+def mode_of(path: Path) -> int:
+    """Return what `path` is and who may use it, as `stat` says it; 0 where there is nothing.
+
+    Raises
+    ------
+    OSError, ValueError
+        If the system cannot tell: a name too long, a folder that may not be looked into. Unlike
+        pathlib, which some versions of Python let take that for "nothing".
+    """
+    try:
+        return path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError):
+        return 0
 
 
 def refuse_mapped(path: Path, source: Path) -> None:
     """Raise `RefineError` where `path` is the mapped file `source` and cannot be replaced."""
     if REPLACES_MAPPED:
         return
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(OSError, ValueError):
         if path.samefile(source):
             msg = (
                 f"{path}: is the file being read, which this system cannot replace; "
@@ -103,28 +119,24 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     refuse_existing(path, overwrite=overwrite)
     try:
         target = path.resolve()
-    except (OSError, RuntimeError, ValueError) as error:  # links in a circle; a zero byte
-        msg = f"{path}: cannot be written ({error}); nothing was changed"
-        raise RefineError(msg) from error
+    except (OSError, RuntimeError) as error:  # links in a circle
+        raise RefineError(_explain(path, error)) from error
     _remove_abandoned(target)
-    with contextlib.ExitStack() as held:
-        temporary = None
-        try:
-            temporary, stream = _new_temporary(target, held)
+    try:
+        with contextlib.ExitStack() as held:
+            temporary, mode, stream = _new_temporary(target, held)
             with stream:
                 yield stream
+            replaced = mode_of(target)
+            mode = stat.S_IMODE(replaced) if replaced else mode
+            if stat.S_IMODE(mode_of(temporary)) != mode:
+                temporary.chmod(mode)
             if overwrite:
-                if target.exists():
-                    temporary.chmod(target.stat().st_mode & 0o7777)
                 temporary.replace(target)
             else:
                 _publish_new(temporary, target)
-        except OSError as error:
-            raise RefineError(_explain(path, error)) from error
-        finally:
-            if temporary is not None:
-                with contextlib.suppress(OSError):
-                    temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise RefineError(_explain(path, error)) from error
 
 
 def _prefix(target: Path) -> str:
@@ -137,14 +149,31 @@ def _prefix(target: Path) -> str:
     return f".refine-{hashlib.blake2b(owner, digest_size=8).hexdigest()}-"
 
 
-def _new_temporary(target: Path, held: contextlib.ExitStack) -> tuple[Path, BinaryIO]:
-    """Make a file beside `target`, locked as long as `held` lasts, or this process lives."""
+def _new_temporary(target: Path, held: contextlib.ExitStack) -> tuple[Path, int, BinaryIO]:
+    """Make a file beside `target` that nobody else may read, and which goes when `held` ends.
+
+    It is locked until then, or until this process dies.
+
+    Returns
+    -------
+    path : Path
+    mode : int
+        The permissions that a new file has, as the user wants them.
+    stream : binary file, open for writing
+    """
     while True:
         temporary = target.with_name(f"{_prefix(target)}{secrets.token_hex(8)}.tmp")
-        # Not tempfile: its files are readable by their owner alone, and the name would keep that.
-        stream = temporary.open("xb")
+        # Ahead of the file itself, so that whatever interrupts from here on, none is left.
+        held.callback(_discard, temporary)
+        # What replaces a secret is one from the start. Otherwise the system applies the user's
+        # mask, which nobody can ask for without setting it, and the file is empty until it is safe.
+        opener = _opener(0o600 if mode_of(target) else 0o666)
+        stream = held.enter_context(open(temporary, "xb", opener=opener))  # noqa: SIM115
+        mode = stat.S_IMODE(os.fstat(stream.fileno()).st_mode)
+        with contextlib.suppress(OSError):  # a drive without permissions
+            temporary.chmod(0o600)
         if fcntl is None:
-            return temporary, stream
+            return temporary, mode, stream
         # A second descriptor: the file is closed, which may fail, before it gets its name.
         lock = os.dup(stream.fileno())
         held.callback(os.close, lock)
@@ -156,8 +185,18 @@ def _new_temporary(target: Path, held: contextlib.ExitStack) -> tuple[Path, Bina
         except OSError:
             taken = False  # no locks on this file system: nobody removes anything here
         if not taken:
-            return temporary, stream
-        stream.close()
+            return temporary, mode, stream
+
+
+def _opener(mode: int) -> Callable[[str, int], int]:
+    """Return what `open` asks for a file that it makes, with these permissions at most."""
+    return lambda name, flags: os.open(name, flags, mode)
+
+
+def _discard(temporary: Path) -> None:
+    """Remove a file if it is there."""
+    with contextlib.suppress(OSError):
+        temporary.unlink(missing_ok=True)
 
 
 def _remove_abandoned(target: Path) -> None:
@@ -194,10 +233,11 @@ def _publish_new(temporary: Path, target: Path) -> None:
         temporary.rename(target)
 
 
-def _explain(path: Path, error: OSError) -> str:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+def _explain(path: Path, error: Exception) -> str:
+    number = getattr(error, "errno", None)
+    if number in (errno.ENOSPC, errno.EDQUOT):
         return f"{path}: no space left on the disk; nothing was changed"
     if isinstance(error, FileExistsError):
         return f"{path}: was made by somebody else in the meantime; it was left as it is"
-    reason = error.strerror or type(error).__name__
+    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return f"{path}: cannot be written ({reason}); nothing was changed"

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from typing import TypeVar
 
 import numpy as np
@@ -16,7 +19,9 @@ Progress = Callable[[float, str], "bool | None"]
 
 Result = TypeVar("Result")
 
-_HELD = 30_000_000  # bytes; glibc heeds no block above 32 MB
+_HELD = 30_000_000  # bytes; glibc ignores blocks above 32 MB here
+_PATIENCE = 0.1  # seconds between two reports while chunks take long
+_own = threading.local()  # of each thread; its `check` is what `checkpoint` calls
 
 
 def silent(_fraction: float, _what: str) -> None:
@@ -32,6 +37,32 @@ def report(progress: Progress, fraction: float, what: str) -> None:
 def part(progress: Progress, start: float, end: float) -> Progress:
     """Return a callback whose 0..1 is `start`..`end` of `progress`."""
     return lambda fraction, what: progress(start + (end - start) * fraction, what)
+
+
+def checkpoint() -> None:
+    """Let a chunk of `for_chunks` be cancelled here; does nothing in any other thread.
+
+    Work whose chunks take long calls this several times a second.
+
+    Raises
+    ------
+    Cancelled
+        If the progress callback of that `for_chunks` answers ``False``.
+    """
+    check: Callable[[], None] | None = getattr(_own, "check", None)
+    if check is not None:
+        check()
+
+
+@contextmanager
+def _checked_by(check: Callable[[], None]) -> Iterator[None]:
+    """Have `checkpoint` call `check` in this thread."""
+    before = getattr(_own, "check", None)
+    _own.check = check
+    try:
+        yield
+    finally:
+        _own.check = before
 
 
 def default_threads() -> int:
@@ -59,7 +90,8 @@ def for_chunks(
     total, chunk : int
         Length to cover and length of one slice.
     progress, what
-        Called from this thread, between slices.
+        Called from this thread, between slices and, where they take long, ten times a second;
+        with one thread only where the work calls `checkpoint`.
     threads : int, optional
         1 runs everything here; by default `default_threads`.
 
@@ -71,30 +103,74 @@ def for_chunks(
     Raises
     ------
     Cancelled
-        If `progress` answers ``False``; work that has not begun is dropped.
+        If `progress` answers ``False``; work that has not begun is dropped, and what has begun
+        ends at its next `checkpoint`.
     """
-    # glibc hands each freed block to the system at once, and takes it back page by page, up to the
-    # size of the largest that was ever freed: chunks are to find their memory where they left it.
+    # Freeing one block of this size makes glibc keep freed blocks up to it instead of handing them
+    # to the system, so the buffers of the next chunk are not mapped in again page by page.
     np.empty(_HELD, np.uint8)
     slices = [slice(start, min(start + chunk, total)) for start in range(0, total, chunk)]
     threads = default_threads() if threads is None else threads
     # About a hundred reports are enough for a bar, and each costs a draw.
     step = max(len(slices) // 100, 1)
-    results: list[Result] = []
     if threads <= 1 or len(slices) <= 1:
+        return _in_turn(work, slices, step, progress, what)
+    return _side_by_side(work, slices, step, progress, what, threads)
+
+
+def _in_turn(
+    work: Callable[[slice], Result], slices: list[slice], step: int, progress: Progress, what: str
+) -> list[Result]:
+    results: list[Result] = []
+    told = 0.0
+
+    def tell() -> None:
+        nonlocal told
+        told = time.monotonic()
+        report(progress, len(results) / len(slices), what)
+
+    def check() -> None:
+        if time.monotonic() - told >= _PATIENCE:
+            tell()
+
+    with _checked_by(check):
         for index, piece in enumerate(slices):
             if index % step == 0:
-                report(progress, index / len(slices), what)
+                tell()
             results.append(work(piece))
-        return results
+    return results
+
+
+def _side_by_side(
+    work: Callable[[slice], Result],
+    slices: list[slice],
+    step: int,
+    progress: Progress,
+    what: str,
+    threads: int,
+) -> list[Result]:
+    cancelled = threading.Event()
+
+    def check() -> None:
+        if cancelled.is_set():
+            raise Cancelled
+
+    def checked(piece: slice) -> Result:
+        with _checked_by(check):
+            return work(piece)
+
+    results: list[Result] = []
     with ThreadPoolExecutor(threads) as pool:
-        futures = [pool.submit(work, piece) for piece in slices]
+        futures = [pool.submit(checked, piece) for piece in slices]
         try:
             for index, future in enumerate(futures):
                 if index % step == 0:
                     report(progress, index / len(slices), what)
+                while not future.done() and not wait([future], _PATIENCE).done:
+                    report(progress, index / len(slices), what)
                 results.append(future.result())
         except BaseException:
+            cancelled.set()
             for future in futures:
                 future.cancel()
             raise

@@ -14,21 +14,22 @@ import numpy as np
 
 from ..core.formats.ply import SplatFile
 from ..core.splats import Splats
-from .layout import KINDS, Column, Layout, add_attributes, check, rest_count
+from .layout import KINDS, Column, SplatObject, add_attributes, rest_count
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from ..core.survivors import Columns
+
 _GROUP = 16  # float32 columns in a cache line
 _ROWS = 4096  # of 16 columns: what stays in the first-level caches while it is turned
 
 
-def file_size(obj: bpy.types.Object) -> tuple[int, int]:
+def file_size(checked: SplatObject) -> tuple[int, int]:
     """Return the bytes that a splat takes in the exported file, and those of all else in it."""
-    layout = check(obj)
-    return layout.row_dtype.itemsize, len(layout.header)
+    return checked.layout.row_dtype.itemsize, len(checked.layout.header)
 
 
 def import_notes(source: SplatFile) -> tuple[str, ...]:
@@ -75,12 +76,12 @@ def mesh_from_file(source: SplatFile, name: str = "") -> bpy.types.Mesh:
     return mesh
 
 
-def splats_from_object(obj: bpy.types.Object, *, sh_rest: bool = True) -> Splats:
+def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
     """Read a splat object, in its own frame.
 
     Parameters
     ----------
-    obj : bpy.types.Object
+    checked : SplatObject
     sh_rest : bool
         Whether to read the view-dependent coefficients. Without them, `Splats.sh_rest` has one
         coefficient: NaN where any is not finite, else 0, which is all that scoring looks at, and
@@ -89,16 +90,10 @@ def splats_from_object(obj: bpy.types.Object, *, sh_rest: bool = True) -> Splats
     Returns
     -------
     Splats
-
-    Raises
-    ------
-    RefineError
-        See `check`.
     """
-    layout = check(obj)
-    read = _Reader(obj.data, layout)
-    rest = [f"f_rest_{index}" for index in range(rest_count(obj.data))]
-    count = len(obj.data.vertices)
+    read = _Reader(checked)
+    rest = [f"f_rest_{index}" for index in range(rest_count(checked.mesh))]
+    count = len(checked)
     if sh_rest:
         planes = read.planes(rest).reshape(3, len(rest) // 3, count)
         coefficients = planes.transpose(2, 1, 0)
@@ -109,7 +104,7 @@ def splats_from_object(obj: bpy.types.Object, *, sh_rest: bool = True) -> Splats
         coefficients = np.where(finite, 0.0, np.nan).astype(np.float32)[:, None, None]
         coefficients = np.broadcast_to(coefficients, (count, 1, 3))
     return Splats(
-        means=read_attribute(obj.data, "position"),
+        means=read_attribute(checked.mesh, "position"),
         log_scales=read.planes(["scale_0", "scale_1", "scale_2"]).T,
         quaternions=read.planes(["rot_0", "rot_1", "rot_2", "rot_3"]).T,
         opacity_logits=read.planes(["opacity"])[0],
@@ -119,13 +114,13 @@ def splats_from_object(obj: bpy.types.Object, *, sh_rest: bool = True) -> Splats
 
 
 def file_from_object(
-    obj: bpy.types.Object, columns: dict[str, NDArray[Any]] | None = None
+    checked: SplatObject, columns: dict[str, NDArray[Any]] | None = None
 ) -> SplatFile:
     """Return a splat object as the file it would be.
 
     Parameters
     ----------
-    obj : bpy.types.Object
+    checked : SplatObject
     columns : mapping of str to (N,), optional
         Properties to write with these values in place of the object's.
 
@@ -133,16 +128,11 @@ def file_from_object(
     -------
     SplatFile
         In memory; `SplatFile.write` writes it.
-
-    Raises
-    ------
-    RefineError
-        See `check`.
     """
-    layout = check(obj)
+    layout = checked.layout
     columns = columns or {}
-    rows = np.empty(len(obj.data.vertices), layout.row_dtype)
-    read = _Reader(obj.data, layout)
+    rows = np.empty(len(checked), layout.row_dtype)
+    read = _Reader(checked)
     for names in _groups([column.name for column in layout.columns], rows.dtype):
         given = [columns.get(name) for name in names]
         planes = [
@@ -151,43 +141,43 @@ def file_from_object(
         ]
         _interleave(rows, names, planes)
     nothing = np.empty(0, np.uint8)
-    return SplatFile(Path(obj.name), rows, layout.header, nothing, nothing)
+    return SplatFile(Path(checked.obj.name), rows, layout.header, nothing, nothing)
 
 
-def stored_columns(obj: bpy.types.Object, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """Return the named columns of a splat object, copies of (N,) each."""
-    read = _Reader(obj.data, check(obj))
-    return {name: read.stored(name).copy() for name in names}
+def stored_columns(checked: SplatObject) -> Columns:
+    """Return the columns of a splat object by their names, each read when it is asked for."""
+    return _Reader(checked)
 
 
-def write_columns(obj: bpy.types.Object, columns: Mapping[str, NDArray[Any]]) -> None:
+def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> None:
     """Store columns of a splat object in the attributes that hold them.
 
     Parameters
     ----------
-    obj : bpy.types.Object
+    checked : SplatObject
     columns : mapping of str to (N,)
-        Properties of the PLY that the object has.
+        Properties of the PLY that the object has, of as many splats as there are by now.
     """
-    places = {column.name: column for column in check(obj).columns}
+    mesh = checked.mesh
+    places = {column.name: column for column in checked.layout.columns}
     vectors: dict[str, NDArray[Any]] = {}
     for name, values in columns.items():
         column = places[name]
         if KINDS[column.kind].width == 1:
-            write_attribute(obj.data, column.attribute, column.kind, values)
+            write_attribute(mesh, column.attribute, column.kind, values)
             continue
         if column.attribute not in vectors:
-            vectors[column.attribute] = read_attribute(obj.data, column.attribute)
+            vectors[column.attribute] = read_attribute(mesh, column.attribute)
         vectors[column.attribute][:, column.component] = values
     for attribute, values in vectors.items():
-        write_attribute(obj.data, attribute, "FLOAT_VECTOR", values)
+        write_attribute(mesh, attribute, "FLOAT_VECTOR", values)
     if columns:
-        obj.data.update()
+        mesh.update()
 
 
-def normals(obj: bpy.types.Object, layout: Layout) -> NDArray[np.float32]:
+def normals(checked: SplatObject) -> NDArray[np.float32]:
     """Return the columns nx, ny, nz as (N, 3)."""
-    read = _Reader(obj.data, layout)
+    read = _Reader(checked)
     return np.stack([read.stored(name) for name in ("nx", "ny", "nz")], axis=-1)
 
 
@@ -221,9 +211,9 @@ def remove_attribute(mesh: bpy.types.Mesh, name: str) -> None:
 class _Reader:
     """Reads the columns of one mesh; keeps a vector attribute while its components are asked."""
 
-    def __init__(self, mesh: bpy.types.Mesh, layout: Layout) -> None:
-        self.mesh = mesh
-        self.columns = {column.name: column for column in layout.columns}
+    def __init__(self, checked: SplatObject) -> None:
+        self.mesh = checked.mesh
+        self.columns = {column.name: column for column in checked.layout.columns}
         self.vectors: dict[str, NDArray[np.float32]] = {}
 
     def stored(self, name: str) -> NDArray[Any]:
@@ -235,6 +225,8 @@ class _Reader:
             return self.vectors[column.attribute][:, column.component]
         values = read_attribute(self.mesh, column.attribute)
         return values.view(np.uint32) if column.dtype[1:] == "u4" else values
+
+    __getitem__ = stored
 
     def planes(self, names: Sequence[str]) -> NDArray[np.float32]:
         """Return float columns as (len(names), N)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import bpy
@@ -12,6 +13,8 @@ from . import attributes as mesh_attributes
 from .node_trees import chain, named_attribute, new_tree
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
 REMOVE = "refine_remove"
@@ -51,6 +54,31 @@ def check_deletable(obj: bpy.types.Object) -> None:
         raise RefineError(msg)
 
 
+@contextmanager
+def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
+    """Undo what a block did to the mesh of an object if the block fails, however far it came.
+
+    A copy of the mesh stands by, which costs nothing: Blender shares attributes until one is
+    changed. Where it is needed, it takes the place and the name of the mesh.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+        See `check_deletable`: no other object may have its mesh.
+    """
+    mesh = obj.data
+    before = mesh.copy()
+    try:
+        yield
+    except BaseException:
+        name, before.use_fake_user = mesh.name, mesh.use_fake_user
+        obj.data = before
+        bpy.data.meshes.remove(mesh)
+        before.name = name
+        raise
+    bpy.data.meshes.remove(before)
+
+
 def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
     """Delete the marked vertices of an object, and nothing else of it.
 
@@ -65,7 +93,8 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
     Raises
     ------
     RefineError
-        See `check_deletable`.
+        See `check_deletable`; also if Blender fails. What it did by then is not undone here, but by
+        `all_or_nothing`.
     """
     check_deletable(obj)
     mesh_attributes.remove_attribute(obj.data, REMOVE)
@@ -92,8 +121,8 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
         mesh_attributes.remove_attribute(obj.data, REMOVE)
     if len(obj.data.vertices) != expected:
         msg = (
-            f"object '{obj.name}': {len(obj.data.vertices)} splats are left, expected {expected}; "
-            "undo, and report this"
+            f"object '{obj.name}': {len(obj.data.vertices)} splats were left, expected "
+            f"{expected}; report this"
         )
         raise RefineError(msg)
 

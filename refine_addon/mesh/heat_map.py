@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     import bpy
     from numpy.typing import NDArray
 
+    from .layout import SplatObject
+
 HEAT, COLOR = "refine_heat", "refine_color"
 """Colour attributes on points: the heat map, and the splat's own constant colour."""
 
@@ -50,7 +52,7 @@ def ramp() -> NDArray[np.float64]:
     return np.where(linear > _KNEE, 1.055 * linear ** (1 / 2.4) - 0.055, 12.92 * linear)
 
 
-def write(mesh: bpy.types.Mesh, ranks: NDArray[np.float32]) -> None:
+def write(mesh: bpy.types.Mesh, ranks: NDArray[np.float64]) -> None:
     """Store the heat map of ranks in 0..1 as the colour attribute `HEAT`."""
     colors = np.ones((_STEPS, 4), np.float32)
     colors[:, :3] = ramp()
@@ -58,10 +60,10 @@ def write(mesh: bpy.types.Mesh, ranks: NDArray[np.float32]) -> None:
     mesh_attributes.write_attribute(mesh, HEAT, "BYTE_COLOR", colors[index])
 
 
-def write_base_color(obj: bpy.types.Object) -> None:
+def write_base_color(checked: SplatObject) -> None:
     """Store the constant colour of each splat, with its opacity as alpha, as `COLOR`."""
-    splats = mesh_attributes.splats_from_object(obj, sh_rest=False)
+    splats = mesh_attributes.splats_from_object(checked, sh_rest=False)
     colors = np.empty((len(splats), 4), np.float32)
     colors[:, :3] = base_color(splats.sh_dc)
     colors[:, 3] = opacity(splats.opacity_logits)
-    mesh_attributes.write_attribute(obj.data, COLOR, "BYTE_COLOR", np.nan_to_num(colors))
+    mesh_attributes.write_attribute(checked.mesh, COLOR, "BYTE_COLOR", np.nan_to_num(colors))

@@ -107,6 +107,32 @@ class Layout:
         return np.dtype([(column.name, column.dtype) for column in self.columns])
 
 
+@dataclass(frozen=True)
+class SplatObject:
+    """An object that holds splats, as `check` found it; what works on splats is handed one.
+
+    It is made once, where an operation begins, and holds until splats or attributes come or go.
+
+    Attributes
+    ----------
+    obj : bpy.types.Object
+    layout : Layout
+        Which attribute of its mesh holds what.
+    """
+
+    obj: bpy.types.Object
+    layout: Layout
+
+    @property
+    def mesh(self) -> bpy.types.Mesh:
+        """The object's mesh."""
+        return self.obj.data
+
+    def __len__(self) -> int:
+        """Return the number of splats."""
+        return len(self.obj.data.vertices)
+
+
 def looks_like_splats(obj: bpy.types.Object | None) -> bool:
     """Tell whether an object is worth offering to the splat tools; cheap enough for a poll."""
     return (
@@ -117,8 +143,8 @@ def looks_like_splats(obj: bpy.types.Object | None) -> bool:
     )
 
 
-def check(obj: bpy.types.Object) -> Layout:
-    """Return the layout of a splat object.
+def check(obj: bpy.types.Object) -> SplatObject:
+    """Find out that an object holds splats, and in which attributes.
 
     Parameters
     ----------
@@ -126,8 +152,9 @@ def check(obj: bpy.types.Object) -> Layout:
 
     Returns
     -------
-    Layout
-        The one remembered from the import, or the standard one with all scalar attributes.
+    SplatObject
+        Its layout is the one remembered from the import, or the standard one with all scalar
+        attributes.
 
     Raises
     ------
@@ -153,7 +180,7 @@ def check(obj: bpy.types.Object) -> Layout:
         raise RefineError(msg)
     layout = _remembered(obj.data) or _standard(obj)
     _check_attributes(obj, layout)
-    return layout
+    return SplatObject(obj, layout)
 
 
 def sh_degree(mesh: bpy.types.Mesh) -> int:

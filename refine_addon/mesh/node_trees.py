@@ -10,11 +10,18 @@ import bpy
 def new_tree(name: str) -> bpy.types.NodeTree:
     """Return a geometry node group with a geometry in and out, and nothing between."""
     tree = bpy.data.node_groups.new(name, "GeometryNodeTree")
+    make_empty(tree)
+    return tree
+
+
+def make_empty(tree: bpy.types.NodeTree) -> None:
+    """Leave of a geometry node group a geometry in and out, and nothing between."""
+    tree.nodes.clear()
+    tree.interface.clear()
     for direction in ("INPUT", "OUTPUT"):
         tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
     tree.nodes.new("NodeGroupInput")
     tree.nodes.new("NodeGroupOutput").location.x = 600
-    return tree
 
 
 def named_attribute(tree: bpy.types.NodeTree, name: str, data_type: str) -> bpy.types.NodeSocket:

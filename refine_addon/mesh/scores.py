@@ -14,13 +14,12 @@ from ..core.selection import rank
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
 from . import heat_map
-from .layout import check
 
 if TYPE_CHECKING:
     import bpy
 
     from ..core.pipeline import Settings
-    from ..core.views import ViewSet
+    from .layout import SplatObject
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
 """Point attributes: the score, its place from 0 (goes first) to 1, in how many views it lies."""
@@ -30,9 +29,8 @@ RECORD = "refine_scores"
 
 
 def store(
-    obj: bpy.types.Object,
+    checked: SplatObject,
     scores: Scores,
-    views: ViewSet,
     settings: Settings,
     origin: dict[str, Any] | None = None,
 ) -> None:
@@ -40,8 +38,8 @@ def store(
 
     Parameters
     ----------
-    obj : bpy.types.Object
-    scores, views, settings
+    checked : SplatObject
+    scores, settings
         What `core.pipeline.score` gave, and was given.
     origin : dict, optional
         See `staleness.origin`.
@@ -51,12 +49,11 @@ def store(
     RefineError
         If the object cannot be written to, or no longer has as many splats.
     """
-    mesh_edit.check_writable(obj)
-    check(obj)
-    mesh = obj.data
-    if len(mesh.vertices) != len(scores.values):
+    mesh_edit.check_writable(checked.obj)
+    mesh = checked.mesh
+    if len(checked) != len(scores.values):
         msg = (
-            f"object '{obj.name}': has {len(mesh.vertices)} splats, was scored with "
+            f"object '{checked.obj.name}': has {len(checked)} splats, was scored with "
             f"{len(scores.values)}; score it again"
         )
         raise RefineError(msg)
@@ -69,11 +66,13 @@ def store(
         {
             "splats": len(scores.values),
             "settings": asdict(settings),
-            "views_given": len(views),
+            "method": scores.method,
+            "frustum": scores.frustum,
+            "views_given": scores.views_given,
             "views_used": scores.views_used,
             "undrawable": scores.undrawable,
             "weights": scores.weights,
-            "notes": [*scores.notes, *([views.note] if views.note else [])],
+            "notes": scores.notes,
             "origin": origin,
         }
     )
@@ -90,36 +89,39 @@ def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
     return noted if complete else None
 
 
-def stored_scores(obj: bpy.types.Object) -> Scores:
+def stored_scores(checked: SplatObject) -> Scores:
     """Return the scores that an object's mesh holds.
 
     Raises
     ------
     RefineError
-        If it was not scored, or is in a state in which it cannot be read.
+        If it was not scored, or has splats that were not.
     """
-    check(obj)
-    noted = record(obj.data)
+    mesh, label = checked.mesh, f"object '{checked.obj.name}'"
+    noted = record(mesh)
     kinds = {SCORE: "FLOAT", SEEN: "INT"}
     for name, kind in kinds.items():
-        attribute = obj.data.attributes.get(name)
+        attribute = mesh.attributes.get(name)
         if noted is None or not attribute or attribute.data_type != kind:
-            msg = f"object '{obj.name}': has no scores; score it first"
+            msg = f"{label}: has no scores; score it first"
             raise RefineError(msg)
-    values = mesh_attributes.read_attribute(obj.data, SCORE)
+    values = mesh_attributes.read_attribute(mesh, SCORE)
     # Splats joined or added since hold a score of 0, as those do that no renderer can draw.
     unscored = int(np.count_nonzero(values == 0.0)) - noted.get("undrawable", 0)
     if len(values) > noted["splats"] or unscored > 0:
         msg = (
-            f"object '{obj.name}': scored with {noted['splats']} splats, has {len(values)} now, "
+            f"{label}: scored with {noted['splats']} splats, has {len(values)} now, "
             f"{max(unscored, 0)} of them without a score; score it again"
         )
         raise RefineError(msg)
     return Scores(
         values=values,
-        seen=mesh_attributes.read_attribute(obj.data, SEEN),
+        seen=mesh_attributes.read_attribute(mesh, SEEN),
         views_used=noted["views_used"],
         undrawable=noted.get("undrawable", 0),
         weights=noted.get("weights", {}),
         notes=tuple(noted.get("notes", ())),
+        method=noted.get("method", ""),
+        frustum=noted.get("frustum", True),
+        views_given=noted["views_given"],
     )

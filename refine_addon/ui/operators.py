@@ -1,8 +1,13 @@
-"""Operators on splat objects: each reads what the user chose and makes one call."""
+"""Operators on splat objects: each reads what the user chose and makes one call.
+
+Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* is clicked.
+"""
 
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -13,6 +18,7 @@ from .. import splat_object
 from ..cameras.sets import views_from_scene
 from ..core import pipeline
 from ..core.errors import Cancelled, RefineError
+from ..core.report import scoring_notes
 from ..core.work import Progress, silent
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
@@ -21,9 +27,11 @@ from . import plans, preview, staleness
 from .worker import Worker
 
 if TYPE_CHECKING:
-    from ..core.absorbing.absorb import Absorbed
+    from ..core.pipeline import Result, Settings, Task
     from ..core.scores import Scores
+    from ..core.splats import Splats
     from ..core.views import ViewSet
+    from ..mesh.layout import SplatObject
 
 Answer = set[str]
 
@@ -76,21 +84,45 @@ def _views(context: bpy.types.Context) -> ViewSet:
     )
 
 
+@dataclass
+class _Running:
+    """An operation while it runs: all that an operator holds of it, dropped when it is over.
+
+    Blender keeps an operator in its history long after; splats and results are not to stay there.
+
+    Attributes
+    ----------
+    job
+        What `prepare` gathered.
+    name : str
+        Of the object: the object itself may not be the same one after an undo.
+    worker : Worker
+    timer : bpy.types.Timer
+    """
+
+    job: Any
+    name: str
+    worker: Worker[Any]
+    timer: bpy.types.Timer
+
+
 class _OnThread:
     """An operator that waits for a thread in a window, with a bar to watch and a key to cancel.
 
-    It says what to do in three steps: `prepare` reads what it needs of the scene, `work` runs on
-    the thread and touches arrays alone, `finish` writes the result.
+    It says what to do in three steps. `prepare` reads the scene and returns a job: all that is
+    needed of it. `work` runs on the thread and touches the job's arrays alone. `finish` writes what
+    came of it. The operator itself keeps neither.
     """
 
     doing = ""
+    _running: _Running | None = None
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Do all of it at once."""
         try:
-            self.prepare(context, context.object)
-            result = self.work(silent)
-            return self.finish(context, context.object, result)
+            checked = mesh_layout.check(context.object)
+            job = self.prepare(context, checked)
+            return self.finish(context, checked, job, self.work(job, silent))
         except RefineError as error:
             return fail(self, error)
 
@@ -99,31 +131,42 @@ class _OnThread:
         if bpy.app.background or context.window is None:
             return self.execute(context)
         try:
-            self.prepare(context, context.object)
+            job = self.prepare(context, mesh_layout.check(context.object))
         except RefineError as error:
             return fail(self, error)
-        # By name: the object itself may not be the same one after an undo.
-        self._name = context.object.name
-        self._worker = Worker(self.work)
-        manager = context.window_manager
-        self._timer = manager.event_timer_add(0.05, window=context.window)
-        manager.modal_handler_add(self)
-        self._show(context, 0.0)
+        self.start(context, job)
         return {"RUNNING_MODAL"}
+
+    def start(self, context: bpy.types.Context, job: Any) -> None:  # noqa: ANN401 - its own kind
+        """Start the thread, and have Blender call `modal` from now on."""
+        manager = context.window_manager
+        self._running = _Running(
+            job=job,
+            name=context.object.name,
+            worker=Worker(partial(self.work, job)),
+            timer=manager.event_timer_add(0.05, window=context.window),
+        )
+        manager.modal_handler_add(self)
+        _show_progress(context, self.doing, 0.0)
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Wait for the thread, and write what it found."""
+        running = self._running
+        if running is None:
+            return {"CANCELLED"}
+        worker = running.worker
         if event.type == "ESC":
-            self._worker.cancel()
+            worker.cancel()
         if event.type != "TIMER":
             return {"RUNNING_MODAL"}
-        if self._worker.running():
-            self._show(context, self._worker.fraction)
+        if worker.running():
+            _show_progress(context, self.doing, worker.fraction)
             return {"RUNNING_MODAL"}
-        self._clean_up(context)
+        self._over(context, running)
         try:
-            result = self._worker.result()
-            return self.finish(context, splat_object.find(self._name), result)
+            result = worker.result()
+            checked = mesh_layout.check(splat_object.find(running.name))
+            return self.finish(context, checked, running.job, result)
         except Cancelled:
             self.report({"INFO"}, f"{self.doing} cancelled; nothing was changed")
             return {"CANCELLED"}
@@ -132,20 +175,35 @@ class _OnThread:
 
     def cancel(self, context: bpy.types.Context) -> None:
         """Stop the thread where Blender ends the operator."""
-        self._worker.cancel()
-        self._clean_up(context)
+        if (running := self._running) is not None:
+            self._over(context, running)
+            running.worker.cancel()
 
-    def _show(self, context: bpy.types.Context, fraction: float) -> None:
-        context.window_manager.refine_progress = fraction
-        context.workspace.status_text_set(f"{self.doing}: {fraction:.0%} (Esc cancels)")
-        for area in context.window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
+    def _over(self, context: bpy.types.Context, running: _Running) -> None:
+        """Clear the bar and let go of what ran."""
+        self._running = None
+        context.window_manager.event_timer_remove(running.timer)
+        _show_progress(context, self.doing, None)
 
-    def _clean_up(self, context: bpy.types.Context) -> None:
-        context.window_manager.event_timer_remove(self._timer)
-        self._show(context, -1.0)
-        context.workspace.status_text_set(None)
+
+def _show_progress(context: bpy.types.Context, doing: str, fraction: float | None) -> None:
+    """Draw how much is done in panel and status bar; None clears both."""
+    context.window_manager.refine_progress = -1.0 if fraction is None else fraction
+    text = None if fraction is None else f"{doing}: {fraction:.0%} (Esc cancels)"
+    context.workspace.status_text_set(text)
+    for area in context.window.screen.areas:
+        if area.type == "VIEW_3D":
+            area.tag_redraw()
+
+
+@dataclass(frozen=True, eq=False)
+class _Scoring:
+    """What is to be scored, by which views and how; where all of it stood (`staleness.origin`)."""
+
+    splats: Splats
+    views: ViewSet
+    settings: Settings
+    origin: dict[str, Any]
 
 
 class REFINE_OT_score(_OnThread, _OnSplats, bpy.types.Operator):
@@ -156,31 +214,31 @@ class REFINE_OT_score(_OnThread, _OnSplats, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
     doing = "Scoring splats"
 
-    def prepare(self, context: bpy.types.Context, obj: bpy.types.Object) -> None:
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Scoring:
         """Gather splats, views and settings."""
-        self._settings = context.scene.refine.to_settings()
-        self._views = _views(context)
-        splat_object.check_scorable(obj)
-        self._splats = splat_object.gather(obj)
-        self._origin = staleness.origin(context, obj)
+        settings, views = context.scene.refine.to_settings(), _views(context)
+        mesh_edit.check_writable(checked.obj)
+        splats = splat_object.gather(checked)
+        return _Scoring(splats, views, settings, staleness.origin(context, checked.obj))
 
-    def work(self, progress: Progress) -> Scores:
+    @staticmethod
+    def work(job: _Scoring, progress: Progress) -> Scores:
         """Score."""
-        return pipeline.score(self._splats, self._views, self._settings, progress=progress)
+        return pipeline.score(job.splats, job.views, job.settings, progress=progress)
 
-    def finish(self, context: bpy.types.Context, obj: bpy.types.Object, scores: Scores) -> Answer:
+    def finish(
+        self, context: bpy.types.Context, checked: SplatObject, job: _Scoring, scores: Scores
+    ) -> Answer:
         """Store the scores on the mesh and say what came of it."""
-        views = self._views
-        mesh_scores.store(obj, scores, views, self._settings, self._origin)
+        mesh_scores.store(checked, scores, job.settings, job.origin)
         plans.refresh(context)
         unseen = int((scores.seen == 0).sum())
         self.report(
             {"INFO"},
-            f"Scored {len(scores.values):,} splats by {scores.views_used} of {len(views)} views; "
-            f"{unseen:,} lie in none",
+            f"Scored {len(scores.values):,} splats by {scores.views_used} of "
+            f"{scores.views_given} views; {unseen:,} lie in none",
         )
-        notes = [*scores.notes, *([views.note] if views.note else [])]
-        for note in (*notes, *splat_object.modifier_notes(obj)):
+        for note in (*scoring_notes(scores), *splat_object.modifier_notes(checked.obj)):
             self.report({"WARNING"}, note)
         return {"FINISHED"}
 
@@ -212,47 +270,40 @@ class REFINE_OT_apply(_OnThread, _OnScored, bpy.types.Operator):
             return self.execute(context)
         return super().invoke(context, event)
 
-    def prepare(self, context: bpy.types.Context, obj: bpy.types.Object) -> None:
-        """Gather what absorbing needs."""
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> Task:
+        """Gather the scores that decide; to absorb, splats and views besides."""
         settings = context.scene.refine
-        self._absorb = settings.absorb
-        if not self._absorb:
-            return
-        self._settings = settings.to_settings()
-        self._views = _views(context)
-        self._count = int(splat_object.keep_mask(obj, settings.to_budget(), settings.protect).sum())
-        self._protected = splat_object.protected(obj, settings.protect)
-        mesh_edit.check_deletable(obj)
-        self._splats = splat_object.gather(obj, whole=True)
+        mesh_edit.check_deletable(checked.obj)
+        return splat_object.stored_task(
+            checked,
+            settings.to_budget(),
+            settings.protect,
+            settings=settings.to_settings(),
+            views=_views(context) if settings.absorb else None,
+        )
 
-    def work(self, progress: Progress) -> Absorbed | None:
-        """Absorb, where that is asked for."""
-        if not self._absorb:
-            return None
-        return pipeline.absorb_removed(
-            self._splats, self._views, self._count, self._settings,
-            protected=self._protected, progress=progress,
-        )  # fmt: skip
+    @staticmethod
+    def work(task: Task, progress: Progress) -> Result:
+        """Decide which splats stay, and what they absorb."""
+        return pipeline.decide(task, progress=progress)
 
     def finish(
-        self, context: bpy.types.Context, obj: bpy.types.Object, absorbed: Absorbed | None
+        self, context: bpy.types.Context, checked: SplatObject, task: Task, result: Result
     ) -> Answer:
         """Delete what does not stay, and change what absorbed it."""
-        settings = context.scene.refine
-        budget = settings.to_budget()
         context.view_layer.update()
-        changed = staleness.changes(context, obj)
-        if absorbed and budget.removals(len(absorbed.keep), 1.0) is not None:
+        changed = staleness.changes(context, checked.obj)
+        if result.absorbed and not task.budget.needs_scores:
             changed = []  # nothing went by the scores
-        done = splat_object.apply_object(obj, budget, settings.protect, absorbed)
-        plans.forget(obj.data)
+        done = splat_object.apply_object(checked, result)
+        plans.forget(checked.mesh)
         self.report(
             {"INFO"},
             f"Kept {done.kept:,} splats, removed {done.removed:,}: "
             f"{done.bytes_before / 1e6:,.1f} -> {done.bytes_after / 1e6:,.1f} MB",
         )
-        if absorbed:
-            self.report({"WARNING"}, absorbed.note())
+        if result.absorbed:
+            self.report({"WARNING"}, result.absorbed.note())
         if changed:
             self.report(
                 {"WARNING"},
@@ -343,10 +394,9 @@ class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Write the file."""
-        obj = context.object
         try:
             file = splat_object.export_object(
-                obj,
+                mesh_layout.check(context.object),
                 bpy.path.abspath(self.filepath),
                 apply_transform=self.apply_transform,
                 overwrite=self.overwrite,

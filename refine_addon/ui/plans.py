@@ -32,7 +32,8 @@ def refresh(context: bpy.types.Context) -> None:
     settings = context.scene.refine
     noted: dict[str, Any] = {"key": key(settings), "splats": len(obj.data.vertices)}
     try:
-        plan = splat_object.plan(obj, settings.to_budget(), settings.protect)
+        checked = mesh_layout.check(obj)
+        plan = splat_object.plan(checked, settings.to_budget(), settings.protect)
         noted.update(vars(plan))
     except RefineError as error:
         noted["error"] = str(error)

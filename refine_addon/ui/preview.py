@@ -18,7 +18,16 @@ from ..mesh import edit as mesh_edit
 from ..mesh import heat_map
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import check
-from ..mesh.node_trees import add, chain, logistic, math, named_attribute, new_tree, vector_math
+from ..mesh.node_trees import (
+    add,
+    chain,
+    logistic,
+    make_empty,
+    math,
+    named_attribute,
+    vector_math,
+)
+from ..version import VERSION
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -30,6 +39,10 @@ MODES = {"COLOR": heat_map.COLOR, "HEAT": heat_map.HEAT}
 """What can be shown -> the colour attribute that holds it."""
 
 STYLES = ("POINTS", "SPLATS")
+
+MADE_BY = "refine_version"
+"""Custom property of our node groups and materials: the version of the add-on that made them. Those
+of another version, from an old .blend, are made anew in place, so that what uses them follows."""
 
 _LEAST = 1 / 255
 """Opacity below which a Gaussian is not drawn, as in the reference rasterizer."""
@@ -66,13 +79,13 @@ def show(
     RefineError
         If the object holds no splats or cannot be changed; for the heat map, if it was not scored.
     """
-    check(obj)
+    checked = check(obj)
     mesh_edit.check_writable(obj)
     if mode == "HEAT" and not has_heat(obj):
         msg = f"object '{obj.name}': has no heat map; score it first"
         raise RefineError(msg)
     if mode == "COLOR" and heat_map.COLOR not in obj.data.attributes:
-        heat_map.write_base_color(obj)
+        heat_map.write_base_color(checked)
     tree = _tree(mode, style, hide_removed=hide_removed)
     modifier = obj.modifiers.get(MODIFIER) or obj.modifiers.new(MODIFIER, "NODES")
     modifier.node_group = tree
@@ -128,11 +141,12 @@ def set_up_render(scene: bpy.types.Scene, samples: int = 1) -> None:
 def _tree(mode: str, style: str, *, hide_removed: bool) -> bpy.types.NodeTree:
     """Return the node group of a way to show; objects share it."""
     name = f"REFINE {mode.lower()} {style.lower()}{' kept' if hide_removed else ''}"
-    tree = bpy.data.node_groups.get(name)
-    if tree:
+    tree = bpy.data.node_groups.get((name, None))  # not one that is linked from a library
+    if tree and tree.get(MADE_BY) == VERSION:
         return tree
-    tree = new_tree(name)
-    tree["mode"], tree["hide_removed"] = mode, hide_removed
+    tree = tree or bpy.data.node_groups.new(name, "GeometryNodeTree")
+    make_empty(tree)
+    tree["mode"], tree["hide_removed"], tree[MADE_BY] = mode, hide_removed, VERSION
     builders: dict[str, Callable[..., list[bpy.types.Node]]] = {
         "POINTS": _points,
         "SPLATS": _splats,
@@ -182,10 +196,11 @@ def _splats(tree: bpy.types.NodeTree, material: bpy.types.Material) -> list[bpy.
 
 def _material(mode: str, style: str) -> bpy.types.Material:
     name = f"REFINE {mode.lower()} {style.lower()}"
-    material = bpy.data.materials.get(name)
-    if material:
+    material = bpy.data.materials.get((name, None))
+    if material and material.get(MADE_BY) == VERSION:
         return material
-    material = bpy.data.materials.new(name)
+    material = material or bpy.data.materials.new(name)
+    material[MADE_BY] = VERSION
     material.use_nodes = True
     tree = material.node_tree
     tree.nodes.clear()

@@ -5,6 +5,8 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING, Generic, TypeVar
 
+from ..core.errors import Cancelled
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -14,7 +16,7 @@ Result = TypeVar("Result")
 
 
 class Worker(Generic[Result]):
-    """A call that runs while the window stays alive.
+    """A call that runs while the window stays alive; it keeps nothing once `result` was asked.
 
     Parameters
     ----------
@@ -30,7 +32,7 @@ class Worker(Generic[Result]):
     def __init__(self, work: Callable[[Progress], Result]) -> None:
         self.fraction = 0.0
         self._cancelled = False
-        self._result: Result  # once the work ended well
+        self._outcome: list[Result] = []  # one, once the work ended well
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, args=(work,), name="refine", daemon=True)
         self._thread.start()
@@ -52,15 +54,21 @@ class Worker(Generic[Result]):
             What the work raised.
         """
         self._thread.join()
-        if self._error is not None:
-            raise self._error
-        return self._result
+        outcome, self._outcome = self._outcome, []
+        error, self._error = self._error, None
+        if error is None:
+            return outcome[0]
+        try:
+            raise error
+        finally:
+            del error  # its traceback holds this frame, which would hold it in turn
 
     def _run(self, work: Callable[[Progress], Result]) -> None:
         try:
-            self._result = work(self._progress)
+            self._outcome.append(work(self._progress))
         except BaseException as error:  # noqa: BLE001 - handed to the other thread by `result`
-            self._error = error
+            # Whoever cancels asks for no reason, and a traceback would keep what was worked on.
+            self._error = Cancelled() if self._cancelled else error
 
     def _progress(self, fraction: float, _what: str) -> bool:
         self.fraction = fraction

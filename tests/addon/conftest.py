@@ -100,9 +100,10 @@ def score(addon):
 
     def score(obj, views):
         settings = addon.core.Settings()
-        addon.splat_object.check_scorable(obj)
-        scores = addon.core.score(addon.splat_object.gather(obj), views, settings)
-        addon.mesh.scores.store(obj, scores, views, settings)
+        scores = addon.core.score(
+            addon.splat_object.gather(addon.mesh.layout.check(obj)), views, settings
+        )
+        addon.mesh.scores.store(addon.mesh.layout.check(obj), scores, settings)
 
     return score
 

@@ -20,7 +20,12 @@ def few(addon, room, room_cameras):  # noqa: ARG001
 
 
 def absorbed_in_core(addon, obj, views, budget):
-    return addon.core.prune(addon.splat_object.gather(obj, whole=True), views, budget, absorb=True)
+    return addon.core.prune(
+        addon.splat_object.gather(addon.mesh.layout.check(obj), whole=True),
+        views,
+        budget,
+        absorb=True,
+    )
 
 
 def test_apply_with_absorb_leaves_what_core_says(addon, few, room_views):
@@ -30,7 +35,7 @@ def test_apply_with_absorb_leaves_what_core_says(addon, few, room_views):
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
 
-    splats = addon.mesh.attributes.splats_from_object(room)
+    splats = addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(room))
 
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"):
         wanted = getattr(expected.splats, name).astype(np.float32)
@@ -49,7 +54,7 @@ def test_a_moved_object_is_absorbed_in_its_own_frame(addon, few, room_views):
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
 
-    splats = addon.mesh.attributes.splats_from_object(room)
+    splats = addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(room))
 
     # float32 matrices move a few merges across; the survivors are mostly the same ones.
     here = {tuple(row) for row in np.round(splats.means, 3)}
@@ -103,7 +108,7 @@ def test_saving_leaves_in_the_blend_what_apply_leaves(addon, few, room_views, tm
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
 
     obj = bpy.data.objects["room"]
-    means = addon.mesh.attributes.splats_from_object(obj).means
+    means = addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(obj)).means
     np.testing.assert_array_equal(means, expected.splats.means.astype(np.float32))
     assert "refine_score" in obj.data.attributes
     assert addon.mesh.scores.record(obj.data) is None

@@ -19,6 +19,11 @@ def _link(mesh):
     return obj
 
 
+def _linked(addon, file):
+    """Return a file as an object of the scene, checked."""
+    return addon.mesh.layout.check(_link(addon.mesh.attributes.mesh_from_file(file)))
+
+
 def _file(addon, path, columns, comments=()):
     path.write_bytes(ply_of(columns, comments))
     return addon.core.read_ply(path)
@@ -26,7 +31,7 @@ def _file(addon, path, columns, comments=()):
 
 def test_import_and_export_of_the_room_gives_the_same_bytes(addon, room, tmp_path):
     """Nothing is computed on the way: 39755 rows of 62 floats, the header as it was."""
-    addon.splat_object.export_object(room, tmp_path / "out.ply")
+    addon.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (ROOM / "point_cloud.ply").read_bytes()
 
@@ -34,7 +39,7 @@ def test_import_and_export_of_the_room_gives_the_same_bytes(addon, room, tmp_pat
 def test_a_mesh_gives_the_splats_that_the_file_gives(addon, core, room):
     """The table maps each property to its place and back; no value changes."""
     expected = core.read_ply(ROOM / "point_cloud.ply").splats()
-    got = addon.mesh.attributes.splats_from_object(room)
+    got = addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(room))
 
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"):
         assert np.array_equal(getattr(got, name), getattr(expected, name)), name
@@ -45,7 +50,7 @@ def test_every_degree_of_harmonics_comes_back(addon, make_splats, tmp_path, degr
     """3 ((d + 1)^2 - 1) coefficients: 0, 9, 24, 45, 72."""
     file = _file(addon, tmp_path / "in.ply", make_splats(degree=degree))
     obj = _link(addon.mesh.attributes.mesh_from_file(file))
-    addon.splat_object.export_object(obj, tmp_path / "out.ply")
+    addon.splat_object.export_object(addon.mesh.layout.check(obj), tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
     assert addon.mesh.layout.sh_degree(obj.data) == degree
@@ -61,9 +66,7 @@ def test_extra_properties_of_every_type_keep_type_place_and_value(
     columns = make_splats(count=8)
     columns = {"label": np.resize(np.array([limits.min, limits.max, 0, 1], dtype), 8), **columns}
     file = _file(addon, tmp_path / "in.ply", columns, comments=["made by a test"])
-    addon.splat_object.export_object(
-        _link(addon.mesh.attributes.mesh_from_file(file)), tmp_path / "out.ply"
-    )
+    addon.splat_object.export_object(_linked(addon, file), tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
 
@@ -75,9 +78,7 @@ def test_a_property_with_a_name_that_blender_keeps_survives(addon, make_splats, 
     """Blender's own names are stored under others; the layout knows the way back."""
     columns = {**make_splats(count=8), name: np.arange(8, dtype=np.float32)}
     file = _file(addon, tmp_path / "in.ply", columns)
-    addon.splat_object.export_object(
-        _link(addon.mesh.attributes.mesh_from_file(file)), tmp_path / "out.ply"
-    )
+    addon.splat_object.export_object(_linked(addon, file), tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
 
@@ -91,9 +92,7 @@ def test_big_endian_files_come_back_big_endian(addon, make_splats, tmp_path):
     swapped = np.frombuffer(body, "<f4").astype(">f4").tobytes()
     (tmp_path / "in.ply").write_bytes(header + swapped)
     file = addon.core.read_ply(tmp_path / "in.ply")
-    addon.splat_object.export_object(
-        _link(addon.mesh.attributes.mesh_from_file(file)), tmp_path / "out.ply"
-    )
+    addon.splat_object.export_object(_linked(addon, file), tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
 
@@ -103,9 +102,7 @@ def test_doubles_are_rounded_and_said_so(addon, make_splats, tmp_path):
     columns = {**make_splats(count=8), "fine": np.full(8, 1 / 3)}
     file = _file(addon, tmp_path / "in.ply", columns)
     notes = addon.mesh.attributes.import_notes(file)
-    addon.splat_object.export_object(
-        _link(addon.mesh.attributes.mesh_from_file(file)), tmp_path / "out.ply"
-    )
+    addon.splat_object.export_object(_linked(addon, file), tmp_path / "out.ply")
     got = addon.core.read_ply(tmp_path / "out.ply").rows["fine"]
 
     assert len(notes) == 1
@@ -125,9 +122,7 @@ def test_a_text_file_comes_out_binary_with_the_same_values(addon, make_splats, t
     )
     file = addon.core.read_ply(tmp_path / "in.ply")
     notes = addon.mesh.attributes.import_notes(file)
-    addon.splat_object.export_object(
-        _link(addon.mesh.attributes.mesh_from_file(file)), tmp_path / "out.ply"
-    )
+    addon.splat_object.export_object(_linked(addon, file), tmp_path / "out.ply")
     got = addon.core.read_ply(tmp_path / "out.ply")
 
     assert b"format binary_little_endian 1.0\ncomment kept\n" in got.header
@@ -141,7 +136,9 @@ def test_meshes_of_blenders_own_importer_are_read(addon, make_splats, tmp_path):
     columns = make_splats(count=50, degree=3)
     _file(addon, tmp_path / "in.ply", columns)
     bpy.ops.wm.ply_import(filepath=str(tmp_path / "in.ply"))
-    addon.splat_object.export_object(bpy.context.object, tmp_path / "out.ply")
+    addon.splat_object.export_object(
+        addon.mesh.layout.check(bpy.context.object), tmp_path / "out.ply"
+    )
 
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
     size = addon.mesh.layout.export_bytes(bpy.context.object)  # what the panel says
@@ -165,8 +162,8 @@ def test_kiris_vert_form_is_read_and_its_face_form_refused(addon, make_splats, t
     obj = bpy.context.object
     obj["3DGS_Mesh_Type"] = "vert"
     obj.data.attributes.new("KIRI_3DGS_Paint", "FLOAT", "POINT")
-    count = len(addon.mesh.attributes.splats_from_object(obj))
-    layout = addon.mesh.layout.check(obj)
+    count = len(addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(obj)))
+    layout = addon.mesh.layout.check(obj).layout
     obj["3DGS_Mesh_Type"] = "face"
 
     assert count == 12
@@ -210,7 +207,7 @@ def test_a_missing_property_of_a_foreign_mesh_is_named(addon, make_splats, tmp_p
 def test_a_damaged_layout_falls_back_to_the_standard_one(addon, room, text):
     """Custom properties can be edited by anyone: they are a hint, the attributes are the truth."""
     room.data["refine_layout"] = text
-    columns = [column.name for column in addon.mesh.layout.check(room).columns]
+    columns = [column.name for column in addon.mesh.layout.check(room).layout.columns]
 
     assert columns[:7] == ["x", "y", "z", "nx", "ny", "nz", "f_dc_0"]
     assert len(columns) == 62
@@ -235,7 +232,7 @@ def test_without_harmonics_only_their_finiteness_is_read(addon, make_splats, tmp
     columns["f_rest_4"][3] = np.nan
     file = _file(addon, tmp_path / "in.ply", columns)
     obj = _link(addon.mesh.attributes.mesh_from_file(file))
-    splats = addon.mesh.attributes.splats_from_object(obj, sh_rest=False)
+    splats = addon.mesh.attributes.splats_from_object(addon.mesh.layout.check(obj), sh_rest=False)
 
     assert splats.sh_rest.shape == (8, 1, 3)
     assert addon.core.splats.drawable(splats).tolist() == [i != 3 for i in range(8)]

@@ -42,7 +42,7 @@ def test_every_budget_keeps_the_rows_that_core_keeps(addon, room, room_cameras, 
     settings.budget = kind
     setattr(settings, kind, value)
     bpy.ops.refine.score()
-    got = addon.splat_object.keep_mask(room, settings.to_budget())
+    got = addon.splat_object.keep_mask(addon.mesh.layout.check(room), settings.to_budget())
     core = addon.core
     file = core.read_ply(ROOM / "point_cloud.ply")
     expected = core.prune(
@@ -99,7 +99,9 @@ def test_apply_keeps_everything_else_of_the_object(addon, room, room_cameras):  
     mesh["mine"], room["yours"] = 3, "x"
     room.modifiers.new("mine", "SUBSURF")
     bpy.ops.refine.score()
-    keep = addon.splat_object.keep_mask(room, bpy.context.scene.refine.to_budget())
+    keep = addon.splat_object.keep_mask(
+        addon.mesh.layout.check(room), bpy.context.scene.refine.to_budget()
+    )
     names = {a.name for a in mesh.attributes} - {"refine_remove"}
     bpy.ops.refine.apply()
     kept = addon.mesh.attributes.read_attribute(room.data, "row")
@@ -158,15 +160,15 @@ def test_protected_splats_stay_by_group_or_attribute(addon, room, room_cameras):
     mask[lowest] = True
     addon.mesh.attributes.write_attribute(room.data, "mask", "BOOLEAN", mask)
     budget = addon.core.Budget(keep=500)
-    by_group = addon.splat_object.keep_mask(room, budget, "group")
-    by_mask = addon.splat_object.keep_mask(room, budget, "mask")
+    by_group = addon.splat_object.keep_mask(addon.mesh.layout.check(room), budget, "group")
+    by_mask = addon.splat_object.keep_mask(addon.mesh.layout.check(room), budget, "mask")
 
     assert by_group[lowest].all()
     assert by_group.sum() == 500
     assert np.array_equal(by_group, by_mask)
     assert "REFINE read" not in bpy.data.objects
     with pytest.raises(addon.core.RefineError, match="named 'opacity' \\('opacity' is FLOAT"):
-        addon.splat_object.keep_mask(room, budget, "opacity")
+        addon.splat_object.keep_mask(addon.mesh.layout.check(room), budget, "opacity")
 
 
 def test_the_plan_says_before_apply_what_apply_does(addon, room, room_cameras):  # noqa: ARG001
@@ -181,8 +183,11 @@ def test_the_plan_says_before_apply_what_apply_does(addon, room, room_cameras): 
     assert (first["kept"], first["removed"]) == (19878, 19877)
     assert second["removed"] == 39755 * 3 // 4
     assert len(room.data.vertices) == second["kept"]
-    assert addon.mesh.attributes.file_size(room)[0] == 248
-    assert second["bytes_after"] == addon.mesh.attributes.file_from_object(room).size()
+    assert addon.mesh.attributes.file_size(addon.mesh.layout.check(room))[0] == 248
+    assert (
+        second["bytes_after"]
+        == addon.mesh.attributes.file_from_object(addon.mesh.layout.check(room)).size()
+    )
 
 
 def test_a_plan_of_another_budget_is_not_shown(addon, room, room_cameras):  # noqa: ARG001
@@ -217,6 +222,38 @@ def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(
     unchanged()
 
 
+@pytest.mark.parametrize(
+    "case",
+    [({"method": "auto"}, "threshold", "method auto may score by any model"),
+     ({"method": "auto"}, "min_seen", "method auto may score by any model"),
+     ({"frustum": False}, "min_seen", "min_seen would remove none")],
+)  # fmt: skip
+@pytest.mark.parametrize("absorb", [False, True])
+def test_a_budget_that_means_nothing_to_the_scores_is_refused(
+    addon,
+    room,
+    room_cameras,  # noqa: ARG001
+    unchanged,
+    case,
+    absorb,
+):
+    """As the command refuses it, by the method that made the scores, not by the panel's now."""
+    scoring, kind, reason = case
+    settings = bpy.context.scene.refine
+    settings.views, settings.absorb = 4, absorb
+    for name, value in scoring.items():
+        setattr(settings, name, value)
+    bpy.ops.refine.score()
+    settings.method, settings.frustum = "closed-form", True
+    settings.budget = kind
+    unchanged.start()
+
+    assert reason in addon.ui.plans.stored(room, settings)["error"]
+    with pytest.raises(RuntimeError, match=reason):
+        bpy.ops.refine.apply()
+    unchanged()
+
+
 def test_upright_turns_the_object_and_the_cameras_but_not_the_data(addon, tmp_path):
     """The same rows go as without: a rigid motion of the whole scene changes no score."""
     masks = []
@@ -226,7 +263,9 @@ def test_upright_turns_the_object_and_the_cameras_but_not_the_data(addon, tmp_pa
         obj = bpy.context.object
         bpy.ops.refine.import_cameras(filepath=str(ROOM / "cameras.json"), upright=upright)
         bpy.ops.refine.score()
-        masks.append(addon.splat_object.keep_mask(obj, addon.core.Budget(ratio=0.5)))
+        masks.append(
+            addon.splat_object.keep_mask(addon.mesh.layout.check(obj), addon.core.Budget(ratio=0.5))
+        )
         bpy.ops.refine.export_ply(filepath=str(tmp_path / f"{upright}.ply"))
     up = np.array(obj.matrix_world)[:3, :3] @ [0, -1, 0]
 
@@ -426,7 +465,9 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
     """By the eye, by the monitor icon, by excluding the collection; the command reaches all."""
     views = addon.cameras.sets.views_from_scene(bpy.context, "COLLECTION", collection=room_cameras)
     expected = addon.core.prune(
-        addon.splat_object.gather(room), views, addon.core.Budget(ratio=0.5)
+        addon.splat_object.gather(addon.mesh.layout.check(room)),
+        views,
+        addon.core.Budget(ratio=0.5),
     ).keep
     if how == "hide_set":
         room.hide_set(True)
@@ -439,8 +480,12 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
         bpy.context.scene.collection.objects.unlink(room)
         bpy.context.view_layer.layer_collection.children["excluded"].exclude = True
     score(room, views)
-    keep = addon.splat_object.keep_mask(room, addon.core.Budget(ratio=0.5))
-    addon.splat_object.apply_object(room, addon.core.Budget(ratio=0.5))
+    keep = addon.splat_object.keep_mask(addon.mesh.layout.check(room), addon.core.Budget(ratio=0.5))
+    task = addon.splat_object.stored_task(
+        addon.mesh.layout.check(room), addon.core.Budget(ratio=0.5)
+    )
+    result = addon.core.pipeline.decide(task)
+    addon.splat_object.apply_object(addon.mesh.layout.check(room), result)
 
     assert np.array_equal(keep, expected)
     assert len(room.data.vertices) == expected.sum()
@@ -458,5 +503,5 @@ def test_linked_objects_are_refused(addon, room, room_cameras, score, tmp_path):
 
     with pytest.raises(addon.core.RefineError, match="is linked from"):
         score(room, views)
-    addon.splat_object.export_object(room, tmp_path / "out.ply")
+    addon.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
     assert _bytes(tmp_path / "out.ply") == _bytes(ROOM / "point_cloud.ply")

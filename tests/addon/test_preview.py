@@ -85,6 +85,40 @@ def test_the_preview_outlives_an_apply(addon, room, room_cameras):  # noqa: ARG0
     assert _point_count(room) == len(room.data.vertices) == 19878
 
 
+@pytest.mark.parametrize("style", ["POINTS", "SPLATS"])
+def test_a_preview_of_another_version_is_made_anew(addon, room, style):
+    """As in an old .blend: emptied trees without a version, or of another, show splats again.
+
+    An object that shows them already follows, as node group and material stay the same ones.
+    """
+    modifier = addon.ui.preview.show(room, "COLOR", style=style)
+    tree, material = modifier.node_group, bpy.data.materials[f"REFINE color {style.lower()}"]
+    nodes, drawn = (len(tree.nodes), len(material.node_tree.nodes)), len(_evaluated(room))
+    for version in (None, "0.0.1"):
+        for made in (tree, material):
+            del made["refine_version"]
+            if version:
+                made["refine_version"] = version
+        tree.nodes.clear()
+        tree.interface.clear()
+        material.node_tree.nodes.clear()
+        again = addon.ui.preview.show(room, "COLOR", style=style)
+
+        assert again.node_group == modifier.node_group == tree
+        assert (len(tree.nodes), len(material.node_tree.nodes)) == nodes
+        assert len(_evaluated(room)) == drawn > 0
+    assert [group.name for group in bpy.data.node_groups] == [tree.name]
+
+
+def test_what_was_changed_by_hand_in_a_preview_stays(addon, room):
+    """Shown once more by the same version, the node group is as it was left."""
+    tree = addon.ui.preview.show(room, "COLOR").node_group
+    tree.nodes.new("GeometryNodeTransform").name = "mine"
+    addon.ui.preview.show(room, "COLOR")
+
+    assert "mine" in tree.nodes
+
+
 def _render(path):
     scene = bpy.context.scene
     scene.render.filepath = str(path)

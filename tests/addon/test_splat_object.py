@@ -123,14 +123,16 @@ def test_an_unevenly_scaled_object_is_scored_as_it_stands_in_the_world(addon, co
     obj = bpy.data.objects.new("stretched", mesh)
     obj.scale = (1.0, 2.0, 1.0)
     bpy.context.scene.collection.objects.link(obj)
-    splats = addon.splat_object.gather(obj)
+    splats = addon.splat_object.gather(addon.mesh.layout.check(obj))
 
     assert np.allclose(splats.means[:, 1], 2 * columns["y"])
     assert np.allclose(
         np.sort(splats.log_scales, axis=1), [-3.0, -3.0, math.log(2) - 3.0], atol=1e-5
     )
     with pytest.raises(core.RefineError, match="make the object's scale uniform"):
-        addon.splat_object.export_object(obj, tmp_path / "out.ply", apply_transform=True)
+        addon.splat_object.export_object(
+            addon.mesh.layout.check(obj), tmp_path / "out.ply", apply_transform=True
+        )
     assert not (tmp_path / "out.ply").exists()
 
 
@@ -142,8 +144,10 @@ def test_an_export_with_the_transform_is_the_moved_splats(addon, core, room, tmp
         @ mathutils.Matrix.Scale(2.0, 4)
     )
     bpy.context.view_layer.update()
-    addon.splat_object.export_object(room, tmp_path / "moved.ply", apply_transform=True)
-    addon.splat_object.export_object(room, tmp_path / "kept.ply")
+    addon.splat_object.export_object(
+        addon.mesh.layout.check(room), tmp_path / "moved.ply", apply_transform=True
+    )
+    addon.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "kept.ply")
     file = core.read_ply(PLY)
     expected = core.affine.transformed(
         file.splats(), np.array(room.matrix_world, np.float64), rotate_sh=True
@@ -168,7 +172,9 @@ def test_normals_turn_with_the_transform(addon, core, make_splats, tmp_path):
     obj = bpy.data.objects.new("turned", mesh)
     obj.rotation_euler.z = math.pi / 2
     bpy.context.scene.collection.objects.link(obj)
-    addon.splat_object.export_object(obj, tmp_path / "out.ply", apply_transform=True)
+    addon.splat_object.export_object(
+        addon.mesh.layout.check(obj), tmp_path / "out.ply", apply_transform=True
+    )
     rows = core.read_ply(tmp_path / "out.ply").rows
 
     assert [(row["nx"], row["ny"], row["nz"]) for row in rows] == [(0, 1, 0), (0, 0, 0)]
@@ -177,19 +183,19 @@ def test_normals_turn_with_the_transform(addon, core, make_splats, tmp_path):
 def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):  # noqa: ARG001
     """Someone deleted a vertex while the scoring ran."""
     views = addon.cameras.sets.visible_views(bpy.context.scene)
-    scores = addon.core.score(addon.splat_object.gather(room), views)
+    scores = addon.core.score(addon.splat_object.gather(addon.mesh.layout.check(room)), views)
     keep = np.ones(39755, np.bool_)
     keep[7] = False
     addon.mesh.edit.delete_vertices(room, ~keep)
 
     with pytest.raises(addon.core.RefineError, match="39754 splats, was scored with 39755"):
-        addon.mesh.scores.store(room, scores, views, addon.core.Settings())
+        addon.mesh.scores.store(addon.mesh.layout.check(room), scores, addon.core.Settings())
 
 
 def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, room, room_views):
     """The thread of the window: same scores; after `cancel` its result raises `Cancelled`."""
     core = addon.core
-    splats = addon.splat_object.gather(room)
+    splats = addon.splat_object.gather(addon.mesh.layout.check(room))
     worker = addon.ui.worker.Worker(
         lambda progress: core.pipeline.score(splats, room_views, progress=progress)
     )
@@ -208,7 +214,7 @@ def test_a_pruned_object_is_imported_and_pruned_again(addon, room, room_cameras,
     for _ in range(2):
         bpy.ops.refine.score()
         bpy.ops.refine.apply()
-    addon.splat_object.export_object(room, tmp_path / "out.ply")
+    addon.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
 
     assert len(addon.core.read_ply(tmp_path / "out.ply")) == 39755 - 19877 - 9939
 

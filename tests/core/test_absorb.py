@@ -1,6 +1,7 @@
 """Merging and absorbing: the moments by hand, the laws, and what must not happen."""
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,11 +9,15 @@ import pytest
 from refine_addon.core.absorbing import merge_field, merge_graph, merging
 from refine_addon.core.absorbing.absorb import absorb, patience
 from refine_addon.core.absorbing.merge_graph import MergeGraph
-from refine_addon.core.absorbing.merging import Field, Seen
+from refine_addon.core.absorbing.merging import Field, ViewSums
 from refine_addon.core.affine import transformed
 from refine_addon.core.errors import Cancelled
-from refine_addon.core.splats import Splats, opacity, rotation_matrices
+from refine_addon.core.rendering import ALPHA_MAX
+from refine_addon.core.scene import Scene, scene_of
+from refine_addon.core.splats import Splats, drawable, opacity, rotation_matrices
 from refine_addon.core.views import View, ViewSet
+
+SCENE = Scene(np.zeros(3), 1.0, np.eye(3))
 
 FIELDS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
 
@@ -36,6 +41,15 @@ def flat(opacities, means, variances, *, colors=None, error=None):
         np.full((count, 3), 0.5) if colors is None else np.array(colors, float),
         np.zeros(count),
     )
+
+
+def look(means, views):
+    return merge_field.look(means, views, scene_of(means, np.ones(len(means), bool), views))
+
+
+def field_of(splats, views, seen):
+    scene = scene_of(splats.means, drawable(splats), views)
+    return merge_field.field(splats, np.arange(len(splats)), views, scene, seen)
 
 
 def merged_of(field, first=0, second=1):
@@ -79,7 +93,7 @@ def measure(splats, _progress=None):
     logs = np.asarray(splats.log_scales, np.float64)
     size = np.exp(2 / 3 * np.sum(logs - np.median(logs), axis=1))
     alpha = opacity(splats.opacity_logits)
-    return Seen(alpha * size, 0.05 * alpha**2 * size)
+    return ViewSums(alpha * size, 0.05 * alpha**2 * size)
 
 
 def same(one, other):
@@ -178,7 +192,7 @@ def test_a_merge_along_the_line_of_sight_costs_what_views_from_aside_see():
     """One behind the other: alike from the front; from the side as two that lie side by side."""
     field = flat([0.01, 0.01], [[0.0, 0, 0], [0, 0, 4]], [[1.0, 1, 1]] * 2)
     turned = flat([0.01, 0.01], [[0.0, 0, 0], [4, 0, 0]], [[1.0, 1, 1]] * 2)
-    field.spread[:] = [1e9, 0, 0]
+    field.deviation[:] = [1e9, 0, 0]
     pair = np.array([0]), np.array([1])
 
     front, aside = (merging.price(field, *pair, tilt).cost for tilt in (0.0, 1.0))
@@ -200,15 +214,15 @@ def test_splats_that_do_not_stand_out_cost_nothing_to_merge_whatever_their_colou
 
 
 def test_splats_seen_from_opposite_sides_do_not_lose_their_direction():
-    """The mean of opposites is none, and a spread to the left is one to the right."""
+    """The mean of opposites is none, and a deviation to the left is one to the right."""
     field = flat([0.3, 0.3], [[0.0, 0, 0], [1, 0, 0]], [[1.0, 1, 1]] * 2)
     field.direction[:] = [[0, 0, 1], [0, 0, -1]]
-    field.spread[:] = [[0.5, 0, 0], [-0.5, 0, 0]]
+    field.deviation[:] = [[0.5, 0, 0], [-0.5, 0, 0]]
 
     _, merged = merged_of(field)
 
     np.testing.assert_allclose(np.abs(merged.direction), [[0, 0, 1]])
-    np.testing.assert_allclose(np.abs(merged.spread), [[0.5, 0, 0]])
+    np.testing.assert_allclose(np.abs(merged.deviation), [[0.5, 0, 0]])
 
 
 def test_no_mass_is_created_and_none_is_lost_but_the_overlap():
@@ -229,7 +243,7 @@ def test_no_mass_is_created_and_none_is_lost_but_the_overlap():
     after, before = mass(merged), whole[first] + whole[second]
     assert (after <= before * (1 + 1e-9)).all()
     assert (after >= np.maximum(whole[first], whole[second]) * (1 - 1e-9)).all()
-    assert merged.opacity.max() <= merging.OPACITY_MAX * (1 + 1e-12)
+    assert merged.opacity.max() <= ALPHA_MAX * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1e-3, 1e-9, 0.0])
@@ -292,7 +306,7 @@ def three_of_five(order=(0, 1, 2, 3, 4)):
     splats.sh_rest[:] = np.arange(5)[:, None, None] * 0.1
     splats = splats.take(np.array(order))
     contribution = np.array([1.0, 2, 5, 9, 9])[list(order)]
-    return splats, lambda _splats, _progress: Seen(contribution, contribution * 0.005)
+    return splats, lambda _splats, _progress: ViewSums(contribution, contribution * 0.005)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (2, 4, 1, 0, 3), (1, 3, 2, 0, 4)])
@@ -312,10 +326,10 @@ def test_a_survivor_has_the_colours_of_all_it_absorbed_by_what_is_seen_of_each(o
     assert result.keep.tolist() == [index > 1 for index in order]
     (survivor,) = np.flatnonzero(result.changed)
     assert np.flatnonzero(result.keep)[survivor] == place[2]
-    look = merge_field.look(splats.means[place], around())
-    mass = 0.01 * (np.exp(-4.0) + 0.3 * look.pixel) / look.pixel
-    floor = mass * 26 / (look.inside @ mass) / (look.inside + 1)
-    shares = np.array([1, 2, 5]) + floor[:3]
+    looked = look(splats.means[place], around())
+    mass = 0.01 * (np.exp(-4.0) + 0.3 * looked.pixel) / looked.pixel
+    allowance = mass * 26 / (looked.seen @ mass) / (looked.seen + 1)
+    shares = np.array([1, 2, 5]) + allowance[:3]
     shares /= shares.sum()
     for name in ("sh_dc", "sh_rest"):
         expected = np.tensordot(shares, getattr(splats, name)[place[:3]].astype(float), 1)
@@ -373,13 +387,13 @@ def looking(at, center, **changes):
 
 
 def test_a_splat_is_looked_at_along_the_mean_direction_of_what_sees_it():
-    """From 45 degrees either side: along the bisector, with a spread of sin 45 to the side."""
+    """From 45 degrees either side: along the bisector, with a deviation of sin 45 to the side."""
     views = ViewSet((looking([0, 0, 0], [2, 0, -2]), looking([0, 0, 0], [-2, 0, -2])))
 
-    found = merge_field.look(np.zeros((1, 3)), views)
+    found = look(np.zeros((1, 3)), views)
 
     np.testing.assert_allclose(found.direction, [[0, 0, 1]], atol=1e-12)
-    np.testing.assert_allclose(np.abs(found.spread), [[np.sqrt(0.5), 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(np.abs(found.deviation), [[np.sqrt(0.5), 0, 0]], atol=1e-12)
     np.testing.assert_allclose(found.pixel, [8 / (200 * 250)])
 
 
@@ -387,7 +401,7 @@ def test_a_nearer_view_counts_by_its_pixels():
     """At distances 1 and 2 as 4 to 1."""
     views = ViewSet((looking([0, 0, 0], [1, 0, 0]), looking([0, 0, 0], [0, 0, -2])))
 
-    found = merge_field.look(np.zeros((1, 3)), views)
+    found = look(np.zeros((1, 3)), views)
 
     np.testing.assert_allclose(found.direction, [np.array([-4, 0, 1]) / np.sqrt(17)], atol=1e-12)
 
@@ -399,10 +413,22 @@ def test_a_view_beside_whose_image_a_splat_lies_hardly_counts(aside):
         (looking([0, 0, 1], [0, 0, 0]), looking(np.add([0, 0, 1], aside), [-3, 0, 1.0]))
     )
 
-    found = merge_field.look(np.add([[0.0, 0, 1]], aside), views)
+    found = look(np.add([[0.0, 0, 1]], aside), views)
 
     expected = np.add([0, 0, 1], aside) - [-3, 0, 1]
     np.testing.assert_allclose(found.direction, [expected / np.linalg.norm(expected)], atol=1e-4)
+
+
+def test_a_view_between_whose_planes_a_splat_does_not_lie_hardly_counts():
+    """At depth 1, before the near plane of a view and beyond the far plane of another."""
+    far_off = looking([0, 0, 1], [-3, 0, 1.0])
+    for planes in ({"near": 1.1}, {"far": 0.9}):
+        views = ViewSet((replace(looking([0, 0, 1], [0, 0, 0]), **planes), far_off))
+
+        found = look(np.array([[0.0, 0, 1]]), views)
+
+        np.testing.assert_allclose(found.direction, [[1, 0, 0]], atol=1e-4)
+        assert found.seen.tolist() == [1]
 
 
 def test_colour_is_that_seen_along_the_mean_direction_and_blur_a_third_of_a_pixel():
@@ -412,7 +438,7 @@ def test_colour_is_that_seen_along_the_mean_direction_and_blur_a_third_of_a_pixe
     splats.sh_rest[:, 1] = [[0.3, 0.3, 0.3], [-3, -3, -3]]
     views = ViewSet((looking([0, 0, 0], [0, 0, -2]),))
 
-    field = merge_field.field(splats, np.arange(2), views, measure(splats))
+    field = field_of(splats, views, measure(splats))
 
     expected = 0.5 + 0.28209479 * 0.2 + 0.48860251 * 0.3
     np.testing.assert_allclose(field.color, [[expected] * 3, [0.0] * 3], rtol=1e-6)
@@ -461,7 +487,7 @@ def test_where_nothing_is_seen_absorbing_is_deleting_the_lowest_errors():
     table = {tuple(mean): value for mean, value in zip(splats.means, error, strict=True)}
 
     def unseen(left, _progress):
-        return Seen(np.zeros(len(left)), np.array([table[tuple(mean)] for mean in left.means]))
+        return ViewSums(np.zeros(len(left)), np.array([table[tuple(mean)] for mean in left.means]))
 
     result = absorb(splats, around(), unseen, 120)
 
@@ -475,9 +501,9 @@ def test_what_these_views_do_not_show_is_worth_what_another_may_see():
     Of the two in four views 8 was seen, 1 a splat and view: the floor is 1 / (4 + 1).
     """
     splats = cloud(1).take(np.array([0, 0]))
-    seen = Seen(np.array([8.0, 0.0]), np.array([4.0, 0.0]))
+    seen = ViewSums(np.array([8.0, 0.0]), np.array([4.0, 0.0]))
 
-    field = merge_field.field(splats, np.arange(2), around(), seen)
+    field = field_of(splats, around(), seen)
 
     np.testing.assert_allclose(field.contribution, [8.2, 0.2], rtol=1e-12)
     np.testing.assert_allclose(field.error, [4.1, 0.1], rtol=1e-12)
@@ -491,7 +517,7 @@ def test_black_and_white_on_grey_are_not_merged():
     field.error *= 0.75
 
     pairs, _ = merged_of(field)
-    graph = MergeGraph(field, 1.0)
+    graph = MergeGraph(field, SCENE, 1.0)
     graph.reduce(1)
 
     np.testing.assert_allclose(pairs.cost, field.error.sum(), rtol=1e-6)
@@ -501,7 +527,7 @@ def test_black_and_white_on_grey_are_not_merged():
 def test_no_merge_is_carried_out_that_costs_more_than_deleting():
     """Every pair merged in the first round was cheaper than either of its splats."""
     splats, views = cloud(2000), around()
-    graph = MergeGraph(merge_field.field(splats, np.arange(2000), views, measure(splats)), 2.0)
+    graph = MergeGraph(field_of(splats, views, measure(splats)), SCENE, 2.0)
     before = graph.field.take(np.arange(2000))
 
     graph.reduce(1950)
@@ -543,7 +569,7 @@ def test_the_cheapest_of_all_operations_is_next_each_time(seed):
         colors=rng.uniform(size=(9, 3)),
     )  # fmt: skip
     field.error *= rng.uniform(0.02, 1.0, 9)
-    graph = MergeGraph(field.take(np.arange(9)), 1.0)
+    graph = MergeGraph(field.take(np.arange(9)), SCENE, 1.0)
 
     graph.reduce(2)
 
@@ -562,7 +588,7 @@ def test_neighbours_of_what_is_absorbed_are_neighbours_of_what_absorbed_it(monke
     monkeypatch.setattr(merge_graph, "NEIGHBOURS", 1)
     places = [0.0, 0.001, 1.5, 50, 100, 200, 400, 800]
     field = flat([0.03, 0.02, 0.01] + [0.5] * 5, np.outer(places, [1, 0, 0]), np.ones((8, 3)))
-    graph = MergeGraph(field, 1.0)
+    graph = MergeGraph(field, SCENE, 1.0)
 
     graph.reduce(6)
 
@@ -575,7 +601,7 @@ def test_neighbours_of_what_is_absorbed_are_neighbours_of_what_absorbed_it(monke
 def test_when_half_have_gone_neighbours_are_found_anew():
     """Two heaps of a dozen: each has its neighbours in its own, and one is left of both."""
     places = np.outer(np.r_[np.arange(12) * 1e-4, 0.3 + np.arange(12) * 1e-4], [1, 0, 0])
-    graph = MergeGraph(flat([0.01] * 24, places, np.ones((24, 3))), 1.0)
+    graph = MergeGraph(flat([0.01] * 24, places, np.ones((24, 3))), SCENE, 1.0)
 
     graph.reduce(1)
 
@@ -589,7 +615,7 @@ def test_undrawable_splats_go_first():
 
     def careful(left, _progress):
         seen = measure(left)
-        return Seen(*(np.nan_to_num(values, nan=0.0, posinf=0.0) for values in seen))
+        return ViewSums(*(np.nan_to_num(values, nan=0.0, posinf=0.0) for values in seen))
 
     assert not absorb(splats, around(), careful, 98).keep[[7, 11]].any()
     assert absorb(splats, around(), careful, 99).keep.sum() == 99
@@ -672,12 +698,12 @@ def test_extreme_splats_raise_no_warning_and_stay_drawable():
     splats.quaternions[::7] = 0.0
 
     def wild(left, _progress):
-        return Seen(
+        return ViewSums(
             np.exp(np.linspace(-300, 300, len(left))), np.exp(np.linspace(300, -300, len(left)))
         )
 
     with np.errstate(all="raise"):
-        for seen in (wild, lambda left, _: Seen(np.ones(len(left)), np.ones(len(left)))):
+        for seen in (wild, lambda left, _: ViewSums(np.ones(len(left)), np.ones(len(left)))):
             result = absorb(splats, around(), seen, 150)
 
             changed = result.splats.take(result.changed)

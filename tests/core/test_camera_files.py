@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from refine_addon.core import RefineError, ViewSet, read_cameras, read_ply
 from refine_addon.core.cameras.place import Place
+from tests.users import closed_folder
 
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 
@@ -302,7 +303,7 @@ def test_a_path_that_is_not_there_is_named(tmp_path, name):
     with pytest.raises(RefineError) as caught:
         read_cameras(tmp_path / name)
 
-    assert str(tmp_path / name) in str(caught.value)
+    assert str(tmp_path / name).replace("\0", r"\x00") in str(caught.value)
 
 
 def test_an_unknown_home_is_no_crash():
@@ -320,6 +321,35 @@ def test_a_file_that_may_not_be_read_says_why(tmp_path, monkeypatch):
 
     with pytest.raises(RefineError, match=r"cameras\.json: cannot be read \(Permission denied\)"):
         read_cameras(path)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs permissions")
+def test_a_folder_that_may_not_be_entered_says_why():
+    """The folder itself, and one that a name leads through."""
+    with closed_folder({"cameras.json": json.dumps([INRIA])}) as folder:
+        for path in (folder, folder / "cameras.json"):
+            with pytest.raises(RefineError) as caught:
+                read_cameras(path)
+
+            expected = f"{folder / 'cameras.json'}: cannot be read (Permission denied)"
+            assert str(caught.value) == expected
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "dataparser_transforms.json"])
+def test_files_beside_that_may_not_be_looked_for_say_why(tmp_path, monkeypatch, name):
+    """Simulated: the folder is closed once the cameras have been read."""
+    write(tmp_path / "transforms.json", TRANSFORMS)
+    asking = Path.stat
+
+    def refuse(path, **how):
+        if path.name == name:
+            raise PermissionError(13, "Permission denied")
+        return asking(path, **how)
+
+    monkeypatch.setattr(Path, "stat", refuse)
+
+    with pytest.raises(RefineError, match=rf"{name}: cannot be read \(Permission denied\)"):
+        read_cameras(tmp_path / "transforms.json")
 
 
 def test_what_a_view_refuses_is_refused_with_the_place():

@@ -418,6 +418,21 @@ def test_a_count_that_the_file_does_not_back_allocates_nothing(tmp_path, file, c
     assert f"truncated: number of {file}: {count} of at least " in message
 
 
+@pytest.mark.parametrize("file", ["cameras", "images"])
+def test_a_count_below_what_the_file_holds_is_refused(tmp_path, file):
+    """Two are there and one is announced: nobody can tell which the count is wrong about."""
+    write(tmp_path, ".bin", [PINHOLE, (2, 0, 8, 8, (1, 2, 3))], [IMAGE, (2, POSE, 2, "b", 2)])
+    path = tmp_path / f"{file}.bin"
+    whole = path.read_bytes()
+    first = {"cameras": 8 + 24 + 4 * 8, "images": 8 + 64 + len("a.png") + 1 + 8}[file]
+    path.write_bytes(struct.pack("<Q", 1) + whole[8:])
+
+    message = refused(tmp_path, path.name)
+
+    expected = f"byte {first}: expected the end of the file behind 1 {file[:-1]}"
+    assert f"{expected}, got {len(whole) - first} more bytes" in message
+
+
 @pytest.mark.parametrize("count", [1, 2**32, 2**63, 2**64 - 1])
 def test_a_count_of_points_that_the_file_does_not_back_is_refused(tmp_path, count):
     data = binary_images([IMAGE])

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import re
-import signal
 import subprocess
 import sys
 import time
@@ -65,6 +64,11 @@ SCORE = ["score", "in.ply", "--cameras", "cameras.json"]
 def names(folder: Path) -> set[str]:
     """Return what is in the folder besides the input and its cameras."""
     return {path.name for path in folder.iterdir()} - {"in.ply", "cameras.json"}
+
+
+def contents(folder: Path) -> dict[Path, bytes]:
+    """Return every file below the folder."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 # What is done.
@@ -414,6 +418,21 @@ USAGE = {
     "report over the input": [*PRUNE, "-o", "out.ply", "--report", "./in.ply", "--overwrite"],
     "report over the output": [*PRUNE, "-o", "out.ply", "--report", "out.ply"],
     "report over an output": [*PRUNE, "--output-dir", "made", "--report", "made/in.ply"],
+    "report over other splats": [*PRUNE, "--dry-run", "--report", "b.ply", "--overwrite"],
+    "report over other cameras": [*PRUNE, "--dry-run", "--report", "t.json", "--overwrite"],
+    "output over an input's namesake": [
+        *("prune", "in.dat", *PRUNE[2:], "--output-dir", "made", "--overwrite"),
+    ],
+    "no name of cameras": ["prune", "in.ply", "--cameras", "", "-o", "out.ply"],
+    "no name of an input": ["prune", "", *PRUNE[2:], "-o", "out.ply"],
+    "no name of an input to describe": ["info", "in.ply", ""],
+    "no name of an output": [*PRUNE, "-o", ""],
+    "no name of a folder": [*PRUNE, "--output-dir", ""],
+    "no name of a report": [*PRUNE, "-o", "out.ply", "--report", ""],
+    "no name of an object": [*PRUNE, "-o", "out.ply", "--object", ""],
+    "no name of an output of scores": [*SCORE, "-o", ""],
+    "a name with a zero byte": [*PRUNE, "-o", "out\0.ply"],
+    "cameras with a zero byte": ["prune", "in.ply", "--cameras", "c\0", "-o", "out.ply"],
     "report over the cameras": [*PRUNE, "--dry-run", "--report", "cameras.json", "--overwrite"],
     "score of two": ["score", "in.ply", "b.ply", *SCORE[2:], "-o", "out.ply"],
     "score to nowhere": SCORE,
@@ -426,14 +445,22 @@ USAGE = {
 @pytest.mark.parametrize("name", USAGE)
 def test_wrong_usage_is_code_2_and_one_sentence(folder, capsys, name):
     """Before anything is read or written: the usage, then the error."""
+    (folder / "made").mkdir()
+    for path, content in (("b.ply", b"ply\n"), ("t.json", b'{"frames": []}'), ("in.dat", b"ply\n")):
+        (folder / path).write_bytes(content)
+    (folder / "made/in.dat").write_bytes(b"notes")
+    before = contents(folder)
+
     assert command.main(USAGE[name]) == 2
 
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err.startswith("usage: refine")
     assert re.search(r"\nrefine[a-z ]*: error: .+\n\Z", said.err)
-    assert set() == names(folder)
+    assert contents(folder) == before
 
+
+LONG = "n" * 300  # file systems take 255 bytes
 
 FAILS = {
     "no input": (["prune", "none.ply", *PRUNE[2:], "-o", "out.ply"], "none.ply: cannot be read"),
@@ -471,6 +498,36 @@ FAILS = {
         [*PRUNE, "-o", "out.ply", "--report", "none/report.json"],
         "none/report.json: cannot be written, there is no folder none",
     ),
+    "a report that is a folder": (
+        [*PRUNE, "-o", "out.ply", "--report", "folder", "--overwrite"],
+        "folder: is a folder, expected",
+    ),
+    "a report through a link to nowhere": (
+        [*PRUNE, "-o", "out.ply", "--report", "link.json"],
+        "link.json: cannot be written (No such file or directory); nothing was changed",
+    ),
+    "an input of too long a name": (
+        ["prune", LONG, *PRUNE[2:], "-o", "out.ply"],
+        f"{LONG}: cannot be read (File name too long)",
+    ),
+    "cameras of too long a name": (
+        ["prune", "in.ply", "--cameras", LONG, "-o", "out.ply"],
+        f"{LONG}: cannot be read (File name too long)",
+    ),
+    "an output of too long a name": ([*PRUNE, "-o", LONG], f"{LONG}: cannot be "),
+    "an output of scores of too long a name": ([*SCORE, "-o", LONG], f"{LONG}: cannot be "),
+    "a folder of too long a name": (
+        [*PRUNE, "--output-dir", LONG],
+        f"{LONG}: cannot be made (File name too long)",
+    ),
+    "a report of too long a name": (
+        [*PRUNE, "-o", "out.ply", "--report", LONG],
+        f"{LONG}: cannot be written (File name too long); nothing was changed",
+    ),
+    "info of too long a name": (
+        ["info", LONG],
+        f"{LONG}: cannot be read (File name too long)",
+    ),
     "too small a size": (
         [*PRUNE, "-o", "out.ply", "--max-mb", "1e-6"],
         "in.ply: max_mb is 1e-06",
@@ -492,19 +549,20 @@ def test_what_fails_is_code_1_and_one_sentence_that_names_the_file(folder, capsy
     """No traceback, nothing written, and every file as it was."""
     arguments, expected = FAILS[name]
     (folder / "folder").mkdir()
+    (folder / "link.json").symlink_to(folder / "none/report.json")
     (folder / "mesh.ply").write_bytes(plain_header(0, ["x", "y", "z"]))
     (folder / "cut.ply").write_bytes(plain_ply(COUNT)[:-1])
     away = json.loads((folder / "cameras.json").read_text())[:1]
     away[0]["position"] = [0, 0, 100]
     (folder / "away.json").write_text(json.dumps(away))
-    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    before = contents(folder)
 
     assert command.main(arguments) == 1
 
     said = capsys.readouterr()
     assert said.err.startswith(f"refine: error: {expected}")
     assert said.err.count("\n") == 1
-    assert before == {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    assert before == contents(folder)
 
 
 @pytest.mark.parametrize("option", ["--help", "--version"])
@@ -552,51 +610,6 @@ def test_the_exit_code_is_that_of_the_process(arguments, code):
     assert code == done.returncode
     assert (code == 0) == (done.stderr == b"")
     assert b"Traceback" not in done.stderr
-
-
-STOPPED = """
-import sys, time
-from refine_addon import command
-from refine_addon.core.formats import ply
-
-write = ply.write_rows
-
-def slow(stream, *arguments):
-    write(stream, *arguments)
-    stream.flush()
-    print("halfway", flush=True)
-    time.sleep(60)
-
-ply.write_rows = slow
-sys.exit(command.main(sys.argv[1:]))
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(os.name != "posix", reason="needs signals")
-@pytest.mark.parametrize("overwrite", [False, True])
-def test_interrupted_in_the_middle_of_a_write_it_leaves_what_was_there(folder, overwrite):
-    """A real SIGINT, as of Ctrl-C, while the rows are in the temporary file: code 130."""
-    if overwrite:
-        (folder / "out.ply").write_bytes(b"old")
-    arguments = [*PRUNE, "-o", "out.ply", *(["--overwrite"] if overwrite else [])]
-    with subprocess.Popen(
-        [sys.executable, "-c", STOPPED, *arguments],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        # Whoever runs the tests in the background has Ctrl-C ignored, and programs inherit that.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
-    ) as process:
-        assert process.stdout.readline() == b"halfway\n"
-        process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=30)
-
-    assert process.returncode == 130
-    assert errors == b"refine: error: cancelled; nothing was left half-written\n"
-    if overwrite:
-        assert (folder / "out.ply").read_bytes() == b"old"
-    assert names(folder) == ({"out.ply"} if overwrite else set())
 
 
 @pytest.mark.parametrize("stage", ["score", "write_rows"])

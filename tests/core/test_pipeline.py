@@ -6,7 +6,7 @@ import itertools
 import json
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,10 +29,12 @@ from refine_addon.core import (
     score,
     select,
 )
+from refine_addon.core.pipeline import Task, decide
 from refine_addon.core.scoring import froxels, projection
 from refine_addon.core.scoring.adaptive import Statistics, weights
 from refine_addon.core.scoring.closed_form import LUMA
 from refine_addon.core.selection import rank
+from tests.strategies import plain_header, ply_of
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 PLY = ROOM / "point_cloud.ply"
@@ -104,6 +106,29 @@ def test_the_pruned_file_holds_the_kept_rows_and_the_report_is_json(file, views,
 
     assert read_ply(tmp_path / "out.ply").rows.tobytes() == file.rows[result.keep].tobytes()
     assert json.loads(json.dumps(result.report, allow_nan=False))["splats"]["before"] == 39755
+
+
+@pytest.mark.parametrize("form", ["binary_little_endian", "ascii"])
+def test_faces_that_count_splats_are_noted_once_splats_go(small, views, tmp_path, form):
+    """They are kept byte for byte, and the third corner is then no splat any more."""
+    rows = read_ply(small).rows
+    faces = b"element face 1\nproperty list uchar int vertex_indices\n"
+    header = plain_header(len(rows), list(rows.dtype.names), form)
+    texts = b"".join(b" ".join(b"%.9g" % value for value in row.tolist()) + b"\n" for row in rows)
+    body, face = (
+        (texts, b"3 0 1 1987\n") if form == "ascii" else (rows.tobytes(), b"\x03" + bytes(12))
+    )
+    path = tmp_path / "in.ply"
+    path.write_bytes(header.replace(b"end_header", faces + b"end_header") + body + face)
+
+    fewer = prune_file(path, tmp_path / "out.ply", views, Budget(ratio=0.5)).report["notes"]
+    same = prune_file(path, None, views, Budget(ratio=0.0)).report["notes"]
+
+    expected = (
+        "element 'face' beside the splats is kept as it is; its indices may point past the end"
+    )
+    assert (fewer, same) == ([expected], [])
+    assert (tmp_path / "out.ply").read_bytes().endswith(face)
 
 
 def test_no_output_writes_nothing(views, tmp_path):
@@ -242,7 +267,7 @@ def test_core_imports_where_there_is_no_blender():
     code = (
         "import sys\n"
         "for name in ('bpy', 'bmesh', 'mathutils', 'gpu'): sys.modules[name] = None\n"
-        "import refine_addon.core, refine_addon.command\n"
+        "import refine_addon.core, refine_addon.command.flow\n"
     )
 
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -280,6 +305,78 @@ def test_absorbing_file_to_file_writes_the_changed_survivors_and_the_rest_bit_fo
     assert any("survivors absorbed" in note for note in result.report["notes"])
 
 
+def test_survivors_of_doubles_are_doubles(small, views, tmp_path):
+    """At an offset of 1e6, float32 knows steps of .0625: each survivor has a place of its own.
+
+    Every number written is the one that absorbing came to, to the last of its 53 bits.
+    """
+    rows = read_ply(small).rows
+    columns = {name: rows[name].astype("f8") for name in rows.dtype.names}
+    columns["x"] += 1e6
+    (tmp_path / "in.ply").write_bytes(ply_of(columns))
+    moved = ViewSet(
+        tuple(replace(view, center=view.center + np.array([1e6, 0, 0])) for view in views)
+    )
+
+    result = prune_file(
+        tmp_path / "in.ply", tmp_path / "out.ply", moved, Budget(ratio=0.6), absorb=True
+    )
+
+    written, changed = read_ply(tmp_path / "out.ply").splats(), result.absorbed.changed
+    assert len(np.unique(written.means[changed, 0])) == np.count_nonzero(changed) > 100
+    for item in fields(Splats):
+        wanted = getattr(result.absorbed.splats, item.name)
+        np.testing.assert_array_equal(getattr(written, item.name), wanted)
+        assert wanted.dtype == np.float64
+
+
+@pytest.fixture(scope="module")
+def text(small, tmp_path_factory):
+    """Write the small room as text: numbers of three digits, two spaces ahead of each."""
+    rows = read_ply(small).rows
+    lines = ["".join(f"  {value:.3g}" for value in row) for row in rows]
+    path = tmp_path_factory.mktemp("text") / "text.ply"
+    body = "\n".join([*lines, ""]).encode()
+    path.write_bytes(plain_header(len(rows), list(rows.dtype.names), "ascii") + body)
+    return path
+
+
+def test_absorbing_text_changes_the_words_of_what_changed_and_no_other(text, views, tmp_path):
+    """A survivor that absorbed nothing is its own line; the others read back as they became."""
+    result = prune_file(text, tmp_path / "out.ply", views, Budget(ratio=0.6), absorb=True)
+
+    before, after = read_ply(text), read_ply(tmp_path / "out.ply")
+    kept, changed = np.flatnonzero(result.keep), result.absorbed.changed
+    own = [line == before.lines[index] for line, index in zip(after.lines, kept, strict=True)]
+    np.testing.assert_array_equal(own, ~changed)
+    for item in fields(Splats):
+        wanted = getattr(result.absorbed.splats, item.name)
+        np.testing.assert_array_equal(getattr(after.splats(), item.name), wanted)
+    for index in np.flatnonzero(changed):
+        words = zip(after.lines[index].split(), after.rows[index], strict=True)
+        assert all(len(word) <= len(str(value)) for word, value in words)
+
+
+@pytest.mark.parametrize("absorb", [False, True])
+def test_the_report_says_how_large_a_text_file_is_before_it_is_written(
+    text, views, tmp_path, absorb
+):
+    """Of a dry run as of what stands on the disk, though changed rows are longer than they were."""
+    done, dry = (
+        prune_file(text, output, views, Budget(ratio=0.6), absorb=absorb).report["files"]
+        for output in (tmp_path / "out.ply", None)
+    )
+
+    assert (tmp_path / "out.ply").stat().st_size == done["output_bytes"] == dry["output_bytes"]
+
+
+def test_a_size_in_megabytes_holds_for_text_whose_rows_grow(text, views, tmp_path):
+    """Numbers of three digits become numbers of nine: the rows are counted as they may become."""
+    prune_file(text, tmp_path / "out.ply", views, Budget(max_mb=0.3), absorb=True)
+
+    assert 0.1e6 < (tmp_path / "out.ply").stat().st_size <= 0.3e6
+
+
 @pytest.mark.slow
 def test_a_budget_that_only_scores_can_tell_says_how_many_survivors_absorb(small, views):
     """The threshold is the median score: half survive, by whatever costs least."""
@@ -297,6 +394,43 @@ def test_without_the_frustum_test_no_number_of_views_is_counted(small, views):
 
     with pytest.raises(RefineError, match="min_seen would remove none"):
         prune(read_ply(small).splats(), views, Budget(min_seen=3), published)
+
+
+@pytest.mark.parametrize("budget", [Budget(threshold=0.5), Budget(min_seen=3)])
+def test_what_autos_scores_cannot_mean_is_refused_before_the_work(small, views, budget):
+    """Nothing is scored first: the first report of progress would fail the test."""
+
+    def never(_fraction, what):
+        raise AssertionError(what)
+
+    for absorb in (False, True):
+        with pytest.raises(RefineError, match="method auto may score by any model"):
+            prune(
+                read_ply(small).splats(), views, budget, Settings("auto"),
+                absorb=absorb, progress=never,
+            )  # fmt: skip
+
+
+@pytest.mark.parametrize("absorb", [False, True])
+def test_scores_that_are_there_already_decide_as_new_ones_would(small, views, absorb):
+    """The panel scores once and applies later: the same splats, and the same report of them."""
+    splats, budget = read_ply(small).splats(), Budget(threshold=0.5)
+    at_once = prune(splats, views, budget, absorb=absorb)
+    scores = score(splats, views)
+    scene = {"splats": splats, "views": views} if absorb else {}
+
+    later = decide(Task(budget, scores=scores, absorb=absorb, **scene))
+
+    np.testing.assert_array_equal(at_once.keep, later.keep)
+    for report in (at_once.report, later.report):
+        del report["timings"]
+    assert at_once.report == later.report
+
+
+def test_splats_without_scores_need_views_to_decide(small):
+    """And absorbing needs both."""
+    with pytest.raises(RefineError, match="need views to be scored"):
+        decide(Task(Budget(ratio=0.5), splats=read_ply(small).splats()))
 
 
 @pytest.mark.slow

@@ -17,7 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core import RefineError, read_ply
-from refine_addon.core.formats.ply import columns_from_splats, splats_from_columns
+from refine_addon.core.formats.ply import REQUIRED, columns_from_splats, splats_from_columns
+from refine_addon.core.formats.ply_write import longest_line, text_lines
 from tests.strategies import (
     LINE_ENDS,
     TYPES,
@@ -222,6 +223,7 @@ def test_a_new_property_comes_last_and_all_else_stays(folder, case, data, kind):
     line = b"property %s refine_score" % declared.encode()
     written = (folder / "out.ply").read_bytes()
     assert written.count(case.line_end + line + case.line_end) == 1
+    assert len(written) == file.size(keep, {"refine_score": values})
     again = read_ply(folder / "out.ply")
     np.testing.assert_array_equal(values[keep], again.rows["refine_score"])
     assert again.rows.dtype.names[-1] == "refine_score"
@@ -244,6 +246,7 @@ def test_a_property_that_is_there_is_set_in_place(folder, case):
     again = read_ply(folder / "out.ply")
 
     assert case.data[: len(file.header)] == again.header
+    assert (folder / "out.ply").stat().st_size == file.size(columns={"opacity": third})
     expected = case.rows.copy()
     expected["opacity"] = 1 / 3
     assert expected.dtype == again.rows.dtype
@@ -264,6 +267,48 @@ def test_the_words_of_a_text_row_stay_when_one_is_set(tmp_path):
 
     expected = b" +1.50\t2 3e0  0 0 0 0.5 0 0 0 1 0 0 0 9 \r\n"
     assert expected == (tmp_path / "out.ply").read_bytes()[-len(expected) :]
+
+
+def test_the_text_of_a_number_stays_where_it_is_set_to_itself(tmp_path):
+    """One third has many spellings and keeps its own, as NaN does; -0 is another number than 0."""
+    row = b"0.333333343 0 nan  0 0 0 7 0 0 0 1 0 0 0\n"
+    file = opened(tmp_path, plain_header(1, splat_names(0), "ascii") + row)
+    same = {"x": np.array([1 / 3]), "z": np.array([np.nan])}
+    file.write(tmp_path / "out.ply", columns={**same, "y": np.array([-0.0])})
+
+    expected = row.replace(b" 0 nan", b" -0.0 nan")
+    assert expected == (tmp_path / "out.ply").read_bytes()[-len(expected) :]
+
+
+@given(
+    bits=st.integers(0, 2**64 - 1),
+    kind=st.sampled_from(["f4", "f8"]),
+    own=st.sampled_from([b"1", b"-0.1000000000000000055511151231257827"]),
+)
+def test_no_number_makes_a_line_longer_than_the_longest(bits, kind, own):
+    """Whatever becomes of x, y or both; the tag is not ours and keeps its 20 digits."""
+    dtype = np.dtype([("x", kind), ("tag", "f8"), ("y", kind)])
+    line = b" %s\t12345678901234567890  %s \n" % (own, own)
+    rows = np.zeros(1, dtype)
+    width = dtype["x"].itemsize
+    value = np.array([bits % 2 ** (8 * width)], f"u{width}").view(kind)
+    longest = longest_line(dtype, [line], REQUIRED)
+
+    for columns in ({"x": value}, {"y": value}, {"x": value, "y": value}):
+        assert len(next(text_lines(rows, [line], None, columns))) <= longest
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"), [("f4", -1.2345679e15), ("f8", -1.2345678901234567e-308)]
+)
+def test_the_longest_line_can_be_reached(kind, value):
+    """The bound is no larger than it must be: one of these numbers fills it."""
+    dtype = np.dtype([("x", kind)])
+    longest = longest_line(dtype, [b"7\n"], REQUIRED)
+
+    (line,) = text_lines(np.zeros(1, dtype), [b"7\n"], None, {"x": np.array([value], kind)})
+
+    assert len(line) == longest
 
 
 @pytest.mark.parametrize("end", LINE_ENDS)
@@ -676,5 +721,6 @@ def test_what_is_no_file_is_refused(tmp_path):
         str(tmp_path / ("a" * 300)): "cannot be read (File name too long)",
         "~nobody-of-that-name/in.ply": "cannot be found (",
     }.items():
-        with pytest.raises(RefineError, match=re.escape(f"{path}: {expected}")):
+        named = path.replace("\0", r"\x00")
+        with pytest.raises(RefineError, match=re.escape(f"{named}: {expected}")):
             read_ply(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core import Budget, RefineError, Scores, rank, select
+from refine_addon.core.scores import shares_gone
 from tests.strategies import masks, scores
 
 
@@ -194,6 +196,36 @@ def test_a_number_that_cannot_be_is_refused_with_its_name(name, values, expected
             Budget(**{name: value})
 
 
+def test_only_a_threshold_and_a_number_of_views_need_scores_to_count_what_goes():
+    """The others say a number: `removals` is one exactly where no scores are needed."""
+    for kind, value in (("ratio", 0.5), ("keep", 2), ("max_mb", 1.0), ("threshold", 0.1),
+                        ("min_seen", 3.0)):  # fmt: skip
+        budget = Budget(**{kind: value})
+
+        assert budget.needs_scores == (kind in ("threshold", "min_seen"))
+        assert budget.needs_scores == (budget.removals(10, 248) is None)
+
+
+@pytest.mark.parametrize("budget", [Budget(threshold=0.0), Budget(min_seen=0.0)])
+def test_scores_of_auto_are_refused_a_meaning_that_they_have_not(budget):
+    """Wherever the scores come from, as long as they say that auto made them."""
+    scores = replace(scored([1, 2]), method="auto")
+
+    with pytest.raises(RefineError, match=f"method auto may score by any.* {budget.kind} means"):
+        select(scores, budget)
+    assert select(replace(scores, method="occlusion"), budget).all()
+    assert np.count_nonzero(select(scores, Budget(ratio=0.5))) == 1
+
+
+def test_views_that_see_all_count_nothing():
+    """Without the frustum test `seen` is the number of views for every splat."""
+    scores = replace(scored([1, 2], [64, 64]), frustum=False)
+
+    with pytest.raises(RefineError, match="min_seen would remove none"):
+        select(scores, Budget(min_seen=50.0))
+    assert np.count_nonzero(select(scores, Budget(threshold=1.5))) == 1
+
+
 def test_whole_numbers_of_any_kind_are_taken():
     """3, 3.0 and NumPy's 3 keep three; more than there are keeps all."""
     for keep in (3, 3.0, np.int64(3), np.float32(3)):
@@ -209,9 +241,54 @@ def test_the_rank_is_the_place_in_the_order_of_removal(values):
 
     ranks = rank(values)
 
-    assert np.float32 == ranks.dtype
+    assert np.float64 == ranks.dtype
     assert order == np.argsort(ranks, kind="stable").tolist()
     assert ranks.max() == 1.0
     assert (0.0 if len(values) > 1 else 1.0) == ranks.min()
     expected = np.linspace(0, 1, len(values)) if len(values) > 1 else np.ones(1)
     np.testing.assert_allclose(ranks[order], expected, atol=1e-6)
+
+
+MANY = (1 << 24) + 100
+"""More than float32 has equal steps between 0 and 1."""
+
+
+def test_ranks_of_more_splats_than_float32_can_tell_apart_are_distinct():
+    """Scored in the order of the file, the rank of row k is k / (N - 1), each above the last."""
+    ranks = rank(np.arange(MANY, dtype=np.float32))  # neighbours tie, and go by row
+
+    assert (np.diff(ranks) > 0.0).all()
+    assert (ranks[0], ranks[-1]) == (0.0, 1.0)
+
+
+def test_shares_of_more_splats_than_float32_can_tell_apart_are_distinct():
+    """Half of them, 2^23 + 50, go to the 2^23 numbers from 0.5 to 1: as quotients 50 would tie."""
+    places = np.arange(1, MANY + 1)
+    quotients = (places / MANY).astype(np.float32)
+
+    shares = shares_gone(places, MANY)
+
+    assert np.float32 == shares.dtype
+    assert np.count_nonzero(np.diff(quotients) == 0.0) == 50
+    assert (np.diff(shares) > 0.0).all()
+    assert (shares <= quotients).all()
+    assert (shares[0], shares[-1]) == (quotients[0], 1.0)
+
+
+def test_a_round_of_a_very_large_scene_scores_as_all_rounds_at_once():
+    """50 million places: where a round ends, the next goes on; a thousand of each part tell."""
+    count = 50_000_000
+    for start in (1, count // 4, count // 2 - 500, 3 * count // 4, count - 999):
+        places = np.arange(start, start + 1000)
+        shares = shares_gone(places, count)
+
+        assert (np.diff(shares) > 0.0).all()
+        np.testing.assert_array_equal(shares[600:], shares_gone(places[600:], count))
+
+
+@given(count=st.integers(1, 1 << 24), data=st.data())
+def test_shares_of_fewer_splats_are_the_quotients(count, data):
+    """Each rounded once."""
+    places = np.array(data.draw(st.lists(st.integers(1, count), min_size=1)))
+
+    np.testing.assert_array_equal(np.float32(places / count), shares_gone(places, count))

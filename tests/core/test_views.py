@@ -175,3 +175,24 @@ def test_the_middle_of_one_view_is_its_place():
     middle, spread = ViewSet((view([1, 2, 3]),)).middle()
 
     assert (middle.tolist(), spread) == ([1, 2, 3], 0.0)
+
+
+@pytest.mark.parametrize("away", [1e2, 1e5])
+def test_stray_cameras_do_not_open_gaps_between_the_others(away):
+    """A corridor of 30 m, 300 cameras that look anywhere, a few more far outside of it.
+
+    64 views spread along it leave gaps of about 2 m; a mean and a root mean square let the strays
+    set the unit, so that directions decided alone and gaps grew to twice that.
+    """
+
+    def largest_gap(strays: int) -> float:
+        rng = np.random.default_rng(0)
+        views = [
+            view((0.1 * k, 0.0, 1.6), rotation=np.linalg.qr(rng.normal(size=(3, 3)))[0])
+            for k in range(300)
+        ]
+        views += [view((away * (k + 1), 0.0, 0.0)) for k in range(strays)]
+        along = ViewSet(tuple(views)).spread(64).centers[:, 0]
+        return float(np.diff(np.sort(along[along < 30.0])).max())
+
+    assert largest_gap(3) <= 1.15 * largest_gap(0)

@@ -21,6 +21,7 @@ from refine_addon.core import whole_file as whole_files
 from refine_addon.core.formats import ply
 from refine_addon.core.whole_file import expanded, refuse_existing, whole_file
 from tests.strategies import plain_header, plain_ply, splat_names
+from tests.users import closed_folder
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs fork, links and signals")
 
@@ -192,14 +193,11 @@ def test_a_device_is_never_replaced(tmp_path):
 
 def test_a_folder_that_may_not_be_written_to_is_said_so(source, monkeypatch):
     """Simulated, since the root user may write anywhere."""
-    opening = Path.open
 
-    def refuse(path, mode="r", *rest):
-        if "x" in mode:
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
-        return opening(path, mode, *rest)
+    def refuse(*_):
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(os, "open", refuse)
     folder = source.path.parent
 
     with pytest.raises(RefineError, match=re.escape("out.ply: cannot be written (Permission den")):
@@ -208,16 +206,37 @@ def test_a_folder_that_may_not_be_written_to_is_said_so(source, monkeypatch):
     assert list(contents(folder)) == ["in.ply"]
 
 
-def test_a_folder_that_may_not_be_looked_into_is_said_so(tmp_path, monkeypatch):
+@posix
+def test_a_folder_that_may_not_be_looked_into_is_said_so():
     """Where even asking whether the file is there is refused."""
+    with closed_folder({"old": "old"}) as folder:
+        for path in (folder / "old", folder / "new"):
+            expected = re.escape(f"{path}: cannot be written (Permission denied)")
+            with pytest.raises(RefineError, match=expected):
+                refuse_existing(path, overwrite=True)
+            with pytest.raises(RefineError, match=expected), whole_file(path, overwrite=True):
+                pytest.fail("the block must not run")
+            with pytest.raises(RefineError, match=re.escape(f"{path}: cannot be read (Permission")):
+                read_ply(path)
 
-    def refuse(_):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
-    monkeypatch.setattr(Path, "is_dir", refuse)
+@pytest.mark.parametrize("replaces", [False, True])
+def test_what_cannot_be_compared_is_not_taken_for_the_file_being_read(
+    tmp_path, monkeypatch, replaces
+):
+    """Names that no system takes are refused where they are opened, by those who open them."""
+    monkeypatch.setattr(whole_files, "REPLACES_MAPPED", replaces)
+    for name in ("n" * 300, "a\0b", "no/folder", "\ud800"):
+        whole_files.refuse_mapped(tmp_path / name, tmp_path / name)
 
-    with pytest.raises(RefineError, match=re.escape("out: cannot be written (Permission denied)")):
-        refuse_existing(tmp_path / "out", overwrite=False)
+
+@pytest.mark.parametrize("name", ["n" * 300, "a\0b", "\ud800", f"{'n' * 300}/out"])
+def test_an_odd_name_is_refused_before_any_work(tmp_path, name):
+    """With the name and a reason; the work may take minutes."""
+    with pytest.raises(RefineError, match="cannot be written"):
+        refuse_existing(tmp_path / name, overwrite=True)
+    with pytest.raises(RefineError, match="cannot be read"):
+        read_ply(tmp_path / name)
 
 
 def test_a_name_that_no_system_takes_is_refused(tmp_path):
@@ -265,18 +284,101 @@ def test_a_link_is_followed_and_stays(tmp_path):
 
 
 @posix
-def test_a_file_keeps_its_permissions_and_a_new_one_has_the_usual(tmp_path):
-    """Unlike those of temporary files, which their owner alone may read."""
+@pytest.mark.parametrize("old_mode", [0o640, 0o000, 0o777])
+@pytest.mark.parametrize("mask", [0o000, 0o022, 0o077])
+def test_a_file_keeps_its_permissions_and_a_new_one_has_the_usual(tmp_path, mask, old_mode):
+    """Whatever the user's mask for new files; none of either mask or mode is left changed."""
     old, new = tmp_path / "old", tmp_path / "new"
     old.write_bytes(b"old")
-    old.chmod(0o640)
-    for path in (old, new):
-        with whole_file(path, overwrite=True) as stream:
-            stream.write(b"new")
-    (tmp_path / "plain").write_bytes(b"")
+    old.chmod(old_mode)
+    before = os.umask(mask)
+    try:
+        for path in (old, new):
+            with whole_file(path, overwrite=True) as stream:
+                stream.write(b"new")
+    finally:
+        assert os.umask(before) == mask
 
-    assert stat.S_IMODE(old.stat().st_mode) == 0o640
-    assert (tmp_path / "plain").stat().st_mode == new.stat().st_mode
+    assert stat.S_IMODE(old.stat().st_mode) == old_mode
+    assert stat.S_IMODE(new.stat().st_mode) == 0o666 & ~mask
+
+
+@posix
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_nobody_else_may_read_a_file_that_is_not_whole(tmp_path, monkeypatch, overwrite):
+    """One that replaces a secret is its owner's alone from the moment it is made."""
+    opening, made = os.open, []
+
+    def watch(path, *how, **more):
+        descriptor = opening(path, *how, **more)
+        made.append(stat.S_IMODE(os.fstat(descriptor).st_mode))
+        return descriptor
+
+    path = tmp_path / "secret"
+    if overwrite:
+        path.write_bytes(b"old")
+        path.chmod(0o600)
+    monkeypatch.setattr(os, "open", watch)
+    with whole_file(path, overwrite=overwrite) as stream:
+        stream.write(b"half of")
+        (temporary,) = tmp_path.glob(".refine-*")
+        while_written = stat.S_IMODE(temporary.stat().st_mode)
+
+    assert while_written == 0o600
+    assert not overwrite or made == [0o600]
+
+
+@posix
+def test_a_drive_without_permissions_is_written_to_the_same(tmp_path, monkeypatch):
+    """FAT: every file has those of the drive, and changing them is refused."""
+
+    def refuse(*_, **__):
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    (tmp_path / "old").write_bytes(b"old")
+    (tmp_path / "old").chmod(0o600)
+    monkeypatch.setattr(Path, "chmod", refuse)
+    for name in ("old", "new"):
+        with whole_file(tmp_path / name, overwrite=True) as stream:
+            stream.write(b"all")
+
+    assert contents(tmp_path) == {"old": b"all", "new": b"all"}
+
+
+def test_interrupted_at_any_line_before_the_block_nothing_is_left(tmp_path):
+    """Ctrl-C and kills become exceptions anywhere: there is no line between file and clean-up."""
+    file, lines = whole_files.__file__, 0
+
+    def interrupt_at(number):
+        left = [number]
+
+        def trace(frame, event, _):
+            if frame.f_code.co_filename != file:
+                return None
+            left[0] -= event == "line"
+            if event == "line" and left[0] == 0:
+                raise KeyboardInterrupt
+            return trace
+
+        return trace
+
+    reached = False
+    while not reached:
+        lines += 1
+        before = sys.gettrace()
+        try:
+            sys.settrace(interrupt_at(lines))
+            with whole_file(tmp_path / "out", overwrite=False):
+                sys.settrace(before)
+                reached = True
+        except KeyboardInterrupt:
+            pass
+        finally:
+            sys.settrace(before)
+        if not reached:
+            assert list(tmp_path.iterdir()) == [], lines
+
+    assert lines > 20
 
 
 def test_the_file_being_read_can_be_the_one_written(source):

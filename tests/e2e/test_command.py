@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -140,6 +141,46 @@ def test_blends_cameras_decide_as_their_file_does(
     assert from_file.returncode == 0, from_file.stderr
     common = np.count_nonzero(rows_in(rows(by_scene), rows(by_file)))
     assert common >= 0.999 * len(rows(by_file))
+
+
+SIGNALLED = """
+import pathlib, signal, subprocess, sys, time
+
+number, made = int(sys.argv[1]), pathlib.Path(sys.argv[2])
+
+def listen():
+    for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(each, signal.SIG_DFL)
+
+process = subprocess.Popen(sys.argv[3:], preexec_fn=listen)
+while process.poll() is None and not made.exists():
+    time.sleep(0.01)
+process.send_signal(number)
+code = process.wait()
+sys.exit(code if code >= 0 else f"killed by {-code}")
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "reason"),
+    [(signal.SIGINT, "cancelled"), (signal.SIGTERM, "terminated"), (signal.SIGHUP, "hung up")],
+)
+def test_stopped_at_work_it_leaves_nothing_and_says_so(
+    binary: Binary, cloud: Path, cameras: Path, number: int, reason: str
+):
+    """The folder of the outputs is made first; scoring by occlusion then takes seconds."""
+    made = binary.work / "made"
+    words = ("prune", cloud, "--cameras", cameras, "--method", "occlusion", "--views", "0")
+
+    done = binary.run(
+        *("python3", "-c", SIGNALLED, str(int(number)), made),
+        *("blender", "--background", "--command", "refine", *words, "--output-dir", made),
+    )
+
+    assert done.returncode == 128 + number, done.stdout + done.stderr
+    assert f"refine: error: {reason}; nothing was left half-written\n" in done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+    assert list(made.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["NoSuchObject", "Camera.000"])

@@ -14,10 +14,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..scene import scene_of, spatial_order
 from ..splats import Splats, drawable
 from ..work import Progress, part, report, silent
 from . import merge_field, merging
-from .merge_field import Seen
+from .merge_field import ViewSums
 from .merge_graph import MergeGraph
 
 if TYPE_CHECKING:
@@ -25,10 +26,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..scene import Scene
     from ..views import ViewSet
     from .merge_field import Array, Index
 
-Measure = Callable[[Splats, Progress], Seen]
+Measure = Callable[[Splats, Progress], ViewSums]
 """Called with splats, as they are by then; says what the views see of each."""
 
 STAGE = 0.6
@@ -108,7 +110,7 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
     views : ViewSet
         They tell from where each splat is looked at.
     measure : callable
-        ``measure(splats, progress)`` returns a `Seen`; called once a stage.
+        ``measure(splats, progress)`` returns a `ViewSums`; called once a stage.
     keep_count : int
         How many survive; more where more are protected. Splats that no renderer can draw go first.
     protected : (N,) bool, optional
@@ -129,15 +131,16 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
     count = len(splats)
     spared = np.zeros(count, np.bool_) if protected is None else np.array(protected, np.bool_)
     goal = max(keep_count, int(np.count_nonzero(spared)), 0)
+    scene = scene_of(splats.means, drawable(splats), views)
     origin, members = np.arange(count), np.ones(count, np.int64)
     factor = patience(1.0 - goal / max(count, 1))
     stages = math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE)) if goal < count else 0
     for stage in range(stages):
         ahead = part(progress, stage / stages, (stage + 1) / stages)
         left = round(count * (goal / count) ** ((stage + 1) / stages))
-        seen = measure(splats, part(ahead, 0.0, 0.5))
+        sums = measure(splats, part(ahead, 0.0, 0.5))
         splats, kept, taken = _absorb_once(
-            splats, views, seen, max(left, goal), protected=spared[origin],
+            splats, views, scene, sums, max(left, goal), protected=spared[origin],
             factor=factor, progress=part(ahead, 0.5, 1.0), threads=threads,
         )  # fmt: skip
         # A survivor stands for all that those it took stood for.
@@ -152,7 +155,8 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
 def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     splats: Splats,
     views: ViewSet,
-    seen: Seen,
+    scene: Scene,
+    sums: ViewSums,
     keep_count: int,
     *,
     protected: NDArray[np.bool_],
@@ -171,7 +175,7 @@ def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     taken : (N,) int64
         Into which survivor each splat went; -1 where it was deleted.
     """
-    seen = Seen(np.asarray(seen.contribution, np.float64), np.asarray(seen.error, np.float64))
+    sums = ViewSums(np.asarray(sums.contribution, np.float64), np.asarray(sums.error, np.float64))
     good, free = drawable(splats), ~protected
     keep = np.ones(len(splats), np.bool_)
     excess = max(len(splats) - keep_count, 0)
@@ -183,9 +187,10 @@ def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     report(progress, 0.0, "absorbing")
     if excess <= 0:
         return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1)
-    graph = MergeGraph(
-        merge_field.field(splats, rows, views, seen, threads=threads), factor, threads=threads
-    )
+    # In an order of the scene's own, so that ties do not depend on that of the file.
+    rows = rows[spatial_order(scene.place(splats.means[rows]))]
+    found = merge_field.field(splats, rows, views, scene, sums, threads=threads)
+    graph = MergeGraph(found, scene, factor, threads=threads)
     graph.reduce(len(rows) - excess, part(progress, 0.1, 0.95))
     keep[rows[~graph.alive]] = False
     return _written(splats, keep, rows, graph)

@@ -1,4 +1,4 @@
-"""Splats as merging sees them: what the views see of each, from where, and how finely."""
+"""Splats as merging needs them: what the views see of each, from which side, and how finely."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .. import spherical_harmonics
+from .. import frustum, spherical_harmonics
+from ..rendering import LOW_PASS
 from ..splats import SH_C0, opacity, rotation_matrices
 from ..work import for_chunks
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ..scene import Scene
     from ..splats import Splats
     from ..views import View, ViewSet
 
@@ -21,23 +23,21 @@ if TYPE_CHECKING:
     Index = NDArray[np.int64] | NDArray[np.int32]
     Footprint = tuple[Array, Array, Array]
 
-LOW_PASS = 0.3
-"""Variance that renderers add to every footprint, pixels squared."""
-
 NEAREST = 0.01
-"""Share of the scene's size below which a camera comes no nearer to a splat."""
+"""Least distance of a camera to a splat, over the scene's size; nearer ones count as this near."""
 
 LOOKS = 32
-"""Views, spread out, that tell from where splats are looked at."""
+"""Views, spread evenly, that tell from which directions splats are viewed."""
 
 BESIDE = 1e-6
-"""Weight of a view beside whose image a splat lies, so that every splat has a direction."""
+"""Factor on the weight of views that a splat's centre does not lie in: every splat gets a viewing
+direction, and views that contain it decide it wherever there is one."""
 
 _CHUNK = 1 << 14
-_LOG_RANGE = 80.0
+_LOG_RANGE = 80.0  # of log scales, either way, so that squares of scales stay finite
 
 
-class Seen(NamedTuple):
+class ViewSums(NamedTuple):
     """What the views see of each of N splats; both in one unit, such as pixels of all views.
 
     Attributes
@@ -54,7 +54,7 @@ class Seen(NamedTuple):
 
 @dataclass(eq=False)
 class Field:
-    """Splats as merging sees them; the rows of merged ones are overwritten.
+    """Splats as merging needs them. Merged splats are written over those that absorb.
 
     Attributes
     ----------
@@ -62,10 +62,10 @@ class Field:
     covariances : (N, 6) float64
         xx, xy, xz, yy, yz, zz.
     opacity, contribution, error : (N,) float64
-    direction, spread : (N, 3) float64
+    direction, deviation : (N, 3) float64
         See `Look`.
     color : (N, 3) float64
-        Seen along `direction`.
+        As viewed along `direction`.
     blur : (N,) float64
         Variance of the low-pass at the splat, world units squared.
     """
@@ -76,7 +76,7 @@ class Field:
     contribution: Array
     error: Array
     direction: Array
-    spread: Array
+    deviation: Array
     color: Array
     blur: Array
 
@@ -87,36 +87,37 @@ class Field:
 
     def take(self, rows: Index) -> Field:
         """Return a copy of some rows."""
-        # Twice as fast as square brackets.
+        # Twice as fast as indexing.
         return Field(*(getattr(self, item.name).take(rows, axis=0) for item in fields(self)))
 
 
 class Look(NamedTuple):
-    """How the views look at each of N splats, whatever is between.
+    """From where the views look at each of N splats, hidden or not.
 
     Attributes
     ----------
     direction : (N, 3) float64
         Mean viewing direction, length 1.
-    spread : (N, 3) float64
-        The longest standard deviation of the directions across their mean, of either sign.
+    deviation : (N, 3) float64
+        The longest axis of one standard deviation of the directions about their mean; of two
+        opposite vectors either one.
     pixel : (N,) float64
         Area of a pixel at the splat, world units squared.
-    inside : (N,) float64
+    seen : (N,) float64
         In how many of the views the centre lies.
     """
 
     direction: Array
-    spread: Array
+    deviation: Array
     pixel: Array
-    inside: Array
+    seen: Array
 
 
-def look(means: NDArray[Any], views: ViewSet, *, threads: int | None = None) -> Look:
-    """Return how the views look at splats.
+def look(means: NDArray[Any], views: ViewSet, scene: Scene, *, threads: int | None = None) -> Look:
+    """Return from where the views look at splats.
 
-    A view weighs what its pixels see of the splat, 1 / distance^2, and next to nothing where the
-    splat's centre lies beside the image.
+    A view counts by the pixels that a splat covers in it, 1 / distance^2, and next to nothing where
+    the splat's centre does not lie in it (`frustum`).
 
     Parameters
     ----------
@@ -124,31 +125,34 @@ def look(means: NDArray[Any], views: ViewSet, *, threads: int | None = None) -> 
         Of drawable splats.
     views : ViewSet
         At most `LOOKS` of them are used.
+    scene : Scene
+        Its size says how near is too near.
     threads : int, optional
     """
     count = len(means)
     result = Look(np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count))
     some = views.spread(LOOKS)
     looks = [(view, share) for view, share in zip(some, some.weights, strict=True) if share]
-    offset = np.median(means, axis=0) - views.centers if count else np.ones((1, 3))
-    closest = NEAREST**2 * float(np.median(np.sum(offset * offset, axis=1))) or 1.0
+    closest = (NEAREST * scene.size) ** 2
 
-    def measure(piece: slice) -> None:
+    def fill(piece: slice) -> None:
         points = np.asarray(means[piece], np.float64).T
         with np.errstate(under="ignore"):
             found = _look(points, looks, closest)
         for values, part_of in zip(result, found, strict=True):
             values[piece] = part_of
 
-    for_chunks(measure, count, _CHUNK, threads=threads)
+    for_chunks(fill, count, _CHUNK, threads=threads)
     return result
 
 
 def _look(points: Array, looks: list[tuple[View, float]], closest: float) -> Look:
-    """Return how views, each of a weight, look at `points`, (3, M).
+    """Return from where views, each of a weight, look at `points`, (3, M).
 
     Parameters
     ----------
+    points : (3, M) float64
+    looks : list of view, weight
     closest : float
         Least squared distance of a camera.
     """
@@ -156,36 +160,55 @@ def _look(points: Array, looks: list[tuple[View, float]], closest: float) -> Loo
     total, finest, seen = np.zeros((3, points.shape[1]))
     toward, second = np.zeros((3, points.shape[1])), np.zeros((6, points.shape[1]))
     for view, share in looks:
-        ray = points - view.center[:, None]
-        x, y, z = view.rotation @ ray
-        inside = np.abs(view.fx * x + (view.cx - view.width / 2) * z) <= view.width / 2 * z
-        inside &= np.abs(view.fy * y + (view.cy - view.height / 2) * z) <= view.height / 2 * z
+        ray = points - view.center[:, None]  # (3, M)
+        planes = frustum.clip_planes(view, closest**0.5)
+        inside = frustum.contains(view, view.rotation @ ray, planes)  # (M,)
         seen += inside
         squared = np.maximum(np.einsum("ij,ij->j", ray, ray), closest)
         weight = np.where(inside, share, share * BESIDE) / squared
         ray /= np.sqrt(squared)
         weighted = ray * weight
         toward += weighted
-        second += weighted[rows] * ray[columns]
+        second += weighted[rows] * ray[columns]  # xx, xy, xz, yy, yz, zz
         total += weight
-        finest += weight * (view.fx * view.fy / squared)
+        finest += weight * (view.fx * view.fy / squared)  # pixels per squared world unit
     direction = normalized(toward.T)
+    return Look(direction, _deviation(direction, (second / total).T), total / finest, seen)
+
+
+def _deviation(direction: Array, second: Array) -> Array:
+    """Return the longest axis of the distribution of viewing directions about their mean, (M, 3).
+
+    Parameters
+    ----------
+    direction : (M, 3) float64
+        Their mean, length 1.
+    second : (M, 6) float64
+        Means of their products xx, xy, xz, yy, yz, zz. In the plane across the mean these are
+        variances.
+    """
     u, v = across(direction)
-    xx, xy, yy = footprint((second / total).T, (u, v), np.zeros(len(direction)))
-    # The longer axis of a 2 x 2 covariance.
+    xx, xy, yy = footprint(second, (u, v), np.zeros(len(direction)))
+    # The larger eigenvalue of a symmetric 2 x 2 matrix, and the angle of its vector.
     half, angle = np.hypot(0.5 * (xx - yy), xy), 0.5 * np.arctan2(2.0 * xy, xx - yy)
     longest = np.sqrt(np.maximum(0.5 * (xx + yy) + half, 0.0))
-    spread = longest * (np.cos(angle) * u + np.sin(angle) * v)
-    return Look(direction, spread.T, total / finest, seen)
+    deviation: Array = longest * (np.cos(angle) * u + np.sin(angle) * v)
+    return deviation.T
 
 
 def field(
-    splats: Splats, rows: Index, views: ViewSet, seen: Seen, *, threads: int | None = None
+    splats: Splats,
+    rows: Index,
+    views: ViewSet,
+    scene: Scene,
+    sums: ViewSums,
+    *,
+    threads: int | None = None,
 ) -> Field:
-    """Return some splats as merging sees them.
+    """Return some splats as merging needs them.
 
-    What these views do not show may be plain to see from elsewhere: each splat gets a floor, what
-    it would be worth to one more view if nothing hid anything (`_floored`).
+    What these views do not show may be in plain sight of others, so each splat gets an allowance:
+    what one more view may see of it (`_with_allowance`).
 
     Parameters
     ----------
@@ -194,13 +217,15 @@ def field(
     rows : (M,) int
         Which of them; drawable ones.
     views : ViewSet
-    seen : Seen
+    scene : Scene
+        Of splats and views.
+    sums : ViewSums
         Of all splats.
     threads : int, optional
     """
     count = len(rows)
     covariances, color = np.empty((count, 6)), np.empty((count, 3))
-    seen_from = look(splats.means[rows], views, threads=threads)
+    looked = look(splats.means[rows], views, scene, threads=threads)
     upper = np.triu_indices(3)
 
     def fill(piece: slice) -> None:
@@ -210,45 +235,56 @@ def field(
         covariances[piece] = (axes @ np.swapaxes(axes, 1, 2))[:, upper[0], upper[1]]
         color[piece] = 0.5 + SH_C0 * np.asarray(chunk.sh_dc, np.float64)
         if chunk.sh_degree:
-            basis = spherical_harmonics.basis(seen_from.direction[piece], chunk.sh_degree)[:, 1:]
+            basis = spherical_harmonics.basis(looked.direction[piece], chunk.sh_degree)[:, 1:]
             color[piece] += np.einsum("nk,nkc->nc", basis, chunk.sh_rest)
 
     for_chunks(fill, count, _CHUNK, threads=threads)
-    alpha, blur = opacity(splats.opacity_logits[rows]), LOW_PASS * seen_from.pixel
+    alpha, blur = opacity(splats.opacity_logits[rows]), LOW_PASS * looked.pixel
     with np.errstate(under="ignore"):
-        xx, xy, yy = footprint(covariances, across(seen_from.direction), blur)
-        mass = alpha * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / seen_from.pixel
-        contribution = _floored(seen.contribution[rows], mass, seen_from.inside)
-        error = _floored(seen.error[rows], mass * alpha, seen_from.inside)
+        xx, xy, yy = footprint(covariances, across(looked.direction), blur)
+        mass = alpha * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / looked.pixel
+        contribution = _with_allowance(sums.contribution[rows], mass, looked.seen)
+        error = _with_allowance(sums.error[rows], mass * alpha, looked.seen)
     return Field(
         np.asarray(splats.means[rows], np.float64),
         covariances,
         alpha,
         contribution,
         error,
-        seen_from.direction,
-        seen_from.spread,
+        looked.direction,
+        looked.deviation,
         np.maximum(color, 0.0, out=color),
         blur,
     )
 
 
-def _floored(values: Array, worth: Array, inside: Array) -> Array:
-    """Return `values` and, on top, what one more view may see of each splat, (M,).
+def _with_allowance(values: Array, worth: Array, seen: Array) -> Array:
+    """Return `values` plus what one more view may see of each splat, (M,).
 
-    Were nothing hidden, a splat would give its `worth` to each view that its centre lies in; of all
-    that, the views saw some share. Of n views that might have shown a splat none did, at worst: by
-    the rule of succession the next one does with a chance of about 1 / (n + 1).
+    If nothing were hidden, each view that a splat's centre lies in would see its `worth`. What the
+    views did see is some share of the sum of all that; of another view the same share is expected.
+    At worst none of the n views that contain a splat showed it; then the next one does with a
+    chance of about 1 / (n + 1), by the rule of succession.
+
+    Parameters
+    ----------
+    values, worth : (M,) float64
+        As measured, summed over views, and in one view if nothing hid it.
+    seen : (M,) float64
+        In how many views each centre lies.
     """
-    shown = inside @ worth
-    if not shown > 0.0:
+    unhidden = seen @ worth
+    if not unhidden > 0.0:
         return values
-    floored: Array = values + worth * (values.sum() / shown) / (1.0 + inside)
-    return floored
+    allowed: Array = values + worth * (values.sum() / unhidden) / (1.0 + seen)
+    return allowed
 
 
 def across(normal: Array) -> tuple[Array, Array]:
-    """Return two unit vectors, (3, M), across `normal` and each other (Duff et al. 2017)."""
+    """Return two unit vectors, (3, M), at right angles to `normal`, (M, 3), and to each other.
+
+    Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
+    """
     x, y, z = normal.T
     sign = np.where(z >= 0.0, 1.0, -1.0)
     a = -1.0 / (sign + z)
@@ -259,7 +295,15 @@ def across(normal: Array) -> tuple[Array, Array]:
 
 
 def footprint(covariances: Array, plane: tuple[Array, Array], blur: Array) -> Footprint:
-    """Return xx, xy, yy of ``(u, v)' C (u, v) + blur I``."""
+    """Return xx, xy, yy of ``(u, v)' C (u, v) + blur I``, (M,) each: C in a plane.
+
+    Parameters
+    ----------
+    covariances : (M, 6) float64
+    plane : (u, v)
+        Unit vectors, (3, M).
+    blur : (M,) float64
+    """
     u, v = plane
     xx, xy, xz, yy, yz, zz = covariances.T
     cu = (xx * u[0] + xy * u[1] + xz * u[2], xy * u[0] + yy * u[1] + yz * u[2],

@@ -13,6 +13,7 @@ from .neighbours import nearest
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ..scene import Scene
     from .merge_field import Array, Field, Index
 
     Rows = NDArray[np.int32]
@@ -41,18 +42,22 @@ class MergeGraph:
         How many splats went without being absorbed.
     """
 
-    def __init__(self, field: Field, patience: float, *, threads: int | None = None) -> None:
+    def __init__(
+        self, field: Field, scene: Scene, patience: float, *, threads: int | None = None
+    ) -> None:
         """Take over a field.
 
         Parameters
         ----------
         field : Field
             Is changed.
+        scene : Scene
+            In whose frame near splats are looked for.
         patience : float
             Factor on the cost of merging.
         threads : int, optional
         """
-        self.field, self.patience, self.threads = field, patience, threads
+        self.field, self.scene, self.patience, self.threads = field, scene, patience, threads
         self.alive = np.ones(len(field.means), np.bool_)
         self.merges: list[tuple[Index, Index, Array]] = []
         self.deleted = 0
@@ -82,7 +87,8 @@ class MergeGraph:
     def _connect(self, progress: Progress) -> None:
         """Find the pairs of near splats, and price them."""
         rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))
-        near = nearest(self.field.means[rows], NEIGHBOURS, progress=progress, threads=self.threads)
+        place = self.scene.place(self.field.means[rows])
+        near = nearest(place, NEIGHBOURS, progress=progress, threads=self.threads)
 
         def pairs(piece: slice) -> tuple[Rows, Rows]:
             own, others = np.arange(piece.start, piece.stop)[:, None], near[piece]

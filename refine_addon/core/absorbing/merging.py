@@ -1,27 +1,28 @@
 """What merging two splats costs the pictures, and the splat that comes of it.
 
-Every splat i is an image signal: its footprint ``f_i = alpha_i exp(-q_i / 2)`` times its contrast
-``s_i = c_i - B`` to what lies behind it. Two numbers say what the cameras see of it, summed over
-the pixels of all views; T is the transmittance in front of it::
+Every splat i changes the picture by its footprint ``f_i = alpha_i exp(-q_i / 2)`` times the
+contrast ``s_i = c_i - B`` of its colour to what lies behind it. What the views see of it is two
+sums over the pixels of all views, T being the transmittance in front of it::
 
     contribution  W_i = sum of T alpha              error  E_i = sum of (T alpha)^2 |s_i|^2
 
-E is what deleting the splat costs. Merging i and j to m costs the squared error of the picture,
-in the plane that the cameras look at (across the viewing direction of the pair), with the inner
-products ``<f, g>`` of Gaussians in closed form::
+E is what deleting the splat costs. Replacing i and j by m costs the squared error of the picture,
+with the inner products ``<f, g>`` of Gaussians in closed form, in a plane across the direction that
+the pair is viewed along (derived in docs/method.md, section 5)::
 
     p = f_i - l_i f_m,  q = f_j - l_j f_m                l: share of the colour, l_i + l_j = 1
     cost = tau (|s_i|^2 <p, p> + 2 s_i.s_j <p, q> + |s_j|^2 <q, q>)
     tau  = (W_i + W_j) / (A_i + A_j)                     A: mass, the integral of f
     |s_i|^2 = E_i / (tau_i <f_i, f_i>),   2 s_i.s_j = |s_i|^2 + |s_j|^2 - |c_i - c_j|^2
 
-The merged splat has the mean and covariance of both (weights: mass), their colour (weights:
-contribution) and, by its opacity, their mass less the overlap, which the eye counts once:
-``A_m = A_i + A_j - <f_i, f_j>``. Where that would take an opacity above `OPACITY_MAX`, the splat
-grows instead.
+The merged splat has the mean and covariance of the two as one distribution, weighted by mass; their
+mean colour, weighted by contribution; and the opacity that gives it their mass less the overlap,
+``A_m = A_i + A_j - <f_i, f_j>``, since what both cover is covered once. Where that opacity would
+exceed `ALPHA_MAX`, the covariance grows instead.
 
-What lies one behind the other along the mean direction would merge for nothing, but other views
-look past it: costs are taken from two directions, a standard deviation to either side (`tilt`).
+Along the mean viewing direction two splats one behind the other merge for nothing, though other
+views see both. So a pair's cost is the mean of that from two directions, one standard deviation of
+the viewing directions to either side (`costs`).
 """
 
 from __future__ import annotations
@@ -31,23 +32,22 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..affine import quaternion
-from .merge_field import Field, Seen, across, footprint, normalized
+from ..rendering import ALPHA_MAX
+from .merge_field import Field, ViewSums, across, footprint, normalized
 
 if TYPE_CHECKING:
     from .merge_field import Array, Footprint, Index
 
-__all__ = ["Field", "Pairs", "Seen", "axes", "costs", "merge", "price"]
-
-OPACITY_MAX = 0.99
-"""Largest opacity of a merged splat; renderers show no more."""
+__all__ = ["Field", "Pairs", "ViewSums", "axes", "costs", "merge", "price"]
 
 FLATTEST = 1e-14
-"""Least eigenvalue of a covariance over their sum: rounding leaves no less."""
+"""Least eigenvalue of a covariance over the sum of the three; less is lost in rounding."""
 
 CHANNELS = 3
+"""Red, green and blue."""
 
-_CANCELLED = 1e-6
-_TINY = 1e-280
+_CANCELLED = 1e-6  # squared length of the mean of two unit vectors that is taken for none
+_TINY = 1e-280  # divided by instead of 0
 
 
 class Pairs(NamedTuple):
@@ -56,11 +56,11 @@ class Pairs(NamedTuple):
     Attributes
     ----------
     cost : (M,) float64
-        Added to the squared error of the pictures, in the unit of `Seen`.
+        Added to the squared error of the pictures, in the unit of `ViewSums`.
     position, color : (M,) float64
         Share of the first splat in the mean and covariance, and in the colour.
     opacity, growth : (M,) float64
-        Of the merged splat; growth is a factor on its covariance.
+        Of the merged splat; growth is the factor on its covariance that keeps the opacity down.
     error : (M,) float64
         What deleting the merged splat would cost.
     """
@@ -74,7 +74,7 @@ class Pairs(NamedTuple):
 
 
 def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pairs:
-    """Price merges by the equations at the top of this file.
+    """Return prices and results of merges, by the equations at the top of this file.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pair
     first, second : (M,) int
         Rows; both splats of a pair contribute.
     tilt : float
-        From where: the mean viewing direction plus so many standard deviations of the directions.
+        How many standard deviations of the viewing directions to add to their mean.
     """
     return _price(_gather(splats, first, second), tilt)
 
@@ -94,15 +94,18 @@ def costs(splats: Field, first: Index, second: Index) -> Array:
 
 
 class _Ends(NamedTuple):
-    """Both splats of each pair, and what they have in common.
+    """The two splats of M pairs, and what they have in common.
 
     Attributes
     ----------
     one, two : Field
+        The first and the second splats.
     color, rest : (M,) float64
         Shares of the first and of the second in the colour.
-    direction, spread : (M, 3) float64
+    direction, deviation : (M, 3) float64
+        From where the pair is viewed; see `merge_field.Look`.
     blur : (M,) float64
+        Variance of the low-pass, world units squared.
     apart : (M,) float64
         Squared difference of their colours.
     """
@@ -112,7 +115,7 @@ class _Ends(NamedTuple):
     color: Array
     rest: Array
     direction: Array
-    spread: Array
+    deviation: Array
     blur: Array
     apart: Array
 
@@ -123,7 +126,7 @@ def _gather(splats: Field, first: Index, second: Index) -> _Ends:
     color, rest = _shares(one.contribution, two.contribution)
     direction = one.direction * color[:, None]
     direction += two.direction * rest[:, None]
-    # Seen from opposite sides alike: the plane across the first one's direction is as good.
+    # Opposite directions cancel; both view the same plane, so the first one's will do.
     lost = np.einsum("ij,ij->i", direction, direction) < _CANCELLED
     direction[lost] = one.direction[lost]
     step = one.color - two.color
@@ -133,48 +136,156 @@ def _gather(splats: Field, first: Index, second: Index) -> _Ends:
         color,
         rest,
         normalized(direction),
-        _spread(one.spread, two.spread, color),
+        _mean_deviation(one.deviation, two.deviation, color),
         color * one.blur + rest * two.blur,
         np.einsum("ij,ij->i", step, step),
     )
 
 
 def _price(ends: _Ends, tilt: float) -> Pairs:
-    """Price merges seen from one direction; the factor 2 pi of masses and products cancels."""
+    """Price merges viewed from one direction.
+
+    Masses and inner products are all taken over 2 pi here, which cancels.
+    """
     first, second, color, rest = ends.one, ends.two, ends.color, ends.rest
+    signals = _signals(ends, tilt)
+    mass_1, mass_2 = signals.masses
+    products = _products(signals)
+    contrasts = _contrasts(ends, signals.masses, products)
+    pp = products.one - 2.0 * color * products.one_merged + color * color * products.merged
+    qq = products.two - 2.0 * rest * products.two_merged + rest * rest * products.merged
+    pq = products.overlap - rest * products.one_merged - color * products.two_merged
+    pq += color * rest * products.merged
+    tau = (first.contribution + second.contribution) / (mass_1 + mass_2)
+    cost = contrasts.one * pp + 2.0 * contrasts.both * pq + contrasts.two * qq
+    cost = tau * np.maximum(cost, 0.0)
+    # The merged splat's own contrast is l_i s_i + l_j s_j.
+    mixed = color * color * contrasts.one + 2.0 * color * rest * contrasts.both
+    mixed += rest * rest * contrasts.two
+    error = tau * np.maximum(mixed, 0.0) * products.merged
+    opacity = signals.mass / signals.areas[2]
+    return Pairs(cost, signals.position, color, opacity, signals.growth, error)
+
+
+class _Signals(NamedTuple):
+    """Footprints and masses of M pairs and of what they become, in the plane viewed.
+
+    Attributes
+    ----------
+    one, two, merged : Footprint
+        Covariances in the plane, low-pass included.
+    x, y : (M,) float64
+        From the centre of the first to that of the second.
+    areas : tuple of (M,) float64
+        Of the first, the second and the merged footprint; see `_area`.
+    masses : tuple of (M,) float64
+        Of the first and of the second.
+    mass : (M,) float64
+        Of the merged splat.
+    position, other : (M,) float64
+        Shares of the first and of the second in the mass.
+    growth : (M,) float64
+        Factor by which `merged` has grown so that its opacity is no more than `ALPHA_MAX`.
+    overlap : (M,) float64
+        Inner product of the two.
+    """
+
+    one: Footprint
+    two: Footprint
+    merged: Footprint
+    x: Array
+    y: Array
+    areas: tuple[Array, Array, Array]
+    masses: tuple[Array, Array]
+    mass: Array
+    position: Array
+    other: Array
+    growth: Array
+    overlap: Array
+
+
+def _signals(ends: _Ends, tilt: float) -> _Signals:
+    """Return footprints and masses of pairs and of what they become."""
     one, two, x, y = _plane(ends, tilt)
-    areas = _area(one), _area(two)
-    mass_1, mass_2 = first.opacity * areas[0], second.opacity * areas[1]
+    area_1, area_2 = _area(one), _area(two)
+    mass_1, mass_2 = ends.one.opacity * area_1, ends.two.opacity * area_2
     position, other = _shares(mass_1, mass_2)
     overlap = mass_1 * mass_2 * _product(one, two, x, y)
-    spread = position * other
-    merged = _mixed(one, two, position, (spread * x * x, spread * x * y, spread * y * y))
-    # For nearly opaque splats the second order takes off more than one can hide of the other.
+    between = position * other
+    merged = _mixed(one, two, position, (between * x * x, between * x * y, between * y * y))
+    # The overlap of nearly opaque splats can exceed the smaller mass, which is all that one can
+    # cover of the other.
     mass = mass_1 + mass_2 - np.minimum(overlap, np.minimum(mass_1, mass_2))
-    growth = np.maximum(mass / (_area(merged) * OPACITY_MAX), 1.0)
+    growth = np.maximum(mass / (_area(merged) * ALPHA_MAX), 1.0)
     merged = (merged[0] * growth, merged[1] * growth, merged[2] * growth)
-    area = _area(merged)
-    tau = (first.contribution + second.contribution) / (mass_1 + mass_2)
-    own_1, own_2 = mass_1 * mass_1 / (2.0 * areas[0]), mass_2 * mass_2 / (2.0 * areas[1])
-    own = mass * mass / (2.0 * area)
-    with_1 = mass_1 * mass * _product(one, merged, other * x, other * y)
-    with_2 = mass_2 * mass * _product(two, merged, position * x, position * y)
-    contrast_1 = _contrast(first.error, first.contribution / mass_1 * own_1)
-    contrast_2 = _contrast(second.error, second.contribution / mass_2 * own_2)
-    both = 0.5 * (contrast_1 + contrast_2 - ends.apart)
-    limit = np.sqrt(contrast_1 * contrast_2)
+    areas, masses = (area_1, area_2, _area(merged)), (mass_1, mass_2)
+    return _Signals(one, two, merged, x, y, areas, masses, mass, position, other, growth, overlap)
+
+
+class _Products(NamedTuple):
+    """Inner products of the signals of M pairs, (M,) float64 each.
+
+    Attributes
+    ----------
+    one, two, merged
+        ``<f_i, f_i>``, ``<f_j, f_j>``, ``<f_m, f_m>``.
+    overlap, one_merged, two_merged
+        ``<f_i, f_j>``, ``<f_i, f_m>``, ``<f_j, f_m>``.
+    """
+
+    one: Array
+    two: Array
+    merged: Array
+    overlap: Array
+    one_merged: Array
+    two_merged: Array
+
+
+def _products(signals: _Signals) -> _Products:
+    """Return the inner products of pairs and of what they become."""
+    merged, mass, x, y = signals.merged, signals.mass, signals.x, signals.y
+    mass_1, mass_2 = signals.masses
+    area_1, area_2, area = signals.areas
+    # The merged centre lies between the two: the other's share of the step away from each.
+    away_1, away_2 = signals.other, signals.position
+    return _Products(
+        mass_1 * mass_1 / (2.0 * area_1),
+        mass_2 * mass_2 / (2.0 * area_2),
+        mass * mass / (2.0 * area),
+        signals.overlap,
+        mass_1 * mass * _product(signals.one, merged, away_1 * x, away_1 * y),
+        mass_2 * mass * _product(signals.two, merged, away_2 * x, away_2 * y),
+    )
+
+
+class _Contrasts(NamedTuple):
+    """Contrasts of M pairs to what lies behind, (M,) float64 each.
+
+    Attributes
+    ----------
+    one, two, both
+        ``|s_i|^2``, ``|s_j|^2``, ``s_i.s_j``.
+    """
+
+    one: Array
+    two: Array
+    both: Array
+
+
+def _contrasts(ends: _Ends, masses: tuple[Array, Array], products: _Products) -> _Contrasts:
+    """Return the contrasts that explain the measured errors of pairs."""
+    first, second = ends.one, ends.two
+    one = _squared_contrast(first.error, first.contribution / masses[0] * products.one)
+    two = _squared_contrast(second.error, second.contribution / masses[1] * products.two)
+    both = 0.5 * (one + two - ends.apart)
+    # Measured errors and colours need not fit together: by Cauchy-Schwarz it is no larger.
+    limit = np.sqrt(one * two)
     both = np.clip(both, -limit, limit)
-    pp = own_1 - 2.0 * color * with_1 + color * color * own
-    qq = own_2 - 2.0 * rest * with_2 + rest * rest * own
-    pq = overlap - rest * with_1 - color * with_2 + color * rest * own
-    cost = tau * np.maximum(contrast_1 * pp + 2.0 * both * pq + contrast_2 * qq, 0.0)
-    contrast = color * color * contrast_1 + 2.0 * color * rest * both + rest * rest * contrast_2
-    error = tau * np.maximum(contrast, 0.0) * own
-    return Pairs(cost, position, color, mass / area, growth, error)
+    return _Contrasts(one, two, both)
 
 
 def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
-    """Return the merged splats: their moments are those of the two, weighted.
+    """Return the merged splats: mean and covariance are those of the mixture of the two.
 
     ``mu = w mu_i + w' mu_j`` and ``C = w C_i + w' C_j + w w' d d'``, w + w' = 1, d = mu_j - mu_i.
     """
@@ -182,8 +293,8 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
     position, color = pairs.position[:, None], pairs.color[:, None]
     step = two.means - one.means
     rows, columns = np.triu_indices(3)
-    spread = step[:, rows] * step[:, columns] * (position * (1.0 - position))
-    covariances = position * one.covariances + (1.0 - position) * two.covariances + spread
+    between = step[:, rows] * step[:, columns] * (position * (1.0 - position))  # (M, 6)
+    covariances = position * one.covariances + (1.0 - position) * two.covariances + between
     direction = normalized(color * one.direction + (1.0 - color) * two.direction)
     lost = ~direction.any(axis=1)
     direction[lost] = one.direction[lost]
@@ -194,7 +305,7 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
         one.contribution + two.contribution,
         pairs.error,
         direction,
-        _spread(one.spread, two.spread, pairs.color),
+        _mean_deviation(one.deviation, two.deviation, pairs.color),
         color * one.color + (1.0 - color) * two.color,
         pairs.color * one.blur + (1.0 - pairs.color) * two.blur,
     )
@@ -216,10 +327,13 @@ def _shares(one: Array, two: Array) -> tuple[Array, Array]:
     return one / total, two / total
 
 
-def _contrast(error: Array, whole: Array) -> Array:
-    """Return |s|^2, E over what it would be at a contrast of 1; colours differ by 1 at most."""
-    contrast: Array = np.minimum(error, CHANNELS * whole) / np.maximum(whole, _TINY)
-    return contrast
+def _squared_contrast(error: Array, whole: Array) -> Array:
+    """Return |s|^2, (M,): the error over what it would be if |s| were 1.
+
+    Colours are in 0..1, so |s|^2 is at most 1 a channel.
+    """
+    squared: Array = np.minimum(error, CHANNELS * whole) / np.maximum(whole, _TINY)
+    return squared
 
 
 def _plane(ends: _Ends, tilt: float) -> tuple[Footprint, Footprint, Array, Array]:
@@ -231,7 +345,7 @@ def _plane(ends: _Ends, tilt: float) -> tuple[Footprint, Footprint, Array, Array
         xx, xy, yy, low-pass included; world units squared.
     x, y : (M,) float64
     """
-    normal = normalized(ends.direction + tilt * ends.spread) if tilt else ends.direction
+    normal = normalized(ends.direction + tilt * ends.deviation) if tilt else ends.direction
     u, v = across(normal)
     step = (ends.two.means - ends.one.means).T
     return (
@@ -242,35 +356,48 @@ def _plane(ends: _Ends, tilt: float) -> tuple[Footprint, Footprint, Array, Array
     )
 
 
-def _spread(one: Array, two: Array, share: Array) -> Array:
-    """Return the mean of spreads, whose sign means nothing, (M, 3)."""
+def _mean_deviation(one: Array, two: Array, share: Array) -> Array:
+    """Return the mean of deviations, (M, 3); either sign of each means the same."""
     sign = np.where(np.einsum("ij,ij->i", one, two) < 0.0, -1.0, 1.0)
     mean: Array = share[:, None] * one + ((1.0 - share) * sign)[:, None] * two
     return mean
 
 
-def _mixed(one: Footprint, two: Footprint, share: Array, spread: Footprint) -> Footprint:
-    """Return the footprint of the mixture of two."""
+def _mixed(one: Footprint, two: Footprint, share: Array, between: Footprint) -> Footprint:
+    """Return the covariance of the mixture of two.
+
+    Parameters
+    ----------
+    one, two : Footprint
+    share : (M,) float64
+        Of the first.
+    between : Footprint
+        Covariance between the two centres, weighted by their shares.
+    """
     rest = 1.0 - share
     return (
-        share * one[0] + rest * two[0] + spread[0],
-        share * one[1] + rest * two[1] + spread[1],
-        share * one[2] + rest * two[2] + spread[2],
+        share * one[0] + rest * two[0] + between[0],
+        share * one[1] + rest * two[1] + between[1],
+        share * one[2] + rest * two[2] + between[2],
     )
 
 
 def _determinant(footprint: Footprint) -> Array:
-    """Return the determinant, a little above 0 where rounding leaves none of a thin one."""
+    """Return the determinant, (M,), at least a little above 0 where rounding leaves none."""
     xx, xy, yy = footprint
     return np.maximum(xx * yy - xy * xy, 1e-12 * xx * yy + _TINY)
 
 
 def _area(footprint: Footprint) -> Array:
+    """Return the area of the ellipse of one standard deviation over pi, (M,)."""
     return np.sqrt(_determinant(footprint))
 
 
 def _product(one: Footprint, other: Footprint, x: Array, y: Array) -> Array:
-    """Return 2 pi times the integral of the product of two normal densities, `x`, `y` apart."""
+    """Return 2 pi times the integral of the product of two normal densities, (M,).
+
+    It is a normal density of their step `x`, `y` whose covariance is the sum of theirs.
+    """
     total = (one[0] + other[0], one[1] + other[1], one[2] + other[2])
     determinant = _determinant(total)
     square = (total[2] * x * x - 2.0 * total[1] * x * y + total[0] * y * y) / determinant

@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from ..foreign_files import refuse_pointer
 from ..views import View, ViewSet
-from .lenses import MODELS, MODELS_BY_NAME, Model, lens_note
-from .place import Place
+from .lenses import MODELS, MODELS_BY_NAME, Model, counted, lens_note
+from .place import Place, is_file
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -79,7 +80,7 @@ def find_colmap(folder: Path) -> tuple[Path, str] | None:
     """
     for place in (".", "sparse/0", "sparse", "colmap/sparse/0"):
         for suffix in SUFFIXES:
-            if all((folder / place / f"{stem}{suffix}").is_file() for stem in MODEL_FILES[:2]):
+            if all(is_file(folder / place / f"{stem}{suffix}") for stem in MODEL_FILES[:2]):
                 return folder / place, suffix
     return None
 
@@ -178,6 +179,7 @@ class _Binary:
                     self.file.fail("the file is empty, expected a COLMAP model")
                 # Mapped: most of images.bin is observations, which are skipped.
                 self.data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+                refuse_pointer(path, self.data[:SHORT_LINE])
         except (OSError, ValueError) as error:
             self.file.fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
 
@@ -213,6 +215,14 @@ class _Binary:
             )
         return int(count)
 
+    def end(self, what: str, count: int) -> None:
+        """Refuse bytes behind the last of so many things, which would be more of them."""
+        left = self.size - self.offset
+        if left:
+            self.file.at(f"byte {self.offset}").fail(
+                f"expected the end of the file behind {counted(count, what)}, got {left} more bytes"
+            )
+
     def truncated(self, what: str, expected: str) -> NoReturn:
         """Raise the error of a file that ends early."""
         left = self.size - self.offset
@@ -231,6 +241,7 @@ def _binary_cameras(path: Path) -> dict[int, Lens]:
             model = MODELS[model_id]
             values = data.take(f"{model.count}d", f"parameters of camera row {row}")
             _add(lenses, place, camera_id, _lens(place, model, size, values))
+        data.end("camera", len(lenses))
         return lenses
 
 
@@ -245,6 +256,7 @@ def _binary_images(path: Path) -> list[Image]:
             (points,) = data.take("Q", f"number of points of image row {row}")
             data.skip(points * POINT_BYTES, f"{points} points of image row {row}")
             images.append(_image(place, image_id, pose, camera_id, name))
+        data.end("image", len(images))
         return images
 
 
@@ -258,6 +270,7 @@ def _lines(path: Path) -> list[tuple[Place, bytes]]:
         file.fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
     if not any(lines):
         file.fail("the file is empty, expected a COLMAP model")
+    refuse_pointer(path, lines[0])
     lines[0] = lines[0].removeprefix(codecs.BOM_UTF8)
     return [
         (file.at(f"line {number}"), line)

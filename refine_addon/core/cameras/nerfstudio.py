@@ -25,7 +25,7 @@ import numpy as np
 from ..views import View, ViewSet
 from .image_size import image_size
 from .lenses import FISHEYE624, MODELS_BY_NAME, PANORAMAS, Model, counted, lens_note
-from .place import ORTHONORMAL_TOLERANCE, Place, described, read_json
+from .place import ORTHONORMAL_TOLERANCE, Place, described, is_file, is_folder, read_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -228,7 +228,7 @@ def without_scale(place: Place, matrix: NDArray[np.float64]) -> tuple[NDArray[np
 def _splat_world(place: Place, shared: Mapping[str, Any]) -> tuple[Similarity, list[str]]:
     """Return how the world of the splats lies to that of the file, and what to tell about it."""
     beside = place.path.parent / DATAPARSER_FILE
-    if not beside.is_file():
+    if not is_file(beside):
         hint = f"splats of ns-export need {DATAPARSER_FILE} beside it"
         return Similarity(), [hint] if "applied_transform" in shared else []
     source = Place(beside)
@@ -243,7 +243,7 @@ def _splat_world(place: Place, shared: Mapping[str, Any]) -> tuple[Similarity, l
     applied[:, :3] = np.eye(3)
     if "applied_transform" in shared:
         applied = at.matrix(shared["applied_transform"], (3, 4), 4)
-    elif (place.path.parent / "colmap" / "sparse" / "0").exists():
+    elif is_folder(place.path.parent / "colmap" / "sparse" / "0"):
         applied[:, :3] = LEGACY_TRANSFORM
     turned = rotation @ at.rotation(applied[:3, :3]).T
     offset = matrix[:, 3] - turned @ applied[:3, 3]

@@ -7,13 +7,16 @@ error names the file, the place, what was found and what was expected.
 from __future__ import annotations
 
 import json
+import stat
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
 from ..errors import RefineError
+from ..foreign_files import refuse_pointer
 from ..views import View
+from ..whole_file import mode_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -170,6 +173,29 @@ class Place:
             self.fail(str(error))
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is such a file.
+
+    Raises
+    ------
+    RefineError
+        If the system does not say: a name too long, a folder that may not be entered.
+    """
+    return stat.S_ISREG(_mode(path))
+
+
+def is_folder(path: Path) -> bool:
+    """Whether there is such a folder; see `is_file`."""
+    return stat.S_ISDIR(_mode(path))
+
+
+def _mode(path: Path) -> int:
+    try:
+        return mode_of(path)
+    except (OSError, ValueError) as error:
+        Place(path).fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
+
+
 def described(value: object) -> str:
     """Return a short description of a value out of JSON, for messages."""
     if isinstance(value, dict):
@@ -197,6 +223,7 @@ def read_json(path: Path) -> object:
     try:
         with path.open("rb") as stream:
             head = stream.read(SNIFFED_BYTES)
+            refuse_pointer(path, head)
             if head[:1] not in b"{[\xef \t\r\n":  # so that no splat file is read whole
                 place.fail(
                     "not a camera file: expected JSON (cameras.json, transforms.json) "

@@ -7,14 +7,18 @@ place where it is wrong. Nothing is guessed that would move a camera.
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..views import View, ViewSet
+from ..whole_file import expanded
 from .colmap import MODEL_FILES, SUFFIXES, find_colmap, read_colmap
 from .nerfstudio import read_transforms
-from .place import Place, described, read_json
+from .place import Place, described, is_file, is_folder, read_json
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
 """What a camera of ``cameras.json`` cannot do without."""
@@ -47,15 +51,10 @@ def read_cameras(path: Path | str) -> ViewSet:
         If there is no such file or it is wrong; the message names the file, the place, what was
         found and what was expected.
     """
-    path = Path(path)
-    try:
-        path = path.expanduser()
-        is_folder, is_file = path.is_dir(), path.is_file()
-    except (OSError, RuntimeError) as error:  # a name too long; a home that is not known
-        Place(path).fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
-    if is_folder:
+    path = expanded(path)
+    if is_folder(path):
         return _read_folder(path)
-    if not is_file:
+    if not is_file(path):
         Place(path).fail("no such file or folder, expected cameras")
     if path.suffix in SUFFIXES and path.stem in MODEL_FILES:
         return read_colmap(path.parent, path.suffix)
@@ -63,7 +62,7 @@ def read_cameras(path: Path | str) -> ViewSet:
 
 
 def _read_folder(folder: Path) -> ViewSet:
-    files = [folder / name for name in JSON_NAMES if (folder / name).is_file()]
+    files = [folder / name for name in JSON_NAMES if is_file(folder / name)]
     colmap = find_colmap(folder)
     if not files and not colmap:
         Place(folder).fail(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import mmap
 import stat
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from ..whole_file import expanded, refuse_mapped, whole_file
 from .ply_body import check_counts, read_text, vertex_range
 from .ply_columns import REQUIRED, REST_COUNTS, columns_from_splats, splats_from_columns
 from .ply_header import TEXT, Header, format_of, read_header, shown, with_count, with_properties
-from .ply_write import declarations, write_lines, write_rows
+from .ply_write import declarations, longest_line, text_lines, write_rows
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..absorbing.absorb import Absorbed
     from ..splats import Splats
 
 __all__ = [
@@ -38,6 +37,9 @@ __all__ = [
     "read_ply",
     "splats_from_columns",
 ]
+
+INDEXING = ("edge", "face", "tristrips")
+"""Elements that, by a PLY's convention, hold numbers of vertices."""
 
 _NAMES_SHOWN = 12
 
@@ -58,6 +60,8 @@ class SplatFile:
         Bytes of the body ahead of and behind the vertex rows.
     lines : list of bytes or None
         For ASCII files, the text of each vertex row with its line end.
+    indexing : tuple of str
+        Names of other elements whose rows hold numbers of splats.
     """
 
     path: Path
@@ -66,6 +70,7 @@ class SplatFile:
     before: NDArray[np.uint8]
     after: NDArray[np.uint8]
     lines: list[bytes] | None = None
+    indexing: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of splats."""
@@ -79,6 +84,15 @@ class SplatFile:
         return int(self.rows.dtype.itemsize)
 
     @property
+    def changed_row_bytes(self) -> int:
+        """Bytes one splat takes at most where its numbers may become any others."""
+        if self.lines is None:
+            return self.row_bytes
+        names = self.rows.dtype.names or ()
+        ours = [name for name in names if name in REQUIRED or name.startswith("f_rest_")]
+        return longest_line(self.rows.dtype, self.lines, ours)
+
+    @property
     def fixed_bytes(self) -> int:
         """Bytes that stay however many splats go."""
         return len(self.header) + len(self.before) + len(self.after)
@@ -88,16 +102,34 @@ class SplatFile:
         """What the header's format line says, such as ``binary_little_endian 1.0``."""
         return format_of(self.header)
 
-    def size(self, keep: NDArray[np.bool_] | None = None) -> int:
-        """Return how many bytes the file takes with the kept rows (all by default)."""
-        count = len(self) if keep is None else int(np.count_nonzero(keep))
-        header = len(with_count(self.header, count))
+    def size(
+        self,
+        keep: NDArray[np.bool_] | None = None,
+        columns: Mapping[str, NDArray[Any]] | None = None,
+    ) -> int:
+        """Return how many bytes `write` would write.
+
+        Parameters
+        ----------
+        keep, columns
+            See `write`.
+        """
+        columns = columns or {}
         if self.lines is None:
-            rows = count * self.row_bytes
+            count = len(self) if keep is None else int(np.count_nonzero(keep))
+            kinds = [v.dtype for n, v in columns.items() if n not in (self.rows.dtype.names or ())]
+            rows = count * (self.row_bytes + sum(kind.itemsize for kind in kinds))
         else:
-            kept = range(len(self)) if keep is None else np.flatnonzero(keep).tolist()
-            rows = sum(len(self.lines[index]) for index in kept)
-        return header + len(self.before) + rows + len(self.after)
+            rows = sum(map(len, text_lines(self.rows, self.lines, keep, columns)))
+        return len(self._new_header(keep, columns)) + len(self.before) + rows + len(self.after)
+
+    def notes(self, keep: NDArray[np.bool_]) -> list[str]:
+        """Return what the user should know of a file of the kept rows, in sentences."""
+        return [
+            f"element '{name}' beside the splats is kept as it is; "
+            "its indices may point past the end"
+            for name in ([] if keep.all() else self.indexing)
+        ]
 
     def splats(self) -> Splats:
         """Return the rows as splats, as views of the file where its layout permits."""
@@ -138,50 +170,26 @@ class SplatFile:
                 f"expected one bool for each of {len(self)} splats"
             )
             raise RefineError(msg)
-        header = with_count(self.header, len(self) if keep is None else int(np.sum(keep)))
-        declared = declarations(self.path, self.rows, columns)
-        if declared:
-            header = with_properties(header, declared)
+        header = self._new_header(keep, columns)
         if self.lines is None and not self.rows.flags.writeable:
             refuse_mapped(path, self.path)
         with whole_file(path, overwrite=overwrite) as stream:
             stream.write(header)
             stream.write(self.before.data)
             if self.lines is not None:
-                write_lines(stream, self.lines, keep, columns, self.rows.dtype)
+                stream.writelines(text_lines(self.rows, self.lines, keep, columns))
             else:
                 write_rows(stream, self.rows, keep, columns)
             stream.write(self.after.data)
 
-    def write_survivors(
-        self, path: Path | str, absorbed: Absorbed, *, overwrite: bool = False
-    ) -> None:
-        """Write the survivors of absorbing, in order; those that did not change, as they were.
-
-        Parameters
-        ----------
-        path : path-like
-            The file to make; written whole or not at all.
-        absorbed : Absorbed
-            Of the splats of this file.
-        overwrite : bool
-            Whether an existing file may be replaced.
-
-        Raises
-        ------
-        RefineError
-            See `write`.
-        """
-        rows = self.rows[absorbed.keep]
-        lines = None
-        if self.lines is not None:
-            lines = [self.lines[index] for index in np.flatnonzero(absorbed.keep).tolist()]
-        columns = {
-            name: np.where(absorbed.changed, values, rows[name]).astype(rows[name].dtype)
-            for name, values in columns_from_splats(absorbed.splats).items()
-        }
-        kept = replace(self, rows=rows, lines=lines)
-        kept.write(path, columns=columns, overwrite=overwrite)
+    def _new_header(
+        self, keep: NDArray[np.bool_] | None, columns: Mapping[str, NDArray[Any]]
+    ) -> bytes:
+        """Return the header of the kept rows with these columns."""
+        count = len(self) if keep is None else int(np.count_nonzero(keep))
+        header = with_count(self.header, count)
+        declared = declarations(self.path, self.rows, columns)
+        return with_properties(header, declared) if declared else header
 
 
 def read_ply(path: Path | str) -> SplatFile:
@@ -218,13 +226,15 @@ def read_ply(path: Path | str) -> SplatFile:
         raise RefineError(msg) from error
     body = np.frombuffer(whole, np.uint8)[len(header.raw) :]
     check_counts(header, len(body))
+    filled = [e.name for e, count in zip(header.elements, header.counts, strict=True) if count]
+    indexing = tuple(name for name in filled if name in INDEXING)
     if header.order == TEXT:
         rows, lines, beside = read_text(header, vertex, body.tobytes())
         before, after = (np.frombuffer(part, np.uint8) for part in beside)
-        return SplatFile(path, rows, header.raw, before, after, lines)
+        return SplatFile(path, rows, header.raw, before, after, lines, indexing)
     start, end = vertex_range(header, vertex, body)
     rows = body[start:end].view(header.elements[vertex].dtype(header.order))
-    return SplatFile(path, rows, header.raw, body[:start], body[end:])
+    return SplatFile(path, rows, header.raw, body[:start], body[end:], indexing=indexing)
 
 
 def _vertex_index(header: Header) -> int:
@@ -282,6 +292,6 @@ def _check_properties(header: Header, vertex: int) -> None:
 def _guess(header: Header, kinds: Mapping[str, str]) -> str:
     if "opacity" in kinds:
         return "incomplete splats"
-    if any(element.name in ("face", "tristrips") for element in header.elements):
+    if any(element.name in INDEXING for element in header.elements):
         return "a mesh, not splats"
     return "a point cloud, not splats"

@@ -57,26 +57,33 @@ def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> S
     )
 
 
+def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
+    """Return views of splats, (N,) each, under the names that a 3DGS PLY gives its properties.
+
+    In the order of the reference implementation, without normals, and of the splats' own types.
+    """
+    coefficients = splats.sh_rest.shape[1]
+    return {
+        **{name: splats.means[:, axis] for axis, name in enumerate("xyz")},
+        **{f"f_dc_{channel}": splats.sh_dc[:, channel] for channel in range(3)},
+        **{
+            f"f_rest_{channel * coefficients + index}": splats.sh_rest[:, index, channel]
+            for channel in range(3)
+            for index in range(coefficients)
+        },
+        "opacity": splats.opacity_logits,
+        **{f"scale_{axis}": splats.log_scales[:, axis] for axis in range(3)},
+        **{f"rot_{index}": splats.quaternions[:, index] for index in range(4)},
+    }
+
+
 def columns_from_splats(splats: Splats) -> dict[str, NDArray[np.float32]]:
     """Return the float32 columns that a 3DGS PLY stores, in the reference order, no normals."""
-    columns: dict[str, NDArray[Any]] = {}
-    groups: list[tuple[Sequence[str], NDArray[Any]]] = [
-        (["x", "y", "z"], splats.means),
-        (["f_dc_0", "f_dc_1", "f_dc_2"], splats.sh_dc),
-    ]
-    coefficients = splats.sh_rest.shape[1] * 3
-    rest = splats.sh_rest.transpose(0, 2, 1).reshape(len(splats), coefficients)
-    groups += [
-        ([f"f_rest_{index}" for index in range(coefficients)], rest),
-        (["opacity"], splats.opacity_logits[:, None]),
-        (["scale_0", "scale_1", "scale_2"], splats.log_scales),
-        (["rot_0", "rot_1", "rot_2", "rot_3"], splats.quaternions),
-    ]
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # of double into float
-        for names, values in groups:
-            for index, name in enumerate(names):
-                columns[name] = np.ascontiguousarray(values[:, index], np.float32)
-    return columns
+        return {
+            name: np.ascontiguousarray(values, np.float32)
+            for name, values in values_by_name(splats).items()
+        }
 
 
 def _stack(columns: Any, names: Sequence[str]) -> NDArray[Any]:  # noqa: ANN401

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import plyfile
 
 from ..errors import RefineError
+from ..foreign_files import refuse_foreign_splats
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -71,6 +72,7 @@ def read_header(path: Path, stream: BinaryIO) -> Header:
         msg = f"{path}: the file is empty, expected a PLY"
         raise RefineError(msg)
     if not re.match(rb"ply[\r\n]", head):
+        refuse_foreign_splats(path, head)
         msg = f"{path}: not a PLY: it starts with {head[:8]!r}, expected 'ply' and a line end"
         raise RefineError(msg)
     found = _END[_line_end(head)].search(head)

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import RefineError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
     from typing import BinaryIO
 
@@ -27,6 +27,9 @@ PLY_TYPES = {
     "f8": "double",
 }
 """NumPy's names of the types a PLY knows -> the PLY's."""
+
+_LONGEST = {4: len("-1234567800000000.0"), 8: len("-1.2345678901234567e-308")}
+"""Bytes of a float or double -> the most characters that the shortest text for one takes."""
 
 _ROWS = 1 << 14
 """Rows gathered at a time: 4 MB at degree 3, as fast as any more and nothing to hold."""
@@ -68,31 +71,74 @@ def _with_cells(
     return grown
 
 
-def write_lines(
-    stream: BinaryIO,
+def text_lines(
+    rows: NDArray[Any],
     lines: Sequence[bytes],
     keep: NDArray[np.bool_] | None,
     columns: Mapping[str, NDArray[Any]],
-    dtype: np.dtype[Any],
-) -> None:
-    """Write the kept rows of an ASCII file as their text, with `columns` set or appended."""
-    kept: Iterable[int] = range(len(lines)) if keep is None else np.flatnonzero(keep).tolist()
-    if not columns:
-        stream.writelines(lines[index] for index in kept)
-        return
-    names = dtype.names or ()
-    cells = {n: _cast(v, _stored(dtype, n, v.dtype)) for n, v in columns.items()}
-    places = {names.index(name): values for name, values in cells.items() if name in names}
+) -> Iterator[bytes]:
+    """Yield the kept rows of an ASCII file with `columns` set or appended.
+
+    Only the words of numbers that become other numbers are replaced; all other text stays.
+
+    Parameters
+    ----------
+    rows : (N,) structured
+        The numbers that the lines hold.
+    lines : sequence of bytes
+    keep : (N,) bool or None
+    columns : mapping of str to (N,)
+
+    Yields
+    ------
+    bytes
+        A line with its end.
+    """
+    names = rows.dtype.names or ()
+    cells = {n: _cast(v, _stored(rows.dtype, n, v.dtype)) for n, v in columns.items()}
     added = [values for name, values in cells.items() if name not in names]
-    # str of a NumPy number is the shortest text that reads back as the same number.
-    stream.writelines(
-        _edited(
-            lines[index],
-            {place: str(values[index]).encode() for place, values in places.items()},
-            [str(values[index]).encode() for values in added],
-        )
-        for index in kept
-    )
+    replaced = [
+        (names.index(name), values, _differs(values, rows[name]))
+        for name, values in cells.items()
+        if name in names
+    ]
+    kept: Iterable[int] = range(len(lines)) if keep is None else np.flatnonzero(keep).tolist()
+    for index in kept:
+        # str of a NumPy number is the shortest text that reads back as the same number.
+        words = {
+            place: str(values[index]).encode()
+            for place, values, differs in replaced
+            if differs[index]
+        }
+        more = [str(values[index]).encode() for values in added]
+        yield _edited(lines[index], words, more) if words or more else lines[index]
+
+
+def longest_line(dtype: np.dtype[Any], lines: Sequence[bytes], names: Collection[str]) -> int:
+    """Return how many bytes a line takes at most, whatever its numbers of these names become.
+
+    Parameters
+    ----------
+    dtype : structured
+        Of the numbers that the lines hold.
+    lines : sequence of bytes
+    names : collection of str
+        Properties of type float or double.
+    """
+    room = [_LONGEST[dtype[name].itemsize] if name in names else 0 for name in dtype.names or ()]
+
+    def longest(line: bytes) -> int:
+        more = (most - len(word) for most, word in zip(room, line.split(), strict=True))
+        return len(line) + sum(each for each in more if each > 0)
+
+    return max(map(longest, lines), default=0)
+
+
+def _differs(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return where two columns of one type differ in their bits, as 0 and -0 do."""
+    bits = f"u{one.dtype.itemsize}"
+    differs: NDArray[np.bool_] = one.view(bits) != np.ascontiguousarray(other).view(bits)
+    return differs
 
 
 def _edited(line: bytes, words: Mapping[int, bytes], added: Sequence[bytes]) -> bytes:

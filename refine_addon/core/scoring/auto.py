@@ -144,7 +144,8 @@ def score(
         "tolerance": tolerance,
         "tried": {trial.choice: trial.disagreement for trial in trials},
     }
-    return replace(scores, weights={**scores.weights, "auto": facts}, notes=(*scores.notes, note))
+    weights = {**scores.weights, "auto": facts}
+    return replace(scores, weights=weights, notes=(*scores.notes, note), method="auto")
 
 
 def _models(

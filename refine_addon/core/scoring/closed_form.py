@@ -18,11 +18,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ..errors import RefineError
+from ..frustum import Frustums
+from ..rendering import NEAR_RELATIVE
+from ..scene import median_size
 from ..scores import Scores
 from ..splats import base_color, drawable, opacity
 from ..work import Progress, for_chunks, part, silent
 from . import adaptive
-from .frustum import Frustums
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -35,9 +37,6 @@ LUMA = (0.299, 0.587, 0.114)
 
 ETA_RELATIVE = 0.005
 """Default eta over the squared size of the scene: the paper's .05 at a viewing distance of 3 m."""
-
-NEAR_RELATIVE = 0.01
-"""Default near plane over the size of the scene, where a view brings none of its own."""
 
 UNSEEN = 1e-6
 """Factor on 1 / (squared distance to the views + eta), the weight of splats that no view sees: it
@@ -150,9 +149,9 @@ def score(
     if not scene.good.any():
         msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
         raise RefineError(msg)
-    scene.measure()
+    scene.set_lengths()
     sums = for_chunks(
-        scene.weigh, len(splats), _CHUNK,
+        scene.sum_views, len(splats), _CHUNK,
         progress=part(progress, 0.2, 0.95), what="scoring", threads=threads,
     )  # fmt: skip
     if settings.frustum and not scene.seen.any():
@@ -177,6 +176,8 @@ def score(
             "lambda": dict(zip(adaptive.TERMS, lambdas, strict=True)),
             "statistics": vars(statistics).copy(),
         },
+        method="closed-form",
+        frustum=settings.frustum,
     )
 
 
@@ -184,7 +185,7 @@ def _statistics(tallies: NDArray[np.float64]) -> adaptive.Statistics:
     """Return the statistics of a scene from those of its chunks; see `_Scene.read`."""
     count, ratios, translucency, luma, squares = tallies.T
     total = count.sum()
-    # Around the mean of each chunk, and of these around that of all: nothing cancels.
+    # Variance within the chunks plus variance of their means: sums of squares, so none cancel.
     around = luma - luma @ count / total
     return adaptive.Statistics(
         anisotropy=float(ratios.sum() / total),
@@ -196,17 +197,18 @@ def _statistics(tallies: NDArray[np.float64]) -> adaptive.Statistics:
 class _Scene:
     """What the formula needs of N splats, filled chunk by chunk.
 
-    The splats are read once, since they may be a file larger than memory: 57 bytes of each stay.
+    The splats are read once, since they may be a file larger than memory; 57 bytes of each stay.
+    H is called visibility here.
     """
 
     def __init__(self, splats: Splats, views: ViewSet, settings: ClosedForm) -> None:
         self.splats, self.views, self.settings = splats, views, settings
         self.weights = views.weights
-        self.origin, self.spread = views.middle()
+        self.origin, self.view_variance = views.middle()
         count = len(splats)
         self.good = np.empty(count, np.bool_)
         self.means = np.empty((count, 3), splats.means.dtype.newbyteorder("="))
-        self.squared, self.alpha, self.area, self.weight = (np.empty(count) for _ in range(4))
+        self.squared, self.alpha, self.area, self.visibility = (np.empty(count) for _ in range(4))
         self.luma = np.empty(count, np.float32)  # in 0..1, to 6e-8
         self.values = np.empty(count, np.float32)
         self.seen = np.zeros(count, np.int32)
@@ -224,9 +226,9 @@ class _Scene:
         good = self.good[piece] = drawable(chunk)
         means = self.means[piece] = np.where(good[:, None], chunk.means, 0.0)
         offset = means - self.origin
-        # What underflows to 0 is 0 beside everything that counts.
+        # What underflows to 0 is negligible beside everything that counts.
         with np.errstate(under="ignore"):
-            self.squared[piece] = np.einsum("ij,ij->i", offset, offset) + self.spread
+            self.squared[piece] = np.einsum("ij,ij->i", offset, offset) + self.view_variance
             alpha = self.alpha[piece] = opacity(np.where(good, chunk.opacity_logits, -np.inf))
             red, green, blue = base_color(np.where(good[:, None], chunk.sh_dc, 0.0)).T
             self.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
@@ -250,22 +252,27 @@ class _Scene:
             return area, np.exp(np.minimum(largest - np.maximum(smallest, -1e300), limit))
         return area, np.exp(largest) / (np.exp(smallest) + offset)
 
-    def measure(self) -> None:
-        """Derive from the size of the scene what is relative to it.
+    def set_lengths(self) -> None:
+        """Set eta and the near plane, which are multiples of the scene's size.
 
-        The median over splats of their squared distance to the views follows the scene's unit,
-        and not its origin, order or outliers.
+        The size is a median over splats: it changes with the scene's unit, but not with its origin,
+        the order of its splats or a few far ones.
         """
-        good = self.good
-        size = float(np.sqrt(np.median(self.squared if good.all() else self.squared[good]))) or 1.0
+        size = median_size(self.squared, self.good)
         eta = self.settings.eta
         self.eta = ETA_RELATIVE * size * size if eta is None else eta
         self.frustums = Frustums(
             self.views, self.origin, NEAR_RELATIVE * size, self.settings.margin
         )
 
-    def weigh(self, piece: slice) -> list[float]:
-        """Compute H of one slice of splats, and in how many views it lies; sum its three terms."""
+    def sum_views(self, piece: slice) -> list[float]:
+        """Compute H of one slice of splats, and in how many views each lies.
+
+        Returns
+        -------
+        list of float
+            The sums over the slice of ``H G`` for each of the three G.
+        """
         points = np.ones((4, piece.stop - piece.start))
         points[:3] = (self.means[piece] - self.origin).T
         total = np.zeros(points.shape[1])
@@ -276,7 +283,7 @@ class _Scene:
                 depth, inside = self.frustums.project(points, block)
                 if not self.settings.frustum:
                     inside[:] = True
-                # A block has fewer views than a byte counts.
+                # A block has at most 64 views, so a byte can count them.
                 seen += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.uint8)
                 share = inside
                 if self.settings.projection:
@@ -289,8 +296,8 @@ class _Scene:
                 total = np.where(seen == 0, UNSEEN / near, total)
             if self.settings.visibility:
                 total *= self.alpha[piece]
-            weight = self.weight[piece] = total * self.good[piece]
-            sums = [float(np.sum(weight * content)) for content in self._contents(piece)]
+            visibility = self.visibility[piece] = total * self.good[piece]
+            sums = [float(np.sum(visibility * content)) for content in self._contents(piece)]
         self.seen[piece] = seen * self.good[piece]
         return sums
 
@@ -302,7 +309,7 @@ class _Scene:
     def _squared(
         self, points: NDArray[np.float64], depth: NDArray[np.float64], block: slice
     ) -> NDArray[np.float64]:
-        """Return d^2, (V, n), in the memory of `depth`."""
+        """Return d^2, (V, n); `depth` is overwritten by it."""
         if self.settings.depth == "z":
             return np.multiply(depth, depth, out=depth)
         depth[:] = 0.0
@@ -312,12 +319,12 @@ class _Scene:
         return depth
 
     def add(self, factors: NDArray[np.float64], piece: slice) -> None:
-        """Sum up the terms of one slice of splats, each times its factor."""
-        weight, good = self.weight[piece], self.good[piece]
+        """Set the scores of one slice of splats: the sum of the terms, each times its factor."""
+        visibility, good = self.visibility[piece], self.good[piece]
         with np.errstate(under="ignore"):
             terms = zip(factors, self._contents(piece), strict=True)
-            values = sum(factor * (weight * content) for factor, content in terms)
+            values = sum(factor * (visibility * content) for factor, content in terms)
             stored = np.asarray(values, np.float32)
-        # A splat that can be drawn must never tie with one that cannot.
+        # A splat that can be drawn must never tie with one that cannot, which scores 0.
         stored[good] = np.maximum(stored[good], np.finfo(np.float32).tiny)
         self.values[piece] = stored

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from .projection import Gaussians
+
 WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-5.0, 0.5, 0.5)))
 """What is tried, of the mean of the scores for a splat of mean worth that no view looks at."""
 
@@ -33,8 +35,15 @@ LEAST_WEIGHTS = (0.0, 0.0, 0.03, 0.03, 0.03)
 """The least that the floor weighs at each of `SHARES`: it costs tenths of a dB on views like those
 that score, and is worth up to 20 dB on others."""
 
+TIED = 0.002
+"""Weights whose losses differ by this much or less are nearly as good: what is taken is the mean of
+their logarithms, so that a change in the last digits does not jump from one to another."""
+
 SAMPLE = 1 << 15
 """How many splats are enough to choose by."""
+
+_NO_WEIGHT = 10.0**-5.5  # stands for none in a mean of logarithms
+_MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: spreads what differs little
 
 
 def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> NDArray[np.float64]:
@@ -84,8 +93,34 @@ def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[floa
     if not losses:
         return [1.0] * len(SHARES)
     table = np.mean(np.concatenate(losses), axis=0)  # (weights, shares)
-    best = [WEIGHTS[k] for k in table.argmin(axis=0)]
-    return [max(pair) for pair in zip(best, LEAST_WEIGHTS, strict=True)]
+    nearly = np.exp(np.maximum((table.min(axis=0) - table) / TIED, -50.0))
+    logs = np.log(np.maximum(WEIGHTS, _NO_WEIGHT))
+    best = np.exp(logs @ nearly / nearly.sum(axis=0))
+    return [max(pair) for pair in zip(best.tolist(), LEAST_WEIGHTS, strict=True)]
+
+
+def sample(gaussians: Gaussians, count: int = SAMPLE) -> NDArray[np.int64]:
+    """Return `count` of the splats, or all, ascending: by chance, but always the same ones.
+
+    Which they are depends on a hash of opacity and colour, which neither the order of the splats
+    nor a motion of the scene changes.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    count : int
+    """
+    total = len(gaussians)
+    if total <= count:
+        return np.arange(total)
+    key = np.zeros(total, np.uint64)
+    for values in (gaussians.alphas, *gaussians.colors.T):
+        key = (key ^ np.ascontiguousarray(values, np.float32).view(np.uint32)) * _MIX
+        key ^= key >> np.uint64(29)
+    # Splats that are all alike are taken evenly from the whole scene.
+    order = np.arange(total, dtype=np.uint64) * _MIX
+    key = key >> np.uint64(32) << np.uint64(32) | order >> np.uint64(32)
+    return np.sort(np.argpartition(key, count)[:count])
 
 
 def order(

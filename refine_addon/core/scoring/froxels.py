@@ -1,13 +1,13 @@
-"""What hides what in a view: splats as points in the columns of a grid of cells, front to back.
+"""What hides what in a view: points of splats, sorted by depth within the cells of the image.
 
-A froxel is a cell of the image times a slab of depth. Slabs here are as thin as can be: within a
-cell everything is in its exact order of depth, by one radix sort, and running sums along it say
-how much lies in front of each point and which colour lies behind it. There is no dense grid, so
-memory goes with the number of points, whatever the depth of the scene.
+Each splat becomes a lattice of points over its footprint; each point carries a share of the splat's
+mass, the integral of its alpha. The image is cut into square cells. Within a cell the points are
+sorted by depth, and running sums along the depth give, for each point, the optical thickness in
+front of it and the colour behind it. (A froxel is a cell of the image times a slab of depth; sorted
+points are slabs of no thickness, so no grid of depths has to be chosen or stored.)
 
-A splat is a lattice of points over its footprint, each standing for the share of its mass around
-it. In a cell of area A a point of opacity-weighted mass m covers ``a = m / A`` of it, and points
-that know nothing of each other let ``prod (1 - a)`` through: optical thickness ``-log(1 - a)``.
+In a cell of area A a point of mass m covers the share ``a = m / A``. Points that are independent of
+each other let ``prod (1 - a)`` through, so each has the optical thickness ``-log(1 - a)``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .projection import ALPHA_CUT
+from ..rendering import ALPHA_CUT, ALPHA_MAX
+from ..work import checkpoint
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -30,32 +31,35 @@ if TYPE_CHECKING:
     from ..views import View
     from .projection import Footprints
 
-ALPHA_MAX = 0.99
-"""Renderers let no single splat hide more than this."""
-
-DOUBT = 12.0
-"""What lies loosely in front is believed to be gamma distributed, its shape this over the side of a
-cell in pixels: coarse cells know less, and as cells shrink nothing is left to doubt."""
+GAMMA_SHAPE = 12.0
+"""Shape of the gamma distribution of the thickness in front of a point, times the side of a cell in
+pixels. The smaller the cells, the narrower the distribution: `transmittance` tends to exp(-mean).
+"""
 
 MAX_CELLS = 65535
-"""Cells are numbered by 16 bits: such numbers sort by counting, in linear time."""
+"""Cells of an image, at most: NumPy sorts numbers of 16 bits by radix, in linear time."""
 
 MAX_POINTS = 1 << 22
-"""Points in one view, at most; cells grow until they suffice. About 100 bytes each."""
+"""Points that a view may have, as estimated: cells grow until they suffice. About 100 bytes each.
+"""
+
+LEAST_POINTS = 1.25
+"""Points that a footprint may have on average in a view of so many that `MAX_POINTS` are too few:
+each needs one at least, whatever the size of the cells."""
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """How many points a lattice may have along an axis."""
 
 FLAT = 16
-"""Points along either side of the image for a splat that the whole image lies in."""
+"""Points across and down the image for a splat much larger than it, instead of a lattice."""
 
 Line = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
-"""Points and their weights."""
+"""Points on a line and the share of the mass that each has."""
 
-_EXTENT, _WIDE_EXTENT, _WIDE = 2.4, 3.0, 8  # standard deviations; the latter from 8 points on
-_GROWTH = 2.0**0.25
-_OUTSIDE = MAX_CELLS  # the number of no cell
-_BLOCK = 1 << 16  # points worked on at a time: fewer calls to wait for, and memory stays bounded
+_EXTENT, _WIDE_EXTENT, _WIDE = 2.4, 3.0, 8  # standard deviations; the wide one from 8 points on
+_GROWTH = 2.0**0.25  # of the side of a cell, a step
+_OUTSIDE = MAX_CELLS  # stands for a cell where a point lies beside the image
+_BLOCK = 1 << 16  # points worked on at a time, which bounds temporary memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,19 +70,20 @@ class Lattice:
     ----------
     points : (2, k) float32
         In standard deviations along the major and the minor axis.
-    weights : (k,) float32
-        Share of the mass; sums to 1.
+    shares : (k,) float32
+        Of the mass; their sum is 1.
     """
 
     points: NDArray[np.float32]
-    weights: NDArray[np.float32]
+    shares: NDArray[np.float32]
 
 
 @functools.cache
 def lattices() -> tuple[Lattice, ...]:
-    """Return the lattice of every kind: ``COUNTS[i]`` by ``COUNTS[j]`` points are number i L + j.
+    """Return all lattices: number ``i L + j`` has ``COUNTS[i]`` by ``COUNTS[j]`` points.
 
-    After those comes one of `FLAT` by `FLAT` points over an image, from -1 to 1.
+    L is the length of `COUNTS`. The last one has `FLAT` by `FLAT` points over the image; its points
+    are in half image sizes, -1 to 1.
     """
     lines = [_line(count) for count in COUNTS]
     made = [_lattice(major, minor) for major in lines for minor in lines]
@@ -88,19 +93,21 @@ def lattices() -> tuple[Lattice, ...]:
 
 
 def _lattice(major: Line, minor: Line) -> Lattice:
-    weight = np.outer(major[1], minor[1])
+    """Return the product of two lines without its corners, scaled to variance 1 again."""
+    product = np.outer(major[1], minor[1])  # (k_major, k_minor), shares
     place = np.broadcast_arrays(major[0][:, None], minor[0])
-    extent = _WIDE_EXTENT if max(weight.shape) >= _WIDE else _EXTENT
-    keep = (np.hypot(*place) <= extent + 0.1) | (weight.size <= 4)  # noqa: PLR2004 - 2 x 2 is whole
-    weights = weight[keep] / weight[keep].sum()
-    points = np.stack([axis[keep] for axis in place])
-    variance = (points * points) @ weights  # the corners are gone: back to 1
+    extent = _WIDE_EXTENT if max(product.shape) >= _WIDE else _EXTENT
+    keep = np.hypot(*place) <= extent + 0.1
+    keep |= product.size <= 4  # noqa: PLR2004 - 2 x 2 points are all corners
+    shares = product[keep] / product[keep].sum()  # (k,)
+    points = np.stack([axis[keep] for axis in place])  # (2, k)
+    variance = (points * points) @ shares
     points /= np.sqrt(np.where(variance > 0.0, variance, 1.0))[:, None]
-    return Lattice(points.astype(np.float32), weights.astype(np.float32))
+    return Lattice(points.astype(np.float32), shares.astype(np.float32))
 
 
 def _line(count: int) -> Line:
-    """Return points and weights on a line: equal bins, each at its mean, with variance 1."""
+    """Return the means of bins of equal width of the normal distribution, scaled to variance 1."""
     if count == 1:
         return np.zeros(1), np.ones(1)
     extent = _WIDE_EXTENT if count >= _WIDE else _EXTENT
@@ -114,36 +121,37 @@ def _line(count: int) -> Line:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """The m points of all splats that fall in the image, by cell and, in each, front to back.
+    """The m points that fall in the image, cell by cell and, in each cell, front to back.
 
-    Points of one splat in one cell are one: a splat does not hide itself.
+    Points of one splat in one cell are merged to one, so that a splat does not hide itself.
 
     Attributes
     ----------
     owners : (m,) int64
         Row of the `Footprints`.
-    weights : (m,) float32
-        Share of the splat's mass.
+    shares : (m,) float32
+        Of the splat's mass.
     columns : (C,) int64
-        How many points each occupied cell holds.
+        How many points each of the C cells with points holds.
     area : float
         Of a cell, px^2.
     """
 
     owners: NDArray[np.int64]
-    weights: NDArray[np.float32]
+    shares: NDArray[np.float32]
     columns: NDArray[np.int64]
     area: float
 
     def pieces(self) -> Iterator[tuple[slice, Points]]:
-        """Cut into whole columns, about `_BLOCK` points at a time: (place, points) in turn."""
+        """Yield about `_BLOCK` points at a time, in whole cells: (which points, the points)."""
         for cells, place in _runs(self.columns):
+            checkpoint()
             columns = self.columns[cells]
-            yield place, Points(self.owners[place], self.weights[place], columns, self.area)
+            yield place, Points(self.owners[place], self.shares[place], columns, self.area)
 
 
 def _runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
-    """Cut groups of such sizes into runs of about `_BLOCK` members: (groups, members) in turn."""
+    """Cut groups of these sizes into runs of about `_BLOCK` members; yield (groups, members)."""
     ends = np.cumsum(sizes)
     cuts = np.searchsorted(ends, np.arange(_BLOCK, int(sizes.sum()), _BLOCK)) + 1
     start = member = 0
@@ -158,18 +166,21 @@ def cell_size(footprints: Footprints, view: View, cell: float, density: float) -
     side = max(cell, math.sqrt(view.width * view.height / MAX_CELLS) * 1.01)
     while math.ceil(view.width / side) * math.ceil(view.height / side) > MAX_CELLS:
         side *= _GROWTH  # an image a few pixels thin
-    while _points_needed(footprints, side, density) > MAX_POINTS:
+    # As cells grow the points needed fall to one a footprint: always below this limit.
+    limit = max(MAX_POINTS, LEAST_POINTS * len(footprints.index))
+    while _points_needed(footprints, side, density) > limit:
         side *= _GROWTH
     return side
 
 
 def _points_needed(footprints: Footprints, side: float, density: float) -> float:
+    """Return about how many points the footprints have with cells of this side."""
     along = (footprints.sigmas * np.float32(density / side)).clip(1.0, COUNTS[-1])
     return float(np.dot(along[0], along[1]))
 
 
 def scatter(footprints: Footprints, view: View, side: float, density: float) -> Points:
-    """Lay points over the footprints and sort them into the cells.
+    """Return points over all footprints, sorted into cells.
 
     Parameters
     ----------
@@ -179,31 +190,31 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
     side : float
         Of a cell, pixels.
     density : float
-        Points per standard deviation for cells of that size.
+        Points per standard deviation that is as long as a cell.
     """
-    kinds = _kinds(footprints, view, density / side)
+    kinds = _kinds(footprints, view, density / side)  # (n,)
     sizes, *_ = _table()
-    counts = sizes[kinds]
-    cells = np.empty(int(counts.sum()), np.uint16)
-    weights = np.empty(len(cells), np.float32)
+    counts = sizes[kinds]  # (n,), points of each footprint
+    cells = np.empty(int(counts.sum()), np.uint16)  # (p,), as all that follows
+    shares = np.empty(len(cells), np.float32)
     for row, place in _runs(counts):
-        cells[place], weights[place] = _laid(footprints, row, kinds[row], view, side)
-    # Few, if any: theirs are laid again, over the image.
+        checkpoint()
+        cells[place], shares[place] = _laid(footprints, row, kinds[row], view, side)
+    # What was laid for splats much larger than the image is replaced. They are few.
     vast = np.flatnonzero(kinds == len(sizes) - 1)
     if len(vast):
         at = np.cumsum(counts)[vast][:, None] - np.arange(FLAT**2, 0, -1)
-        cells[at], weights[at] = _flat(footprints, vast, view, side)
-    return _merged(
-        cells, np.repeat(np.arange(len(counts), dtype=np.int32), counts), weights, side * side
-    )
+        cells[at], shares[at] = _flat(footprints, vast, view, side)
+    owners = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+    return _merged(cells, owners, shares, side * side)
 
 
 def _kinds(footprints: Footprints, view: View, scale: float) -> NDArray[np.uint8]:
-    """Return which of `lattices` suits each footprint."""
+    """Return which of `lattices` each footprint gets, (n,); `scale`: points per pixel of sigma."""
     table = np.searchsorted(COUNTS, np.arange(COUNTS[-1] + 1)).astype(np.uint8)
     wanted = np.ceil((footprints.sigmas * np.float32(scale)).clip(1.0, COUNTS[-1]))
     index = table[wanted.astype(np.int64)]
-    # Of a splat much larger than the image no point of its own lattice may fall there.
+    # Where the points of the largest lattice are this far apart, none may fall in the image.
     spacing = footprints.sigmas[0] * (2.0 * _WIDE_EXTENT / COUNTS[-1])
     vast = spacing > max(view.width, view.height) / 8
     kinds = index[0] * np.uint8(len(COUNTS)) + index[1]
@@ -212,20 +223,21 @@ def _kinds(footprints: Footprints, view: View, scale: float) -> NDArray[np.uint8
 
 @functools.cache
 def _table() -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any], NDArray[Any]]:
-    """Return the lattices one after the other: size and start of each, points and weights."""
-    sizes = np.array([len(lattice.weights) for lattice in lattices()])
+    """Return all lattices in one table: size and start of each, points (2, K) and shares (K,)."""
+    sizes = np.array([len(lattice.shares) for lattice in lattices()])
     points = np.concatenate([lattice.points for lattice in lattices()], axis=1)
-    weights = np.concatenate([lattice.weights for lattice in lattices()])
-    return sizes, np.cumsum(sizes) - sizes, points, weights
+    shares = np.concatenate([lattice.shares for lattice in lattices()])
+    return sizes, np.cumsum(sizes) - sizes, points, shares
 
 
 def _laid(
     footprints: Footprints, row: slice, kinds: NDArray[np.uint8], view: View, side: float
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
-    """Return cell and weight of every point of some footprints, one footprint after the other."""
-    sizes, starts, points, weights = _table()
+    """Return cell and share, (p,) each, of the points of some footprints, one after the other."""
+    sizes, starts, points, shares = _table()
     counts = sizes[kinds]
     first = np.cumsum(counts) - counts
+    # Row of the table for each point: where its footprint's lattice starts, and on from there.
     which = np.arange(int(counts.sum())) - np.repeat(first - starts[kinds], counts)
     along, across = points[0].take(which), points[1].take(which)
     place = []
@@ -234,18 +246,18 @@ def _laid(
         where += across * np.repeat(footprints.minor[axis, row], counts)
         where += np.repeat(footprints.centers[axis, row], counts)
         place.append(where)
-    return _cells(place, view, side), weights.take(which)
+    return _cells(place, view, side), shares.take(which)
 
 
 def _cells(place: list[NDArray[np.float32]], view: View, side: float) -> NDArray[np.uint16]:
-    """Return the number of the cell that each point lies in, or `_OUTSIDE`."""
+    """Return the number of the cell that each point, (p,) across and down, lies in; `_OUTSIDE`."""
     inside = np.ones(place[0].shape, np.bool_)
     number = np.zeros(place[0].shape, np.int32)
     for where, size in zip(place[::-1], (view.height, view.width), strict=True):
         inside &= where >= 0.0
         inside &= where < size
-        # Clipped before rounding: far outside they would not fit the integers, and rounding may
-        # put the last pixel one cell beyond the last.
+        # Clipped before it becomes an integer: far outside it would not fit one, and in float32
+        # the last pixel may come out one cell too far.
         cell = where * np.float32(1.0 / side)
         np.maximum(cell, np.float32(0.0), out=cell)
         np.minimum(cell, np.float32(math.ceil(size / side) - 1), out=cell)
@@ -259,11 +271,14 @@ def _cells(place: list[NDArray[np.float32]], view: View, side: float) -> NDArray
 def _flat(
     footprints: Footprints, row: NDArray[np.int64], view: View, side: float
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
-    """Return cells and weights of points all over the image, for splats larger than it."""
+    """Return cells and shares of points over the image, (r, FLAT^2), for r vast footprints.
+
+    The share of a point is the density of the splat's mass there times the area it stands for.
+    """
     points = lattices()[-1].points
     u = np.float32(view.width / 2) * (points[0] + 1)
     v = np.float32(view.height / 2) * (points[1] + 1)
-    squared = np.zeros((len(row), len(u)), np.float32)
+    squared = np.zeros((len(row), len(u)), np.float32)  # squared Mahalanobis distance
     dx = u - footprints.centers[0, row][:, None]
     dy = v - footprints.centers[1, row][:, None]
     for half, sigma in zip((footprints.major, footprints.minor), footprints.sigmas, strict=True):
@@ -278,26 +293,37 @@ def _flat(
 def _merged(
     cells: NDArray[np.uint16],
     owners: NDArray[np.int32],
-    weights: NDArray[np.float32],
+    shares: NDArray[np.float32],
     area: float,
 ) -> Points:
-    """Sort points into the cells and merge those of one splat in one cell."""
+    """Sort p points into cells, and merge those of one splat in one cell.
+
+    Parameters
+    ----------
+    cells : (p,) uint16
+        `_OUTSIDE` for points beside the image, which are dropped.
+    owners : (p,) int32
+        Ascending, that is, front to back.
+    shares : (p,) float32
+    area : float
+    """
     filled = np.bincount(cells, minlength=_OUTSIDE)[:_OUTSIDE]
-    filled = filled[filled > 0]
-    # Footprints came front to back, so cells stay so; what is outside comes last.
+    filled = filled[filled > 0]  # (C,), points of each cell before merging
+    # The sort is stable, so each cell stays front to back; `_OUTSIDE` sorts last.
     order = np.argsort(cells, kind="stable")[: filled.sum()]
+    checkpoint()
     if not len(order):
-        return Points(order, weights[:0], order, area)
+        return Points(order, shares[:0], order, area)
     owners = owners.take(order)
-    tops = np.cumsum(filled) - filled
-    new = np.empty(len(owners), np.bool_)
+    tops = np.cumsum(filled) - filled  # first point of each cell
+    new = np.empty(len(owners), np.bool_)  # whether a point is the first of its splat in its cell
     np.not_equal(owners[1:], owners[:-1], out=new[1:])
     new[tops] = True
     starts = np.flatnonzero(new)
     columns = np.add.reduceat(new, tops, dtype=np.int64)
     return Points(
         owners.take(starts).astype(np.int64),
-        np.add.reduceat(weights.take(order), starts),
+        np.add.reduceat(shares.take(order), starts),
         columns,
         area,
     )
@@ -306,97 +332,124 @@ def _merged(
 def thickness(
     points: Points, alphas: NDArray[np.float32], mass: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Optical thickness that each point adds to its cell, (m,).
+    """Return the optical thickness of each point, (m,).
 
-    ``-log(1 - a)``, a the share of the cell that it covers: its mass over the cell's area, and no
-    more than the splat's opacity.
+    ``-log(1 - a)``, a the share of the cell that the point covers: its mass over the cell's area,
+    and no more than the splat's opacity.
+
+    Parameters
+    ----------
+    points : Points
+    alphas, mass : (n,) float32
+        Of the footprints.
     """
-    share = points.weights * (mass / np.float32(points.area)).take(points.owners)
-    np.minimum(share, np.minimum(alphas, np.float32(ALPHA_MAX)).take(points.owners), out=share)
-    np.subtract(np.float32(1.0), share, out=share)
-    np.log(share, out=share)
-    return np.negative(share, out=share)
+    covered = points.shares * (mass / np.float32(points.area)).take(points.owners)
+    np.minimum(covered, np.minimum(alphas, np.float32(ALPHA_MAX)).take(points.owners), out=covered)
+    np.subtract(np.float32(1.0), covered, out=covered)
+    np.log(covered, out=covered)
+    return np.negative(covered, out=covered)
+
+
+def paired(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[Any]:
+    """Return two real arrays as the real and imaginary parts of one complex array, (n,).
+
+    Sums, and products with real numbers, work on both parts separately, so one running sum over the
+    pair is two running sums in the time of one.
+    """
+    pair = np.empty(first.shape, np.result_type(first, np.complex64))
+    pair.real, pair.imag = first, second
+    return pair
 
 
 def in_front(
     points: Points, thick: NDArray[np.float32], even: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Sum two thicknesses, (m,) each, in front of each point in its cell."""
-    both = np.empty(len(thick), np.complex128)  # running sums of two take as long as of one
-    both.real, both.imag = thick, even
-    both = _before(both, points.columns)
-    return both.real.astype(np.float32), both.imag.astype(np.float32)
+    """Return the sums of two thicknesses, (m,) each, over what lies in front in the same cell."""
+    sums = _before(paired(thick, even), points.columns)
+    return sums.real.astype(np.float32), sums.imag.astype(np.float32)
 
 
 def _before(values: NDArray[Any], columns: NDArray[np.int64]) -> NDArray[Any]:
-    """Sum what stands before each of `values`, (m,), in its group of so many; in float64."""
+    """Return for each of `values`, (m,), the sum of those before it in its column, in float64.
+
+    Parameters
+    ----------
+    values : (m,) floating or complex
+    columns : (C,) int64
+        Lengths of the columns, which follow each other.
+    """
     starts = np.cumsum(columns) - columns
     steps = np.empty(len(values), np.result_type(values, np.float64))
     steps[1:] = values[:-1]
     steps[starts] = 0.0
-    # Each group begins by taking back what the last one came to.
+    # Subtract the previous column's total, so that the running sum restarts at 0.
     steps[starts[1:]] = -np.add.reduceat(steps, starts)[:-1]
     return np.cumsum(steps)
 
 
 def evenness(footprints: Footprints, area: float) -> NDArray[np.float32]:
-    """Return how evenly each splat covers the cells it lies in, (n,): 0 a dot, 1 a veil."""
+    """Return which share of each splat's thickness is uniform over a cell of such area, (n,).
+
+    ``s^2 / (s^2 + area)``, s the shorter sigma: near 0 for a splat much narrower than a cell, which
+    leaves gaps in it, near 1 for one much wider.
+    """
     narrow = footprints.sigmas[1] ** 2
     return np.asarray(narrow / (narrow + np.float32(area)))
 
 
-def light(
+def transmittance(
     front: NDArray[np.float32], even: NDArray[np.float32], area: float
 ) -> NDArray[np.float32]:
-    """Return the expected transmittance through a thickness of which only the mean is known.
+    """Return the transmittance in front of each point, (m,), given the mean thickness of its cell.
 
-    ``E[exp(-tau)] = (1 + mean / k)^-k`` for tau of a gamma distribution of shape k.
-    A cell says how much lies in front, not whether it leaves a gap for the point: ``exp(-mean)``
-    would take what shows through foliage for hidden, and the score would throw it away. Splats
-    wider than a cell leave no gaps: for them it is ``exp(-mean)``.
+    Splats narrower than a cell leave gaps, so the thickness in front of a point may be more or less
+    than the cell's mean. It is taken for gamma distributed with shape k, and the transmittance for
+    its expectation, ``E[exp(-tau)] = (1 + mean / k)^-k``. (With ``exp(-mean)`` what shows through
+    foliage would count as hidden and be removed.) The even part leaves no gaps: ``exp(-even)``.
 
     Parameters
     ----------
     front : (m,) float32
         Mean thickness in front of each point.
     even : (m,) float32
-        The part of it that covers the cell evenly.
+        The part of it that is uniform over the cell; see `evenness`.
     area : float
         Of a cell, px^2.
     """
-    shape = np.float32(DOUBT / math.sqrt(area))
+    shape = np.float32(GAMMA_SHAPE / math.sqrt(area))
     gaps = np.maximum(front - even, np.float32(0.0))
     return np.asarray(np.exp(-even) * (np.float32(1.0) + gaps / shape) ** -shape)
 
 
-def contrast(
+def squared_contrast(
     points: Points,
     front: NDArray[np.float32],
     thick: NDArray[np.float32],
     colors: Sequence[NDArray[Any]],
 ) -> NDArray[np.float32]:
-    """Squared difference between each point's colour and that behind it in its cell, (m,).
+    """Return the squared difference of colour between each point and what is behind it, (m,).
 
-    The colour in front of point k is ``C_k = sum over j < k of T_j a_j c_j``; behind it, over
-    black, is ``B_k = (C_end - C_{k+1}) / T_{k+1}``.
+    Point j shows ``T_j a_j c_j``, T the transmittance in front of it and a the share it covers.
+    Behind point k, over black, its cell has the colour ``B_k = (sum over j > k of T_j a_j c_j) /
+    T_{k+1}``; the contrast is ``c_k - B_k``, squared and summed over the channels.
 
     Parameters
     ----------
     points : Points
     front, thick : (m,) float32
-        Optical thickness in front of it, and its own.
+        Optical thickness in front of each point, and its own.
     colors : sequence of (n,) arrays
-        Of the footprints; complex where two channels are one.
+        Channels of the footprints, or two of them `paired`.
     """
-    through = np.exp(-np.minimum(front, np.float32(60.0)))
-    left = through * np.exp(-thick)
-    through -= left
-    # Where less than this is left, what is behind changes nothing that could be seen.
+    shown = np.exp(-np.minimum(front, np.float32(60.0)))  # T_k, then T_k a_k
+    left = shown * np.exp(-thick)  # T_{k+1}
+    shown -= left
+    # Where less than this is left, what is behind cannot be seen anyway.
     scale = np.float32(1.0) / np.maximum(left, np.float32(1e-4))
     squared = np.zeros_like(front)
     for pair in colors:
         color = pair.take(points.owners)
-        behind = _before((through * color)[::-1], points.columns[::-1])[::-1].astype(pair.dtype)
+        behind = _before((shown * color)[::-1], points.columns[::-1])[::-1].astype(pair.dtype)
         behind *= scale
         behind -= color
         squared += np.square(behind.real)
@@ -405,30 +458,43 @@ def contrast(
     return squared
 
 
-def mean_light(
-    points: Points, light: NDArray[np.float32], contrast: NDArray[np.float32], count: int
+def mean_visible(
+    points: Points,
+    transmittance: NDArray[np.float32],
+    squared_contrast: NDArray[np.float32],
+    count: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return for each of `count` splats its mean transmittance and its mean visible contrast.
+    """Return the means over each footprint of T and of ``T^2 |c - B|^2``, both (count,).
 
-    The former is weighted by alpha, the latter, ``T^2 |c - B|^2``, by alpha^2; what falls outside
-    the image counts as 0.
+    The former is weighted by alpha, the latter by alpha^2; outside the image both count as 0.
+
+    Parameters
+    ----------
+    points : Points
+    transmittance, squared_contrast : (m,) float32
+        Of each point.
+    count : int
+        Number of footprints.
     """
-    owners, weights = points.owners, points.weights
-    squares = weights * weights
-    shown = np.bincount(owners, weights * light, count)
-    errors = np.bincount(owners, squares * light * light * contrast, count)
-    # Over the sum of the squares, and the share of the footprint that lies in the image.
-    share = np.bincount(owners, weights, count)
-    errors = errors * share / np.maximum(np.bincount(owners, squares, count), 1e-30)
-    return np.asarray(shown, np.float64), np.asarray(errors, np.float64)
+    checkpoint()
+    owners, shares = points.owners, points.shares
+    squares = shares * shares
+    visible = np.bincount(owners, shares * transmittance, count)
+    errors = np.bincount(owners, squares * transmittance * transmittance * squared_contrast, count)
+    # The weights alpha^2 do not sum to 1: divide by their sum, and multiply by the share of the
+    # footprint that lies in the image.
+    inside = np.bincount(owners, shares, count)
+    errors = errors * inside / np.maximum(np.bincount(owners, squares, count), 1e-30)
+    return np.asarray(visible, np.float64), np.asarray(errors, np.float64)
 
 
 def masses(
     footprints: Footprints, alphas: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Integrals of alpha and of alpha^2 over each footprint, px^2.
+    """Return the integrals of alpha and of alpha^2 over each footprint, (n,) each, px^2.
 
-    With ``S`` the product of the two sigmas and the footprint ending where alpha is `ALPHA_CUT`::
+    With S the product of the two sigmas, A the opacity, q the squared Mahalanobis distance and the
+    footprint ending where alpha is `ALPHA_CUT`::
 
         integral of A exp(-q / 2) = 2 pi S (A - cut)
         integral of A^2 exp(-q)   =   pi S (A^2 - cut^2)

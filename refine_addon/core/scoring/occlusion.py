@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import RefineError
-from ..scores import Scores
-from ..work import Progress, for_chunks, part, silent
+from ..scores import Scores, shares_gone
+from ..work import Progress, for_chunks, part, report, silent
 from . import closed_form, coverage, froxels, projection
 
 if TYPE_CHECKING:
@@ -33,9 +33,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..scene import Scene
     from ..splats import Splats
     from ..views import View, ViewSet
-    from .projection import Frame, Gaussians
+    from .projection import Gaussians
 
 LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
@@ -118,8 +119,8 @@ def score(
     Notes
     -----
     Memory: about 300 bytes a splat, a third more for each thread beyond the first; where a view
-    has many points, 100 bytes for each of them and thread, of which
-    there are at most 4 million (`froxels.MAX_POINTS`).
+    has many points, 100 bytes for each of them and thread. A view has about 4 million points at
+    most (`froxels.MAX_POINTS`), and more only where it shows more than 3 million splats.
     """
     return _scored(splats, views, settings, progress, threads)[0]
 
@@ -162,13 +163,13 @@ def _scored(
     if not len(splats):
         msg = "there are no splats to score"
         raise RefineError(msg)
-    gaussians, frame, good = projection.prepare(
+    gaussians, scene, good = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.05), threads=threads
     )
     if not good.any():
         msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
         raise RefineError(msg)
-    run = _Run(gaussians, frame, views, settings, threads)
+    run = _Run(gaussians, scene, views, settings, threads)
     prior = closed_form.score(
         splats, views, PRIOR, progress=part(progress, 0.05, 0.1), threads=threads
     )
@@ -180,7 +181,14 @@ def _scored(
         )
         raise RefineError(msg)
     values[~good] = 0.0
-    scores = Scores(values, seen, len(views), int(np.count_nonzero(~good)), {"floor": run.weights})
+    scores = Scores(
+        values=values,
+        seen=seen,
+        views_used=len(views),
+        undrawable=int(np.count_nonzero(~good)),
+        weights={"floor": run.floor_weights},
+        method="occlusion",
+    )
     return scores, run
 
 
@@ -209,113 +217,169 @@ def measure(
     Cancelled
         If `progress` answers ``False``.
     """
-    gaussians, frame, _ = projection.prepare(
+    gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.1), threads=threads
     )
-    run = _Run(gaussians, frame, views, settings, threads)
-    some = Measured.sum(run.measure(gaussians, part(progress, 0.1, 1.0)))
+    run = _Run(gaussians, scene, views, settings, threads)
+    some = run.measure(gaussians, part(progress, 0.1, 1.0))
     return some.spread(gaussians.index, len(splats))
 
 
 class _Run:
-    """One scoring: the scene as Gaussians, and what is left of it."""
+    """One scoring: the scene as Gaussians, and what the first round measured."""
 
     def __init__(
         self,
         gaussians: Gaussians,
-        frame: Frame,
+        scene: Scene,
         views: ViewSet,
         settings: Occlusion,
         threads: int | None,
     ) -> None:
-        self.gaussians, self.frame, self.settings, self.threads = (
+        self.gaussians, self.scene, self.settings, self.threads = (
             gaussians,
-            frame,
+            scene,
             settings,
             threads,
         )
         self.measured = Measured.zero(len(gaussians))  # in the first round
-        self.weights = [0.0] * len(coverage.SHARES)  # of the floor, up to each share
+        self.floor_weights = [0.0] * len(coverage.SHARES)  # up to each share
         self.views = _by_distance(views)
-        # Neighbours follow each other, so every k-th of them is all over the scene.
-        self.some = slice(None, None, max(-(-len(gaussians) // coverage.SAMPLE), 1))
-        self.errors: dict[int, list[NDArray[np.float64]]] = {}  # of those, for the views of a block
 
     def rank(
         self, prior: NDArray[np.float32], progress: Progress
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Return the values and `seen` of all splats; `prior` decides where the views do not."""
-        count, rounds, left = len(prior), self.settings.rounds, self.gaussians
-        values, seen = np.zeros(count, np.float32), np.zeros(count, np.int32)
-        hopeless = np.ones(count, np.bool_)
-        hopeless[left.index] = False
-        going = np.flatnonzero(hopeless)
-        going = going[np.argsort(prior[going], kind="stable")]
-        gone, start = 0, 0.0
-        for number in range(rounds):
-            values[going] = np.arange(gone + 1, gone + len(going) + 1) / count
-            gone += len(going)
-            # Each round has the views times what is left to do; all of them about thrice the first.
-            end = start + (1.0 - start) * max(1.0 / (rounds - number), 0.25)
-            blocks = self.measure(left, part(progress, start, end))
-            start, share = end, gone / count
-            measured = Measured.sum(blocks)
+        count, left = len(prior), self.gaussians
+        removal = _Removal(count)
+        undrawn = np.setdiff1d(np.arange(count), left.index)
+        removal.add(undrawn[np.argsort(prior[undrawn], kind="stable")])
+        seen, done = np.zeros(count, np.int32), 0.0
+        for number, stay in enumerate(_survivors(count, self.settings.rounds)):
+            # A round costs the views times the splats left: all of them about three first rounds.
+            end = done + (1.0 - done) * max(1.0 / (self.settings.rounds - number), 0.25)
+            ahead, done = part(progress, done, end), end
             if number == 0:
-                self.weights = self._weigh(blocks, measured, prior)
+                measured = self.measured = self._measure_first(prior, ahead)
                 seen[left.index] = measured.seen
-                self.measured = measured
-            last = number == rounds - 1
-            stay = 0 if last else round(count * LEAST ** ((number + 1) / (rounds - 1)))
-            floors = coverage.floor(
-                prior[left.index].astype(np.float64), measured.seen, 1.0 + _exponent(share)
-            )
+            else:
+                measured = self.measure(left, ahead)
+            report(ahead, 1.0, "scoring")
             go = max(len(left) - stay, 0)
-            stops = np.clip(np.rint(np.multiply(coverage.SHARES, count)) - gone, 0, go).astype(int)
-            stops[-1] = go
-            order = coverage.order(
-                combined(measured, share), floors, prior[left.index], self.weights, stops
-            )
-            going = left.index[order[:go]]
+            order = self._order(measured, prior[left.index], removal.gone, count, go)
+            removal.add(left.index[order[:go]])
             left = left.take(np.sort(order[go:]))
-        values[going] = np.arange(gone + 1, gone + len(going) + 1) / count
-        return values, seen
+        return removal.values, seen
 
-    def _weigh(
-        self, blocks: list[Measured], measured: Measured, prior: NDArray[np.float32]
-    ) -> list[float]:
-        """Return the weights of the floor by what each block of views says of the others."""
-        some = self.some
-        worth = prior[self.gaussians.index[some]].astype(np.float64)
-        power = 1.0 + _exponent(0.0)
+    def _order(
+        self,
+        measured: Measured,
+        prior: NDArray[np.float32],
+        gone: int,
+        count: int,
+        go: int,
+    ) -> NDArray[np.int64]:
+        """Return the rows of those left in the order of removal, exact for the first `go`.
+
+        Parameters
+        ----------
+        measured : Measured
+        prior : (n,) float32
+            Of those left.
+        gone, count : int
+            How many splats of how many have gone before.
+        go : int
+            How many go now.
+        """
+        share = gone / count
+        floors = coverage.floor(prior.astype(np.float64), measured.seen, 1.0 + _exponent(share))
+        stops = np.clip(np.rint(np.multiply(coverage.SHARES, count)) - gone, 0, go).astype(int)
+        stops[-1] = go
+        scores = combined(measured, share)
+        return coverage.order(scores, floors, prior, self.floor_weights, stops)
+
+    def _measure_first(self, prior: NDArray[np.float32], progress: Progress) -> Measured:
+        """Measure all Gaussians, and choose the weights of the floor by what each view says."""
+        sample = coverage.sample(self.gaussians)
+        blocks = self._blocks(self.gaussians, sample, progress)
+        measured = Measured.sum([block for block, _ in blocks])
+        worth = prior[self.gaussians.index[sample]].astype(np.float64)
 
         def folds() -> Iterator[tuple[NDArray[np.float64], ...]]:
-            for number, block in enumerate(blocks if len(blocks) > 1 else ()):
+            for block, errors in blocks if len(blocks) > 1 else ():
+                report(progress, 1.0, "scoring")
                 others = Measured(
                     # What is left of a sum may be negative by rounding.
-                    np.maximum(measured.contribution[some] - block.contribution[some], 0.0),
-                    np.maximum(measured.contrast[some] - block.contrast[some], 0.0),
-                    measured.seen[some] - block.seen[some],
+                    np.maximum(measured.contribution[sample] - block.contribution[sample], 0.0),
+                    np.maximum(measured.contrast[sample] - block.contrast[sample], 0.0),
+                    measured.seen[sample] - block.seen[sample],
                 )
-                floors = coverage.floor(worth, others.seen, power)
-                yield combined(others, 0.0), floors, np.array(self.errors[number])
+                floors = coverage.floor(worth, others.seen, 1.0 + _exponent(0.0))
+                yield combined(others, 0.0), floors, errors
 
-        return coverage.floor_weights(folds())
+        self.floor_weights = coverage.floor_weights(folds())
+        return measured
 
-    def measure(self, gaussians: Gaussians, progress: Progress) -> list[Measured]:
-        """Sum contribution and contrast of the Gaussians over the views of each block."""
+    def measure(self, gaussians: Gaussians, progress: Progress) -> Measured:
+        """Sum contribution and contrast of the Gaussians over all views."""
+        return Measured.sum([block for block, _ in self._blocks(gaussians, None, progress)])
+
+    def _blocks(
+        self, gaussians: Gaussians, sample: NDArray[np.int64] | None, progress: Progress
+    ) -> list[tuple[Measured, NDArray[np.float64]]]:
+        """Return the sums over each block of views, and the contrast of a sample in each view.
+
+        Parameters
+        ----------
+        gaussians : Gaussians
+        sample : (m,) int64, optional
+            Rows.
+        progress : callable
+
+        Returns
+        -------
+        list of Measured, (views, m) float64
+        """
         blocks = min(_BLOCKS, len(self.views))
+        rows = np.empty(0, np.int64) if sample is None else sample
 
-        def block(piece: slice) -> Measured:
+        def block(piece: slice) -> tuple[Measured, NDArray[np.float64]]:
             total = Measured.zero(len(gaussians))
             errors = []
             for view, weight in self.views[piece.start :: blocks]:
-                before = total.contrast[self.some].copy()
-                measure_view(gaussians, self.frame, view, weight, self.settings, total)
-                errors.append(total.contrast[self.some] - before)
-            self.errors[piece.start] = errors
-            return total
+                before = total.contrast[rows]
+                measure_view(gaussians, self.scene, view, weight, self.settings, total)
+                errors.append(total.contrast[rows] - before)
+            return total, np.array(errors)
 
         return for_chunks(block, blocks, 1, progress=progress, what="scoring", threads=self.threads)
+
+
+class _Removal:
+    """The order in which splats go.
+
+    Attributes
+    ----------
+    values : (N,) float32
+        Share of the splats that has gone once this one has, of those that were added.
+    gone : int
+        How many were added.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.values = np.zeros(count, np.float32)
+        self.gone = 0
+
+    def add(self, splats: NDArray[np.int64]) -> None:
+        """Append splats in their order."""
+        end = self.gone + len(splats)
+        self.values[splats] = shares_gone(np.arange(self.gone + 1, end + 1), len(self.values))
+        self.gone = end
+
+
+def _survivors(count: int, rounds: int) -> list[int]:
+    """Return how many of `count` splats stay after each round: `LEAST` before the last, then 0."""
+    return [round(count * LEAST ** (number / (rounds - 1))) for number in range(1, rounds)] + [0]
 
 
 def _by_distance(views: ViewSet) -> list[tuple[View, float]]:
@@ -394,7 +458,7 @@ def _exponent(gone: float) -> float:
 
 def measure_view(
     gaussians: Gaussians,
-    frame: Frame,
+    scene: Scene,
     view: View,
     weight: float,
     settings: Occlusion,
@@ -402,25 +466,25 @@ def measure_view(
 ) -> None:
     """Add what one view says to `total`."""
     with np.errstate(under="ignore"):
-        footprints = projection.project(gaussians, frame, view)
+        footprints = projection.project(gaussians, scene, view)
         count = len(footprints.index)
         if not count:
             return
-        total.seen[footprints.index[footprints.inside(view)]] += 1
+        total.seen[footprints.index[footprints.inside]] += 1
         side = froxels.cell_size(footprints, view, settings.cell, settings.density)
         points = froxels.scatter(footprints, view, side, settings.density)
         alphas = gaussians.alphas[footprints.index]
         red, green, blue = gaussians.colors[footprints.index].T
-        colors = (red + np.complex64(1j) * green, blue.copy())
+        colors = (froxels.paired(red, green), blue.copy())
         mass, mass_squared = froxels.masses(footprints, alphas)
         evenness = froxels.evenness(footprints, points.area)
-        light = np.empty(len(points.owners), np.float32)
-        contrast = np.empty(len(points.owners), np.float32)
+        transmittance = np.empty(len(points.owners), np.float32)
+        squared_contrast = np.empty(len(points.owners), np.float32)
         for place, piece in points.pieces():
             thick = froxels.thickness(piece, alphas, mass)
             front, even = froxels.in_front(piece, thick, thick * evenness.take(piece.owners))
-            light[place] = froxels.light(front, even, points.area)
-            contrast[place] = froxels.contrast(piece, front, thick, colors)
-        shown, errors = froxels.mean_light(points, light, contrast, count)
-        total.contribution[footprints.index] += weight * (mass * shown)
+            transmittance[place] = froxels.transmittance(front, even, points.area)
+            squared_contrast[place] = froxels.squared_contrast(piece, front, thick, colors)
+        visible, errors = froxels.mean_visible(points, transmittance, squared_contrast, count)
+        total.contribution[footprints.index] += weight * (mass * visible)
         total.contrast[footprints.index] += weight * (mass_squared * errors)

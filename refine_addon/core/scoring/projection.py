@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .. import frustum
+from ..rendering import ALPHA_CUT, LOW_PASS, NEAR_RELATIVE
+from ..scene import Scene, scene_of, spatial_order
 from ..splats import SH_C0, drawable, opacity, rotation_matrices
-from ..work import Progress, for_chunks, silent
+from ..work import Progress, checkpoint, for_chunks, part, report, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -16,20 +19,10 @@ if TYPE_CHECKING:
     from ..splats import Splats
     from ..views import View, ViewSet
 
-LOW_PASS = 0.3
-"""Variance every renderer adds to a footprint so that it is not thinner than a pixel, px^2."""
-
-ALPHA_CUT = 1.0 / 255.0
-"""Renderers draw a splat only where its alpha reaches this."""
-
-NEAR_RELATIVE = 0.01
-"""Near plane over the size of the scene, where a view brings none of its own."""
-
 REACH = 3.3
 """Standard deviations at which alpha = 1 falls to `ALPHA_CUT`: sqrt(2 ln 255) = 3.33."""
 
 _CHUNK = 1 << 14
-_GRID_BITS = 10
 _FARTHEST = 1e6  # beyond so many scene sizes a splat counts as seen by nobody
 _LOG_SCALE_RANGE = (-16.0, 5.0)  # relative to the size of the scene; keeps float32 in range
 _LARGEST_VARIANCE = 1e12  # px^2; a footprint a million pixels wide is flat over any image
@@ -48,9 +41,9 @@ class Gaussians:
     index : (M,) int64
         Which splat it is.
     means : (3, M) float32
-        From the middle of the views, in scene sizes.
+        In the scene's frame, in scene sizes.
     covariances : (6, M) float32
-        xx, xy, xz, yy, yz, zz, squared scene sizes.
+        xx, xy, xz, yy, yz, zz in the scene's frame, squared scene sizes.
     largest : (M,) float32
         Longest standard deviation, scene sizes.
     alphas : (M,) float32
@@ -79,22 +72,6 @@ class Gaussians:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """The frame and unit in which a scene is computed, so that float32 is enough for any scene.
-
-    Attributes
-    ----------
-    origin : (3,) float64
-        Weighted mean of the views' centres, world units.
-    size : float
-        Median over splats of the root mean square distance to the views, world units.
-    """
-
-    origin: NDArray[np.float64]
-    size: float
-
-
-@dataclass(frozen=True, eq=False)
 class Footprints:
     """The n splats that may touch an image, front to back.
 
@@ -108,6 +85,8 @@ class Footprints:
         Half axes: one standard deviation along each principal direction, pixels.
     sigmas : (2, n) float32
         Their lengths, the longer first.
+    inside : (n,) bool
+        Which centres lie in the view's frustum; see `frustum`.
     """
 
     index: NDArray[np.int64]
@@ -115,23 +94,19 @@ class Footprints:
     major: NDArray[np.float32]
     minor: NDArray[np.float32]
     sigmas: NDArray[np.float32]
-
-    def inside(self, view: View) -> NDArray[np.bool_]:
-        """Which centres lie in the image, (n,)."""
-        u, v = self.centers
-        return np.asarray((u >= 0.0) & (u <= view.width) & (v >= 0.0) & (v <= view.height))
+    inside: NDArray[np.bool_]
 
 
 def prepare(
     splats: Splats, views: ViewSet, *, progress: Progress = silent, threads: int | None = None
-) -> tuple[Gaussians, Frame, NDArray[np.bool_]]:
+) -> tuple[Gaussians, Scene, NDArray[np.bool_]]:
     """Activate the splats once for all views.
 
     Returns
     -------
     gaussians : Gaussians
         Only of splats that can be drawn and whose opacity reaches `ALPHA_CUT`.
-    frame : Frame
+    scene : Scene
     good : (N,) bool
         Which splats can be drawn.
     """
@@ -144,36 +119,35 @@ def prepare(
         logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
         worth[piece] = opacity(logits) > ALPHA_CUT
 
-    for_chunks(judge, len(splats), 4 * _CHUNK, progress=progress, what="reading", threads=threads)
-    origin, spread = views.middle()
-    means = np.where(good[:, None], splats.means, origin) - origin  # float64
-    frame = Frame(origin, _size(means, good, spread))
-    means /= frame.size
-    worth &= np.max(np.abs(means), axis=1) <= _FARTHEST
+    for_chunks(
+        judge, len(splats), 4 * _CHUNK,
+        progress=part(progress, 0.0, 0.4), what="reading", threads=threads,
+    )  # fmt: skip
+    scene = scene_of(splats.means, good, views)
+    report(progress, 0.4, "reading")
     index = np.flatnonzero(worth)
-    means = means[index]
-    order = np.argsort(_morton(means), kind="stable")
-    return _activate(splats, index[order], means[order], frame, threads), frame, good
-
-
-def _size(means: NDArray[np.float64], good: NDArray[np.bool_], spread: float) -> float:
-    if not good.any():
-        return 1.0
-    squared = np.einsum("ij,ij->i", means, means)
-    return float(np.sqrt(np.median(squared if good.all() else squared[good]) + spread)) or 1.0
+    place = scene.place(splats.means[index])
+    near = np.max(np.abs(place), axis=1, initial=0.0) <= _FARTHEST
+    index, place = index[near], place[near]
+    report(progress, 0.4, "reading")
+    order = spatial_order(place)
+    ahead = part(progress, 0.4, 1.0)
+    return _activate(splats, index[order], place[order], scene, ahead, threads), scene, good
 
 
 def _activate(
     splats: Splats,
     index: NDArray[np.int64],
-    means: NDArray[np.float64],
-    frame: Frame,
+    place: NDArray[np.float64],
+    scene: Scene,
+    progress: Progress,
     threads: int | None,
 ) -> Gaussians:
+    """Return the splats at `index` as Gaussians, `place` being their positions in the scene."""
     count = len(index)
     result = Gaussians(
         index,
-        np.ascontiguousarray(means.T, np.float32),
+        np.ascontiguousarray(place.T, np.float32),
         np.empty((6, count), np.float32),
         np.empty(count, np.float32),
         np.empty(count, np.float32),
@@ -182,9 +156,9 @@ def _activate(
 
     def fill(piece: slice) -> None:
         chunk = splats.take(index[piece])
-        relative = np.asarray(chunk.log_scales, np.float64) - np.log(frame.size)
+        relative = np.asarray(chunk.log_scales, np.float64) - np.log(scene.size)
         scales = np.exp(relative.clip(*_LOG_SCALE_RANGE))
-        axes = rotation_matrices(chunk.quaternions) * scales[:, None, :]
+        axes = scene.axes @ rotation_matrices(chunk.quaternions) * scales[:, None, :]
         for row, (a, b) in enumerate(_PAIRS):
             result.covariances[row, piece] = np.einsum("ij,ij->i", axes[:, a], axes[:, b])
         result.largest[piece] = scales.max(axis=1)
@@ -193,83 +167,65 @@ def _activate(
         result.colors[piece] = colors.clip(0.0, 16.0)  # what is brighter is white all the same
 
     with np.errstate(under="ignore"):
-        for_chunks(fill, count, _CHUNK, threads=threads)
+        for_chunks(fill, count, _CHUNK, progress=progress, what="reading", threads=threads)
     return result
 
 
-def _morton(means: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return a key whose order keeps neighbours together, so that what is read is in the cache."""
-    cells = (1 << _GRID_BITS) - 1
-    # The unit is the scene's size: two of them either way hold nearly all; the rest may be far.
-    place = ((means / 4.0 + 0.5) * cells).clip(0, cells).astype(np.int64)
-    code = np.zeros(len(means), np.int64)
-    for bit in range(_GRID_BITS):
-        for axis in range(3):
-            code |= (place[:, axis] >> bit & 1) << (3 * bit + axis)
-    return code
-
-
-def project(gaussians: Gaussians, frame: Frame, view: View) -> Footprints:
+def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
     """Project what may touch the image of a view.
 
     The footprint is the Gaussian of covariance ``J W S W' J' + 0.3 I`` (Zwicker et al., "EWA
     splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean.
     """
-    if not _computable(frame, view):
+    if not _computable(scene, view):
         return _nothing()
-    near, far = clip_planes(frame, view)
-    rotation = _rotation6(view)
+    planes = clip_planes(scene, view)
+    rotation = _rotation6(view.rotation @ scene.axes.T)
     pieces: list[tuple[NDArray[Any], ...]] = []
     for start in range(0, len(gaussians), _CHUNK):
+        checkpoint()
         piece = slice(start, start + _CHUNK)
-        local = _local(gaussians.means[:, piece], frame, view)
-        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, (near, far)))
+        local = _local(gaussians.means[:, piece], scene, view)
+        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, planes))
         if len(touching):
             local = np.take(local, touching, axis=1)
             shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)
-            pieces.append((touching + start, local[2], *_ellipses(local, shape, view)))
+            inside = frustum.contains(view, local, planes)
+            pieces.append((touching + start, local[2], *_ellipses(local, shape, view), inside))
     if not pieces:
         return _nothing()
     index, depth, *rest = (np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True))
+    checkpoint()
     order = _by_depth(depth)
-    return Footprints(index[order], *(np.take(values, order, axis=1) for values in rest))
+    return Footprints(index[order], *(np.take(values, order, axis=-1) for values in rest))
 
 
 def _nothing() -> Footprints:
     empty = np.empty((2, 0), np.float32)
-    return Footprints(np.empty(0, np.int64), empty, empty, empty, empty)
+    return Footprints(np.empty(0, np.int64), empty, empty, empty, empty, np.empty(0, np.bool_))
 
 
-def _computable(frame: Frame, view: View) -> bool:
+def _computable(scene: Scene, view: View) -> bool:
     """Whether float32 holds what the view sees; it shows nothing of the scene where not."""
-    away = float(np.abs(view.center - frame.origin).max())
+    away = float(np.abs(view.center - scene.origin).max())
     lens = (view.fx, view.fy, abs(view.cx), abs(view.cy), view.width, view.height)
     known = min(view.fx, view.fy) >= 1.0 / _LARGEST_LENS and max(lens) <= _LARGEST_LENS
-    return known and away <= _FARTHEST_VIEW * frame.size
+    return known and away <= _FARTHEST_VIEW * scene.size
 
 
-def clip_planes(frame: Frame, view: View) -> tuple[float, float]:
-    """Near and far plane in scene sizes."""
-    near = view.near / frame.size if view.near > 0.0 else NEAR_RELATIVE
+def clip_planes(scene: Scene, view: View) -> tuple[float, float]:
+    """Return near and far plane in scene sizes."""
+    near, far = frustum.clip_planes(view, NEAR_RELATIVE * scene.size)
     # Nearer than this a footprint's size leaves float32, and no renderer draws it.
-    return min(max(near, 1e-5), 1e30), min(view.far / frame.size, 1e30)
+    return min(max(near / scene.size, 1e-5), 1e30), min(far / scene.size, 1e30)
 
 
-def _local(means: NDArray[np.float32], frame: Frame, view: View) -> NDArray[np.float32]:
+def _local(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.float32]:
     """Camera coordinates of centres, (3, M), scene sizes."""
-    center = (view.center - frame.origin) / frame.size
-    shift = (view.rotation @ center).astype(np.float32)
-    local: NDArray[np.float32] = view.rotation.astype(np.float32) @ means
+    shift = (view.rotation @ ((view.center - scene.origin) / scene.size)).astype(np.float32)
+    local: NDArray[np.float32] = (view.rotation @ scene.axes.T).astype(np.float32) @ means
     local -= shift[:, None]
     return local
-
-
-def _sides(view: View, x: Any, y: Any) -> tuple[tuple[Any, float, float, int], ...]:  # noqa: ANN401
-    """Coordinate, focal length, principal point off the middle and size, across and down."""
-    return (
-        (x, view.fx, view.cx - view.width / 2, view.width),
-        (y, view.fy, view.cy - view.height / 2, view.height),
-    )
 
 
 def _touches(
@@ -278,20 +234,24 @@ def _touches(
     view: View,
     planes: tuple[float, float],
 ) -> NDArray[np.bool_]:
-    """Which footprints may reach into the image, on the safe side."""
+    """Return which footprints may reach into the image, (M,): at least all that do.
+
+    It is `frustum.contains` with the image widened by how far each footprint may reach.
+    """
     x, y, z = local
-    touching: NDArray[np.bool_] = (z > planes[0]) & (z <= planes[1])
-    for coordinate, focal, middle, size in _sides(view, x, y):
-        slope = (abs(middle) + (0.5 + _BEYOND) * size) / focal
-        reach = REACH * focal * float(np.hypot(1.0, slope)) * largest
-        pixels = size / 2 + REACH * LOW_PASS**0.5
-        touching &= np.abs(focal * coordinate + middle * z) <= pixels * z + reach
+    touching: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
+    for coordinate, (focal, offset, half) in zip((x, y), frustum.image_sides(view), strict=True):
+        # The steepest ray at which the projection is linearised bounds how long a footprint is.
+        slope = (abs(offset) + (1.0 + 2.0 * _BEYOND) * half) / focal
+        reach = REACH * focal * float(np.hypot(1.0, slope)) * largest  # (M,), px times depth
+        pixels = half + REACH * LOW_PASS**0.5
+        touching &= np.abs(focal * coordinate + offset * z) <= pixels * z + reach
     return touching
 
 
-def _rotation6(view: View) -> NDArray[np.float32]:
-    """Return the matrix that takes the 6 numbers of S to those of ``W S W'``."""
-    r = view.rotation
+def _rotation6(rotation: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return the matrix that takes the 6 numbers of S to those of ``R S R'``, R a rotation."""
+    r = rotation
     return np.array(
         [
             [r[a, i] * r[b, j] + (r[a, j] * r[b, i] if i != j else 0.0) for i, j in _PAIRS]
@@ -304,10 +264,40 @@ def _rotation6(view: View) -> NDArray[np.float32]:
 def _ellipses(
     local: NDArray[np.float32], shape: NDArray[np.float32], view: View
 ) -> tuple[NDArray[np.float32], ...]:
-    """Return centres, half axes and their lengths, each (2, n), pixels."""
+    """Return centres, major and minor half axes and their lengths, each (2, n), pixels.
+
+    Parameters
+    ----------
+    local : (3, n) float32
+        Camera coordinates of the centres, scene sizes.
+    shape : (6, n) float32
+        Covariances in camera coordinates, squared scene sizes.
+    view : View
+    """
     x, y, z = local
     across, down = x / z, y / z
     centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
+    return centers, *_half_axes(*_image_covariance((across, down, z), shape, view))
+
+
+def _image_covariance(
+    ray: tuple[NDArray[np.float32], ...], shape: NDArray[np.float32], view: View
+) -> tuple[NDArray[np.float32], ...]:
+    """Return xx, xy, yy, (n,) each, of ``J S J'`` in pixels, without the low-pass.
+
+    J is the Jacobian of the projection at ``(x, y, z)``: rows ``(fx / z, 0, -fx x / z^2)`` and
+    ``(0, fy / z, -fy y / z^2)``.
+
+    Parameters
+    ----------
+    ray : (across, down, z)
+        ``x / z``, ``y / z`` and z of the centres, (n,) each. Where a centre lies far beside the
+        image, J is taken nearer to it (`_BEYOND`), for it grows without bound.
+    shape : (6, n) float32
+        S: xx, xy, xz, yy, yz, zz.
+    view : View
+    """
+    across, down, z = ray
     beyond = _BEYOND * view.width / view.fx, _BEYOND * view.height / view.fy
     across = across.clip(
         -view.cx / view.fx - beyond[0], (view.width - view.cx) / view.fx + beyond[0]
@@ -318,26 +308,49 @@ def _ellipses(
     yy = fy * fy * (shape[3] + down * (down * shape[5] - 2 * shape[4]))
     xy = fx * fy * (shape[1] + across * (down * shape[5] - shape[4]) - down * shape[2])
     factor = np.minimum(1.0, _LARGEST_VARIANCE / np.maximum(xx + yy, 1.0))
-    xx, yy, xy = xx * factor, yy * factor, xy * factor
+    return xx * factor, xy * factor, yy * factor
+
+
+def _half_axes(
+    xx: NDArray[np.float32], xy: NDArray[np.float32], yy: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], ...]:
+    """Return the half axes of ``C + LOW_PASS I`` and their lengths, (2, n) each, the longer first.
+
+    With ``m = (xx + yy) / 2`` and ``r = hypot((xx - yy) / 2, xy)`` the eigenvalues of C are m + r
+    and m - r; the latter is computed as ``det C / (m + r)``, since the difference would cancel.
+    """
     middle, half = (xx + yy) / 2, (xx - yy) / 2
     root = np.sqrt(half * half + xy * xy)
     first = np.sqrt(np.maximum(middle + root, 0.0) + LOW_PASS)
-    # The smaller eigenvalue from the determinant: the difference would cancel.
     second = np.maximum(xx * yy - xy * xy, 0.0) / np.maximum(middle + root, 1e-30)
     second = np.sqrt(second + LOW_PASS)
-    # Direction of the major axis: (xx - yy + 2 root, 2 xy), or its turned twin where that is 0.
+    c, s = _major_direction(half, xy, root)
+    return first * np.stack([c, s]), second * np.stack([-s, c]), np.stack([first, second])
+
+
+def _major_direction(
+    half: NDArray[np.float32], xy: NDArray[np.float32], root: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the unit vector along the major axis, (n,) across and down; (1, 0) of a circle.
+
+    ``(half + root, xy)`` and ``(xy, root - half)`` both point along it, half being (xx - yy) / 2
+    and root that of `_half_axes`. The one whose sum does not cancel is taken, turned to the right.
+    """
     wide = half >= 0.0
     c, s = np.where(wide, half + root, np.abs(xy)), np.where(wide, xy, root - half)
     s = np.where(wide | (xy >= 0.0), s, -s)
     length = np.hypot(c, s)
     c = np.where(length > 0.0, c / np.maximum(length, 1e-30), 1.0)
     s = np.where(length > 0.0, s / np.maximum(length, 1e-30), 0.0)
-    axes = np.stack([c, s]), np.stack([-s, c])
-    return centers, first * axes[0], second * axes[1], np.stack([first, second])
+    return c, s
 
 
 def _by_depth(depth: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Order of positive float32 numbers; their bits sort as they do, by two radix passes."""
+    """Return the order of positive float32 numbers, (n,), nearest first.
+
+    The bits of positive floats, read as integers, sort as the floats do; NumPy sorts 16 bits at a
+    time by radix, in linear time.
+    """
     bits = np.ascontiguousarray(depth).view(np.uint32)
     order = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable")
     high = (bits >> 16).astype(np.uint16)

@@ -1,20 +1,78 @@
-"""Which points lie in which view, and how deep: many points against many views at once."""
+"""Which points lie in a view: the frustum's one definition, for one view and for many at once.
+
+A point of camera coordinates ``x, y, z`` lies in a view if it is between the near and the far plane
+and projects into the image, all edges included::
+
+    near <= z <= far,   0 <= fx x / z + cx <= width,   0 <= fy y / z + cy <= height
+
+Multiplied by z, with the principal point taken from the image's middle, that is
+``|f x + offset z| <= half z`` across and down: no division, and what is behind is outside.
+"""
 
 from __future__ import annotations
 
 import math
 import threading
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..views import ViewSet
+    from .views import View, ViewSet
 
 _STACK = 16
 """Rows of one matrix product: so few that BLAS starts no threads, which would fight ours."""
+
+
+class Side(NamedTuple):
+    """An image across or down, pixels.
+
+    Attributes
+    ----------
+    focal : float
+        Focal length.
+    offset : float
+        From the middle of the image to the principal point.
+    half : float
+        Half the image's size.
+    """
+
+    focal: float
+    offset: float
+    half: float
+
+
+def image_sides(view: View) -> tuple[Side, Side]:
+    """Return the image of a view across and down."""
+    return (
+        Side(view.fx, view.cx - view.width / 2, view.width / 2),
+        Side(view.fy, view.cy - view.height / 2, view.height / 2),
+    )
+
+
+def clip_planes(view: View, near: float) -> tuple[float, float]:
+    """Return near and far plane, world units; `near` is that of views that bring none."""
+    return (view.near if view.near > 0.0 else near), view.far
+
+
+def contains(view: View, local: NDArray[Any], planes: tuple[float, float]) -> NDArray[np.bool_]:
+    """Return which points lie in a view, (n,).
+
+    Parameters
+    ----------
+    view : View
+    local : (3, n) floating
+        Camera coordinates: x right, y down, z forward.
+    planes : (near, far)
+        In the unit of `local`.
+    """
+    x, y, z = local
+    inside: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
+    for coordinate, side in zip((x, y), image_sides(view), strict=True):
+        inside &= np.abs(side.focal * coordinate + side.offset * z) <= side.half * z
+    return inside
 
 
 class Frustums:
@@ -42,10 +100,9 @@ class Frustums:
     ) -> None:
         self.centers = views.centers - origin
         self._rows = _rows(views, self.centers, margin)
-        planes = np.array([view.near for view in views])
-        self._near = np.where(planes > 0.0, planes, near)[:, None]
-        self._far = np.array([view.far for view in views])[:, None]
-        # Of each thread: memory asked for anew for every product costs as much as the product.
+        planes = np.array([clip_planes(view, near) for view in views])
+        self._near, self._far = planes[:, :1], planes[:, 1:]
+        # Of each thread: allocating anew for every product costs as much as the product.
         self._own = threading.local()
 
     def project(
@@ -63,7 +120,7 @@ class Frustums:
         Returns
         -------
         depth : (b, n) float64
-            Along each view's axis, world units; yours until this thread asks again.
+            Along each view's axis, world units; overwritten by this thread's next call.
         inside : (b, n) bool
             Between near and far plane and within the widened image, edges included.
         """
@@ -76,7 +133,7 @@ class Frustums:
         np.maximum(np.abs(x, out=x), np.abs(y, out=y), out=x)
         inside = np.less_equal(x, depth)
         near, far = self._near[block], self._far[block]
-        # One number for all views is twice as fast as one for each.
+        # Comparing with one number is twice as fast as with one for each view.
         inside &= depth >= (near if np.ptp(near) > 0.0 else near[0, 0])
         if np.isfinite(far).any():
             inside &= depth <= far
@@ -102,10 +159,9 @@ def _rows(views: ViewSet, centers: NDArray[np.float64], margin: float) -> NDArra
     """
     rows = np.empty((3, len(views), 4))
     for index, (view, center) in enumerate(zip(views, centers, strict=True)):
-        right, down, forward = np.column_stack([view.rotation, -view.rotation @ center])
-        half_width = view.width / 2 * (1 + margin)
-        half_height = view.height / 2 * (1 + margin)
-        rows[0, index] = (view.fx * right + (view.cx - view.width / 2) * forward) / half_width
-        rows[1, index] = (view.fy * down + (view.cy - view.height / 2) * forward) / half_height
+        *axes, forward = np.column_stack([view.rotation, -view.rotation @ center])  # (4,) each
+        for row, axis, side in zip(rows, axes, image_sides(view), strict=False):
+            half = side.half * (1 + margin)
+            row[index] = (side.focal * axis + side.offset * forward) / half
         rows[2, index] = forward
     return rows

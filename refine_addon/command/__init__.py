@@ -1,0 +1,50 @@
+"""The command: ``blender -b [scene.blend] --command refine ...``, ``python -m refine_addon ...``.
+
+Both parse the same arguments and run the same pipeline. Only ``--object``, and the cameras of an
+open scene, need Blender; they are imported where they are used.
+
+In the order in which they work: `signals` listens for Ctrl-C, `flow` goes from arguments to exit
+code, `options` parses, `checks` refuses what cannot go together, `runs` does the work (for ``info``
+with `info`), `report` writes down what was done. `terminal` is all that prints.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from .signals import Listener, exit_code, reason
+from .terminal import complain
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+
+def main(arguments: Sequence[str], *, scene: bool = False) -> int:
+    """Run the command.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        What stands behind ``refine`` on the command line.
+    scene : bool
+        Whether this runs in Blender, whose open scene has objects and cameras.
+
+    Returns
+    -------
+    int
+        Exit code: 0 done, 1 failed on an input, 2 wrong usage; 128 and the signal's number where
+        one stopped it, 130 for Ctrl-C.
+    """
+    with Listener() as listener:
+        try:
+            # Loads NumPy, which takes longer than many a run; a signal waits until it is there.
+            from . import flow  # noqa: PLC0415
+
+            listener.interrupt()
+            code = flow.run(arguments, scene=scene)
+            listener.wait()
+        except KeyboardInterrupt as stop:
+            listener.wait()
+            complain(f"{reason(stop)}; nothing was left half-written")
+            return exit_code(stop)
+    return code

@@ -1,0 +1,129 @@
+"""What is refused before anything is read or written, beyond what argparse refuses."""
+
+from __future__ import annotations
+
+import os
+import stat
+from typing import TYPE_CHECKING
+
+from ..core import RefineError
+from . import options
+from .report import is_report
+
+if TYPE_CHECKING:
+    import argparse
+    from pathlib import Path
+
+
+def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Refuse what cannot go together, and outputs that would replace something else.
+
+    Wrong usage leaves through ``parser.error``, code 2.
+
+    Raises
+    ------
+    RefineError
+        If a file that would be replaced cannot be looked into.
+    """
+    _check_report(parser, given)
+    for path in _outputs(given):
+        _check_output(parser, path)
+    if given.command == "info":
+        return
+    try:
+        options.settings(given)
+        if given.command == "prune":
+            options.budget(given)
+    except RefineError as error:
+        parser.error(str(error))
+    if given.method == "occlusion" and (given.published or given.depth != "z"):
+        parser.error("--published and --depth are settings of the closed form")
+    if given.cameras is None and not (given.scene and open_blend()):
+        parser.error("no cameras: give --cameras, or open a .blend that has some")
+    if given.command == "prune":
+        _check_prune(parser, given)
+
+
+def open_blend() -> str:
+    """Return the path of the open .blend, "" if it was never saved."""
+    import bpy  # noqa: PLC0415 - only there inside Blender
+
+    return str(bpy.data.filepath)
+
+
+def _outputs(given: argparse.Namespace) -> list[Path]:
+    """Return the splat files to be made."""
+    if getattr(given, "output_dir", None):
+        return [given.output_dir / path.name for path in given.inputs]
+    return [given.output] if getattr(given, "output", None) else []
+
+
+def _check_report(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Refuse a report that would replace what is read or written, even with --overwrite."""
+    if given.report is None:
+        return
+    others = [*given.inputs, *_outputs(given), getattr(given, "cameras", None)]
+    if given.scene:
+        others.append(open_blend())
+    path = os.path.realpath(given.report)
+    for other in filter(None, others):
+        # Unlike pathlib's, these two never fail, whatever the name.
+        if os.path.realpath(os.path.expanduser(other)) == path:  # noqa: PTH111
+            parser.error(f"--report {given.report} is {other}, expected a file of its own")
+    beginning = _beginning(given.report) if given.overwrite else None
+    if beginning is not None and not is_report(beginning):
+        parser.error(f"{given.report} exists and is no report: write to another name")
+
+
+def _check_output(parser: argparse.ArgumentParser, path: Path) -> None:
+    """Refuse an output that would replace something other than splats, cameras above all."""
+    if path.suffix.lower() == ".ply":
+        return
+    beginning = _beginning(path)
+    if beginning is not None and not beginning.startswith(b"ply"):
+        parser.error(f"{path} exists and is no PLY: write to another name")
+
+
+def _beginning(path: Path) -> bytes | None:
+    """Return the first bytes of a file; None where there is none."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            return None  # which `refuse_existing` says
+        with path.open("rb") as stream:
+            return stream.read(64)
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        msg = f"{path}: cannot be looked into ({error.strerror or error}); nothing was changed"
+        raise RefineError(msg) from error
+
+
+def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    if bool(given.inputs) == bool(given.object):
+        parser.error("expected INPUT files or --object NAME, and not both")
+    if given.object:
+        if not given.scene:
+            parser.error(
+                "--object needs Blender: blender -b scene.blend --command refine prune ..."
+            )
+        if given.output_dir:
+            parser.error("--object is written with -o, not with --output-dir")
+        if not (given.output or given.save or given.dry_run):
+            parser.error("--object needs -o OUT.ply, --save or --dry-run")
+    else:
+        _check_files(parser, given)
+
+
+def _check_files(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    if given.save:
+        parser.error("--save goes with --object")
+    if given.output and given.output_dir:
+        parser.error("expected -o or --output-dir, and not both")
+    if not (given.output or given.output_dir or given.dry_run):
+        parser.error("expected -o OUT.ply, --output-dir DIR or --dry-run")
+    if given.output and len(given.inputs) > 1:
+        parser.error(f"-o takes one input, got {len(given.inputs)}: use --output-dir")
+    names = [path.name for path in given.inputs]
+    double = next((name for name in names if names.count(name) > 1), None)
+    if given.output_dir and double:
+        parser.error(f"two inputs are called {double}: they would be one file in --output-dir")

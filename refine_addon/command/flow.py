@@ -1,0 +1,44 @@
+"""From the arguments to the exit code."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from ..core import RefineError
+from . import checks, options, runs
+from .terminal import complain, described, flush
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+DONE, FAILED, USAGE = 0, 1, 2
+"""Exit codes: done, failed on an input, wrong usage."""
+
+
+def run(arguments: Sequence[str], *, scene: bool) -> int:
+    """Parse the arguments, check them, do what they say.
+
+    Parameters
+    ----------
+    arguments, scene
+        See `refine_addon.command.main`.
+
+    Returns
+    -------
+    int
+        Exit code: `DONE`, `FAILED` or `USAGE`.
+    """
+    parser = options.make_parser()
+    try:
+        given = parser.parse_args(list(arguments), argparse.Namespace(scene=scene))
+        checks.check(parser, given)
+        return DONE if runs.execute(given) else FAILED
+    except SystemExit as leaving:  # argparse leaves the process; Blender wants a number
+        flush()
+        return int(leaving.code or DONE)
+    except RefineError as error:
+        complain(str(error))
+    except (OSError, MemoryError) as error:
+        complain(described(error))
+    return FAILED

@@ -1,0 +1,176 @@
+"""The options of all subcommands, and what they say as budget and settings."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any, NoReturn
+
+from ..core import METHODS, Budget, ClosedForm, RefineError, Settings
+from ..core.whole_file import expanded
+from ..version import VERSION
+from .terminal import shown
+
+DEFAULT_RATIO = 0.5
+
+
+class _Parser(argparse.ArgumentParser):
+    """A parser whose complaints can be shown, whatever the arguments hold."""
+
+    def error(self, message: str) -> NoReturn:
+        super().error(shown(message))
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """Return the parser of all three subcommands."""
+    parser = _Parser(
+        prog="refine",
+        description="Prune 3D Gaussian splats by how much the cameras would miss them.",
+        epilog="Exit codes: 0 done, 1 failed on an input, 2 wrong usage, 130 cancelled, 143 "
+        "terminated.",
+    )
+    parser.add_argument("--version", action="version", version=f"refine {VERSION}")
+    commands = parser.add_subparsers(
+        title="commands", dest="command", required=True, metavar="COMMAND"
+    )
+    _add_prune(commands)
+    _add_score(commands)
+    info = commands.add_parser("info", help="say what is in 3DGS PLY files")
+    info.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help="3DGS PLY files")
+    _add_common(info)
+    return parser
+
+
+def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+    prune = commands.add_parser("prune", help="remove the splats the cameras would miss least")
+    prune.add_argument("inputs", nargs="*", type=_given, metavar="INPUT", help="3DGS PLY files")
+    prune.add_argument(
+        "--object", type=_name, metavar="NAME", help="prune this splat object of the open .blend"
+    )
+    prune.add_argument(
+        "--save", action="store_true", help="with --object: delete the splats there and save"
+    )
+    prune.add_argument("-o", "--output", type=_path, metavar="OUT.ply", help="for a single input")
+    prune.add_argument(
+        "--output-dir", type=_path, metavar="DIR", help="for many inputs; made if it is not there"
+    )
+    amount = prune.add_mutually_exclusive_group()
+    amount.add_argument(
+        "--ratio",
+        type=float,
+        metavar="B",
+        help=f"share of the splats to remove, 0 <= B < 1 (default {DEFAULT_RATIO})",
+    )
+    amount.add_argument("--keep", type=int, metavar="N", help="how many splats stay")
+    amount.add_argument("--max-mb", type=float, metavar="M", help="size of the file, in 1e6 bytes")
+    amount.add_argument("--threshold", type=float, metavar="S", help="remove scores below S")
+    amount.add_argument(
+        "--min-seen", type=float, metavar="P", help="remove what fewer than P %% of the views see"
+    )
+    _add_scoring(prune)
+    prune.add_argument(
+        "--absorb",
+        action="store_true",
+        help="survivors take over what is removed, by what the cameras see of it: far better when "
+        "much is removed, and slower; they change; --method then only matters with --threshold and "
+        "--min-seen",
+    )
+    prune.add_argument("--dry-run", action="store_true", help="decide and report, write nothing")
+    _add_common(prune)
+
+
+def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+    scoring = commands.add_parser("score", help="write the file with a float property refine_score")
+    scoring.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a 3DGS PLY file")
+    scoring.add_argument(
+        "-o", "--output", type=_path, metavar="OUT.ply", required=True, help="the file to make"
+    )
+    _add_scoring(scoring)
+    _add_common(scoring)
+
+
+def _add_scoring(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--cameras",
+        type=_given,
+        metavar="FILE_OR_FOLDER",
+        help="cameras.json, transforms.json or a COLMAP model; default: the open scene's cameras",
+    )
+    parser.add_argument(
+        "--method",
+        choices=METHODS,
+        default=METHODS[0],
+        help="default: closed-form; occlusion knows what hides what, and takes longer; auto takes "
+        "the cheapest that agrees with it",
+    )
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        default=Settings.tolerance,
+        metavar="T",
+        help="with --method auto: share of the kept splats that may differ from the full model's "
+        f"(default {Settings.tolerance})",
+    )
+    parser.add_argument(
+        "--depth",
+        choices=["z", "distance"],
+        default="z",
+        help="what the closed form takes as distance: along the view's axis (z), or to the view "
+        "itself (default z)",
+    )
+    parser.add_argument(
+        "--published",
+        action="store_true",
+        help="the formula as published, without frustum test and with constants in scene units: "
+        "the paper's with --depth z, its authors' code with --depth distance",
+    )
+    parser.add_argument(
+        "--views",
+        type=int,
+        default=64,
+        metavar="N",
+        help="use at most N views, spread out evenly; 0 uses all (default 64)",
+    )
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--report", type=_path, metavar="FILE.json", help="write a report as JSON")
+    parser.add_argument("--overwrite", action="store_true", help="replace files that exist")
+    parser.add_argument("--quiet", action="store_true", help="print errors only")
+
+
+def _name(text: str) -> str:
+    """Return what is there; a variable that a script did not set is a mistake, not a default."""
+    if not text:
+        msg = "expected a name, got none"
+        raise argparse.ArgumentTypeError(msg)
+    return text
+
+
+def _given(text: str) -> Path:
+    """Return the path of what is read, as it was given."""
+    if "\0" in text:
+        msg = "a path holds no zero byte"
+        raise argparse.ArgumentTypeError(msg)
+    return Path(_name(text))
+
+
+def _path(text: str) -> Path:
+    """Return the path of what is written, the home folder spelt out."""
+    try:
+        return expanded(_given(text))
+    except RefineError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def settings(options: argparse.Namespace) -> Settings:
+    """Return how to score, or raise `RefineError` where a value cannot be."""
+    make = ClosedForm.published if options.published else ClosedForm
+    return Settings(options.method, options.views, make(options.depth), tolerance=options.tolerance)
+
+
+def budget(options: argparse.Namespace) -> Budget:
+    """Return how much goes, or raise `RefineError` where a value cannot be."""
+    names = ("ratio", "keep", "max_mb", "threshold", "min_seen")
+    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    return Budget(**(given or {"ratio": DEFAULT_RATIO}))

@@ -1,0 +1,87 @@
+"""The report: what was done, as JSON, for programs."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..core import RefineError
+from ..core.whole_file import refuse_existing, whole_file
+from ..version import VERSION
+
+
+def check(path: Path, *, overwrite: bool) -> None:
+    """Refuse a report that could not be written, before the work that it would tell of.
+
+    Raises
+    ------
+    RefineError
+        If it exists and may not be replaced, its name is none that the system takes, or its folder
+        takes no files.
+    """
+    refuse_existing(path, overwrite=overwrite)
+    target = Path(os.path.realpath(path))  # a link stays one: what it points to is written
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            target.stat()  # of a name that is too long, whatever the version of Python, says so
+        with tempfile.TemporaryFile(dir=target.parent):
+            pass
+    except OSError as error:
+        msg = f"{path}: cannot be written ({error.strerror or error}); nothing was changed"
+        raise RefineError(msg) from error
+
+
+def write(
+    path: Path, results: list[dict[str, Any]], seconds: float, *, overwrite: bool, splats: bool
+) -> None:
+    """Write the report.
+
+    Parameters
+    ----------
+    path : Path
+        The file to make.
+    results : list of dict
+        One an input.
+    seconds : float
+        How long all of it took.
+    overwrite : bool
+        Whether the file may be replaced.
+    splats : bool
+        Whether splats were written, for the message if the report is not.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be written; the message says what was and what was not.
+    """
+    content = {
+        "refine": VERSION,  # first: by this a report is known, see `is_report`
+        "python": sys.version.split()[0],
+        "numpy": np.__version__,
+        "seconds": seconds,
+        "results": results,
+    }
+    try:
+        with whole_file(path, overwrite=overwrite) as stream:
+            stream.write(json.dumps(content, indent=2, allow_nan=False).encode() + b"\n")
+    except RefineError as error:
+        # What `whole_file` says of "nothing" holds for its own file alone.
+        why = str(error).removeprefix(f"{path}: ")
+        if isinstance(error.__cause__, OSError):
+            why = error.__cause__.strerror or why
+        done = "; the splats were" if splats else ""
+        msg = f"{path}: the report was not written ({why}){done}"
+        raise RefineError(msg) from error
+
+
+def is_report(beginning: bytes) -> bool:
+    """Return whether a file that begins like this is a report, or empty: nothing to be missed."""
+    words = beginning.split()
+    return not words or b"".join(words).startswith(b'{"refine":')

@@ -1,0 +1,213 @@
+"""What the subcommands do, input by input."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..core import RefineError, prune_file, read_cameras, read_ply, score
+from ..core.errors import printable
+from ..core.report import scoring_notes
+from ..core.whole_file import refuse_existing
+from . import report
+from .info import describe
+from .options import budget, settings
+from .terminal import Terminal, complain, described
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable
+
+    from ..core import ViewSet
+
+
+def execute(options: argparse.Namespace) -> bool:
+    """Do what the options say; return whether all of it went well.
+
+    Raises
+    ------
+    RefineError
+        If cameras cannot be read, or a folder or the report not be written; what is wrong with one
+        input is said, and noted in the report.
+    """
+    if options.report is not None:
+        report.check(options.report, overwrite=options.overwrite)
+    run = _Run(options)
+    {"prune": _prune, "score": _score, "info": _info}[options.command](run)
+    run.finish()
+    return not run.failed
+
+
+class _Run:
+    """What one call of the command did so far."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.options = options
+        self.terminal = Terminal(quiet=options.quiet)
+        self.entries: list[dict[str, Any]] = []
+        self.failed = False
+        self._started = time.perf_counter()
+
+    def attempt(self, label: str, work: Callable[[], dict[str, Any]]) -> None:
+        """Do one input's work; note its error, so that the others go on."""
+        try:
+            self.entries.append({"status": "done", **work()})
+        except (RefineError, OSError, MemoryError) as error:
+            self.failed = True
+            message = str(error) if isinstance(error, RefineError) else described(error)
+            # What is wrong with the splats is said without the file.
+            files = (Path(label), getattr(self.options, "output", None))
+            if not any(file and printable(file.name) in message for file in files):
+                message = f"{label}: {message}"
+            self.entries.append({"status": "failed", "input": label, "error": message})
+            complain(message)
+
+    def finish(self) -> None:
+        """Write the report, where one is wanted."""
+        options = self.options
+        if options.report is None:
+            return
+        writes = options.command != "info" and not getattr(options, "dry_run", False)
+        report.write(
+            options.report,
+            self.entries,
+            time.perf_counter() - self._started,
+            overwrite=options.overwrite,
+            splats=writes and any(entry["status"] == "done" for entry in self.entries),
+        )
+
+
+def _prune(run: _Run) -> None:
+    options = run.options
+    views = _views(options)
+    if options.object:
+        run.attempt(options.object, lambda: _prune_object(run, views))
+    elif options.output_dir and not options.dry_run:
+        _make_folder(options.output_dir)
+    for source in options.inputs:
+        run.attempt(str(source), lambda source=source: _prune_one(run, source, views))
+
+
+def _make_folder(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        msg = f"{folder}: cannot be made ({error.strerror or error})"
+        raise RefineError(msg) from error
+
+
+def _prune_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
+    options = run.options
+    output = options.output
+    if options.output_dir:
+        output = options.output_dir / source.name
+    result = prune_file(
+        source,
+        None if options.dry_run else output,
+        views,
+        budget(options),
+        settings(options),
+        absorb=options.absorb,
+        overwrite=options.overwrite,
+        progress=run.terminal.progress(source.name),
+    )
+    run.terminal.clear()
+    _say_result(run, str(source), result.report)
+    return result.report
+
+
+def _prune_object(run: _Run, views: ViewSet) -> dict[str, Any]:
+    from .. import splat_object  # noqa: PLC0415 - needs Blender
+
+    options = run.options
+    done = splat_object.prune_object(
+        options.object,
+        views,
+        budget(options),
+        settings(options),
+        absorb=options.absorb,
+        output=options.output,
+        save=options.save,
+        dry_run=options.dry_run,
+        overwrite=options.overwrite,
+        progress=run.terminal.progress(options.object),
+    )
+    run.terminal.clear()
+    _say_result(run, options.object, done)
+    return done
+
+
+def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
+    splats, views, files = done["splats"], done["views"], done["files"]
+    verb = "would keep" if run.options.dry_run else "kept"
+    before, after = (files[name] / 1e6 for name in ("input_bytes", "output_bytes"))
+    share = splats["removed"] / splats["before"]
+    parts = [
+        f"{verb} {splats['kept']:,} of {splats['before']:,} splats ({share:.1%} removed)",
+        f"{before:,.1f} -> {after:,.1f} MB",
+        f"by {views['used']} of {views['given']} views",
+        f"{done['timings']['total_s']:.2f} s",
+    ]
+    target = f" -> {files['output']}" if files["output"] else ""
+    run.terminal.say(f"{label}: {', '.join(parts)}{target}")
+    for note in done["notes"]:
+        run.terminal.say(f"  note: {note}")
+
+
+def _score(run: _Run) -> None:
+    options = run.options
+    views = _views(options)
+    source = options.inputs[0]
+    run.attempt(str(source), lambda: _score_one(run, source, views))
+
+
+def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
+    options = run.options
+    output = options.output
+    refuse_existing(output, overwrite=options.overwrite)
+    file = read_ply(source)
+    scores = score(
+        file.splats(), views, settings(options), progress=run.terminal.progress(source.name)
+    )
+    file.write(output, columns={"refine_score": scores.values}, overwrite=options.overwrite)
+    run.terminal.clear()
+    run.terminal.say(
+        f"{source}: scored {len(file):,} splats by {scores.views_used} views -> {output}"
+    )
+    notes = scoring_notes(scores)
+    for note in notes:
+        run.terminal.say(f"  note: {note}")
+    return {
+        "files": {"input": str(source), "output": str(output)},
+        "splats": {"before": len(file), "undrawable": scores.undrawable},
+        "views": {"given": len(views), "used": scores.views_used},
+        "settings": asdict(settings(options)),
+        "weights": scores.weights,
+        "notes": notes,
+    }
+
+
+def _info(run: _Run) -> None:
+    for source in run.options.inputs:
+        run.attempt(str(source), lambda source=source: _info_one(run, source))
+
+
+def _info_one(run: _Run, source: Path) -> dict[str, Any]:
+    file = read_ply(source)
+    facts = describe(file)
+    run.terminal.say(f"{source}")
+    for name, value in facts.items():
+        run.terminal.say(f"  {name.replace('_', ' '):18} {value}")
+    return {"input": str(source), **facts}
+
+
+def _views(options: argparse.Namespace) -> ViewSet:
+    if options.cameras is not None:
+        return read_cameras(options.cameras)
+    import bpy  # noqa: PLC0415
+
+    from ..cameras import sets as camera_sets  # noqa: PLC0415
+
+    return camera_sets.visible_views(bpy.context.scene)

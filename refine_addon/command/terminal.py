@@ -1,0 +1,103 @@
+"""What the command prints: sentences, errors and progress, none of which can harm a terminal."""
+
+from __future__ import annotations
+
+import os
+import sys
+import unicodedata
+from typing import TYPE_CHECKING, Literal, TextIO
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_OBEYED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
+"""Categories of characters that a terminal obeys, or cannot show, and nobody reads."""
+
+_CLEAR = "\r\x1b[K"
+
+
+def shown(text: str) -> str:
+    r"""Return `text` on one line, as a terminal can show it.
+
+    A name of a file can hold anything, such as an escape sequence that renames the window.
+
+    >>> print(shown("a\x1b[2J\nb"))
+    a\x1b[2J\nb
+    """
+    return "".join(
+        char.encode("unicode_escape").decode() if unicodedata.category(char) in _OBEYED else char
+        for char in text
+    )
+
+
+def described(error: OSError | MemoryError) -> str:
+    """Return what the system refused, and of which file."""
+    if not isinstance(error, OSError) or error.strerror is None:
+        return str(error) or type(error).__name__
+    return error.strerror if error.filename is None else f"{error.filename}: {error.strerror}"
+
+
+def complain(text: str) -> None:
+    """Print an error, in place of the progress that may stand there."""
+    start = _CLEAR if _is_terminal(sys.stderr) else ""
+    _write("stderr", f"{start}refine: error: {shown(text)}\n")
+
+
+def flush() -> None:
+    """Hand on what argparse printed, which is help that nobody may be there to read."""
+    _write("stdout", "")
+
+
+class Terminal:
+    """Where a run says what it does.
+
+    Parameters
+    ----------
+    quiet : bool
+        Whether to say nothing but errors.
+    """
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._quiet = quiet
+        self._draws = not quiet and _is_terminal(sys.stderr)
+
+    def say(self, text: str) -> None:
+        """Print a line, unless quiet."""
+        if not self._quiet:
+            _write("stdout", f"{shown(text)}\n")
+
+    def progress(self, label: str) -> Callable[[float, str], None]:
+        """Return a callback that draws on a terminal and is silent elsewhere."""
+        if not self._draws:
+            return lambda _fraction, _what: None
+        label = shown(label)
+
+        def draw(fraction: float, what: str) -> None:
+            _write("stderr", f"{_CLEAR}{label}: {what} {fraction:4.0%}")
+
+        return draw
+
+    def clear(self) -> None:
+        """Wipe away what was drawn."""
+        if self._draws:
+            _write("stderr", _CLEAR)
+
+
+def _is_terminal(stream: TextIO | None) -> bool:
+    return stream is not None and stream.isatty()
+
+
+def _write(name: Literal["stdout", "stderr"], text: str) -> None:
+    """Write to a stream of the process, at once."""
+    stream: TextIO | None = getattr(sys, name)
+    if stream is None:  # closed before Python began
+        return
+    try:
+        stream.write(text)
+        stream.flush()
+    except UnicodeEncodeError:  # a name that this terminal's encoding cannot show
+        _write(name, text.encode("ascii", "backslashreplace").decode())
+    except OSError:
+        # Whoever read this has gone, or its disk is full: the work goes on. Python would try once
+        # more as it exits, and make that the exit code.
+        setattr(sys, name, open(os.devnull, "w"))  # noqa: PTH123, SIM115 - closed with the process

@@ -1,0 +1,77 @@
+"""Files that are something else than was asked for, but nothing unknown: what to do with them."""
+
+from __future__ import annotations
+
+import zlib
+from typing import TYPE_CHECKING
+
+from .errors import RefineError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+_POINTER = b"version https://git-lfs.github.com/spec/"
+_GZIP, _ZIP, _SPZ = b"\x1f\x8b", b"PK\x03\x04", b"NGSP"
+_UNSIGNED = (".splat", ".ksplat")
+"""Formats in whose files nothing tells them."""
+
+_CONVERT = "convert it to a plain 3DGS PLY first (SuperSplat and splat-transform do)"
+
+
+def refuse_pointer(path: Path, head: bytes) -> None:
+    """Refuse what Git leaves in place of a large file.
+
+    Parameters
+    ----------
+    path : Path
+        For the message.
+    head : bytes
+        What the file starts with.
+
+    Raises
+    ------
+    RefineError
+        With what to do.
+    """
+    if head.startswith(_POINTER):
+        msg = f"{path}: a Git LFS pointer, not the file itself: 'git lfs pull' fetches that"
+        raise RefineError(msg)
+
+
+def refuse_foreign_splats(path: Path, head: bytes) -> None:
+    """Refuse splats in another format than PLY, and what they are packed in, by name.
+
+    Parameters
+    ----------
+    path, head
+        See `refuse_pointer`; a few hundred bytes.
+
+    Raises
+    ------
+    RefineError
+        With what to do.
+    """
+    refuse_pointer(path, head)
+    suffix = path.suffix.lower()
+    if suffix in _UNSIGNED:
+        problem = f"a {suffix} file: {_CONVERT}"
+    elif head.startswith(_SPZ) or _unpacked(head).startswith(_SPZ):
+        problem = f"an SPZ file: {_CONVERT}"
+    elif head.startswith(_GZIP):
+        problem = "compressed with gzip: unpack it first"
+    elif head.startswith(_ZIP) and (suffix == ".sog" or b"meta.json" in head):
+        problem = f"a SOG file: {_CONVERT}"
+    elif head.startswith(_ZIP):
+        problem = "a ZIP archive: unpack it first"
+    else:
+        return
+    msg = f"{path}: {problem}"
+    raise RefineError(msg)
+
+
+def _unpacked(head: bytes) -> bytes:
+    """Return the first bytes of what gzip compressed, if it did."""
+    try:
+        return zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, len(_SPZ))
+    except zlib.error:
+        return b""

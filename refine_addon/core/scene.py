@@ -1,0 +1,164 @@
+"""The scene's own frame: where its middle is, how large it is and which way it lies.
+
+Everything that is computed in float32, or compared with a fixed number, is computed in this frame.
+It moves, turns and grows with the scene, so the result depends neither on the frame that a file
+happens to use nor on the order of its splats.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from .views import ViewSet
+
+_CHUNK = 1 << 16
+_BITS = 21  # of each coordinate in the order of `Scene.order`: three of them fill an int64
+_HALF_WIDTH = 4.0  # scene sizes either way that the order resolves; what is farther is at its edge
+_SPREAD_BITS = (
+    (32, 0x1F00000000FFFF),
+    (16, 0x1F0000FF0000FF),
+    (8, 0x100F00F00F00F00F),
+    (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)
+"""Shifts and masks that leave two free bits behind each bit of a 21-bit number."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The frame of a scene.
+
+    Attributes
+    ----------
+    origin : (3,) float64
+        Geometric median of the views' centres, world units.
+    size : float
+        The root of S + V, world units, > 0: S is the median over drawable splats of their squared
+        distance to the origin, V the median over views of theirs.
+    axes : (3, 3) float64
+        Rotation from the world to the frame: its rows are the principal axes of the splats.
+    """
+
+    origin: NDArray[np.float64]
+    size: float
+    axes: NDArray[np.float64]
+
+    def place(self, means: NDArray[Any]) -> NDArray[np.float64]:
+        """Return positions in the frame, in scene sizes.
+
+        Parameters
+        ----------
+        means : (N, 3) floating
+            World units.
+
+        Returns
+        -------
+        (N, 3) float64
+        """
+        return np.asarray((means - self.origin) @ (self.axes.T / self.size))
+
+
+def median_size(squared: NDArray[np.float64], drawable: NDArray[np.bool_]) -> float:
+    """Return the size of a scene, 1 where all of it is one point.
+
+    Parameters
+    ----------
+    squared : (N,) float64
+        Squared distance of each splat to the scene's origin, plus the median of the views'.
+    drawable : (N,) bool
+        Which splats count; those that a renderer can draw.
+    """
+    if not drawable.any():
+        return 1.0
+    return float(np.sqrt(np.median(squared if drawable.all() else squared[drawable]))) or 1.0
+
+
+def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -> Scene:
+    """Return the frame of a scene.
+
+    Parameters
+    ----------
+    means : (N, 3) floating
+        Centres of the splats, world units.
+    drawable : (N,) bool
+        Which splats count.
+    views : ViewSet
+
+    Returns
+    -------
+    Scene
+    """
+    origin, views_squared = views.middle()
+    squared = np.empty(len(means))
+    with np.errstate(under="ignore"):
+        for piece in _pieces(len(means)):
+            # What cannot be drawn may hold any number.
+            offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
+            squared[piece] = np.einsum("ij,ij->i", offset, offset) + views_squared
+        unturned = Scene(origin, median_size(squared, drawable), np.eye(3))
+        return replace(unturned, axes=_principal_axes(means, drawable, unturned))
+
+
+def _principal_axes(
+    means: NDArray[Any], drawable: NDArray[np.bool_], scene: Scene
+) -> NDArray[np.float64]:
+    """Return the axes along which positions vary, the least first, as the rows of a rotation.
+
+    A position at distance r counts 1 / (1 + r^2)^2, so that a few far ones decide nothing. An axis
+    points to where more of the splats lie. In a scene as long as it is wide the axes are arbitrary.
+
+    Parameters
+    ----------
+    means, drawable
+        See `scene_of`.
+    scene : Scene
+        Its origin and size count.
+    """
+    second, first = np.zeros((3, 3)), np.zeros(3)  # weighted moments
+    for piece in _pieces(len(means)):
+        place = scene.place(means[piece][drawable[piece]])  # (n, 3)
+        weights = (1.0 + np.einsum("ij,ij->i", place, place)) ** -2.0  # (n,)
+        weighted = place * weights[:, None]
+        second += weighted.T @ place
+        first += weighted.sum(axis=0)
+    _, vectors = np.linalg.eigh(second)  # in columns
+    axes = (vectors * np.where(first @ vectors < 0.0, -1.0, 1.0)).T
+    if np.linalg.det(axes) < 0.0:
+        axes[2] = -axes[2]
+    return np.ascontiguousarray(axes)
+
+
+def _pieces(count: int) -> Iterator[slice]:
+    return (slice(start, start + _CHUNK) for start in range(0, count, _CHUNK))
+
+
+def spatial_order(place: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return an order of positions in which neighbours follow each other (Morton, 1966).
+
+    Parameters
+    ----------
+    place : (N, 3) float64
+        As `Scene.place` returns them.
+
+    Returns
+    -------
+    (N,) int64
+        Positions that agree in 21 bits of each coordinate keep their order.
+    """
+    cells = float(1 << _BITS)
+    code = np.zeros(len(place), np.int64)
+    for axis in range(3):
+        along = place[:, axis] * (0.5 / _HALF_WIDTH) + 0.5
+        bits = (along * cells).clip(0.0, cells - 1.0).astype(np.int64)
+        for shift, mask in _SPREAD_BITS:
+            bits = (bits | bits << shift) & mask
+        code |= bits << axis
+    return np.argsort(code, kind="stable")

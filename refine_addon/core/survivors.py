@@ -1,0 +1,66 @@
+"""What absorbing made of splats, put among the columns that a file or a mesh stores of them.
+
+Above both: a format knows nothing of absorbing, nor absorbing of how splats are stored.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from .affine import transformed
+from .formats.ply_columns import values_by_name
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .absorbing.absorb import Absorbed
+
+
+class Columns(Protocol):
+    """Stored properties of N splats by their names, such as a mapping or a structured array."""
+
+    def __getitem__(self, name: str, /) -> NDArray[Any]:
+        """Return a property, (N,)."""
+        ...
+
+
+def survivor_columns(
+    stored: Columns | NDArray[Any], absorbed: Absorbed, matrix: NDArray[Any] | None = None
+) -> dict[str, NDArray[Any]]:
+    """Return stored columns with what absorbing changed put in.
+
+    Parameters
+    ----------
+    stored : mapping of str to (N,), or structured array
+        All properties of the splats before absorbing, such as `SplatFile.rows`; not changed.
+    absorbed : Absorbed
+        Of these splats.
+    matrix : (4, 4) floating, optional
+        From the frame of the survivors to that of the columns, where these are two.
+
+    Returns
+    -------
+    dict of str to (N,)
+        The properties that make a splat, each of its stored type and rounded to it once. What did
+        not change, or is gone, is what it was, to the bit.
+
+    Examples
+    --------
+    A file is written so that the survivors are in it as they became::
+
+        file.write("out.ply", absorbed.keep, columns=survivor_columns(file.rows, absorbed))
+    """
+    changed = np.flatnonzero(absorbed.changed)
+    rows = np.flatnonzero(absorbed.keep)[changed]
+    survivors = absorbed.splats.take(changed)
+    if matrix is not None and not np.array_equal(matrix, np.eye(4)):
+        survivors = transformed(survivors, matrix)
+    columns = {}
+    # A double may be too large or too small for a float.
+    with np.errstate(over="ignore", under="ignore"):
+        for name, values in values_by_name(survivors).items():
+            columns[name] = stored[name].copy()
+            columns[name][rows] = values
+    return columns

@@ -1,0 +1,89 @@
+"""What is kept does not depend on the frame or the order of the splats: the committed scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from refine_addon.core import Budget, Settings, ViewSet, prune, read_cameras, read_ply, select
+from refine_addon.core.affine import transformed
+
+pytestmark = pytest.mark.slow
+
+ROOM = Path(__file__).parents[1] / "data/room_small"
+QUARTER = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # about x, as *Upright* turns
+
+
+def rotation(axis, degrees):
+    """Rodrigues' formula."""
+    x, y, z = np.array(axis) / np.linalg.norm(axis)
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = np.deg2rad(degrees)
+    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+
+
+def moved(splats, views, turn, step):
+    """Move splats and views by the same rigid motion."""
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn, step
+    poses = (
+        replace(view, rotation=view.rotation @ turn.T, center=turn @ view.center + step)
+        for view in views
+    )
+    return transformed(splats, matrix, rotate_sh=True), ViewSet(tuple(poses))
+
+
+MOTIONS = {
+    "a quarter about x": (QUARTER, np.zeros(3)),
+    "a turn and a move": (rotation([3, -1, 2], 111.0), np.array([-3.0, 5.0, 9.0])),
+}
+
+
+@pytest.fixture(scope="module")
+def room():
+    splats = read_ply(ROOM / "point_cloud.ply").splats()
+    return splats, read_cameras(ROOM / "cameras.json")
+
+
+def kept(splats, views, ratio, *, absorb):
+    if absorb:
+        return prune(splats, views, Budget(ratio=ratio), absorb=True).keep
+    scores = prune(splats, views, Budget(ratio=ratio), Settings("occlusion")).scores
+    return np.stack([select(scores, Budget(ratio=share)) for share in (0.5, 0.9)])
+
+
+@pytest.fixture(scope="module", params=["occlusion", "absorb at 50 %", "absorb at 90 %"])
+def how(request, room):
+    """Return what decides, and the kept set of the scene as it is."""
+    words = {"ratio": 0.9 if "90" in request.param else 0.5, "absorb": "absorb" in request.param}
+    return words, kept(*room, **words)
+
+
+def jaccard(one, other):
+    """Return the least over the budgets of the share that both keep in what either keeps."""
+    return np.min((one & other).sum(axis=-1) / (one | other).sum(axis=-1))
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_a_motion_of_the_scene_keeps_the_same_splats(room, how, motion):
+    """Coordinates differ in their last digits of float64; nothing else may."""
+    words, expected = how
+
+    found = kept(*moved(*room, *MOTIONS[motion]), **words)
+
+    assert jaccard(found, expected) >= 0.9999
+
+
+def test_another_order_of_splats_and_views_keeps_the_same_splats(room, how):
+    """No two splats of the room are alike, so no tie is decided by place in the file."""
+    words, expected = how
+    rng = np.random.default_rng(0)
+    splats, views = room
+    order = rng.permutation(len(splats))
+
+    found = kept(splats.take(order), views.take(rng.permutation(len(views))), **words)
+
+    assert jaccard(found, expected[..., order]) >= 0.9999

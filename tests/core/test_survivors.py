@@ -1,0 +1,110 @@
+"""Survivors among stored columns: what changed is put in, all else stays to the bit."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from refine_addon.core import Splats, read_ply, survivor_columns
+from refine_addon.core.absorbing.absorb import Absorbed
+from refine_addon.core.affine import transformed
+from refine_addon.core.formats.ply_columns import values_by_name
+from tests.strategies import plain_ply
+
+CORE = Path(__file__).parents[2] / "refine_addon/core"
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Open a file of 5 splats, one of whose numbers is a signalling NaN and one a -0."""
+    data = bytearray(plain_ply(5, 1))
+    (tmp_path / "in.ply").write_bytes(data)
+    rows = read_ply(tmp_path / "in.ply").rows.copy()
+    rows["x"].view(np.uint32)[0] = 0x7F800001
+    rows["f_rest_3"][1] = -0.0
+    (tmp_path / "in.ply").write_bytes(data[: -rows.nbytes] + rows.tobytes())
+    return read_ply(tmp_path / "in.ply")
+
+
+def absorbed_of(splats, keep, changed, factor=2.0):
+    """Return survivors of which some have become `factor` times what they were."""
+    kept = splats.take(keep)
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest"):
+        getattr(kept, name)[changed] *= factor
+    gone = len(keep) - int(keep.sum())
+    return Absorbed(kept, keep, changed, 0, gone)
+
+
+KEEP = np.array([True, True, False, True, True])
+CHANGED = np.array([False, False, True, True])
+
+
+def test_what_changed_is_put_in_and_all_else_stays_to_the_bit(file):
+    """Rows 3 and 4 are doubled, in all 23 properties; the file's own rows are not touched."""
+    before = file.rows.tobytes()
+
+    columns = survivor_columns(file.rows, absorbed_of(file.splats(), KEEP, CHANGED))
+
+    assert set(columns) == set(file.rows.dtype.names)
+    for name, values in columns.items():
+        np.testing.assert_array_equal(values[3:], 2 * file.rows[name][3:])
+        assert values[:3].tobytes() == file.rows[name][:3].tobytes()
+        assert values.dtype == file.rows.dtype[name]
+    assert before == file.rows.tobytes()
+
+
+def test_a_file_is_written_with_its_survivors_in_one_call(file, tmp_path):
+    """As the README says: rows 0 and 1 byte for byte, and then the changed ones."""
+    absorbed = absorbed_of(file.splats(), KEEP, CHANGED)
+    file.write(tmp_path / "out.ply", absorbed.keep, columns=survivor_columns(file.rows, absorbed))
+
+    written = read_ply(tmp_path / "out.ply")
+
+    assert written.rows[:2].tobytes() == file.rows[:2].tobytes()
+    np.testing.assert_array_equal(written.splats().sh_rest, absorbed.splats.sh_rest)
+    np.testing.assert_array_equal(written.splats().means[2:], absorbed.splats.means[2:])
+
+
+@pytest.mark.parametrize("kind", ["<f4", ">f4", "<f8", ">f8"])
+def test_every_property_keeps_its_type_and_is_rounded_to_it_once(file, kind):
+    """A third of what doubles hold is the nearest number that the property can be."""
+    with np.errstate(invalid="ignore"):  # of the signalling NaN, which turns quiet
+        rows = file.rows.astype([(name, kind) for name in file.rows.dtype.names])
+        splats = vars(file.splats())
+        wide = Splats(**{name: values.astype(np.float64) for name, values in splats.items()})
+    absorbed = absorbed_of(wide, KEEP, CHANGED, factor=1 / 3)
+
+    columns = survivor_columns(rows, absorbed)
+
+    for name, values in values_by_name(absorbed.splats).items():
+        np.testing.assert_array_equal(columns[name][3:], values[2:].astype(kind))
+        assert columns[name].dtype == np.dtype(kind)
+
+
+def test_a_matrix_leads_the_changed_ones_to_the_frame_of_the_columns(file):
+    """Turned by 90 degrees about z and moved along x; the unchanged ones are not taken along."""
+    matrix = np.array([[0.0, -1, 0, 7], [1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    absorbed = absorbed_of(file.splats(), KEEP, CHANGED)
+
+    columns = survivor_columns({n: file.rows[n] for n in file.rows.dtype.names}, absorbed, matrix)
+
+    wanted = values_by_name(transformed(absorbed.splats.take(CHANGED), matrix))
+    np.testing.assert_allclose(columns["x"][3:], 7 - 2 * file.rows["y"][3:], rtol=1e-6)
+    for name, values in wanted.items():
+        np.testing.assert_array_equal(columns[name][3:], values.astype(np.float32))
+        assert columns[name][:3].tobytes() == file.rows[name][:3].tobytes()
+
+
+def test_a_format_knows_nothing_of_what_is_done_with_splats():
+    """The wall: files are read and written whatever scores, selects and absorbs."""
+    above = {"absorbing", "scoring", "pipeline", "selection", "survivors", "scores"}
+    for room in ("formats", "cameras"):
+        files = sorted((CORE / room).glob("*.py"))
+        assert files
+        for path in files:
+            nodes = ast.walk(ast.parse(path.read_text()))
+            found = [n.module or "" for n in nodes if isinstance(n, ast.ImportFrom)]
+            assert not [name for name in found if above & {*name.split(".")}], path.name

@@ -1,0 +1,73 @@
+"""Chunked work: it can be cancelled between its chunks, and within one that takes long."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import pytest
+
+from refine_addon.core.errors import Cancelled
+from refine_addon.core.work import checkpoint, for_chunks
+
+LONG = 60.0
+
+
+def endless(_piece: slice) -> None:
+    """Work until cancelled."""
+    end = time.monotonic() + LONG
+    while time.monotonic() < end:
+        time.sleep(0.001)
+        checkpoint()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_work_that_takes_long_is_cancelled_within_a_chunk(threads):
+    """The first report begins the work, the second comes while it runs: it stops there."""
+    calls = iter(range(100))
+    start = time.monotonic()
+
+    with pytest.raises(Cancelled):
+        for_chunks(endless, 2, 1, progress=lambda _fraction, _what: next(calls) < 1,
+                   threads=threads)  # fmt: skip
+
+    assert time.monotonic() - start < LONG / 10
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_error_stops_the_chunks_that_run(threads):
+    """The first chunk fails while the second runs; nothing waits for the end of that one."""
+    running = threading.Event()
+
+    def work(piece: slice) -> None:
+        if piece.start:
+            running.set()
+            endless(piece)
+        elif threads > 1:
+            running.wait()
+        message = "broken"
+        raise ValueError(message)
+
+    start = time.monotonic()
+
+    with pytest.raises(ValueError, match="broken"):
+        for_chunks(work, 2, 1, threads=threads)
+
+    assert time.monotonic() - start < LONG / 10
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_after_the_work_nothing_is_left_to_cancel(threads):
+    """A checkpoint outside of chunked work does nothing, though the last work was cancelled."""
+    with pytest.raises(Cancelled):
+        for_chunks(endless, 2, 1, progress=lambda *_: False, threads=threads)
+
+    checkpoint()
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_results_come_in_the_order_of_the_slices(threads):
+    """Whatever the number of threads; the last slice is what is left."""
+    found = for_chunks(lambda piece: (piece.start, piece.stop), 10, 4, threads=threads)
+
+    assert found == [(0, 4), (4, 8), (8, 10)]

@@ -1,0 +1,35 @@
+"""What a user may not do, though tests may be run by the root user, who may do anything."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+NOBODY = 65534
+
+
+@contextlib.contextmanager
+def closed_folder(files: Mapping[str, str]) -> Iterator[Path]:
+    """Make a folder of files that may not be entered; the root user is nobody for that long."""
+    root = os.geteuid() == 0
+    with tempfile.TemporaryDirectory() as made:
+        Path(made).chmod(0o755)
+        folder = Path(made) / "closed"
+        folder.mkdir()
+        for name, content in files.items():
+            (folder / name).write_text(content)
+        folder.chmod(0)
+        if root:
+            os.seteuid(NOBODY)
+        try:
+            yield folder
+        finally:
+            if root:
+                os.seteuid(0)
+            folder.chmod(0o700)
