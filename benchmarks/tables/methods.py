@@ -156,7 +156,7 @@ def _published() -> list[Method]:
         _scoring(
             f"refine-{depth}",
             LITERATURE,
-            f"REFINE's closed form, {text} (`--published {depth}`)",
+            f"REFINE's closed form, {text} (`--published --depth {depth}`)",
             Settings(views=0, closed_form=ClosedForm.published(depth)),
         )
         for depth, text in readings.items()

@@ -160,7 +160,7 @@ def _main_table(scene: Measured) -> list[str]:
         label = f"**{name}**" if rows[0].method.group == OURS else name
         body.append([label, *cells])
     heads = ["PSNR, held-out views", *(f"{row.ratio:.0%}" for row in first), "seconds", "MB"]
-    return ["Removed, against renders of the unpruned splats (ours in bold, best in bold):", "",
+    return ["Removed, against renders of the unpruned splats (bold: ours, and the best of each column):", "",
             *_table(heads, body)]  # fmt: skip
 
 

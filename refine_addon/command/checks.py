@@ -33,15 +33,16 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     try:
         options.settings(given)
         if given.command == "prune":
-            options.budget(given)
+            frustum = not given.published
+            options.budget(given).refuse_meaningless(given.method, frustum=frustum)
     except RefineError as error:
         parser.error(str(error))
     if given.method == "occlusion" and (given.published or given.depth != "z"):
         parser.error("--published and --depth are settings of the closed form")
-    if given.cameras is None and not (given.scene and open_blend()):
-        parser.error("no cameras: give --cameras, or open a .blend that has some")
     if given.command == "prune":
         _check_prune(parser, given)
+    if given.cameras is None and not (given.scene and open_blend()):
+        parser.error("no cameras: give --cameras, or open a .blend that has some")
 
 
 def open_blend() -> str:

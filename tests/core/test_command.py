@@ -408,6 +408,8 @@ USAGE = {
     "endless megabytes": [*PRUNE, "-o", "out.ply", "--max-mb", "inf"],
     "endless threshold": [*PRUNE, "-o", "out.ply", "--threshold", "inf"],
     "seen by too many": [*PRUNE, "-o", "out.ply", "--min-seen", "101"],
+    "a score of any method": [*PRUNE, "-o", "out.ply", "--method", "auto", "--threshold", "1"],
+    "a count of all views": [*PRUNE, "-o", "out.ply", "--published", "--min-seen", "5"],
     "views below 0": [*PRUNE, "-o", "out.ply", "--views", "-1"],
     "unknown method": [*PRUNE, "-o", "out.ply", "--method", "guess"],
     "unknown depth": [*PRUNE, "-o", "out.ply", "--depth", "y"],
