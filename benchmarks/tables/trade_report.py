@@ -160,8 +160,8 @@ def _main_table(scene: Measured) -> list[str]:
         label = f"**{name}**" if rows[0].method.group == OURS else name
         body.append([label, *cells])
     heads = ["PSNR, held-out views", *(f"{row.ratio:.0%}" for row in first), "seconds", "MB"]
-    return ["Removed, against renders of the unpruned splats (bold: ours, and the best of each column):", "",
-            *_table(heads, body)]  # fmt: skip
+    title = "Removed, against renders of the unpruned splats (bold: ours, and each best):"
+    return [title, "", *_table(heads, body)]
 
 
 def _miscounts(scene: Measured) -> list[str]:

@@ -17,7 +17,7 @@ MANIFEST = tomllib.loads((PROJECT / "blender_manifest.toml").read_text(encoding=
 
 
 def test_zip_holds_the_package_and_nothing_else(extension_zip: Path):
-    """Manifest, wheels, license and all modules of the package: no tests, caches or dot files."""
+    """Manifest, wheels, license, the package's modules and type marker: no tests, no caches."""
     package = PROJECT / "refine_addon"
     modules = {path.relative_to(package).as_posix() for path in package.rglob("*.py")}
     wheels = {entry.removeprefix("./") for entry in MANIFEST["wheels"]}
@@ -26,7 +26,7 @@ def test_zip_holds_the_package_and_nothing_else(extension_zip: Path):
     with zipfile.ZipFile(extension_zip) as archive:
         names = set(archive.namelist())
 
-    assert names == modules | wheels | license_text | {"blender_manifest.toml"}
+    assert names == modules | wheels | license_text | {"blender_manifest.toml", "py.typed"}
 
 
 def test_zip_is_named_after_the_manifest(extension_zip: Path):
