@@ -99,6 +99,15 @@ MUTANTS = {
             "LEAST ** ((number - 1) / (rounds - 1))",
             "a round late",
         ),
+        ('ClosedForm("distance", frustum=False)', 'ClosedForm("distance")', "prior with a frustum"),
+        (
+            'removal.add(undrawn[np.argsort(prior[undrawn], kind="stable")])',
+            "removal.add(undrawn)",
+            "hopeless in file order",
+        ),
+        ("    values[~good] = 0.0\n", "", "undrawable not lowest"),
+    ],
+    "scoring/measuring.py": [
         (
             "self.views[piece.start :: blocks]",
             "self.views[::blocks]",
@@ -109,14 +118,7 @@ MUTANTS = {
             "total.contribution[footprints.index] += mass * visible",
             "weight of views forgotten",
         ),
-        ('ClosedForm("distance", frustum=False)', 'ClosedForm("distance")', "prior with a frustum"),
-        (
-            'removal.add(undrawn[np.argsort(prior[undrawn], kind="stable")])',
-            "removal.add(undrawn)",
-            "hopeless in file order",
-        ),
         ("footprints.index[footprints.inside]", "footprints.index", "seen beside the image"),
-        ("    values[~good] = 0.0\n", "", "undrawable not lowest"),
     ],
     "scoring/froxels.py": [
         ("    np.log(covered, out=covered)\n", "", "thickness of a thin point"),
@@ -360,7 +362,12 @@ MUTANTS = {
 
 TESTS = {
     "closed_form": ["frustum.py", "scoring/adaptive.py"],
-    "occlusion": ["scoring/froxels.py", "scoring/projection.py", "scoring/coverage.py"],
+    "occlusion": [
+        "scoring/measuring.py",
+        "scoring/froxels.py",
+        "scoring/projection.py",
+        "scoring/coverage.py",
+    ],
     "absorb": ["absorbing/merge_field.py", "absorbing/merging.py", "absorbing/merge_graph.py"],
     "affine": ["spherical_harmonics.py"],
     "ply": ["formats/ply_columns.py", "formats/ply_write.py"],

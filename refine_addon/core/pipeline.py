@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from .absorbing.absorb import Absorbed
     from .scores import Scores
-    from .scoring.occlusion import Measured
+    from .scoring.measuring import Measured
     from .splats import Splats
     from .views import ViewSet
 
@@ -399,14 +399,14 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
     # What no renderer draws scores lowest, so it is among these, or all of these are such.
     rest = selection.select(scores, Budget(keep=total - first), protected=protected)
     # What goes first hid and showed next to nothing: what was measured with it still holds.
-    at_first = [ViewSums(measured.contribution[rest], measured.contrast[rest])]
+    at_first = [ViewSums(measured.contribution[rest], measured.error[rest])]
     del known, scores, measured
 
     def seen(now: Splats, ahead: Progress) -> ViewSums:
         if at_first:
             return at_first.pop()
         found = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
-        return ViewSums(found.contribution, found.contrast)
+        return ViewSums(found.contribution, found.error)
 
     with np.errstate(under="ignore"):  # as for scores
         absorbed = absorbing.absorb(

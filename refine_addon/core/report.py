@@ -96,7 +96,7 @@ def make_report(
         "views": {"given": scores.views_given, "used": scores.views_used},
         "budget": {budget.kind: getattr(budget, budget.kind)},
         "settings": asdict(settings),
-        "weights": scores.weights,
+        "weights": scores.facts,
         "timings": clock.timings,
         "notes": scoring_notes(scores),
         "versions": {"python": platform.python_version(), "numpy": np.__version__},
