@@ -20,7 +20,7 @@ PROJECT = Path(__file__).resolve().parent.parent
 MUTANTS = {
     "work.py": [
         ("            cancelled.set()\n", "", "what runs is not told"),
-        ("time.monotonic() - told >= _PATIENCE", "False", "one thread not asked"),
+        ("time.monotonic() - told >= _REPORT_INTERVAL", "False", "one thread not asked"),
     ],
     "frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
@@ -298,6 +298,8 @@ MUTANTS = {
         ("        touched[into] = True\n", "", "costs not renewed"),
         ("self.patience * merging.costs", "merging.costs", "patience ignored"),
         ("count < connected / 2", "count < 0", "never connected anew"),
+        ("self.alive & ~np.isnan(self.field.error)", "self.alive", "a round that does nothing"),
+        ("min(limit, _LARGEST)", "limit", "pairs of infinite cost merged"),
     ],
     "scoring/auto.py": [
         (
