@@ -707,7 +707,7 @@ def test_a_view_of_many_splats_is_cancelled_within(monkeypatch):
     """
     monkeypatch.setattr(projection, "_CHUNK", 50)
     monkeypatch.setattr(froxels, "_BLOCK", 50)
-    monkeypatch.setattr(work, "_PATIENCE", 0.0)
+    monkeypatch.setattr(work, "_REPORT_INTERVAL", 0.0)
     steps = []
 
     def scoring(last=10**6):
