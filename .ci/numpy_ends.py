@@ -25,6 +25,6 @@ def tested(folder: str, packages: list[str], *options: str) -> None:
         sys.exit(done.returncode)
 
 
-tested(".venv-numpy1", ["numpy==1.24.*", "plyfile==1.1", *TOOLS])
+tested(".venv-numpy1", ["numpy==1.24.*", "plyfile==1.1.3", *TOOLS])
 tested(".venv-numpy1", ["--no-deps", "--upgrade", "plyfile"], *QUICK)
 tested(".venv-numpy2", ["numpy==2.*", "plyfile", "--upgrade", *TOOLS])

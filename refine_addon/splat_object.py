@@ -19,9 +19,9 @@ from .core import pipeline
 from .core.affine import transformed
 from .core.errors import RefineError
 from .core.formats.ply import columns_from_splats
-from .core.pipeline import Result, Settings, Task
 from .core.report import Clock, Files, complete_report
 from .core.survivors import survivor_columns
+from .core.task import DEFAULTS, Result, Settings, Task
 from .core.whole_file import refuse_existing
 from .core.work import Progress, part, silent
 from .mesh import attributes as mesh_attributes
@@ -99,10 +99,10 @@ def stored_task(
     budget: Budget,
     protect: str = "",
     *,
-    settings: Settings | None = None,
+    settings: Settings = DEFAULTS,
     views: ViewSet | None = None,
 ) -> Task:
-    """Return what Apply decides: by the scores that the object holds, which splats stay.
+    """Return what Apply has to decide: by the scores that the object holds, which splats stay.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def stored_task(
     row_bytes, fixed_bytes = mesh_attributes.file_size(checked)
     return Task(
         budget=budget,
-        settings=settings or Settings(),
+        settings=settings,
         splats=None if views is None else gather(checked, whole=True),
         views=views,
         scores=stored_scores(checked),

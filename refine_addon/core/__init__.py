@@ -10,13 +10,14 @@ In short::
 from .cameras.read import read_cameras
 from .errors import Cancelled, RefineError
 from .formats.ply import SplatFile, read_ply
-from .pipeline import METHODS, Result, Settings, prune, prune_file, score
+from .pipeline import prune, prune_file, score
 from .scores import Scores
 from .scoring.closed_form import ClosedForm
 from .scoring.occlusion import Occlusion
 from .selection import Budget, rank, select
 from .splats import Splats
 from .survivors import survivor_columns
+from .task import METHODS, Result, Settings
 from .views import View, ViewSet
 
 __all__ = [

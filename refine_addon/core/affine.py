@@ -40,7 +40,8 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
     Returns
     -------
     Splats
-        Means in float64; transformed scales, rotations and harmonics in float32.
+        Transformed values are in float64. Rounded to float32 they would differ in the last digits
+        from the splats in the old frame, and so might the kept set.
 
     Raises
     ------
@@ -78,22 +79,21 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
     return replace(
         splats,
         means=means,
-        log_scales=(splats.log_scales + np.float32(np.log(factor))).astype(np.float32),
+        log_scales=splats.log_scales + np.float64(np.log(factor)),
         quaternions=_rotated(splats.quaternions, proper),
         sh_rest=(
-            spherical_harmonics.rotate(splats.sh_rest, rotation).astype(np.float32)
+            spherical_harmonics.rotate(splats.sh_rest, rotation)
             if rotate_sh and splats.sh_degree
             else splats.sh_rest
         ),
     )
 
 
-def _rotated(quaternions: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float32]:
+def _rotated(quaternions: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the product of a rotation and each of `quaternions`, (N, 4); lengths stay."""
     w, x, y, z = quaternion(rotation)
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    product: NDArray[np.float64] = np.asarray(quaternions, np.float64) @ left.T
-    return product.astype(np.float32)
+    return np.asarray(np.asarray(quaternions, np.float64) @ left.T)
 
 
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -120,8 +120,7 @@ def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _stretched(splats: Splats, means: NDArray[Any], linear: NDArray[np.float64]) -> Splats:
     """Return splats with these means and the covariances ``M S M'``, M being `linear`."""
-    logs = np.empty((len(splats), 3), np.float32)
-    quaternions = np.empty((len(splats), 4), np.float32)
+    logs, quaternions = np.empty((len(splats), 3)), np.empty((len(splats), 4))
     for start in range(0, len(splats), 1 << 16):
         piece = slice(start, start + (1 << 16))
         stored = np.asarray(splats.log_scales[piece], np.float64)

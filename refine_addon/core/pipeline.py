@@ -8,20 +8,20 @@ see says which ones stay instead, and as what. So all of them keep the same spla
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from . import selection
 from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
-from .errors import RefineError
 from .formats.ply import read_ply
 from .report import Clock, Files, complete_report, make_report
 from .scoring import auto, closed_form, occlusion
 from .selection import Budget
 from .survivors import survivor_columns
+from .task import DEFAULTS, Result, Settings, Task
 from .whole_file import expanded, refuse_existing, refuse_mapped
 from .work import Progress, part, report, silent
 
@@ -36,137 +36,15 @@ if TYPE_CHECKING:
     from .splats import Splats
     from .views import ViewSet
 
-METHODS = ("closed-form", "occlusion", "auto")
-
 FIRST = 0.1
 """Share of the splats that goes before any are merged: what the views would miss least is next to
 nothing, and any merge changes more."""
 
 
-@dataclass(frozen=True)
-class Settings:
-    """How to score.
-
-    Attributes
-    ----------
-    method : {"closed-form", "occlusion", "auto"}
-        Name of the scoring method: as if nothing hid anything, with what hides what, or the
-        cheapest that agrees with the latter.
-    views : int
-        Use at most this many views, spread out evenly; 0 uses all.
-    closed_form : ClosedForm
-    occlusion : Occlusion
-        Settings of the methods of those names.
-    tolerance : float
-        For "auto": share of the kept set that may differ from that of "occlusion".
-    """
-
-    method: Literal["closed-form", "occlusion", "auto"] = "closed-form"
-    views: int = 64
-    closed_form: closed_form.ClosedForm = field(default_factory=closed_form.ClosedForm)
-    occlusion: occlusion.Occlusion = field(default_factory=occlusion.Occlusion)
-    tolerance: float = 0.01
-
-    def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises
-        ------
-        RefineError
-            If one cannot be.
-        """
-        if self.method not in METHODS:
-            msg = f"method is {self.method!r}, expected one of {', '.join(METHODS)}"
-            raise RefineError(msg)
-        if not 0.0 <= self.tolerance <= 1.0:
-            msg = f"tolerance is {self.tolerance}, expected a share, 0 to 1"
-            raise RefineError(msg)
-        if self.views < 0:
-            msg = f"views is {self.views}, expected 0 (all) or more"
-            raise RefineError(msg)
-
-    @property
-    def frustum(self) -> bool:
-        """Whether the scores will count the views in whose image a splat lies; see `Scores`."""
-        return self.method != "closed-form" or self.closed_form.frustum
-
-
-@dataclass(frozen=True, eq=False)
-class Task:
-    """All that deciding needs, as arrays: nothing of it is a file, or Blender's.
-
-    Attributes
-    ----------
-    budget : Budget
-        How much to remove.
-    settings : Settings
-        How to score.
-    splats : Splats or None
-        In the frame of the views; None where they are scored already and nothing absorbs.
-    views : ViewSet or None
-        None as for `splats`.
-    scores : Scores or None
-        Those that the splats have already; None scores them.
-    protected : (N,) bool or None
-        Splats never to remove, nor to change.
-    absorb : bool
-        Whether survivors absorb what is removed. The budget then says how many survive; which ones
-        do, and as what, is found by what the views see of each, whatever the method.
-    row_bytes, fixed_bytes : float, int
-        See `Budget.removals`.
-    """
-
-    budget: Budget
-    settings: Settings = field(default_factory=Settings)
-    splats: Splats | None = None
-    views: ViewSet | None = None
-    scores: Scores | None = None
-    protected: NDArray[np.bool_] | None = None
-    absorb: bool = False
-    row_bytes: float = 0.0
-    fixed_bytes: int = 0
-
-    def scene(self) -> tuple[Splats, ViewSet]:
-        """Return splats and views.
-
-        Raises
-        ------
-        RefineError
-            If they were not given.
-        """
-        if self.splats is None or self.views is None:
-            msg = "splats without scores need views to be scored, and absorbing needs both"
-            raise RefineError(msg)
-        return self.splats, self.views
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """What a prune decided.
-
-    Attributes
-    ----------
-    keep : (N,) bool
-        Which splats stay.
-    scores : Scores
-        What decided; with `absorbed`, the scores that set how many survive, or which tenth is
-        deleted first.
-    absorbed : Absorbed or None
-        The survivors, changed by what they absorbed.
-    report : dict
-        Counts, settings, weights, timings and versions, ready for JSON.
-    """
-
-    keep: NDArray[np.bool_]
-    scores: Scores
-    report: dict[str, Any]
-    absorbed: Absorbed | None = None
-
-
 def score(
     splats: Splats,
     views: ViewSet,
-    settings: Settings = Settings(),
+    settings: Settings = DEFAULTS,
     *,
     progress: Progress = silent,
     threads: int | None = None,
@@ -194,9 +72,9 @@ def score(
     Cancelled
         If `progress` answers ``False``.
     """
-    used = views.spread(settings.views)
     # What is too small for a float is nothing beside what counts: it may underflow to 0.
     with np.errstate(under="ignore"):
+        used = views.spread(settings.views)
         if settings.method == "occlusion":
             scores = occlusion.score(
                 splats, used, settings.occlusion, progress=progress, threads=threads
@@ -223,7 +101,7 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
     splats: Splats,
     views: ViewSet,
     budget: Budget,
-    settings: Settings = Settings(),
+    settings: Settings = DEFAULTS,
     *,
     protected: NDArray[np.bool_] | None = None,
     absorb: bool = False,
@@ -278,6 +156,9 @@ def decide(
     threads: int | None = None,
 ) -> Result:
     """Decide which splats stay; with `absorb`, what becomes of them. Changes and writes nothing.
+
+    Step 1: scores, new ones or those that are there, and the budget say which splats stay. Step 2,
+    to absorb: as many survive, but which ones, and as what, is found by merging.
 
     Parameters
     ----------
@@ -362,7 +243,7 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
     splats: Splats,
     views: ViewSet,
     count: int,
-    settings: Settings = Settings(),
+    settings: Settings = DEFAULTS,
     *,
     known: tuple[Scores, Measured] | None = None,
     protected: NDArray[np.bool_] | None = None,
@@ -425,7 +306,7 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
     output: Path | str | None,
     views: ViewSet,
     budget: Budget,
-    settings: Settings = Settings(),
+    settings: Settings = DEFAULTS,
     *,
     absorb: bool = False,
     overwrite: bool = False,

@@ -12,9 +12,9 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .pipeline import Settings
     from .scores import Scores
     from .selection import Budget
+    from .task import Settings
 
 
 class Clock:

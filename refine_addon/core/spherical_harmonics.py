@@ -10,6 +10,8 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+_CHUNK = 1 << 16  # splats whose coefficients are widened to float64 at a time
+
 
 def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
     """Return the values of all harmonics in some directions.
@@ -87,7 +89,7 @@ def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
     return np.stack([value for band in bands for value in band], axis=-1)
 
 
-def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[Any]:
+def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return coefficients whose colour along ``rotation @ d`` is the old colour along d.
 
     Parameters
@@ -99,10 +101,10 @@ def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[Any]
 
     Returns
     -------
-    (N, K, 3), of the type of `sh_rest`
+    (N, K, 3) float64
     """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
-    rotated = np.empty_like(sh_rest)
+    rotated = np.empty(sh_rest.shape)
     # A rotation maps each band to itself. Its matrix is fitted to more directions than it has rows.
     points = np.random.default_rng(0).normal(size=(64, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
@@ -111,7 +113,7 @@ def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[Any]
         own = slice(band * band, (band + 1) ** 2)
         matrix = np.linalg.lstsq(here[:, own], before[:, own], rcond=None)[0]
         stored = slice(own.start - 1, own.stop - 1)
-        rotated[:, stored] = np.einsum(
-            "ij,njc->nic", matrix.astype(sh_rest.dtype), sh_rest[:, stored]
-        )
+        for start in range(0, len(rotated), _CHUNK):
+            rows = slice(start, start + _CHUNK)
+            rotated[rows, stored] = np.einsum("ij,njc->nic", matrix, sh_rest[rows, stored])
     return rotated

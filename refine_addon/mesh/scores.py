@@ -18,7 +18,7 @@ from . import heat_map
 if TYPE_CHECKING:
     import bpy
 
-    from ..core.pipeline import Settings
+    from ..core.task import Settings
     from .layout import SplatObject
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"

@@ -18,7 +18,7 @@ from ..core.errors import RefineError
 from ..core.formats.ply import read_ply
 from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
-from .operators import Answer, fail
+from .on_thread import Answer, fail
 
 UPRIGHT_TEXT = (
     "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "

@@ -16,9 +16,9 @@ from bpy.props import (
     StringProperty,
 )
 
-from ..core.pipeline import Settings
 from ..core.scoring.closed_form import ClosedForm
 from ..core.selection import Budget
+from ..core.task import Settings
 from . import plans
 
 if TYPE_CHECKING:

@@ -31,6 +31,33 @@ def test_import_score_apply_export_writes_the_file_that_core_writes(addon, room_
     assert _bytes(tmp_path / "panel.ply") == _bytes(tmp_path / "core.ply")
 
 
+@pytest.mark.parametrize(("method", "absorb"), [("occlusion", False), ("closed-form", True)])
+def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(addon, method, absorb):
+    """A quarter turn of splats and cameras: the command without Blender never sees it."""
+    bpy.ops.refine.import_ply(filepath=str(ROOM / "point_cloud.ply"), upright=True)
+    obj = bpy.context.object
+    obj.data.attributes.new("row", "INT", "POINT")
+    obj.data.attributes["row"].data.foreach_set("value", np.arange(39755))
+    bpy.ops.refine.import_cameras(filepath=str(ROOM / "cameras.json"), upright=True)
+    settings = bpy.context.scene.refine
+    settings.method, settings.absorb, settings.views, settings.ratio = method, absorb, 24, 0.9
+    bpy.ops.refine.score()
+    bpy.ops.refine.apply()
+    core = addon.core
+    splats = core.read_ply(ROOM / "point_cloud.ply").splats()
+    expected = core.prune(
+        splats,
+        core.read_cameras(ROOM / "cameras.json"),
+        core.Budget(ratio=0.9),
+        core.Settings(method, views=24),
+        absorb=absorb,
+    ).keep
+
+    found = addon.mesh.attributes.read_attribute(obj.data, "row")
+
+    np.testing.assert_array_equal(found, np.flatnonzero(expected))
+
+
 @pytest.mark.parametrize(
     ("kind", "value"),
     [("ratio", 0.29), ("ratio", 0.7), ("keep", 1234), ("max_mb", 2.5), ("threshold", 0.1),

@@ -222,7 +222,7 @@ def started(addon, few):
         body = {key: cls.__dict__[key] for key in ("doing", "prepare", "work", "finish")}
         said = []
         body["report"] = lambda _self, _kind, text: said.append(text)
-        operator, context = type(name, (addon.ui.operators._OnThread,), body)(), Context()
+        operator, context = type(name, (addon.ui.on_thread.OnThread,), body)(), Context()
         operator.start(context, operator.prepare(context, addon.mesh.layout.check(few)))
         return operator, context, said
 

@@ -19,7 +19,7 @@ from benchmarks.tables import evaluate, methods, trade
 from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.errors import RefineError
 from refine_addon.core.formats.ply import read_ply
-from refine_addon.core.pipeline import METHODS
+from refine_addon.core.task import METHODS
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 

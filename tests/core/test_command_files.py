@@ -134,6 +134,7 @@ def refused():
         yield {case: (code, errors) for case, code, errors in answers}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", SHUT)
 def test_what_the_system_refuses_is_code_1_and_one_sentence_that_names_it(refused, case):
     """A folder that cannot be entered, a file that cannot be read, a folder that takes no files."""
@@ -146,6 +147,7 @@ def test_what_the_system_refuses_is_code_1_and_one_sentence_that_names_it(refuse
 # The report.
 
 
+@pytest.mark.slow
 def test_a_report_that_fails_in_the_end_says_that_the_splats_were_written(folder):
     """No file may grow beyond 1,000 bytes: one splat fits with its header, the report does not."""
     limit = 1_000
@@ -215,6 +217,7 @@ NASTY = "a\x1b]0;title\x07\nb\x9b\u202e.ply"
 HARMLESS = r"a\x1b]0;title\x07\nb\x9b\u202e.ply"
 
 
+@pytest.mark.slow
 def test_control_characters_in_names_are_escaped_on_the_terminal_and_true_in_the_report(folder):
     """An escape sequence, a bell, a line end, C1's own escape, and writing from right to left."""
     (folder / "in.ply").rename(NASTY)
@@ -239,6 +242,7 @@ def test_control_characters_in_names_are_escaped_on_the_terminal_and_true_in_the
     assert set(printed.decode()) <= {"\n", *map(chr, range(0x20, 0x7F))}
 
 
+@pytest.mark.slow
 def test_control_characters_are_escaped_in_what_is_drawn(folder):
     """On a pseudo-terminal: every escape sequence is the one that clears the line."""
     pty = pytest.importorskip("pty")
@@ -259,6 +263,7 @@ def test_control_characters_are_escaped_in_what_is_drawn(folder):
 # Where nobody listens.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "stream", "code"),
     [

@@ -20,7 +20,10 @@ from refine_addon.command import flow
 ROOT = Path(__file__).parents[2]
 ROOM = ROOT / "tests/data/room_small"
 
-pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs signals")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(os.name != "posix", reason="needs signals"),
+]
 
 CAMERAS = ["--cameras", str(ROOM / "cameras.json")]
 # Some seconds of work, so that it is never done before a signal comes.

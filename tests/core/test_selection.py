@@ -253,6 +253,7 @@ MANY = (1 << 24) + 100
 """More than float32 has equal steps between 0 and 1."""
 
 
+@pytest.mark.slow
 def test_ranks_of_more_splats_than_float32_can_tell_apart_are_distinct():
     """Scored in the order of the file, the rank of row k is k / (N - 1), each above the last."""
     ranks = rank(np.arange(MANY, dtype=np.float32))  # neighbours tie, and go by row
@@ -261,6 +262,7 @@ def test_ranks_of_more_splats_than_float32_can_tell_apart_are_distinct():
     assert (ranks[0], ranks[-1]) == (0.0, 1.0)
 
 
+@pytest.mark.slow
 def test_shares_of_more_splats_than_float32_can_tell_apart_are_distinct():
     """Half of them, 2^23 + 50, go to the 2^23 numbers from 0.5 to 1: as quotients 50 would tie."""
     places = np.arange(1, MANY + 1)

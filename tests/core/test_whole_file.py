@@ -112,6 +112,7 @@ except RefineError as error:
 """
 
 
+@pytest.mark.slow
 @posix
 def test_a_file_that_may_not_grow_leaves_what_was_there(tmp_path):
     """A real limit of 5,000 bytes, on a file of 56,000: the system's own error, in our words."""

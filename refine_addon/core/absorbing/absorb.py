@@ -47,7 +47,7 @@ class Absorbed:
     Attributes
     ----------
     splats : Splats
-        The K survivors, in the order of the N splats.
+        The K survivors, in the order of the N splats, in float64.
     keep : (N,) bool
         Which splats survive.
     changed : (K,) bool
@@ -138,6 +138,10 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     count = len(splats)
     spared = np.zeros(count, np.bool_) if protected is None else np.array(protected, np.bool_)
     goal = max(keep_count, int(np.count_nonzero(spared)), 0)
+    # In float64, since merged splats merge again, and rounding between would depend on the frame.
+    splats = Splats(
+        **{name: np.asarray(values, np.float64) for name, values in vars(splats).items()}
+    )
     scene = scene_of(splats.means, drawable(splats), views)
     # Of each splat left: its row among the N, and how many of the N it stands for.
     origin, members = np.arange(count), np.ones(count, np.int64)
