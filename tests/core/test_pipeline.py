@@ -442,7 +442,7 @@ def test_splats_without_scores_need_views_to_decide(small):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["closed-form", "occlusion"])
 def test_a_report_of_absorbing_says_what_decided_and_what_was_asked(small, views, method):
-    """Occlusion's measure decides; a method that had nothing to decide is said not to have."""
+    """Occlusion's measure decides; a note says that another method was not used."""
     splats = read_ply(small).splats()
     once = score(splats, views, Settings("occlusion", occlusion=Occlusion(rounds=1)))
 
@@ -451,7 +451,7 @@ def test_a_report_of_absorbing_says_what_decided_and_what_was_asked(small, views
     assert report["settings"]["method"] == method
     assert report["weights"] == once.facts
     assert report["splats"]["unseen"] == np.count_nonzero(once.seen == 0)
-    said = any("closed-form had nothing to decide" in note for note in report["notes"])
+    said = any("closed-form was not used" in note for note in report["notes"])
     assert said == (method == "closed-form")
 
 

@@ -445,7 +445,7 @@ def test_a_file_system_without_hard_links_is_written_to_the_same(tmp_path, monke
                 path.write_bytes(b"early")
 
     if taken:
-        with pytest.raises(RefineError, match="was made by somebody else"):
+        with pytest.raises(RefineError, match="another program created this file"):
             write()
     else:
         write()
