@@ -188,8 +188,8 @@ MUTANTS = {
             "tilt of upright ellipses",
         ),
         (
-            "np.maximum(middle + root, 0.0) + LOW_PASS)",
-            "np.maximum(middle + root, 0.0))",
+            "np.maximum(mean + root, 0.0) + LOW_PASS)",
+            "np.maximum(mean + root, 0.0))",
             "low-pass forgotten",
         ),
         (
@@ -240,10 +240,10 @@ MUTANTS = {
     "absorbing/merge_field.py": [
         ("/ (1.0 + seen)\n", "\n", "as likely after many views"),
         ("unhidden = seen @ worth", "unhidden = worth.sum()", "all seen once"),
-        ("np.where(inside, share, share * BESIDE)", "share", "views beside count"),
+        ("np.where(inside, counts, counts * BESIDE)", "counts", "views beside count"),
         (
-            "np.where(inside, share, share * BESIDE) / squared",
-            "np.where(inside, share, share * BESIDE)",
+            "np.where(inside, counts, counts * BESIDE) / squared",
+            "np.where(inside, counts, counts * BESIDE)",
             "distance forgotten",
         ),
         (

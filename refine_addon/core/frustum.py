@@ -5,7 +5,7 @@ plane and projects into the image, edges included::
 
     near <= z <= far,   0 <= fx x / z + cx <= width,   0 <= fy y / z + cy <= height
 
-Multiplied by z, with the principal point measured from the middle of the image, the latter two are
+Multiplied by z, with the principal point measured from the centre of the image, the latter two are
 ``|f x + offset z| <= half z``. This needs no division and excludes points behind the camera.
 """
 
@@ -34,7 +34,7 @@ class Side(NamedTuple):
     focal : float
         Focal length.
     offset : float
-        From the middle of the image to the principal point.
+        From the centre of the image to the principal point.
     half : float
         Half the image's size.
     """

@@ -125,8 +125,8 @@ def _principal_axes(
     second, first = np.zeros((3, 3)), np.zeros(3)  # weighted moments
     for piece in _pieces(len(means)):
         place = scene.place(means[piece][drawable[piece]])  # (n, 3)
-        weights = (1.0 + np.einsum("ij,ij->i", place, place)) ** -2.0  # (n,)
-        weighted = place * weights[:, None]
+        nearness = (1.0 + np.einsum("ij,ij->i", place, place)) ** -2.0  # (n,)
+        weighted = place * nearness[:, None]
         second += weighted.T @ place
         first += weighted.sum(axis=0)
     _, vectors = np.linalg.eigh(second)  # in columns

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _DISTINCT = 1 << 24
-"""float32 tells this many equal steps from 0 to 1 apart; not more."""
+"""Largest number of equal steps from 0 to 1 that are distinct in float32."""
 
 
 @dataclass(frozen=True, eq=False)

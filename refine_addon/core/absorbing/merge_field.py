@@ -140,7 +140,7 @@ def look(means: NDArray[Any], views: ViewSet, scene: Scene, *, threads: int | No
     count = len(means)
     result = Look(np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count))
     some = views.spread(LOOKS)
-    looks = [(view, share) for view, share in zip(some, some.weights, strict=True) if share]
+    looks = [(view, counts) for view, counts in zip(some, some.weights, strict=True) if counts]
     closest = (NEAREST * scene.size) ** 2
 
     def fill(piece: slice) -> None:
@@ -169,13 +169,13 @@ def _look(points: Array, looks: list[tuple[View, float]], closest: float) -> Loo
     rows, columns = np.triu_indices(3)
     total, finest, seen = np.zeros((3, points.shape[1]))  # sums over views, (M,) each
     toward, second = np.zeros((3, points.shape[1])), np.zeros((6, points.shape[1]))
-    for view, share in looks:
+    for view, counts in looks:
         ray = points - view.center[:, None]  # (3, M)
         planes = frustum.clip_planes(view, closest**0.5)
         inside = frustum.contains(view, view.rotation @ ray, planes)  # (M,)
         seen += inside
         squared = np.maximum(np.einsum("ij,ij->j", ray, ray), closest)
-        weight = np.where(inside, share, share * BESIDE) / squared  # (M,)
+        weight = np.where(inside, counts, counts * BESIDE) / squared  # (M,)
         ray /= np.sqrt(squared)
         weighted = ray * weight
         toward += weighted

@@ -24,8 +24,8 @@ VISITED = 20
 _LEAF = 8
 """Most points in a leaf; it holds at least half as many."""
 
-_MIDDLE = 1e-3
-"""Factor on the squared distance between the middles of two boxes; it decides among boxes that
+_CENTER = 1e-3
+"""Factor on the squared distance between the centres of two boxes; it decides among boxes that
 touch."""
 
 _BATCH = 256
@@ -156,8 +156,8 @@ def _near_leaves(tree: _Tree, rows: slice) -> NDArray[np.int64]:
         for axis in range(3):
             lower, upper = boxes[0, axis].take(nodes), boxes[1, axis].take(nodes)
             gap = np.maximum(lower - high[axis], low[axis] - upper)
-            middle = 0.5 * (lower + upper - low[axis] - high[axis])
-            distance += np.maximum(gap, 0.0) ** 2 + _MIDDLE * middle * middle
+            apart = 0.5 * (lower + upper - low[axis] - high[axis])
+            distance += np.maximum(gap, 0.0) ** 2 + _CENTER * apart * apart
         nearest_nodes = np.argpartition(distance, VISITED - 1, axis=1)[:, :VISITED]
         nodes = np.take_along_axis(nodes, nearest_nodes, axis=1)
     return nodes

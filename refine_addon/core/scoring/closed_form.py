@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ..views import ViewSet
 
 LUMA = (0.299, 0.587, 0.114)
-"""Rec. 601 weights of red, green, blue."""
+"""Factors of red, green and blue in the luma (Rec. 601)."""
 
 ETA_RELATIVE = 0.005
 """Default eta over the squared size of the scene: the paper's .05 at a viewing distance of 3 m."""
@@ -306,12 +306,12 @@ class _Scene:
                     inside[:] = True
                 # A byte can count the at most 64 views of a block.
                 seen += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.uint8)
-                share = inside
+                counted = inside
                 if self.settings.projection:
                     squared = self._squared(points, depth, block)
                     squared += self.eta
-                    share = np.divide(inside, squared, out=squared)
-                total += np.einsum("v,vn->n", self.weights[block], share)
+                    counted = np.divide(inside, squared, out=squared)
+                total += np.einsum("v,vn->n", self.weights[block], counted)
             if not seen.all():
                 near = self.squared[piece] + self.eta if self.settings.projection else 1.0
                 total = np.where(seen == 0, UNSEEN / near, total)

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from .projection import Gaussians
 
 FLOOR_WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-5.0, 0.5, 0.5)))
-"""Weights that are tried. At weight 1, a splat of average prior in whose direction no view looks
-gets a floor as high as the mean score."""
+"""Weights that are tried. At weight 1, a splat of average prior that lies in no view gets a floor
+as high as the mean score."""
 
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Shares removed, each with its own weight: the one that loses least if this share is removed."""
@@ -43,7 +43,7 @@ TIED = 0.002
 logarithms is taken, so that a change in the last digits does not switch to another weight."""
 
 SAMPLE = 1 << 15
-"""How many splats are enough to choose the weights."""
+"""How many splats are enough to choose the floor weights."""
 
 _NO_WEIGHT = 10.0**-5.5  # stands for 0 in a mean of logarithms
 _MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: a multiplier for hashing
@@ -62,7 +62,7 @@ def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> 
     seen : (n,) int32
         In how many views the centre lies.
     power : float
-        Exponent of the prior; that of the contribution and the error together in the scores.
+        Exponent of the prior: 1 + p, as the score is ``error contribution^p``.
     """
     return np.asarray(_unit(prior**power) / (1.0 + seen))
 

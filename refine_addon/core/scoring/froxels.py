@@ -501,7 +501,7 @@ def mean_visible(
     squares = shares * shares
     visible = np.bincount(owners, shares * transmittance, count)
     errors = np.bincount(owners, squares * transmittance * transmittance * squared_contrast, count)
-    # The weights alpha^2 do not sum to 1: divide by their sum, and multiply by the share of the
+    # The factors alpha^2 do not sum to 1: divide by their sum, and multiply by the share of the
     # footprint that lies in the image.
     inside = np.bincount(owners, shares, count)
     errors = errors * inside / np.maximum(np.bincount(owners, squares, count), 1e-30)

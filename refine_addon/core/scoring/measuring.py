@@ -190,7 +190,7 @@ def measure_view(
 def _by_distance(views: ViewSet) -> list[tuple[View, float]]:
     """Return the views of positive weight and their weights, in an order given by the scene.
 
-    They are sorted by distance from the middle, then by distance from the view farthest from it.
+    They are sorted by distance from the mean of their centres, then from the view farthest from it.
     So which block a view belongs to depends neither on the order of the list nor, unless all views
     are alike, on the frame.
     """

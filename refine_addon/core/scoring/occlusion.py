@@ -10,7 +10,8 @@ A floor is added to every score, for views that were not given: the closed form,
 rises with the share removed (`coverage`).
 
 Splats hide each other, so they are removed in rounds: a part of the splats goes, the rest is scored
-again, until a tenth is left. One order comes of it, so larger budgets contain smaller ones.
+again, until a tenth is left. The result is one order of removal, so a larger budget also removes
+all that a smaller one does.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
 
 PRIOR = closed_form.ClosedForm("distance", frustum=False)
-"""Scores splats that no view shows. Without frustum test, since they may lie in no frustum."""
+"""Model of the floor. It has no frustum test, since splats that no view shows also need a floor."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +219,7 @@ class _Run:
     Attributes
     ----------
     gaussians : Gaussians
-        The splats that can be drawn, before anything is removed.
+        The splats that can contribute to a picture, before any is removed.
     measured : Measured
         Of these Gaussians, in the first round.
     floor_weights : list of float
@@ -238,7 +239,7 @@ class _Run:
         Parameters
         ----------
         prior : (N,) float32
-            Orders the splats that cannot be drawn, and is the floor of all others.
+            Orders the splats that are not among the Gaussians, and is the floor of all others.
         progress : callable
         """
         count, left = len(prior), self.gaussians

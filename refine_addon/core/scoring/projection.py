@@ -111,13 +111,13 @@ def prepare(
         Which splats can be drawn.
     """
     good = np.empty(len(splats), np.bool_)
-    worth = np.empty(len(splats), np.bool_)
+    opaque = np.empty(len(splats), np.bool_)
 
     def judge(piece: slice) -> None:
         chunk = splats.take(piece)
         good[piece] = drawable(chunk)
         logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
-        worth[piece] = opacity(logits) > ALPHA_CUT
+        opaque[piece] = opacity(logits) > ALPHA_CUT
 
     for_chunks(
         judge, len(splats), 4 * _CHUNK,
@@ -125,7 +125,7 @@ def prepare(
     )  # fmt: skip
     scene = scene_of(splats.means, good, views)
     report(progress, 0.4, "reading")
-    index = np.flatnonzero(worth)
+    index = np.flatnonzero(opaque)
     place = scene.place(splats.means[index])
     near = np.max(np.abs(place), axis=1, initial=0.0) <= _FARTHEST
     index, place = index[near], place[near]
@@ -331,10 +331,10 @@ def _half_axes(
     With ``m = (xx + yy) / 2`` and ``r = hypot((xx - yy) / 2, xy)`` the eigenvalues of C are m + r
     and m - r; the latter is computed as ``det C / (m + r)``, which loses no digits by cancellation.
     """
-    middle, half = (xx + yy) / 2, (xx - yy) / 2
+    mean, half = (xx + yy) / 2, (xx - yy) / 2
     root = np.sqrt(half * half + xy * xy)
-    first = np.sqrt(np.maximum(middle + root, 0.0) + LOW_PASS)
-    second = np.maximum(xx * yy - xy * xy, 0.0) / np.maximum(middle + root, 1e-30)
+    first = np.sqrt(np.maximum(mean + root, 0.0) + LOW_PASS)
+    second = np.maximum(xx * yy - xy * xy, 0.0) / np.maximum(mean + root, 1e-30)
     second = np.sqrt(second + LOW_PASS)
     c, s = _major_direction(half, xy, root)
     return first * np.stack([c, s]), second * np.stack([-s, c]), np.stack([first, second])
