@@ -20,7 +20,7 @@ PROJECT = Path(__file__).resolve().parent.parent
 MUTANTS = {
     "work.py": [
         ("            cancelled.set()\n", "", "what runs is not told"),
-        ("time.monotonic() - told >= _PATIENCE", "False", "one thread not asked"),
+        ("time.monotonic() - told >= _REPORT_INTERVAL", "False", "one thread not asked"),
     ],
     "frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
@@ -99,6 +99,15 @@ MUTANTS = {
             "LEAST ** ((number - 1) / (rounds - 1))",
             "a round late",
         ),
+        ('ClosedForm("distance", frustum=False)', 'ClosedForm("distance")', "prior with a frustum"),
+        (
+            'removal.add(undrawn[np.argsort(prior[undrawn], kind="stable")])',
+            "removal.add(undrawn)",
+            "hopeless in file order",
+        ),
+        ("    values[~good] = 0.0\n", "", "undrawable not lowest"),
+    ],
+    "scoring/measuring.py": [
         (
             "self.views[piece.start :: blocks]",
             "self.views[::blocks]",
@@ -109,14 +118,7 @@ MUTANTS = {
             "total.contribution[footprints.index] += mass * visible",
             "weight of views forgotten",
         ),
-        ('ClosedForm("distance", frustum=False)', 'ClosedForm("distance")', "prior with a frustum"),
-        (
-            'removal.add(undrawn[np.argsort(prior[undrawn], kind="stable")])',
-            "removal.add(undrawn)",
-            "hopeless in file order",
-        ),
         ("footprints.index[footprints.inside]", "footprints.index", "seen beside the image"),
-        ("    values[~good] = 0.0\n", "", "undrawable not lowest"),
     ],
     "scoring/froxels.py": [
         ("    np.log(covered, out=covered)\n", "", "thickness of a thin point"),
@@ -186,8 +188,8 @@ MUTANTS = {
             "tilt of upright ellipses",
         ),
         (
-            "np.maximum(middle + root, 0.0) + LOW_PASS)",
-            "np.maximum(middle + root, 0.0))",
+            "np.maximum(mean + root, 0.0) + LOW_PASS)",
+            "np.maximum(mean + root, 0.0))",
             "low-pass forgotten",
         ),
         (
@@ -238,10 +240,10 @@ MUTANTS = {
     "absorbing/merge_field.py": [
         ("/ (1.0 + seen)\n", "\n", "as likely after many views"),
         ("unhidden = seen @ worth", "unhidden = worth.sum()", "all seen once"),
-        ("np.where(inside, share, share * BESIDE)", "share", "views beside count"),
+        ("np.where(inside, counts, counts * BESIDE)", "counts", "views beside count"),
         (
-            "np.where(inside, share, share * BESIDE) / squared",
-            "np.where(inside, share, share * BESIDE)",
+            "np.where(inside, counts, counts * BESIDE) / squared",
+            "np.where(inside, counts, counts * BESIDE)",
             "distance forgotten",
         ),
         (
@@ -296,6 +298,8 @@ MUTANTS = {
         ("        touched[into] = True\n", "", "costs not renewed"),
         ("self.patience * merging.costs", "merging.costs", "patience ignored"),
         ("count < connected / 2", "count < 0", "never connected anew"),
+        ("self.alive & ~np.isnan(self.field.error)", "self.alive", "a round that does nothing"),
+        ("min(limit, _LARGEST)", "limit", "pairs of infinite cost merged"),
     ],
     "scoring/auto.py": [
         (
@@ -360,7 +364,12 @@ MUTANTS = {
 
 TESTS = {
     "closed_form": ["frustum.py", "scoring/adaptive.py"],
-    "occlusion": ["scoring/froxels.py", "scoring/projection.py", "scoring/coverage.py"],
+    "occlusion": [
+        "scoring/measuring.py",
+        "scoring/froxels.py",
+        "scoring/projection.py",
+        "scoring/coverage.py",
+    ],
     "absorb": ["absorbing/merge_field.py", "absorbing/merging.py", "absorbing/merge_graph.py"],
     "affine": ["spherical_harmonics.py"],
     "ply": ["formats/ply_columns.py", "formats/ply_write.py"],

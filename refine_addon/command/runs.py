@@ -184,7 +184,7 @@ def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
         "splats": {"before": len(file), "undrawable": scores.undrawable},
         "views": {"given": len(views), "used": scores.views_used},
         "settings": asdict(settings(options)),
-        "weights": scores.weights,
+        "weights": scores.facts,
         "notes": notes,
     }
 

@@ -1,4 +1,4 @@
-"""Scoring and pruning of 3D Gaussian splats on NumPy arrays; knows nothing of Blender.
+"""Scoring and pruning of 3D Gaussian splats on NumPy arrays, without Blender.
 
 In short::
 

@@ -1,4 +1,4 @@
-"""Splats moved by an affine matrix, such as a Blender object's."""
+"""Transform splats by an affine matrix, such as a Blender object's."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ UNIFORM_TOLERANCE = 1e-4
 
 
 def is_uniform(matrix: NDArray[Any]) -> bool:
-    """Whether a (4, 4) or (3, 3) matrix scales all directions alike (a mirror image included)."""
+    """Return whether a (4, 4) or (3, 3) matrix scales all directions alike; it may mirror."""
     scales = np.linalg.svd(np.asarray(matrix, np.float64)[:3, :3], compute_uv=False)
     return bool(scales[0] - scales[2] <= UNIFORM_TOLERANCE * scales[0])
 
 
 def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True) -> Splats:
-    """Return the splats as an affine matrix places them.
+    """Return the splats transformed by an affine matrix.
 
     Parameters
     ----------
@@ -33,21 +33,21 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
     matrix : (4, 4) floating
         From the frame of the splats to the new one; any invertible affine matrix.
     rotate_sh : bool
-        Whether harmonics are rotated with the splats. Without, colours are those of the old frame
-        (enough for the closed form, which looks at the constant alone) and non-uniform matrices
-        are allowed: means and covariances follow them exactly.
+        Whether harmonics are rotated with the splats. If not, they stay those of the old frame
+        (enough for the closed form, which only uses the constant), and non-uniform matrices are
+        allowed: means and covariances are transformed exactly.
 
     Returns
     -------
     Splats
-        What the matrix changes in float64: rounded again, it would be other splats, by the last
-        digits of which the kept set may differ from that of the old frame.
+        Transformed values are in float64. Rounded to float32 they would differ in the last digits
+        from the splats in the old frame, and so might the kept set.
 
     Raises
     ------
     RefineError
-        If the matrix is not finite, not invertible or not affine; or, with `rotate_sh`, scales
-        directions differently, for which harmonics have no answer.
+        If the matrix is not finite, not invertible or not affine; or if, with `rotate_sh`, it
+        scales directions differently, which harmonics cannot express.
     """
     matrix = np.asarray(matrix, np.float64)
     linear = matrix[:3, :3]
@@ -73,8 +73,8 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
     rotation = linear / factor
     left, _, right = np.linalg.svd(rotation)
     rotation = left @ right
-    # A splat is its own mirror image along each of its axes, so a reflection R turns it like -R,
-    # which is a rotation; its harmonics follow R itself.
+    # A splat is symmetric about its centre, so a reflection R acts on it like the rotation -R. Its
+    # harmonics are not symmetric and follow R.
     proper = rotation if np.linalg.det(rotation) > 0 else -rotation
     return replace(
         splats,
@@ -90,7 +90,7 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
 
 
 def _rotated(quaternions: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the quaternion of `rotation` times each of `quaternions`, lengths kept."""
+    """Return the product of a rotation and each of `quaternions`, (N, 4); lengths stay."""
     w, x, y, z = quaternion(rotation)
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     return np.asarray(np.asarray(quaternions, np.float64) @ left.T)
@@ -99,8 +99,8 @@ def _rotated(quaternions: NDArray[Any], rotation: NDArray[np.float64]) -> NDArra
 def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the unit quaternion w x y z of rotation matrices, (..., 3, 3) -> (..., 4).
 
-    The eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Bar-Itzhack 2000): no
-    case distinction, and as accurate at half a turn as elsewhere.
+    It is the eigenvector of the largest eigenvalue of a symmetric 4 x 4 matrix (Bar-Itzhack 2000).
+    This needs no case distinction and is as accurate for half a turn as for other angles.
     """
     m = np.asarray(rotation, np.float64)
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
@@ -119,20 +119,20 @@ def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _stretched(splats: Splats, means: NDArray[Any], linear: NDArray[np.float64]) -> Splats:
-    """Apply a non-uniform matrix to the Gaussians: the covariance M S M' and its axes."""
+    """Return splats with these means and the covariances ``M S M'``, M being `linear`."""
     logs, quaternions = np.empty((len(splats), 3)), np.empty((len(splats), 4))
     for start in range(0, len(splats), 1 << 16):
         piece = slice(start, start + (1 << 16))
         stored = np.asarray(splats.log_scales[piece], np.float64)
         usable = np.isfinite(stored).all(axis=1)
         largest = np.where(usable, stored.max(axis=1), 0.0)
-        # Relative to the longest axis, so that neither 1e30 nor 1e-30 leaves the range.
+        # Relative to the longest axis, so that scales such as 1e30 and 1e-30 stay in range.
         relative = np.exp(np.where(usable[:, None], stored - largest[:, None], 0.0).clip(-300, 0))
         axes = linear @ (rotation_matrices(splats.quaternions[piece]) * relative[:, None, :])
-        # Singular values keep the digits that the eigenvalues of the product would square away.
+        # Singular values of M A are more accurate than the eigenvalues of the covariance.
         left, sizes, _ = np.linalg.svd(axes)
         flip = np.where(np.linalg.det(left) < 0.0, -1.0, 1.0)
         quaternions[piece] = quaternion(left * flip[:, None, None])
-        with np.errstate(divide="ignore"):  # a flat splat: log 0 is -inf, as stored
+        with np.errstate(divide="ignore"):  # the log scale of a flat splat is -inf
             logs[piece] = np.where(usable[:, None], np.log(sizes) + largest[:, None], stored)
     return replace(splats, means=means, log_scales=logs, quaternions=quaternions)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import unicodedata
 
 _OBEYED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-"""Categories of characters that a terminal or a panel obeys, or cannot show, and nobody reads."""
+"""Unicode categories of control characters and of characters that cannot be shown."""
 
 
 def printable(text: str) -> str:
-    r"""Return text on one line with control characters escaped, and all else as it is.
+    r"""Return text on one line, with control characters escaped.
 
     Examples
     --------
@@ -23,12 +23,12 @@ def printable(text: str) -> str:
 
 
 class RefineError(Exception):
-    """Bad input, said in words for the user: file, place, what was got, what was expected."""
+    """Bad input. The message is for the user: file, place, what was got, what was expected."""
 
     def __str__(self) -> str:
-        """Return the words; names in them come from anywhere, so they are made `printable`."""
+        """Return the message, made `printable`, since it may hold names out of files."""
         return printable(super().__str__())
 
 
-class Cancelled(Exception):  # noqa: N818 - not an error: somebody asked to stop
+class Cancelled(Exception):  # noqa: N818 - not an error: the user asked to stop
     """Raised between two pieces of work when the progress callback returns ``False``."""

@@ -1,4 +1,4 @@
-"""Files that are something else than was asked for, but nothing unknown: what to do with them."""
+"""Files of known kinds that cannot be read here: they are refused with advice what to do."""
 
 from __future__ import annotations
 
@@ -13,25 +13,25 @@ if TYPE_CHECKING:
 _POINTER = b"version https://git-lfs.github.com/spec/"
 _GZIP, _ZIP, _SPZ = b"\x1f\x8b", b"PK\x03\x04", b"NGSP"
 _UNSIGNED = (".splat", ".ksplat")
-"""Formats in whose files nothing tells them."""
+"""Formats that only the file's name tells, since the files have no signature."""
 
 _CONVERT = "convert it to a plain 3DGS PLY first (SuperSplat and splat-transform do)"
 
 
 def refuse_pointer(path: Path, head: bytes) -> None:
-    """Refuse what Git leaves in place of a large file.
+    """Refuse a Git LFS pointer, which Git leaves in place of a large file.
 
     Parameters
     ----------
     path : Path
         For the message.
     head : bytes
-        What the file starts with.
+        The first bytes of the file.
 
     Raises
     ------
     RefineError
-        With what to do.
+        If it is one; with advice.
     """
     if head.startswith(_POINTER):
         msg = f"{path}: a Git LFS pointer, not the file itself: 'git lfs pull' fetches that"
@@ -39,7 +39,7 @@ def refuse_pointer(path: Path, head: bytes) -> None:
 
 
 def refuse_foreign_splats(path: Path, head: bytes) -> None:
-    """Refuse splats in another format than PLY, and what they are packed in, by name.
+    """Refuse splats in another format than PLY, and archives, by the name of their format.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def refuse_foreign_splats(path: Path, head: bytes) -> None:
     Raises
     ------
     RefineError
-        With what to do.
+        If it is one of them; with advice.
     """
     refuse_pointer(path, head)
     suffix = path.suffix.lower()
@@ -70,7 +70,7 @@ def refuse_foreign_splats(path: Path, head: bytes) -> None:
 
 
 def _unpacked(head: bytes) -> bytes:
-    """Return the first bytes of what gzip compressed, if it did."""
+    """Return the first bytes of a gzip file's content; none if it is not a gzip file."""
     try:
         return zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, len(_SPZ))
     except zlib.error:

@@ -1,12 +1,12 @@
-"""Which points lie in a view: the frustum's one definition, for one view and for many at once.
+"""Which points lie in a view: the only definition of the frustum, for one view and for many.
 
-A point of camera coordinates ``x, y, z`` lies in a view if it is between the near and the far plane
-and projects into the image, all edges included::
+A point with camera coordinates ``x, y, z`` lies in a view if it is between the near and the far
+plane and projects into the image, edges included::
 
     near <= z <= far,   0 <= fx x / z + cx <= width,   0 <= fy y / z + cy <= height
 
-Multiplied by z, with the principal point taken from the image's middle, that is
-``|f x + offset z| <= half z`` across and down: no division, and what is behind is outside.
+Multiplied by z, with the principal point measured from the centre of the image, the latter two are
+``|f x + offset z| <= half z``. This needs no division and excludes points behind the camera.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from .views import View, ViewSet
 
 _STACK = 16
-"""Rows of one matrix product: so few that BLAS starts no threads, which would fight ours."""
+"""Rows of one matrix product: so few that BLAS starts no threads, which would slow down ours."""
 
 
 class Side(NamedTuple):
@@ -34,7 +34,7 @@ class Side(NamedTuple):
     focal : float
         Focal length.
     offset : float
-        From the middle of the image to the principal point.
+        From the centre of the image to the principal point.
     half : float
         Half the image's size.
     """
@@ -53,7 +53,7 @@ def image_sides(view: View) -> tuple[Side, Side]:
 
 
 def clip_planes(view: View, near: float) -> tuple[float, float]:
-    """Return near and far plane, world units; `near` is that of views that bring none."""
+    """Return near and far plane, world units; `near` is for views that have none of their own."""
     return (view.near if view.near > 0.0 else near), view.far
 
 
@@ -82,12 +82,12 @@ class Frustums:
     ----------
     views : ViewSet
     origin : (3,) float64
-        What points are given relative to, world units: near the views, so that a scene a million
-        units from zero keeps its digits.
+        Points are given relative to it, world units. It is near the views, so that a scene far from
+        zero keeps its digits.
     near : float
-        Near plane of views that bring none, world units, > 0.
+        Near plane of views that have none of their own, world units, > 0.
     margin : float
-        How far beyond the image's edge still counts as inside, in half image sizes.
+        How far outside the image still counts as inside, in half image sizes.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class Frustums:
         self._rows = _rows(views, self.centers, margin)
         planes = np.array([clip_planes(view, near) for view in views])
         self._near, self._far = planes[:, :1], planes[:, 1:]
-        # Of each thread: allocating anew for every product costs as much as the product.
+        # One buffer a thread is reused, since allocating one costs as much as the product.
         self._own = threading.local()
 
     def project(
@@ -115,7 +115,7 @@ class Frustums:
         points : (4, n) float64
             x, y, z relative to the origin, and 1.
         block : slice
-            Which views; b of them.
+            Which b views.
 
         Returns
         -------
@@ -124,7 +124,7 @@ class Frustums:
         inside : (b, n) bool
             Between near and far plane and within the widened image, edges included.
         """
-        rows = self._rows[:, block].reshape(-1, 4)
+        rows = self._rows[:, block].reshape(-1, 4)  # (3 b, 4)
         stack = np.zeros((-(-len(rows) // _STACK), _STACK, 4))
         stack.reshape(-1, 4)[: len(rows)] = rows
         product = self._memory((*stack.shape[:2], points.shape[1]))
@@ -133,13 +133,14 @@ class Frustums:
         np.maximum(np.abs(x, out=x), np.abs(y, out=y), out=x)
         inside = np.less_equal(x, depth)
         near, far = self._near[block], self._far[block]
-        # Comparing with one number is twice as fast as with one for each view.
+        # Comparing with a single number is twice as fast as with one for each view.
         inside &= depth >= (near if np.ptp(near) > 0.0 else near[0, 0])
         if np.isfinite(far).any():
             inside &= depth <= far
         return depth, inside
 
     def _memory(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
+        """Return this thread's buffer in a shape; its content is arbitrary."""
         size = math.prod(shape)
         held: NDArray[np.float64] | None = getattr(self._own, "memory", None)
         if held is None or held.size < size:
@@ -150,8 +151,8 @@ class Frustums:
 def _rows(views: ViewSet, centers: NDArray[np.float64], margin: float) -> NDArray[np.float64]:
     """Return rows whose products with ``(p, 1)`` are x', y' and z of every view.
 
-    A point lies between the image's edges, widened by `margin`, where ``|x'| <= z`` and
-    ``|y'| <= z``: the principal point and the half image size are in the rows.
+    x' and y' contain the principal point and the half image size, so a point p lies in the image,
+    widened by `margin`, where ``|x'| <= z`` and ``|y'| <= z``.
 
     Returns
     -------

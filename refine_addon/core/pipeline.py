@@ -1,8 +1,8 @@
-"""The one way through: splats, views and a budget in; what stays, and what becomes of it, out.
+"""The way from splats, views and a budget to the splats that stay.
 
-The panel's buttons, the command and Python code all come through `decide`, in two steps: the
-budget, asked of scores, says which splats stay; where they are to absorb the others, what the views
-see says which ones stay instead, and as what. So all of them keep the same splats.
+The panel, the command and Python code all call `decide`, so all of them keep the same splats. It
+has two steps: the splats are scored and the budget selects by score; then, if survivors are to
+absorb the others, as many survivors are found again, by merging.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ if TYPE_CHECKING:
 
     from .absorbing.absorb import Absorbed
     from .scores import Scores
-    from .scoring.occlusion import Measured
+    from .scoring.measuring import Measured
     from .splats import Splats
     from .views import ViewSet
 
 FIRST = 0.1
-"""Share of the splats that goes before any are merged: what the views would miss least is next to
-nothing, and any merge changes more."""
+"""Share of the splats that is deleted before any are merged: those with the lowest scores, whose
+deletion changes the pictures less than any merge."""
 
 
 def score(
@@ -49,7 +49,7 @@ def score(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
-    """Score splats by how much the views would miss each.
+    """Score splats by how much each matters to the pictures of the views.
 
     Parameters
     ----------
@@ -68,11 +68,11 @@ def score(
     Raises
     ------
     RefineError
-        If there are no splats, or no view sees any.
+        If there are no splats, if none of them can be drawn, or if no view sees any.
     Cancelled
         If `progress` answers ``False``.
     """
-    # What is too small for a float is nothing beside what counts: it may underflow to 0.
+    # Numbers that underflow to 0 are negligible in all sums.
     with np.errstate(under="ignore"):
         used = views.spread(settings.views)
         if settings.method == "occlusion":
@@ -92,12 +92,12 @@ def score(
 
 
 def _with_views(scores: Scores, views: ViewSet) -> Scores:
-    """Return scores that know of all the views there were, not only of those used."""
+    """Return scores with the number and the note of all views, not only of those used."""
     notes = (*scores.notes, views.note) if views.note else scores.notes
     return replace(scores, views_given=len(views), notes=notes)
 
 
-def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
+def prune(  # noqa: PLR0913 - the main function of core; all but three are optional
     splats: Splats,
     views: ViewSet,
     budget: Budget,
@@ -110,7 +110,7 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Result:
-    """Score splats and decide which stay; with `absorb`, what becomes of them.
+    """Score splats and decide which of them stay; with `absorb`, also merge the others into them.
 
     Parameters
     ----------
@@ -119,10 +119,9 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
     budget : Budget
         How much to remove.
     protected : (N,) bool, optional
-        Splats never to remove, nor to change.
+        Splats that are neither removed nor changed.
     absorb : bool
-        Whether survivors absorb what is removed. The budget then says how many survive; which ones
-        do, and as what, is found by what the views see of each, whatever the method.
+        See `Task`.
     row_bytes, fixed_bytes
         See `Budget.removals`.
 
@@ -133,7 +132,7 @@ def prune(  # noqa: PLR0913 - the use case: what, by which views, how much, how
     Raises
     ------
     RefineError, Cancelled
-        See `score`; also if the budget would leave nothing.
+        See `score`; also if no splat would be left.
     """
     task = Task(
         budget=budget,
@@ -155,16 +154,16 @@ def decide(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Result:
-    """Decide which splats stay; with `absorb`, what becomes of them. Changes and writes nothing.
+    """Decide which splats stay and, to absorb, what they become. Nothing is changed or written.
 
-    Step 1: scores, new ones or those that are there, and the budget say which splats stay. Step 2,
-    to absorb: as many survive, but which ones, and as what, is found by merging.
+    Step 1 selects by scores, which are computed unless the task has them. Step 2, only to absorb,
+    keeps the number of survivors, but finds them and their new values by merging.
 
     Parameters
     ----------
     task : Task
     clock : Clock, optional
-        Takes the times of the steps, in a row with what is timed before and after.
+        Gets the timings of the steps; by default a new one.
     progress, threads
         See `score`.
 
@@ -205,22 +204,29 @@ def decide(
         facts["notes"].append(absorbed.note())
         if known and task.settings.method != "occlusion":
             name = task.settings.method
-            facts["notes"].append(f"absorbing measures by occlusion: {name} had nothing to decide")
+            facts["notes"].append(f"absorbing measures by occlusion: {name} was not used")
     return Result(keep, scores, facts, absorbed)
 
 
 def _scores_of(
     task: Task, progress: Progress, threads: int | None
 ) -> tuple[Scores, tuple[Scores, Measured] | None]:
-    """Return the scores that decide and, where absorbing asked for them, what it needs of them."""
+    """Return the scores of a task.
+
+    Returns
+    -------
+    scores : Scores
+    known : tuple of Scores and Measured, or None
+        See `absorb_removed`.
+    """
     if task.scores is not None:
         return task.scores, None
     splats, views = task.scene()
     if task.absorb and not task.budget.needs_scores:
-        # How many go does not depend on the scores, so those that absorbing needs will do.
+        # The number of survivors does not depend on scores, so the scores for absorbing are enough.
         known = _score_once(splats, views, task.settings, progress, threads)
         return known[0], known
-    # `select` would refuse it as well, but only after the work.
+    # `select` checks this too, but only after the work.
     task.budget.refuse_meaningless(task.settings.method, frustum=task.settings.frustum)
     return score(splats, views, task.settings, progress=progress, threads=threads), None
 
@@ -228,7 +234,8 @@ def _scores_of(
 def _score_once(
     splats: Splats, views: ViewSet, settings: Settings, progress: Progress, threads: int | None
 ) -> tuple[Scores, Measured]:
-    with np.errstate(under="ignore"):  # as for scores
+    """Return scores by occlusion in one round, and what was measured of each splat."""
+    with np.errstate(under="ignore"):  # as in `score`
         scores, measured = occlusion.score_once(
             splats,
             views.spread(settings.views),
@@ -239,7 +246,7 @@ def _score_once(
     return _with_views(scores, views), measured
 
 
-def absorb_removed(  # noqa: PLR0913 - the use case, the other one
+def absorb_removed(  # noqa: PLR0913 - as `prune`
     splats: Splats,
     views: ViewSet,
     count: int,
@@ -250,18 +257,18 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Absorbed:
-    """Reduce splats to `count` survivors that absorb the others, by what the views see of each.
+    """Reduce splats to `count` survivors that absorb the others.
 
     Parameters
     ----------
     splats, views, settings, progress, threads
-        See `score`; the occlusion settings count, whatever the method.
+        See `score`; the occlusion settings are used for every method.
     count : int
         How many survive.
     known : tuple of Scores and Measured, optional
-        What `occlusion.score_once` says of these splats and views, if it was asked already.
+        The results of `occlusion.score_once` for these splats and views, if known.
     protected : (N,) bool, optional
-        Splats that neither vanish nor change.
+        Splats that are neither removed nor changed.
 
     Returns
     -------
@@ -277,21 +284,21 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
         splats, views, settings, part(progress, 0.0, 0.2), threads
     )
     first = max(min(math.floor(FIRST * total), total - count), 0)
-    # What no renderer draws scores lowest, so it is among these, or all of these are such.
+    # Undrawable splats have the lowest scores, so these go first.
     rest = selection.select(scores, Budget(keep=total - first), protected=protected)
-    # What goes first hid and showed next to nothing: what was measured with it still holds.
-    at_first = [ViewSums(measured.contribution[rest], measured.contrast[rest])]
+    # The deleted splats hid almost nothing, so the first stage need not measure again.
+    at_first = [ViewSums(measured.contribution[rest], measured.error[rest])]
     del known, scores, measured
 
-    def seen(now: Splats, ahead: Progress) -> ViewSums:
+    def measure(now: Splats, ahead: Progress) -> ViewSums:
         if at_first:
             return at_first.pop()
         found = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
-        return ViewSums(found.contribution, found.contrast)
+        return ViewSums(found.contribution, found.error)
 
-    with np.errstate(under="ignore"):  # as for scores
+    with np.errstate(under="ignore"):  # as in `score`
         absorbed = absorbing.absorb(
-            splats.take(rest), used, seen, count,
+            splats.take(rest), used, measure, count,
             protected=None if protected is None else protected[rest],
             progress=part(progress, 0.2, 1.0), threads=threads,
         )  # fmt: skip
@@ -301,7 +308,7 @@ def absorb_removed(  # noqa: PLR0913 - the use case, the other one
     return replace(absorbed, keep=keep, deleted=absorbed.deleted + gone)
 
 
-def prune_file(  # noqa: PLR0913 - the use case, file to file
+def prune_file(  # noqa: PLR0913 - as `prune`
     source: Path | str,
     output: Path | str | None,
     views: ViewSet,
@@ -313,14 +320,14 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Result:
-    """Prune a 3DGS PLY file into another.
+    """Prune a 3DGS PLY file, and write the result to another file.
 
     Parameters
     ----------
     source : path-like
         The file to read.
     output : path-like or None
-        The file to make; None decides and writes nothing.
+        The file to write; None decides without writing.
     views, budget, settings, absorb, progress, threads
         See `prune`.
     overwrite : bool
@@ -329,12 +336,12 @@ def prune_file(  # noqa: PLR0913 - the use case, file to file
     Returns
     -------
     Result
-        Its report says the files' names and sizes besides.
+        Its report also has the names and sizes of the files.
 
     Raises
     ------
     RefineError, Cancelled
-        See `prune`, `read_ply` and `SplatFile.write`; nothing is written then.
+        See `prune`, `read_ply` and `SplatFile.write`; then nothing is written.
     """
     clock = Clock()
     target = None if output is None else expanded(output)

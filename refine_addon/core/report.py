@@ -1,4 +1,4 @@
-"""What a prune says of itself: counts, sizes, timings and notes, the same whoever asked for it."""
+"""The report of a prune: counts, sizes, timings and notes; the same for panel, command and API."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class Clock:
-    """How long the steps of one prune take.
+    """A clock for the steps of one prune.
 
     Attributes
     ----------
@@ -31,25 +31,25 @@ class Clock:
         self._start = self._last = time.perf_counter()
 
     def lap(self, step: str) -> None:
-        """Note what has passed since the last lap as the time of a step."""
+        """Store the time since the last lap as that of a step."""
         now = time.perf_counter()
         self.timings[step], self._last = now - self._last, now
 
     def stop(self) -> None:
-        """Note what has passed since the start as ``total_s``."""
+        """Store the time since the start as ``total_s``."""
         self.timings["total_s"] = time.perf_counter() - self._start
 
 
 @dataclass(frozen=True)
 class Files:
-    """Where splats came from and where they went, under the names that the report gives them.
+    """The files of a prune, under their names in the report.
 
     Attributes
     ----------
     input : str
-        A file, or a .blend and the object in it.
+        A file, or a .blend file and the object in it.
     output : str or None
-        The file that was made, if any.
+        The file that was written, if any.
     input_bytes, output_bytes : int
         Sizes as PLY files.
     """
@@ -61,7 +61,7 @@ class Files:
 
 
 def scoring_notes(scores: Scores) -> list[str]:
-    """Return what the user should know of a scoring, in sentences."""
+    """Return what the user should know about a scoring, in sentences."""
     notes = list(scores.notes)
     if scores.undrawable:
         notes.append(f"{scores.undrawable} splats cannot be drawn; they rank lowest")
@@ -71,18 +71,18 @@ def scoring_notes(scores: Scores) -> list[str]:
 def make_report(
     scores: Scores, keep: NDArray[np.bool_], budget: Budget, settings: Settings, clock: Clock
 ) -> dict[str, Any]:
-    """Return everything a pipeline wants to know about a prune, as plain JSON values.
+    """Return the report of a prune, as plain JSON values.
 
     Parameters
     ----------
     scores : Scores
-        What decided.
+        Those that decided.
     keep : (N,) bool
         Which splats stay.
     budget, settings
-        What was asked for.
+        Those of the prune.
     clock : Clock
-        Its timings are part of the report, those of later laps too.
+        The report shares its timings, so it also gets those of later laps.
     """
     kept = int(np.count_nonzero(keep))
     return {
@@ -96,7 +96,7 @@ def make_report(
         "views": {"given": scores.views_given, "used": scores.views_used},
         "budget": {budget.kind: getattr(budget, budget.kind)},
         "settings": asdict(settings),
-        "weights": scores.weights,
+        "weights": scores.facts,
         "timings": clock.timings,
         "notes": scoring_notes(scores),
         "versions": {"python": platform.python_version(), "numpy": np.__version__},
@@ -104,6 +104,6 @@ def make_report(
 
 
 def complete_report(report: dict[str, Any], clock: Clock, files: Files) -> None:
-    """Add names, sizes and the total time to the report of a prune that has been written."""
+    """Add the names and sizes of the files and the total time to a report."""
     clock.stop()
     report["files"] = asdict(files)

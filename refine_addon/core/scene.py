@@ -1,8 +1,8 @@
-"""The scene's own frame: where its middle is, how large it is and which way it lies.
+"""The scene's own frame: its middle, its size and its axes.
 
-Everything that is computed in float32, or compared with a fixed number, is computed in this frame.
-It moves, turns and grows with the scene, so the result depends neither on the frame that a file
-happens to use nor on the order of its splats.
+Everything that is computed in float32 or compared with a fixed number is computed in this frame. It
+moves, turns and grows with the scene, so results depend neither on the frame that a file uses nor
+on the order of its splats.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from .views import ViewSet
 
 _CHUNK = 1 << 16
-_BITS = 21  # of each coordinate in the order of `Scene.order`: three of them fill an int64
-_HALF_WIDTH = 4.0  # scene sizes either way that the order resolves; what is farther is at its edge
+_BITS = 21  # of each coordinate in `spatial_order`; three of them fit an int64
+_HALF_WIDTH = 4.0  # scene sizes either way in `spatial_order`; farther positions count as the edge
 _SPREAD_BITS = (
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),
@@ -41,8 +41,8 @@ class Scene:
     origin : (3,) float64
         Geometric median of the views' centres, world units.
     size : float
-        The root of S + V, world units, > 0: S is the median over drawable splats of their squared
-        distance to the origin, V the median over views of theirs.
+        The square root of S + V, world units, > 0. S and V are the medians of the squared distance
+        to the origin over drawable splats and over views.
     axes : (3, 3) float64
         Rotation from the world to the frame: its rows are the principal axes of the splats.
     """
@@ -67,14 +67,14 @@ class Scene:
 
 
 def median_size(squared: NDArray[np.float64], drawable: NDArray[np.bool_]) -> float:
-    """Return the size of a scene, 1 where all of it is one point.
+    """Return the size of a scene, or 1 if the whole scene is one point.
 
     Parameters
     ----------
     squared : (N,) float64
-        Squared distance of each splat to the scene's origin, plus the median of the views'.
+        Squared distance of each splat to the scene's origin, plus the median over views of theirs.
     drawable : (N,) bool
-        Which splats count; those that a renderer can draw.
+        Which splats count.
     """
     if not drawable.any():
         return 1.0
@@ -100,7 +100,7 @@ def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -
     squared = np.empty(len(means))
     with np.errstate(under="ignore"):
         for piece in _pieces(len(means)):
-            # What cannot be drawn may hold any number.
+            # Undrawable splats may hold any number, such as infinity.
             offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
             squared[piece] = np.einsum("ij,ij->i", offset, offset) + views_squared
         unturned = Scene(origin, median_size(squared, drawable), np.eye(3))
@@ -110,23 +110,23 @@ def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -
 def _principal_axes(
     means: NDArray[Any], drawable: NDArray[np.bool_], scene: Scene
 ) -> NDArray[np.float64]:
-    """Return the axes along which positions vary, the least first, as the rows of a rotation.
+    """Return the principal axes of positions as the rows of a rotation, the least variance first.
 
-    A position at distance r counts 1 / (1 + r^2)^2, so that a few far ones decide nothing. An axis
-    points to where more of the splats lie. In a scene as long as it is wide the axes are arbitrary.
+    A position at distance r has the weight 1 / (1 + r^2)^2, so that a few far ones hardly matter.
+    Axes point to where more of the splats lie. If two variances are equal, two axes are arbitrary.
 
     Parameters
     ----------
     means, drawable
         See `scene_of`.
     scene : Scene
-        Its origin and size count.
+        Its origin and size are used.
     """
     second, first = np.zeros((3, 3)), np.zeros(3)  # weighted moments
     for piece in _pieces(len(means)):
         place = scene.place(means[piece][drawable[piece]])  # (n, 3)
-        weights = (1.0 + np.einsum("ij,ij->i", place, place)) ** -2.0  # (n,)
-        weighted = place * weights[:, None]
+        nearness = (1.0 + np.einsum("ij,ij->i", place, place)) ** -2.0  # (n,)
+        weighted = place * nearness[:, None]
         second += weighted.T @ place
         first += weighted.sum(axis=0)
     _, vectors = np.linalg.eigh(second)  # in columns
@@ -137,11 +137,12 @@ def _principal_axes(
 
 
 def _pieces(count: int) -> Iterator[slice]:
+    """Return slices that cover `count` rows."""
     return (slice(start, start + _CHUNK) for start in range(0, count, _CHUNK))
 
 
 def spatial_order(place: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return an order of positions in which neighbours follow each other (Morton, 1966).
+    """Return the order of positions along a Z-shaped curve, near ones together (Morton, 1966).
 
     Parameters
     ----------
@@ -154,7 +155,7 @@ def spatial_order(place: NDArray[np.float64]) -> NDArray[np.int64]:
         Positions that agree in 21 bits of each coordinate keep their order.
     """
     cells = float(1 << _BITS)
-    code = np.zeros(len(place), np.int64)
+    code = np.zeros(len(place), np.int64)  # (N,), bits of the three coordinates interleaved
     for axis in range(3):
         along = place[:, axis] * (0.5 / _HALF_WIDTH) + 0.5
         bits = (along * cells).clip(0.0, cells - 1.0).astype(np.int64)

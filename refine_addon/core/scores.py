@@ -11,41 +11,41 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _DISTINCT = 1 << 24
-"""Up to so many equal steps from 0 to 1 are distinct as float32."""
+"""Largest number of equal steps from 0 to 1 that are distinct in float32."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """How much the views would miss each of N splats.
+    """How much each of N splats matters to the pictures of the views.
 
     Attributes
     ----------
     values : (N,) float32
-        Finite, >= 0; 0 only for splats that no renderer can draw. Each method has its own scale.
+        Finite, >= 0; 0 only for undrawable splats. Each method has its own scale.
     seen : (N,) int32
         In how many of the views used the splat's centre lies.
     views_used : int
-        How many views decided.
+        How many views were used.
     undrawable : int
-        How many splats no renderer can draw.
-    weights : dict of str to float
-        The method's weights, for the report.
+        How many splats cannot be drawn.
+    facts : dict of str to Any
+        Numbers of the method that explain the scores, for the report.
     notes : tuple of str
-        What the user should know about how the scores came to be.
+        What the user should know about how the scores were computed.
     method : str
         Name of the method asked for, as in `Settings.method`; "" where it is not known.
     frustum : bool
-        Whether `seen` counts only the views in whose image the centre lies; without, all views see
-        all splats.
+        True if `seen` counts only the views in whose image the centre lies; False if every view
+        counts for every splat.
     views_given : int
-        How many views there were to choose those used from.
+        How many views were given; those used were chosen from them.
     """
 
     values: NDArray[np.float32]
     seen: NDArray[np.int32]
     views_used: int
     undrawable: int
-    weights: dict[str, Any] = field(default_factory=dict)
+    facts: dict[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     method: str = ""
     frustum: bool = True
@@ -53,16 +53,16 @@ class Scores:
 
 
 def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:
-    """Return the share of `count` splats that have gone once the splat at each place goes.
+    """Return, for each place in the order of removal, the share of `count` splats then removed.
 
     Above 2^24 splats float32 has fewer numbers near 1 than there are places. A share that would
-    then equal the next is lowered to the nearest number below it, so that the order stays whole;
-    the highest shares are too low there, the lowest exact.
+    equal the next one is lowered to the nearest smaller number, so that no two places tie. The
+    highest shares are then a little too low; the lowest stay exact.
 
     Parameters
     ----------
     places : (N,) int64
-        From 1, which goes first, to `count`, which goes last.
+        From 1, removed first, to `count`, removed last.
     count : int
 
     Returns
@@ -78,6 +78,6 @@ def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:
     shares = (places / count).astype(np.float32)
     if count <= _DISTINCT:
         return shares
-    # The bits of positive floats, read as integers, are in the same order without a gap.
+    # Neighbouring positive floats are neighbouring integers if their bits are read as such.
     highest = np.float32(1.0).view(np.int32) - (count - places)
     return np.minimum(shares.view(np.int32), highest).astype(np.int32).view(np.float32)

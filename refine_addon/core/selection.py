@@ -1,4 +1,4 @@
-"""From scores to a keep mask: budgets, protection, stable ties."""
+"""Which splats stay, given scores: budgets, protected splats and ties."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class Budget:
     ratio : float, optional
         Share to remove, in [0, 1): exactly ``floor(ratio * N)`` splats go.
     keep : int, optional
-        How many splats stay, at least 1; all of them where there are fewer.
+        How many splats stay, at least 1; if there are fewer splats, all stay.
     max_mb : float, optional
-        Size of the file afterwards, in megabytes of 1e6 bytes.
+        Largest size of the file afterwards, in megabytes of 1e6 bytes.
     threshold : float, optional
-        Splats that score below this go.
+        Splats with a lower score are removed.
     min_seen : float, optional
-        Splats that lie in fewer than this share of the views go, in percent.
+        Splats that lie in fewer than this percentage of the views are removed.
 
     Examples
     --------
@@ -49,19 +49,19 @@ class Budget:
     min_seen: float | None = None
 
     def __post_init__(self) -> None:
-        """Check that one value is given and can be.
+        """Check that exactly one value is given, and that it is in range.
 
         Raises
         ------
         RefineError
-            With the name of the value, what it is and what was expected.
+            With the name of the value, its value and what was expected.
         """
         given = [item.name for item in fields(self) if getattr(self, item.name) is not None]
         if len(given) != 1:
             msg = f"expected one of ratio, keep, max_mb, threshold, min_seen, got {given or 'none'}"
             raise RefineError(msg)
         value = getattr(self, given[0])
-        # Each is asked of its own value alone: what can be no number of splats can be a size.
+        # Functions, so that only the check of the given value runs.
         checks: dict[str, tuple[str, Callable[[], bool]]] = {
             "ratio": ("0 <= ratio < 1", lambda: 0 <= value < 1),
             "keep": ("a whole number of at least 1", lambda: value >= 1 and value % 1 == 0),
@@ -76,12 +76,12 @@ class Budget:
 
     @property
     def kind(self) -> str:
-        """Name of the value given."""
+        """Name of the value that is given."""
         return next(item.name for item in fields(self) if getattr(self, item.name) is not None)
 
     @property
     def needs_scores(self) -> bool:
-        """Whether only the scores can tell how many splats go, not their number alone."""
+        """Whether the number of splats that are removed depends on their scores."""
         return self.threshold is not None or self.min_seen is not None
 
     def refuse_meaningless(self, method: str, *, frustum: bool = True) -> None:
@@ -103,14 +103,14 @@ class Budget:
             raise RefineError(msg)
 
     def removals(self, count: int, row_bytes: float = 0.0, fixed_bytes: int = 0) -> int | None:
-        """Return how many of `count` splats go, or None where only the scores can tell.
+        """Return how many of `count` splats are removed, or None if that depends on the scores.
 
         Parameters
         ----------
         count : int
             Number of splats.
         row_bytes, fixed_bytes : float, int
-            Size of one splat in the file, and of all else in it; for `max_mb`.
+            Size of one splat in the file, and of everything else in it; for `max_mb`.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class Budget:
             If not even one splat fits in `max_mb`.
         """
         if self.ratio is not None:
-            # The decimal that was written, not its binary neighbour: floor(.29 * 100) is 29.
+            # The decimal as written; the nearest binary number would give floor(.29 * 100) = 28.
             return math.floor(Fraction(repr(float(self.ratio))) * count)
         if self.keep is not None:
             return max(count - int(self.keep), 0)
@@ -145,15 +145,15 @@ def select(
 ) -> NDArray[np.bool_]:
     """Return which splats stay.
 
-    The lowest scores go; of equal ones, the first in the file. Protected splats always stay, others
-    go in their place; where the budget asks for more than there are others, only those go.
+    The splats with the lowest scores are removed; of equal scores, the first in the file. Protected
+    splats always stay, and others are removed instead, as far as there are any.
 
     Parameters
     ----------
     scores : Scores
     budget : Budget
     protected : (N,) bool, optional
-        Splats never to remove.
+        Splats that are not removed.
     row_bytes, fixed_bytes
         See `Budget.removals`.
 
@@ -164,18 +164,18 @@ def select(
     Raises
     ------
     RefineError
-        If the budget means nothing to these scores (`Budget.refuse_meaningless`), or nothing would
-        stay.
+        If the budget has no meaning for these scores (`Budget.refuse_meaningless`), or if no splat
+        would be left.
     """
     budget.refuse_meaningless(scores.method, frustum=scores.frustum)
     values = scores.values
-    keep = np.ones(len(values), np.bool_)
+    keep = np.ones(len(values), np.bool_)  # (N,), as `free`
     free = np.ones(len(values), np.bool_) if protected is None else ~protected
     removals = budget.removals(len(values), row_bytes, fixed_bytes)
     if budget.threshold is not None:
         keep[free & (values < budget.threshold)] = False
     elif budget.min_seen is not None:
-        # In whole numbers: 25 % of 64 views is 16, and 16 is not fewer.
+        # In exact fractions: a splat that lies in 16 of 64 views lies in 25 % of them, and stays.
         least = Fraction(repr(float(budget.min_seen))) * scores.views_used / 100
         keep[free & (scores.seen < math.ceil(least))] = False
     elif removals:
@@ -189,7 +189,7 @@ def select(
 def _remove_lowest(
     keep: NDArray[np.bool_], values: NDArray[np.float32], free: NDArray[np.bool_], count: int
 ) -> None:
-    """Clear `keep` for the `count` lowest of the `free` values, the first of equal ones."""
+    """Set `keep` to False for the `count` lowest `free` values; of equal ones, for the first."""
     if not count:
         return
     candidates = values if free.all() else values[free]
@@ -201,10 +201,10 @@ def _remove_lowest(
 
 
 def rank(values: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return each splat's place in the order of removal, 0 (goes first) to 1 (goes last).
+    """Return each splat's place in the order of removal, 0 (removed first) to 1 (removed last).
 
-    To look at, and to select by in Blender, whose attributes round it to float32: above 2^24 splats
-    neighbours then share a rank. Nothing here decides by it; `select` goes by score and row.
+    It is for display, and for selecting in Blender. Attributes there are float32, so neighbours
+    share a rank above 2^24 splats. Core does not decide by it; `select` uses scores and rows.
 
     Parameters
     ----------

@@ -14,7 +14,7 @@ _CHUNK = 1 << 16  # splats whose coefficients are widened to float64 at a time
 
 
 def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
-    """Evaluate the harmonics.
+    """Return the values of all harmonics in some directions.
 
     Parameters
     ----------
@@ -90,14 +90,14 @@ def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
 
 
 def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotate coefficients so that the colour seen along ``rotation @ d`` is that once seen along d.
+    """Return coefficients whose colour along ``rotation @ d`` is the old colour along d.
 
     Parameters
     ----------
     sh_rest : (N, K, 3) floating
         Coefficients above the constant, K = (degree + 1)^2 - 1.
     rotation : (3, 3) float64
-        Orthonormal; a reflection is as good.
+        Orthonormal; it may be a reflection.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.f
     """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
     rotated = np.empty(sh_rest.shape)
-    # Each band maps to itself: solve for the matrix from more directions than it has rows.
+    # A rotation maps each band to itself. Its matrix is fitted to more directions than it has rows.
     points = np.random.default_rng(0).normal(size=(64, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     here, before = basis(points, degree), basis(points @ rotation, degree)

@@ -1,4 +1,4 @@
-"""3D Gaussian splats as stored by 3DGS files, and the one place where they are activated."""
+"""3D Gaussian splats as 3DGS files store them, and the only place where they are activated."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ SH_C0 = 0.28209479177387814
 class Splats:
     """N splats with the values a 3DGS file stores: log scales, logit opacities, raw harmonics.
 
-    The arrays may be read-only strided views of a memory-mapped file in any byte order; whoever
-    computes with them converts a chunk at a time. Nothing here is ever mutated.
+    The arrays may be read-only strided views of a memory-mapped file in any byte order, so callers
+    convert them one chunk at a time. They are never changed.
 
     Attributes
     ----------
     means : (N, 3) floating
-        Centres, in the file's (or, once transformed, the world's) frame and unit.
+        Centres, in the frame and unit of the file, or of the world after a transform.
     log_scales : (N, 3) floating
         Natural logarithm of the standard deviation along each axis of the splat.
     quaternions : (N, 4) floating
@@ -72,7 +72,7 @@ def opacity(logits: NDArray[Any]) -> NDArray[np.float64]:
     (...) float64
     """
     logits = np.asarray(logits, np.float64)
-    # Beyond 700 the smaller side is below 1e-304: taken as it is there, so that nothing underflows.
+    # exp(-700) is 1e-304; the limit avoids underflow.
     decay = np.exp(-np.minimum(np.abs(logits), 700.0))
     return np.asarray(np.where(logits >= 0.0, 1.0, decay) / (1.0 + decay))
 
@@ -108,7 +108,7 @@ def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
     largest = np.max(np.abs(q), axis=-1, keepdims=True)
     usable = np.isfinite(largest) & (largest > 0.0)
     # Divide by the largest component first: squares of 1e200 or 1e-200 would leave the range.
-    with np.errstate(under="ignore"):  # what is beside the largest as 1e-200 to 1 is nothing
+    with np.errstate(under="ignore"):  # components far smaller than the largest become 0
         q = np.where(usable, q, [1.0, 0.0, 0.0, 0.0]) / np.where(usable, largest, 1.0)
         w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
         rows = [
@@ -120,12 +120,12 @@ def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def drawable(splats: Splats) -> NDArray[np.bool_]:
-    """Which splats a renderer can draw.
+    """Return which splats a renderer can draw.
 
-    Not those with a value that is NaN or infinite (other than an opacity logit, where infinity
-    means 0 or 1, and a scale of zero, a log of minus infinity), nor those that leave the range of
-    the float32 that renderers compute in: opacity 0, size 0 along every axis, a mean or scale too
-    large.
+    A splat cannot be drawn if one of its values is NaN or infinite. Two exceptions: an infinite
+    opacity logit means opacity 0 or 1, and a log scale of minus infinity means scale 0. It cannot
+    be drawn either if a renderer that computes in float32 gets opacity 0, size 0 along every axis,
+    or a mean or scale that overflows.
 
     Returns
     -------
@@ -133,20 +133,20 @@ def drawable(splats: Splats) -> NDArray[np.bool_]:
     """
     s0, s1, s2 = splats.log_scales.T
     largest = np.maximum(np.maximum(s0, s1), s2)
-    # Comparisons with NaN are False, and maximum hands NaN on: every line also rejects NaN.
+    # Comparisons with NaN are False and np.maximum returns NaN, so every line also rejects NaN.
     good = splats.opacity_logits >= _LOG_SMALLEST
     good &= (largest <= _LOG_LARGEST) & (largest >= _LOG_SMALLEST)
     for axis in range(3):
         good &= np.abs(splats.means[:, axis]) <= _LARGEST
     for values in (splats.quaternions, splats.sh_dc, splats.sh_rest):
         finite = np.isfinite(values)
-        if not finite.all():  # seldom: row by row costs ten times as much as all at once
+        if not finite.all():  # rare; testing each row costs ten times as much
             good &= finite.reshape(len(splats), -1).all(axis=1)
     return good
 
 
-# A float32 itself: a Python float of this size would make NumPy 1 widen the column, which warns of
-# signalling NaN and costs time.
+# Of type float32: with a Python float of this size, NumPy 1 would convert the column to float64,
+# which takes time and warns about signalling NaN.
 _LARGEST = np.finfo(np.float32).max
 _LOG_LARGEST = float(np.log(np.float64(_LARGEST)))
 _LOG_SMALLEST = float(np.log(np.float64(np.finfo(np.float32).smallest_subnormal)))

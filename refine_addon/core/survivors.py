@@ -1,6 +1,6 @@
-"""What absorbing made of splats, put among the columns that a file or a mesh stores of them.
+"""Stored columns of splats, updated with the results of absorbing, for files and meshes.
 
-Above both: a format knows nothing of absorbing, nor absorbing of how splats are stored.
+This module stands above formats and absorbing, so that neither has to know the other.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Columns(Protocol):
 def survivor_columns(
     stored: Columns | NDArray[Any], absorbed: Absorbed, matrix: NDArray[Any] | None = None
 ) -> dict[str, NDArray[Any]]:
-    """Return stored columns with what absorbing changed put in.
+    """Return stored columns with the values of changed survivors put in.
 
     Parameters
     ----------
@@ -38,17 +38,17 @@ def survivor_columns(
     absorbed : Absorbed
         Of these splats.
     matrix : (4, 4) floating, optional
-        From the frame of the survivors to that of the columns, where these are two.
+        From the frame of the survivors to that of the columns; by default they are the same.
 
     Returns
     -------
     dict of str to (N,)
-        The properties that make a splat, each of its stored type and rounded to it once. What did
-        not change, or is gone, is what it was, to the bit.
+        The properties that make a splat, each in its stored type, rounded once. Rows of all other
+        splats, unchanged or removed, are equal to the stored ones to the bit.
 
     Examples
     --------
-    A file is written so that the survivors are in it as they became::
+    To write the survivors, with what they absorbed, to a file::
 
         file.write("out.ply", absorbed.keep, columns=survivor_columns(file.rows, absorbed))
     """

@@ -1,4 +1,4 @@
-"""What is asked of the pipeline, and what it answers."""
+"""The input and the result of the pipeline: `Settings`, `Task` and `Result`."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ class Settings:
     Attributes
     ----------
     method : {"closed-form", "occlusion", "auto"}
-        Name of the scoring method: as if nothing hid anything, with what hides what, or the
-        cheapest that agrees with the latter.
+        Scoring method: "closed-form" ignores occlusion, "occlusion" takes it into account, "auto"
+        uses the cheapest model that keeps nearly the same splats as "occlusion".
     views : int
-        Use at most this many views, spread out evenly; 0 uses all.
+        Use at most this many views, spread evenly; 0 uses all.
     closed_form : ClosedForm
     occlusion : Occlusion
-        Settings of the methods of those names.
+        Settings of these methods.
     tolerance : float
-        For "auto": share of the kept set that may differ from that of "occlusion".
+        For "auto": the share of the kept set that may differ from that of "occlusion".
     """
 
     method: Literal["closed-form", "occlusion", "auto"] = "closed-form"
@@ -52,7 +52,7 @@ class Settings:
         Raises
         ------
         RefineError
-            If one cannot be.
+            If a value is out of range.
         """
         if self.method not in METHODS:
             msg = f"method is {self.method!r}, expected one of {', '.join(METHODS)}"
@@ -66,7 +66,7 @@ class Settings:
 
     @property
     def frustum(self) -> bool:
-        """Whether the scores will count the views in whose image a splat lies; see `Scores`."""
+        """Whether `Scores.seen` counts only views in whose frustum a splat lies; see `Scores`."""
         return self.method != "closed-form" or self.closed_form.frustum
 
 
@@ -75,7 +75,7 @@ DEFAULTS = Settings()
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """All that deciding needs, as arrays: nothing of it is a file, or Blender's.
+    """What `decide` needs; all data are arrays, whether they came from a file or from Blender.
 
     Attributes
     ----------
@@ -84,16 +84,16 @@ class Task:
     settings : Settings
         How to score.
     splats : Splats or None
-        In the frame of the views; None where they are scored already and nothing absorbs.
+        In the frame of the views; may be None if `scores` is given and nothing is absorbed.
     views : ViewSet or None
-        None as for `splats`.
+        May be None if `splats` may.
     scores : Scores or None
-        Those that the splats have already; None scores them.
+        Known scores of the splats; None computes them.
     protected : (N,) bool or None
-        Splats never to remove, nor to change.
+        Splats that are neither removed nor changed.
     absorb : bool
-        Whether survivors absorb what is removed. The budget then says how many survive; which ones
-        do, and as what, is found by what the views see of each, whatever the method.
+        Whether survivors absorb the splats that are removed. Then the budget only decides how many
+        survive; which ones, and their new values, come from merging, whatever the method.
     row_bytes, fixed_bytes : float, int
         See `Budget.removals`.
     """
@@ -124,19 +124,19 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a prune decided.
+    """The result of a prune.
 
     Attributes
     ----------
     keep : (N,) bool
         Which splats stay.
     scores : Scores
-        What decided; with `absorbed`, the scores that set how many survive, or which tenth is
-        deleted first.
+        The scores that decided which splats stay. With `absorbed`: the scores that decided how many
+        survive, or else which tenth was deleted first.
     absorbed : Absorbed or None
-        The survivors, changed by what they absorbed.
+        The survivors with what they absorbed.
     report : dict
-        Counts, settings, weights, timings and versions, ready for JSON.
+        Counts, settings, facts about the scores, timings and versions, ready for JSON.
     """
 
     keep: NDArray[np.bool_]

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 ORTHONORMAL = 1e-3
-"""How far from orthonormal a rotation may be: what four decimals in a text file leave."""
+"""How far from orthonormal a rotation may be: four decimals in a text file are enough."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class View:
     width, height : int
         Image size, pixels.
     near, far : float
-        Clip distances along z, world units; 0 and infinity where the source knows none.
+        Clip distances along z, world units; 0 and infinity if the source has none.
     weight : float
         How much this view counts among the others, >= 0.
     name : str
@@ -58,12 +58,12 @@ class View:
     name: str = ""
 
     def __post_init__(self) -> None:
-        """Check everything: what is wrong here would surface as a wrong picture much later.
+        """Check all values.
 
         Raises
         ------
         RefineError
-            With the view's name and the value that cannot be.
+            If a value is wrong; with the view's name and the value.
         """
         try:
             rotation = np.array(self.rotation, np.float64)
@@ -74,7 +74,7 @@ class View:
             msg = f"view {self.name!r}: {error}"
             raise RefineError(msg) from error
         left, _, right = np.linalg.svd(rotation)
-        object.__setattr__(self, "rotation", left @ right)  # files round; make it exactly rigid
+        object.__setattr__(self, "rotation", left @ right)  # exactly orthonormal again
         object.__setattr__(self, "center", center)
 
     def _check_image(self) -> None:
@@ -107,7 +107,7 @@ def _check_pose(rotation: NDArray[np.float64], center: NDArray[np.float64]) -> N
     if np.abs(center).max() > np.finfo(np.float32).max:
         msg = f"center {center.tolist()} is beyond the range of float32"
         raise ValueError(msg)
-    # Entries first: those of a rotation are at most 1, and squares of others might overflow.
+    # Entries first: those of a rotation are at most 1, and squares of large ones could overflow.
     largest = np.abs(rotation).max()
     if largest > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > ORTHONORMAL:  # noqa: PLR2004
         msg = f"rotation is not orthonormal: {rotation.tolist()}"
@@ -116,21 +116,21 @@ def _check_pose(rotation: NDArray[np.float64], center: NDArray[np.float64]) -> N
 
 @dataclass(frozen=True, eq=False)
 class ViewSet:
-    """The views that decide, as arrays.
+    """The views to score by.
 
     Attributes
     ----------
     views : tuple of View
-        At least one, at least one with a positive weight.
+        At least one has a positive weight.
     note : str
-        What the source of the views had that is not modelled (lens distortion), or "".
+        What is not modelled of the source of the views, such as lens distortion; or "".
     """
 
     views: tuple[View, ...]
     note: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse an empty set.
+        """Refuse a set without any view that counts.
 
         Raises
         ------
@@ -162,12 +162,14 @@ class ViewSet:
         return replace(self, views=tuple(self.views[int(index)] for index in indices))
 
     def select(self, names: Sequence[str]) -> ViewSet:
-        """Return the views of these names, in the order of `names`; of equal names, the last.
+        """Return the views of these names, in the order of `names`.
+
+        If several views have one name, the last of them is returned.
 
         Raises
         ------
         RefineError
-            If a name is not there.
+            If no view has one of the names.
         """
         by_name = {view.name: view for view in self.views}
         missing = [name for name in names if name not in by_name]
@@ -190,12 +192,12 @@ class ViewSet:
     def weights(self) -> NDArray[np.float64]:
         """Weights scaled to sum to 1, (V,)."""
         weights = np.array([view.weight for view in self.views], np.float64)
-        with np.errstate(under="ignore"):  # a weight of 1e-300 beside one of 1e300 is none
+        with np.errstate(under="ignore"):  # a weight of 1e-300 beside one of 1e300 becomes 0
             weights /= weights.max()  # first, so that weights of 1e308 do not sum to infinity
             return np.asarray(weights / weights.sum())
 
     def middle(self) -> tuple[NDArray[np.float64], float]:
-        """Return where the views are, and how far from there, whatever a few stray ones do.
+        """Return the middle of the views and how far they are from it; stray ones hardly count.
 
         Returns
         -------
@@ -209,7 +211,7 @@ class ViewSet:
             middle = weights @ centers
             for _ in range(100):
                 distance = np.linalg.norm(centers - middle, axis=1)
-                # Half of the views are nearer than this, however far the farthest strays.
+                # A median, so that stray views do not change it.
                 reach = _median(distance, weights)
                 if reach == 0.0:
                     break
@@ -221,11 +223,12 @@ class ViewSet:
         return middle, _median(squared, weights)
 
     def spread(self, count: int) -> ViewSet:
-        """Return at most `count` views that cover the set evenly, in their old order.
+        """Return at most `count` views that cover the set evenly, in the order of the set.
 
-        Farthest-point sampling over position, in units of the root of `middle`'s variance, and
-        viewing direction, from the view farthest from the middle of the set. Deterministic, and
-        independent of the order and the unit of the set; a stray view takes one place, no more.
+        Farthest-point sampling over position and viewing direction, starting from the view that is
+        farthest from the middle of the set. Positions are divided by the root of `middle`'s
+        variance. The choice depends neither on the order of the set nor on its unit, and a stray
+        view takes up only one place.
 
         Parameters
         ----------
@@ -238,7 +241,7 @@ class ViewSet:
         middle, variance = self.middle()
         offset = self.centers[usable] - middle
         place = np.hstack([offset / (np.sqrt(variance) or 1.0), self.rotations[usable][:, 2]])
-        # Equal distances are decided by place, never by index, so the order of views is nothing.
+        # Sorted by place, so that ties do not depend on the order of the views.
         order = np.lexsort(place.T)
         place = place[order]
         chosen = [int(np.argmax(np.round(np.sum(place * place, axis=1), 9)))]
@@ -252,6 +255,6 @@ class ViewSet:
 
 
 def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
-    """Return the weighted median; of two in the middle the smaller."""
+    """Return the weighted median of values, (V,); the smaller one if two are in the middle."""
     order = np.argsort(values, kind="stable")
     return float(values[order[np.searchsorted(np.cumsum(weights[order]), 0.5 - 1e-9)]])

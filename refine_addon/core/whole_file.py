@@ -1,4 +1,4 @@
-"""Files that are either written whole or not at all."""
+"""Files that are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 REPLACES_MAPPED = os.name != "nt"
-"""Whether the system lets go of a file's name while a program still maps it; Windows does not."""
+"""Whether the system can replace a file that a program has mapped; Windows cannot."""
 
 
 def expanded(path: Path | str) -> Path:
@@ -43,13 +43,13 @@ def expanded(path: Path | str) -> Path:
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """Raise `RefineError` where writing `path` would lose a file, or could not work at all.
+    """Raise `RefineError` if writing `path` would replace a file, or could not work at all.
 
-    Called before the long work starts, so that a mistyped output costs nothing.
+    Call it before long work starts, so that a mistyped output is noticed at once.
     """
     try:
         mode, folder = mode_of(path), mode_of(path.parent)
-    except (OSError, ValueError) as error:  # a name too long, a folder that may not be looked into
+    except (OSError, ValueError) as error:  # a name too long, a folder that may not be entered
         raise RefineError(_explain(path, error)) from error
     if stat.S_ISDIR(mode):
         msg = f"{path}: is a folder, expected a file name to write to"
@@ -66,13 +66,13 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
 
 
 def mode_of(path: Path) -> int:
-    """Return what `path` is and who may use it, as `stat` says it; 0 where there is nothing.
+    """Return the type and permissions of `path`, as ``st_mode``; 0 if it does not exist.
 
     Raises
     ------
     OSError, ValueError
-        If the system cannot tell: a name too long, a folder that may not be looked into. Unlike
-        pathlib, which some versions of Python let take that for "nothing".
+        If the system cannot tell: a name too long, a folder that may not be entered. (In some
+        versions of Python, pathlib says then that the file does not exist.)
     """
     try:
         return path.stat().st_mode
@@ -81,7 +81,7 @@ def mode_of(path: Path) -> int:
 
 
 def refuse_mapped(path: Path, source: Path) -> None:
-    """Raise `RefineError` where `path` is the mapped file `source` and cannot be replaced."""
+    """Raise `RefineError` if `path` is the mapped file `source`, which cannot be replaced."""
     if REPLACES_MAPPED:
         return
     with contextlib.suppress(OSError, ValueError):
@@ -95,10 +95,10 @@ def refuse_mapped(path: Path, source: Path) -> None:
 
 @contextlib.contextmanager
 def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
-    """Open a temporary file beside `path` that takes its name once the block ends well.
+    """Open a temporary file beside `path`, which is renamed to `path` when the block ends.
 
-    Whatever interrupts the block (an error, a kill, a full disk), `path` is what it was before. A
-    symbolic link is followed: the file it points to is replaced, the link stays.
+    If the block is interrupted (by an error, a kill, a full disk), `path` stays as it was. If it is
+    a symbolic link, the file that it points to is replaced.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     refuse_existing(path, overwrite=overwrite)
     try:
         target = path.resolve()
-    except (OSError, RuntimeError) as error:  # links in a circle
+    except (OSError, RuntimeError) as error:  # such as a circle of links
         raise RefineError(_explain(path, error)) from error
     _remove_abandoned(target)
     try:
@@ -140,33 +140,33 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
 
 
 def _prefix(target: Path) -> str:
-    """Return what the names of a target's temporary files begin with on this machine.
+    """Return the start of the names of a target's temporary files on this machine.
 
-    Not the target's own name, which may be as long as a name can be. With the machine's, because
-    locks of other machines are not always seen.
+    It is a hash, since the target's own name may be as long as names can be. The machine's name is
+    in it because locks of other machines are not always visible.
     """
     owner = platform.node().encode() + b"\0" + os.fsencode(target.name)
     return f".refine-{hashlib.blake2b(owner, digest_size=8).hexdigest()}-"
 
 
 def _new_temporary(target: Path, held: contextlib.ExitStack) -> tuple[Path, int, BinaryIO]:
-    """Make a file beside `target` that nobody else may read, and which goes when `held` ends.
+    """Create a file beside `target` that only its owner may read.
 
-    It is locked until then, or until this process dies.
+    When `held` is closed, the file is removed. It is locked until then, or until this process dies.
 
     Returns
     -------
     path : Path
     mode : int
-        The permissions that a new file has, as the user wants them.
+        The permissions that the user wants new files to have.
     stream : binary file, open for writing
     """
     while True:
         temporary = target.with_name(f"{_prefix(target)}{secrets.token_hex(8)}.tmp")
-        # Ahead of the file itself, so that whatever interrupts from here on, none is left.
+        # Before the file exists, so that no interruption from here on can leave it behind.
         held.callback(_discard, temporary)
-        # What replaces a secret is one from the start. Otherwise the system applies the user's
-        # mask, which nobody can ask for without setting it, and the file is empty until it is safe.
+        # A file that replaces another is private from the start. A new one is created with the
+        # user's permissions, which cannot be read otherwise, and made private while it is empty.
         opener = _opener(0o600 if mode_of(target) else 0o666)
         stream = held.enter_context(open(temporary, "xb", opener=opener))  # noqa: SIM115
         mode = stat.S_IMODE(os.fstat(stream.fileno()).st_mode)
@@ -174,22 +174,22 @@ def _new_temporary(target: Path, held: contextlib.ExitStack) -> tuple[Path, int,
             temporary.chmod(0o600)
         if fcntl is None:
             return temporary, mode, stream
-        # A second descriptor: the file is closed, which may fail, before it gets its name.
+        # A second descriptor keeps the lock when the file is closed, before it is renamed.
         lock = os.dup(stream.fileno())
         held.callback(os.close, lock)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             taken = not os.fstat(lock).st_nlink
         except BlockingIOError:
-            taken = True  # by another run, which sees a file without an owner
+            taken = True  # another run locked it between these two lines, to remove it
         except OSError:
-            taken = False  # no locks on this file system: nobody removes anything here
+            taken = False  # this file system has no locks, so no run removes files here
         if not taken:
             return temporary, mode, stream
 
 
 def _opener(mode: int) -> Callable[[str, int], int]:
-    """Return what `open` asks for a file that it makes, with these permissions at most."""
+    """Return an opener for `open` that creates files with at most these permissions."""
     return lambda name, flags: os.open(name, flags, mode)
 
 
@@ -200,7 +200,7 @@ def _discard(temporary: Path) -> None:
 
 
 def _remove_abandoned(target: Path) -> None:
-    """Remove what killed runs on this machine left of this target: files that nobody locks."""
+    """Remove unlocked temporary files of this target: killed runs on this machine left them."""
     if fcntl is None:
         return
     ours = re.compile(re.escape(_prefix(target)) + r"[0-9a-f]{16}\.tmp")
@@ -211,6 +211,7 @@ def _remove_abandoned(target: Path) -> None:
 
 
 def _remove_unlocked(temporary: Path) -> None:
+    """Remove a regular file; raise `OSError` if another process has locked it."""
     descriptor = os.open(temporary, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
     try:
         if stat.S_ISREG(os.fstat(descriptor).st_mode):
@@ -221,23 +222,24 @@ def _remove_unlocked(temporary: Path) -> None:
 
 
 def _publish_new(temporary: Path, target: Path) -> None:
-    """Give `temporary` the name `target`, atomically refusing a name taken in the meantime."""
+    """Rename `temporary` to `target`; raise `FileExistsError` if that exists by now."""
     try:
         os.link(temporary, target)
     except FileExistsError:
         raise
     except OSError:
-        # No hard links here: two steps, the second of which refuses by itself on Windows.
+        # This file system has no hard links. On Windows, rename itself refuses an existing file.
         if target.exists():
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from None
         temporary.rename(target)
 
 
 def _explain(path: Path, error: Exception) -> str:
+    """Return the message for an error of the system."""
     number = getattr(error, "errno", None)
     if number in (errno.ENOSPC, errno.EDQUOT):
         return f"{path}: no space left on the disk; nothing was changed"
     if isinstance(error, FileExistsError):
-        return f"{path}: was made by somebody else in the meantime; it was left as it is"
+        return f"{path}: another program created this file in the meantime; it was left as it is"
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return f"{path}: cannot be written ({reason}); nothing was changed"

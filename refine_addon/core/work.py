@@ -19,9 +19,9 @@ Progress = Callable[[float, str], "bool | None"]
 
 Result = TypeVar("Result")
 
-_HELD = 30_000_000  # bytes; glibc ignores blocks above 32 MB here
-_PATIENCE = 0.1  # seconds between two reports while chunks take long
-_own = threading.local()  # of each thread; its `check` is what `checkpoint` calls
+_HELD = 30_000_000  # bytes; above 32 MB, freeing a block does not raise glibc's threshold
+_REPORT_INTERVAL = 0.1  # seconds between two reports while chunks take long
+_own = threading.local()  # `checkpoint` calls the `check` of its own thread
 
 
 def silent(_fraction: float, _what: str) -> None:
@@ -35,19 +35,19 @@ def report(progress: Progress, fraction: float, what: str) -> None:
 
 
 def part(progress: Progress, start: float, end: float) -> Progress:
-    """Return a callback whose 0..1 is `start`..`end` of `progress`."""
+    """Return a callback that maps fractions 0..1 to `start`..`end` of `progress`."""
     return lambda fraction, what: progress(start + (end - start) * fraction, what)
 
 
 def checkpoint() -> None:
-    """Let a chunk of `for_chunks` be cancelled here; does nothing in any other thread.
+    """Let the work of `for_chunks` be cancelled here; outside of such work, do nothing.
 
-    Work whose chunks take long calls this several times a second.
+    Work with long chunks calls this several times a second.
 
     Raises
     ------
     Cancelled
-        If the progress callback of that `for_chunks` answers ``False``.
+        If the progress callback given to `for_chunks` answers ``False``.
     """
     check: Callable[[], None] | None = getattr(_own, "check", None)
     if check is not None:
@@ -56,7 +56,7 @@ def checkpoint() -> None:
 
 @contextmanager
 def _checked_by(check: Callable[[], None]) -> Iterator[None]:
-    """Have `checkpoint` call `check` in this thread."""
+    """Make `checkpoint` call `check` in this thread, within the block."""
     before = getattr(_own, "check", None)
     _own.check = check
     try:
@@ -86,32 +86,32 @@ def for_chunks(
     Parameters
     ----------
     work : callable
-        Runs on several threads at once; NumPy's loops release the interpreter.
+        Called on several threads at once; NumPy's loops release the interpreter lock.
     total, chunk : int
         Length to cover and length of one slice.
     progress, what
-        Called from this thread, between slices and, where they take long, ten times a second;
-        with one thread only where the work calls `checkpoint`.
+        Called from this thread between slices, and ten times a second while a slice takes long;
+        with one thread, the latter only if the work calls `checkpoint`.
     threads : int, optional
-        1 runs everything here; by default `default_threads`.
+        1 runs everything in this thread; by default `default_threads`.
 
     Returns
     -------
     list
-        One result a slice, in the order of the slices whatever the number of threads.
+        One result for each slice, in the order of the slices.
 
     Raises
     ------
     Cancelled
-        If `progress` answers ``False``; work that has not begun is dropped, and what has begun
-        ends at its next `checkpoint`.
+        If `progress` answers ``False``. Slices that have not begun are dropped; those that have
+        begun end at their next `checkpoint`.
     """
-    # Freeing one block of this size makes glibc keep freed blocks up to it instead of handing them
-    # to the system, so the buffers of the next chunk are not mapped in again page by page.
+    # Freeing one 30 MB block raises glibc's mmap threshold, so chunk buffers are reused instead of
+    # page-faulted. No effect on other systems.
     np.empty(_HELD, np.uint8)
     slices = [slice(start, min(start + chunk, total)) for start in range(0, total, chunk)]
     threads = default_threads() if threads is None else threads
-    # About a hundred reports are enough for a bar, and each costs a draw.
+    # About a hundred reports are enough for a progress bar; each may cost a redraw.
     step = max(len(slices) // 100, 1)
     if threads <= 1 or len(slices) <= 1:
         return _in_turn(work, slices, step, progress, what)
@@ -121,8 +121,9 @@ def for_chunks(
 def _in_turn(
     work: Callable[[slice], Result], slices: list[slice], step: int, progress: Progress, what: str
 ) -> list[Result]:
+    """Do the work of `for_chunks` in this thread."""
     results: list[Result] = []
-    told = 0.0
+    told = 0.0  # when `progress` was last called, seconds
 
     def tell() -> None:
         nonlocal told
@@ -130,7 +131,7 @@ def _in_turn(
         report(progress, len(results) / len(slices), what)
 
     def check() -> None:
-        if time.monotonic() - told >= _PATIENCE:
+        if time.monotonic() - told >= _REPORT_INTERVAL:
             tell()
 
     with _checked_by(check):
@@ -149,6 +150,7 @@ def _side_by_side(
     what: str,
     threads: int,
 ) -> list[Result]:
+    """Do the work of `for_chunks` on several threads."""
     cancelled = threading.Event()
 
     def check() -> None:
@@ -166,7 +168,7 @@ def _side_by_side(
             for index, future in enumerate(futures):
                 if index % step == 0:
                     report(progress, index / len(slices), what)
-                while not future.done() and not wait([future], _PATIENCE).done:
+                while not future.done() and not wait([future], _REPORT_INTERVAL).done:
                     report(progress, index / len(slices), what)
                 results.append(future.result())
         except BaseException:

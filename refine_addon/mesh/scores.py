@@ -71,7 +71,7 @@ def store(
             "views_given": scores.views_given,
             "views_used": scores.views_used,
             "undrawable": scores.undrawable,
-            "weights": scores.weights,
+            "weights": scores.facts,
             "notes": scores.notes,
             "origin": origin,
         }
@@ -119,7 +119,7 @@ def stored_scores(checked: SplatObject) -> Scores:
         seen=mesh_attributes.read_attribute(mesh, SEEN),
         views_used=noted["views_used"],
         undrawable=noted.get("undrawable", 0),
-        weights=noted.get("weights", {}),
+        facts=noted.get("weights", {}),
         notes=tuple(noted.get("notes", ())),
         method=noted.get("method", ""),
         frustum=noted.get("frustum", True),

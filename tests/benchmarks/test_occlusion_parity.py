@@ -11,8 +11,9 @@ pytest.importorskip("numba")
 
 from benchmarks.renderer import rasterizer
 from refine_addon.core import Splats, View, ViewSet
-from refine_addon.core.scoring import occlusion, projection
-from refine_addon.core.scoring.occlusion import Measured, Occlusion
+from refine_addon.core.scoring import measuring, projection
+from refine_addon.core.scoring.measuring import Measured
+from refine_addon.core.scoring.occlusion import Occlusion
 
 SIDES = (12.0, 6.0, 3.0, 1.5)
 
@@ -40,16 +41,16 @@ def measured(splats: Splats, side: float) -> Measured:
     gaussians, frame, _ = projection.prepare(splats, views, threads=1)
     total = Measured.zero(len(gaussians))
     settings = Occlusion(cell=side, density=8.0)
-    occlusion.measure_view(gaussians, frame, view(), 1.0, settings, total)
+    measuring.measure_view(gaussians, frame, view(), 1.0, settings, total)
     back = np.argsort(gaussians.index)
-    return Measured(total.contribution[back], total.contrast[back], total.seen[back])
+    return Measured(total.contribution[back], total.error[back], total.seen[back])
 
 
 def relative_errors(kind: str) -> np.ndarray:
     """Sum of absolute errors over the sum of values, for each of `SIDES`; edges left out."""
     splats = crowd()
     _, exact = rasterizer.render_with_statistics(splats, view())
-    truth = {"contribution": exact.weight_sum, "contrast": exact.removal_error}[kind]
+    truth = {"contribution": exact.weight_sum, "error": exact.removal_error}[kind]
     middle = np.abs(splats.means[:, :2] / splats.means[:, 2:]).max(axis=1) < 0.25
     errors = []
     for side in SIDES:
@@ -68,9 +69,9 @@ def test_contributions_converge_to_the_rendered_ones():
     assert errors[-1] < 0.12, errors
 
 
-def test_contrasts_converge_to_the_rendered_removal_error():
-    """The squared error of removing one splat is contrast; 15 % or less at 1.5."""
-    errors = relative_errors("contrast")
+def test_errors_converge_to_the_rendered_removal_error():
+    """The error is what the rendered picture changes by without one splat; 15 % or less at 1.5."""
+    errors = relative_errors("error")
 
     slope = np.polyfit(np.log2(SIDES), np.log2(errors), 1)[0]
     assert (np.diff(errors) < 0).all()

@@ -608,6 +608,57 @@ def test_when_half_have_gone_neighbours_are_found_anew():
     assert graph.deleted == 0
 
 
+@pytest.fixture
+def rounds(monkeypatch):
+    """Fail where a round does nothing, since `reduce` would then repeat it forever."""
+    carry_out = MergeGraph._round
+
+    def checked(self, quota):
+        done = carry_out(self, quota)
+        assert done > 0, "a round did nothing"
+        return done
+
+    monkeypatch.setattr(MergeGraph, "_round", checked)
+
+
+@pytest.mark.usefixtures("rounds")
+@pytest.mark.parametrize("unknown", [np.nan, np.inf])
+@pytest.mark.parametrize("goal", [0, 1, 3, 5])
+def test_splats_of_unknown_error_go_last_and_exactly_as_many_as_asked_stay(unknown, goal):
+    """Errors .01 and .02 are known: rows 3 and 1 go first, then the rest in their order."""
+    places = np.outer(np.arange(6) * 100.0, [1, 0, 0])
+    error = [unknown, 0.02, unknown, 0.01, unknown, unknown]
+    graph = MergeGraph(flat([0.5] * 6, places, np.ones((6, 3)), error=error), SCENE, 1.0)
+
+    graph.reduce(goal)
+
+    assert np.flatnonzero(graph.alive).tolist() == sorted([3, 1, 0, 2, 4, 5][6 - goal :])
+
+
+@pytest.mark.usefixtures("rounds")
+def test_splats_of_infinite_error_are_not_merged():
+    """A merge that is not cheaper than deleting is none: both lie in one place, one is deleted."""
+    field = flat([0.5] * 2, np.zeros((2, 3)), np.ones((2, 3)), error=[np.inf, np.nan])
+    graph = MergeGraph(field, SCENE, 1.0)
+
+    graph.reduce(1)
+
+    assert (graph.alive.tolist(), graph.deleted) == ([False, True], 1)
+
+
+@pytest.mark.usefixtures("rounds")
+@pytest.mark.parametrize("focal", [1e-200, 1e200])
+def test_a_view_of_an_absurd_focal_length_neither_warns_nor_hangs(focal):
+    """Focal lengths whose square leaves float64 count as 1e-9 or 1e9 px: 50 of 100 survive."""
+    views = around()
+    absurd = replace(views[0], fx=focal, fy=focal)
+
+    absorbed = absorb(cloud(100), ViewSet((*views, absurd)), measure, 50)
+
+    assert len(absorbed.splats) == 50
+    assert all(np.isfinite(getattr(absorbed.splats, name)).all() for name in FIELDS)
+
+
 def test_undrawable_splats_go_first():
     splats = cloud(100)
     splats.means[7] = np.nan

@@ -63,7 +63,7 @@ def test_the_kept_set_differs_from_the_full_models_by_no_more_than_the_tolerance
     scores = auto.score(*scene, tolerance, CHEAP)
 
     assert auto.disagreement(full, scores) <= tolerance
-    assert scores.weights["auto"]["estimate"] <= tolerance
+    assert scores.facts["auto"]["estimate"] <= tolerance
 
 
 @pytest.mark.slow
@@ -88,7 +88,7 @@ def test_no_tolerance_is_the_full_model_to_the_bit(scene):
 
 def test_where_all_may_differ_the_cheapest_model_is_taken(scene):
     """A kept set may differ altogether."""
-    facts = auto.score(*scene, 1.0, CHEAP).weights["auto"]
+    facts = auto.score(*scene, 1.0, CHEAP).facts["auto"]
 
     assert facts["model"] == "closed form without frustum test"
 
@@ -138,7 +138,7 @@ class Told:
         view = View(np.eye(3), np.zeros(3), 50.0, 50.0, 50.0, 50.0, 100, 100)
         views = ViewSet(tuple(replace(view, center=np.array([x, 0.0, 0.0])) for x in range(count)))
         scores = auto.score(None, views, tolerance, CHEAP)
-        return scores.weights["auto"]
+        return scores.facts["auto"]
 
 
 NAMES = ["closed form without frustum test", "closed form", "occlusion measured once", "occlusion"]
@@ -219,7 +219,7 @@ def test_views_of_no_weight_are_not_waited_for(scene):
     scores = auto.score(splats, some, 0.0, CHEAP)
 
     assert scores.views_used == 8
-    assert list(scores.weights["auto"]["tried"]) == NAMES[:3]
+    assert list(scores.facts["auto"]["tried"]) == NAMES[:3]
 
 
 @pytest.mark.slow
@@ -235,8 +235,8 @@ def test_probes_that_see_nothing_leave_it_to_the_full_model(scene, monkeypatch):
 
     expected = occlusion.score(splats, many, CHEAP[1]).values
     np.testing.assert_array_equal(scores.values, expected)
-    assert "as the 1 that probed see nothing; that is the full model" in scores.notes[-1]
-    assert scores.weights["auto"]["model"] == "occlusion"
+    assert "as none of 1 probe views sees anything; that is the full model" in scores.notes[-1]
+    assert scores.facts["auto"]["model"] == "occlusion"
 
 
 def test_a_cheaper_model_that_sees_nothing_does_not_agree(monkeypatch):

@@ -551,7 +551,7 @@ def test_panoramas_are_refused(tmp_path, keys):
     message = refused(tmp_path, with_frame(**keys))
 
     assert "frame 1: '" in message
-    assert "cameras are no pinholes, expected a perspective camera" in message
+    assert "cameras are not pinholes, expected a perspective camera" in message
 
 
 @pytest.mark.parametrize(

@@ -191,9 +191,7 @@ def test_both_published_readings_give_the_numbers_worked_out_by_hand(depth, eta,
     scores = closed_form.score(splats, views, ClosedForm.published(depth))
 
     np.testing.assert_allclose(scores.values, expected, rtol=1e-6)
-    assert scores.weights["lambda"] == pytest.approx(
-        {"geometry": gem, "color": col, "opacity": opa}
-    )
+    assert scores.facts["lambda"] == pytest.approx({"geometry": gem, "color": col, "opacity": opa})
 
 
 def test_only_splats_inside_the_frustum_are_seen():
@@ -294,7 +292,7 @@ def test_scaling_moving_and_turning_the_scene_keeps_the_scores(seed, exponent, m
     scores = closed_form.score(moved, there)
 
     np.testing.assert_allclose(scores.values, here.values, rtol=2e-5)
-    assert scores.weights["lambda"] == pytest.approx(here.weights["lambda"], rel=1e-5)
+    assert scores.facts["lambda"] == pytest.approx(here.facts["lambda"], rel=1e-5)
 
 
 @pytest.mark.parametrize(("chunk", "threads", "block"), [(7, 1, 64), (64, 3, 2), (4096, 2, 1)])

@@ -429,7 +429,7 @@ def test_a_count_below_what_the_file_holds_is_refused(tmp_path, file):
 
     message = refused(tmp_path, path.name)
 
-    expected = f"byte {first}: expected the end of the file behind 1 {file[:-1]}"
+    expected = f"byte {first}: expected the end of the file after 1 {file[:-1]}"
     assert f"{expected}, got {len(whole) - first} more bytes" in message
 
 

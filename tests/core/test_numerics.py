@@ -28,7 +28,7 @@ from refine_addon.core import (
 from refine_addon.core.absorbing import merge_field, merge_graph
 from refine_addon.core.pipeline import absorb_removed
 from refine_addon.core.scoring import froxels, projection
-from refine_addon.core.scoring.adaptive import Statistics, weights
+from refine_addon.core.scoring.adaptive import Statistics, lambdas
 from refine_addon.core.splats import drawable, opacity
 
 FINITE = [
@@ -94,10 +94,10 @@ def check(splats, scores):
     assert scores.undrawable == np.count_nonzero(~good)
     assert (scores.seen >= 0).all()
     assert (scores.seen <= scores.views_used).all()
-    if "lambda" in scores.weights:
-        lambdas = list(scores.weights["lambda"].values())
-        assert all(0 <= value <= 1 for value in lambdas)
-        assert sum(lambdas) == pytest.approx(1)
+    if "lambda" in scores.facts:
+        terms = list(scores.facts["lambda"].values())
+        assert all(0 <= value <= 1 for value in terms)
+        assert sum(terms) == pytest.approx(1)
 
 
 def check_the_others(splats, scores, settings):
@@ -387,7 +387,7 @@ def test_identical_splats_hide_each_other_where_occlusion_counts():
 )
 def test_weights_of_scenes_without_variety(statistics, expected):
     """Each lambda in [0, 1], their sum 1, equal where there is nothing to tell them apart."""
-    assert weights(statistics) == pytest.approx(expected)
+    assert lambdas(statistics) == pytest.approx(expected)
 
 
 @by_method_and_reading
@@ -403,8 +403,8 @@ def test_a_scene_without_variety_is_scored(settings):
     scores = scored(splats, settings=settings)
 
     check(splats, scores)
-    if scores.weights.keys() == {"lambda", "statistics"}:
-        assert list(scores.weights["lambda"].values()) == pytest.approx([1 / 3] * 3)
+    if scores.facts.keys() == {"lambda", "statistics"}:
+        assert list(scores.facts["lambda"].values()) == pytest.approx([1 / 3] * 3)
 
 
 @pytest.mark.parametrize("step", [-1e-3, -1e-7, 0.0, 1e-7, 1e-3])
@@ -416,7 +416,7 @@ def test_the_weight_of_geometry_has_no_jump_where_its_logarithm_crosses_zero(ste
     scores = scored(splats, settings=READINGS["paper"])
 
     check(splats, scores)
-    assert scores.weights["lambda"]["geometry"] <= max(step, 0.0)
+    assert scores.facts["lambda"]["geometry"] <= max(step, 0.0)
 
 
 # ----- everything at once
@@ -542,7 +542,7 @@ def test_the_ranking_is_the_same_in_nanometres_and_in_light_years(exponent, sett
 
 def check_alike(one, other):
     """Assert equal scores, but for rounding: 1e-5, or of a ranking one swap of neighbours."""
-    tolerance = {"rtol": 1e-5} if "lambda" in one.weights else {"atol": 1.5 / len(one.values)}
+    tolerance = {"rtol": 1e-5} if "lambda" in one.facts else {"atol": 1.5 / len(one.values)}
     np.testing.assert_allclose(one.values, other.values, **tolerance)
 
 

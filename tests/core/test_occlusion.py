@@ -10,8 +10,9 @@ import pytest
 
 from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet, work
 from refine_addon.core.affine import transformed
-from refine_addon.core.scoring import coverage, froxels, occlusion, projection
-from refine_addon.core.scoring.occlusion import Measured, Occlusion
+from refine_addon.core.scoring import coverage, froxels, measuring, occlusion, projection
+from refine_addon.core.scoring.measuring import Measured
+from refine_addon.core.scoring.occlusion import Occlusion
 from refine_addon.core.splats import SH_C0, rotation_matrices
 
 ONCE = Occlusion(rounds=1)
@@ -47,9 +48,9 @@ def measured(splats: Splats, *views: View, settings: Occlusion = ONCE) -> Measur
     gaussians, frame, _ = projection.prepare(splats, ViewSet(views), threads=1)
     total = Measured.zero(len(gaussians))
     for view in views:
-        occlusion.measure_view(gaussians, frame, view, 1.0, settings, total)
+        measuring.measure_view(gaussians, frame, view, 1.0, settings, total)
     back = np.argsort(gaussians.index)
-    return Measured(total.contribution[back], total.contrast[back], total.seen[back])
+    return Measured(total.contribution[back], total.error[back], total.seen[back])
 
 
 def cloud(count=300, seed=0) -> Splats:
@@ -124,13 +125,13 @@ def test_a_lone_splat_contributes_the_integral_of_its_alpha():
     assert found.seen.tolist() == [1]
 
 
-def test_a_lone_splat_on_black_has_the_contrast_of_its_colour():
+def test_a_lone_splat_on_black_has_the_error_of_its_colour():
     """Integral of alpha^2 is ``pi variance (A^2 - 1/255^2)``; gray .5 on black: 3 x .25."""
     expected = math.pi * (2.5**2 + 0.3) * (0.25 - CUT**2) * 0.75
 
     found = measured(splats_of([[0, 0, 2]]), look_along_z())
 
-    assert found.contrast[0] == pytest.approx(expected, rel=1e-5)
+    assert found.error[0] == pytest.approx(expected, rel=1e-5)
 
 
 def test_a_long_splat_is_measured_by_both_its_axes():
@@ -179,7 +180,7 @@ def test_a_wall_hides_nothing_beside_it():
     np.testing.assert_allclose(beside.contribution[len(means) :], alone.contribution, rtol=1e-4)
 
 
-def test_what_has_the_colour_of_what_is_behind_it_has_no_contrast():
+def test_what_has_the_colour_of_what_is_behind_it_has_no_error():
     """In front of an opaque wall of its own gray a splat can go; of another gray it cannot."""
     means = np.vstack([wall(2.0), [[0, 0, 1.5]]])
     alphas = np.r_[np.full(len(means) - 1, 0.99), 0.5]
@@ -189,9 +190,9 @@ def test_what_has_the_colour_of_what_is_behind_it_has_no_contrast():
         splats_of(means, alphas, gray=np.r_[np.full(len(means) - 1, 0.5), 0.9]), look_along_z()
     )
 
-    assert same.contrast[-1] < 1e-3 * other.contrast[-1]
+    assert same.error[-1] < 1e-3 * other.error[-1]
     expected = math.pi * ((5 / 1.5) ** 2 + 0.3) * (0.25 - CUT**2) * 3 * 0.4**2
-    assert other.contrast[-1] == pytest.approx(expected, rel=0.02)
+    assert other.error[-1] == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize("side", [2.0, 4.0, 8.0])
@@ -254,7 +255,7 @@ def let_through(*alphas: float) -> float:
 
 
 def test_a_veil_lets_through_what_it_leaves_uncovered():
-    """Behind veils of alpha .6 and .9 a small splat contributes T, its contrast is T^2."""
+    """Behind veils of alpha .6 and .9 a small splat contributes T, its error is T^2."""
     small = splats_of([[0, 0, 3]])
     behind = measured(
         Splats(
@@ -269,10 +270,10 @@ def test_a_veil_lets_through_what_it_leaves_uncovered():
 
     passed = let_through(0.6, 0.9)
     assert behind.contribution[2] / alone.contribution[0] == pytest.approx(passed, rel=1e-4)
-    assert behind.contrast[2] / alone.contrast[0] == pytest.approx(passed**2, rel=1e-4)
+    assert behind.error[2] / alone.error[0] == pytest.approx(passed**2, rel=1e-4)
 
 
-def test_the_contrast_of_each_veil_is_to_what_lies_behind_it():
+def test_the_error_of_each_veil_comes_from_its_contrast_to_what_lies_behind_it():
     """White .3 before gray .5 before .8 of gray .25: B = a c + (1 - a) B' from the back."""
     alphas, grays = np.array([0.3, 0.5, 0.8]), np.array([1.0, 0.5, 0.25])
     cover = alphas - CUT
@@ -285,7 +286,7 @@ def test_the_contrast_of_each_veil_is_to_what_lies_behind_it():
         one = slice(index, index + 1)
         alone = measured(veils(alphas[one], grays[one], [1]), square())
         expected = (passed[index] * (grays[index] - behind[index]) / grays[index]) ** 2
-        assert found.contrast[index] / alone.contrast[0] == pytest.approx(expected, rel=1e-3)
+        assert found.error[index] / alone.error[0] == pytest.approx(expected, rel=1e-3)
         visible = found.contribution[index] / alone.contribution[0]
         assert visible == pytest.approx(passed[index], rel=1e-4)
 
@@ -329,7 +330,7 @@ def test_half_of_a_splat_on_the_edge_of_the_image_counts(x, y):
     found = measured(splats_of([[x, y, 2]], scales=0.16), look_along_z())
 
     assert found.contribution[0] / inside.contribution[0] == pytest.approx(0.5, abs=0.05)
-    assert found.contrast[0] / inside.contrast[0] == pytest.approx(0.5, abs=0.05)
+    assert found.error[0] / inside.error[0] == pytest.approx(0.5, abs=0.05)
 
 
 @pytest.mark.parametrize(("x", "y"), [(-0.82, 0), (0.82, 0), (0, -0.62), (0, 0.62)])
@@ -429,7 +430,7 @@ def test_what_lies_below_a_wide_image_is_not_seen():
 # ----- rounds, weights, floor
 
 
-def test_the_score_is_the_contrast_times_a_power_of_the_contribution():
+def test_the_score_is_the_error_times_a_power_of_the_contribution():
     """P = 1/4 + 1/2 of what has gone: 3 x 16^(1/4) = 6, and 3 x 16^(1/2) = 12 from half on."""
     sums = Measured(np.array([16.0]), np.array([3.0]), np.array([1], np.int32))
 
@@ -444,7 +445,7 @@ def test_a_view_of_thrice_the_weight_counts_thrice():
 
     both = occlusion.measure(splats, ViewSet((one, replace(two, weight=3.0))))
 
-    for name in ("contribution", "contrast"):
+    for name in ("contribution", "error"):
         first, second = (getattr(sums, name) for sums in alone)
         np.testing.assert_allclose(
             getattr(both, name), 0.25 * first + 0.75 * second, rtol=1e-3, atol=1e-3 * first.max()
@@ -518,9 +519,9 @@ def test_the_floor_weighs_what_loses_least_of_what_the_left_out_views_saw():
     found = coverage.floor_weights([(right, wrong, errors), (right, wrong, dark)])
     tenth = np.argsort(coverage.with_floor(right, wrong, found[0]))[:20]
     np.testing.assert_array_equal(np.sort(tenth), np.sort(np.argsort(right)[:20]))
-    assert found[2:] == list(coverage.LEAST_WEIGHTS)[2:]
+    assert found[2:] == list(coverage.LEAST_FLOOR_WEIGHTS)[2:]
     most = coverage.floor_weights([(wrong, right, errors)])
-    assert min(most) == pytest.approx(max(coverage.WEIGHTS))
+    assert min(most) == pytest.approx(max(coverage.FLOOR_WEIGHTS))
     assert coverage.floor_weights([]) == [1.0] * len(coverage.SHARES)
     assert coverage.floor_weights([(right, wrong, dark)]) == [1.0] * len(coverage.SHARES)
     plain, glare = (np.vstack([errors, wrong * bright]) for bright in (1.0, 1e6))
@@ -706,7 +707,7 @@ def test_a_view_of_many_splats_is_cancelled_within(monkeypatch):
     """
     monkeypatch.setattr(projection, "_CHUNK", 50)
     monkeypatch.setattr(froxels, "_BLOCK", 50)
-    monkeypatch.setattr(work, "_PATIENCE", 0.0)
+    monkeypatch.setattr(work, "_REPORT_INTERVAL", 0.0)
     steps = []
 
     def scoring(last=10**6):

@@ -31,7 +31,7 @@ from refine_addon.core import (
 )
 from refine_addon.core.pipeline import decide
 from refine_addon.core.scoring import froxels, projection
-from refine_addon.core.scoring.adaptive import Statistics, weights
+from refine_addon.core.scoring.adaptive import Statistics, lambdas
 from refine_addon.core.scoring.closed_form import LUMA
 from refine_addon.core.selection import rank
 from refine_addon.core.task import Task
@@ -203,7 +203,7 @@ def in_doubles(splats: Splats, views: ViewSet) -> Scores:
     alpha = 1.0 / (1.0 + np.exp(-splats.opacity_logits.astype(np.float64)))
     low, middle_one, high = np.sort(splats.log_scales.astype(np.float64), axis=1).T
     luma = (0.28209479177387814 * splats.sh_dc.astype(np.float64) + 0.5).clip(0, 1) @ LUMA
-    lambdas = weights(
+    factors = lambdas(
         Statistics(
             float(np.mean(np.minimum(np.exp(high - low), 1e6))),
             float(np.var(luma)),
@@ -211,7 +211,7 @@ def in_doubles(splats: Splats, views: ViewSet) -> Scores:
         )
     )
     values = np.zeros(len(means))
-    for share, content in zip(lambdas, (np.exp(middle_one + high), luma**2, alpha**2), strict=True):
+    for share, content in zip(factors, (np.exp(middle_one + high), luma**2, alpha**2), strict=True):
         term = alpha * total * content
         values += share * term / term.mean()
     return Scores(values, seen, len(views), 0)
@@ -442,16 +442,16 @@ def test_splats_without_scores_need_views_to_decide(small):
 @pytest.mark.slow
 @pytest.mark.parametrize("method", ["closed-form", "occlusion"])
 def test_a_report_of_absorbing_says_what_decided_and_what_was_asked(small, views, method):
-    """Occlusion's measure decides; a method that had nothing to decide is said not to have."""
+    """Occlusion's measure decides; a note says that another method was not used."""
     splats = read_ply(small).splats()
     once = score(splats, views, Settings("occlusion", occlusion=Occlusion(rounds=1)))
 
     report = prune(splats, views, Budget(ratio=0.5), Settings(method), absorb=True).report
 
     assert report["settings"]["method"] == method
-    assert report["weights"] == once.weights
+    assert report["weights"] == once.facts
     assert report["splats"]["unseen"] == np.count_nonzero(once.seen == 0)
-    said = any("closed-form had nothing to decide" in note for note in report["notes"])
+    said = any("closed-form was not used" in note for note in report["notes"])
     assert said == (method == "closed-form")
 
 

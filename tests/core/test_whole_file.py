@@ -422,7 +422,7 @@ def test_a_name_taken_while_the_block_ran_is_not_lost(tmp_path):
             with whole_file(path, overwrite=False) as early:
                 early.write(b"early")
 
-    with pytest.raises(RefineError, match="out: was made by somebody else in the meantime"):
+    with pytest.raises(RefineError, match="out: another program created this file in the meantime"):
         race()
 
     assert contents(tmp_path) == {"out": b"early"}
@@ -445,7 +445,7 @@ def test_a_file_system_without_hard_links_is_written_to_the_same(tmp_path, monke
                 path.write_bytes(b"early")
 
     if taken:
-        with pytest.raises(RefineError, match="was made by somebody else"):
+        with pytest.raises(RefineError, match="another program created this file"):
             write()
     else:
         write()

@@ -1,8 +1,8 @@
-"""Survivors take over what is removed: the cheapest merges and deletions, until the budget is met.
+"""Absorbing: reduce splats to a number by the cheapest merges and deletions.
 
-`merging` says what merging two splats costs the pictures, and `merge_graph` carries out the
-cheapest operations. What the views see of the survivors changes on the way, so the work is done
-in stages, and measured anew before each. Splats that absorb nothing stay as they were to the bit.
+`merging` computes what a merge costs, and `merge_graph` carries out the cheapest operations. What
+the views see of the survivors changes meanwhile, so the work is done in stages, and the splats left
+are measured before each. Survivors that absorb nothing stay as they were, to the bit.
 """
 
 from __future__ import annotations
@@ -31,29 +31,29 @@ if TYPE_CHECKING:
     from .merge_field import Array, Index
 
 Measure = Callable[[Splats, Progress], ViewSums]
-"""Called with splats, as they are by then; says what the views see of each."""
+"""``measure(splats, progress)`` returns what the views see of each of the splats it is given."""
 
 STAGE = 0.6
-"""Share of the splats that a stage leaves at least."""
+"""A stage leaves at least this share of its splats."""
 
 PATIENCE = 2.0
-"""Factor on the cost of merging where half of the splats go. See `patience`."""
+"""Factor on the cost of merging if half of the splats go; see `patience`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Absorbed:
-    """What is left of N splats.
+    """The result of absorbing N splats.
 
     Attributes
     ----------
     splats : Splats
-        The K survivors, in their old order, in float64.
+        The K survivors, in the order of the N splats, in float64.
     keep : (N,) bool
-        Which they are.
+        Which splats survive.
     changed : (K,) bool
-        Which of them absorbed others; the rest are what they were, to the bit.
+        Which survivors absorbed others; all others are equal to the bit to what they were.
     merged, deleted : int
-        How many splats went into a survivor, and how many are gone altogether.
+        How many splats were absorbed by a survivor, and how many were deleted.
     """
 
     splats: Splats
@@ -68,19 +68,26 @@ class Absorbed:
         return {"changed": changed, "merged": self.merged, "deleted": self.deleted}
 
     def note(self) -> str:
-        """Return the counts as a sentence: absorbing is never silent."""
+        """Return the counts as a sentence, for the user."""
         return "{changed:,} survivors absorbed {merged:,} splats; {deleted:,} were deleted".format(
             **self.facts()
         )
 
 
 def patience(share: float) -> float:
-    """Return how much dearer merging is made, by the share of the splats that is to go.
+    """Return the factor on the cost of merging, given the share of the splats that goes.
 
-    The errors of deletions add up as long as few splats go. The more of its neighbours go with
-    it, the more their errors become one, whose square grows faster: a surface thins. Merging keeps
-    the mass, so that its errors stay apart. By the odds of staying; the result hardly depends on it
-    (half of it or twice cost .3 dB or less on three scenes).
+    It is `PATIENCE` times the square root of the odds of staying, (1 - share) / share.
+
+    If few splats go, the squared errors of their deletions add up. If neighbours go together, their
+    errors add up before they are squared, which costs more: a surface thins out. Merging keeps the
+    mass, so it does not have this problem, and is made cheaper the more splats go. The result
+    hardly depends on the factor: half or twice of it costs at most .3 dB on three scenes.
+
+    Parameters
+    ----------
+    share : float
+        Of the splats that go, 0 to 1.
 
     Examples
     --------
@@ -91,7 +98,7 @@ def patience(share: float) -> float:
     return PATIENCE * math.sqrt((1.0 - share) / share)
 
 
-def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
+def absorb(  # noqa: PLR0913 - three keywords are optional
     splats: Splats,
     views: ViewSet,
     measure: Measure,
@@ -101,20 +108,20 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Absorbed:
-    """Reduce splats to `keep_count` by merging and deleting, whatever costs the views least.
+    """Reduce splats to `keep_count` by the merges and deletions that cost the pictures least.
 
     Parameters
     ----------
     splats : Splats
         In the frame and unit of the views.
     views : ViewSet
-        They tell from where each splat is looked at.
+        From where the splats are seen.
     measure : callable
-        ``measure(splats, progress)`` returns a `ViewSums`; called once a stage.
+        See `Measure`; called once in each stage.
     keep_count : int
-        How many survive; more where more are protected. Splats that no renderer can draw go first.
+        How many survive, or more if more are protected. Undrawable splats go first.
     protected : (N,) bool, optional
-        Splats that neither vanish nor change.
+        Splats that are neither removed nor changed.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
     threads : int, optional
@@ -131,11 +138,12 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
     count = len(splats)
     spared = np.zeros(count, np.bool_) if protected is None else np.array(protected, np.bool_)
     goal = max(keep_count, int(np.count_nonzero(spared)), 0)
-    # Merged splats merge again. Rounding them to float32 in between would depend on the frame.
+    # In float64, since merged splats merge again, and rounding between would depend on the frame.
     splats = Splats(
         **{name: np.asarray(values, np.float64) for name, values in vars(splats).items()}
     )
     scene = scene_of(splats.means, drawable(splats), views)
+    # Of each splat left: its row among the N, and how many of the N it stands for.
     origin, members = np.arange(count), np.ones(count, np.int64)
     factor = patience(1.0 - goal / max(count, 1))
     stages = math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE)) if goal < count else 0
@@ -147,7 +155,7 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
             splats, views, scene, sums, max(left, goal), protected=spared[origin],
             factor=factor, progress=part(ahead, 0.5, 1.0), threads=threads,
         )  # fmt: skip
-        # A survivor stands for all that those it took stood for.
+        # A survivor now also stands for all that the splats it absorbed stood for.
         members = np.bincount(taken[taken >= 0], members[taken >= 0], len(splats)).astype(np.int64)
         origin = origin[kept]
     keep = np.zeros(count, np.bool_)
@@ -156,7 +164,7 @@ def absorb(  # noqa: PLR0913 - what, seen how, how much, what is spared
     return Absorbed(splats, keep, members > 1, merged, count - len(origin) - merged)
 
 
-def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
+def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     splats: Splats,
     views: ViewSet,
     scene: Scene,
@@ -168,16 +176,26 @@ def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Splats, NDArray[np.bool_], Index]:
-    """Do one stage of `absorb`; `factor` is on the cost of merging.
+    """Do one stage of `absorb`.
+
+    Parameters
+    ----------
+    splats, views, keep_count, protected, progress, threads
+        See `absorb`.
+    scene : Scene
+    sums : ViewSums
+        Of these splats.
+    factor : float
+        On the cost of merging, see `patience`.
 
     Returns
     -------
     splats : Splats
         The K survivors of N.
     keep : (N,) bool
-        Which they are.
+        Which splats survive.
     taken : (N,) int64
-        Into which survivor each splat went; -1 where it was deleted.
+        Which of the K survivors each splat is, or was absorbed by; -1 if it was deleted.
     """
     sums = ViewSums(np.asarray(sums.contribution, np.float64), np.asarray(sums.error, np.float64))
     good, free = drawable(splats), ~protected
@@ -191,7 +209,7 @@ def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
     report(progress, 0.0, "absorbing")
     if excess <= 0:
         return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1)
-    # In an order of the scene's own, so that ties do not depend on that of the file.
+    # Sorted by place in the scene, so that ties do not depend on the order of the file.
     rows = rows[spatial_order(scene.place(splats.means[rows]))]
     found = merge_field.field(splats, rows, views, scene, sums, threads=threads)
     graph = MergeGraph(found, scene, factor, threads=threads)
@@ -203,22 +221,35 @@ def _absorb_once(  # noqa: PLR0913 - what, seen how, how much, what is spared
 def _written(
     splats: Splats, keep: NDArray[np.bool_], rows: Index, graph: MergeGraph
 ) -> tuple[Splats, NDArray[np.bool_], Index]:
-    """Return what `_absorb_once` does, the merged splats written over those that absorbed."""
+    """Return the results of `_absorb_once`, with the merged splats in place of the survivors.
+
+    Parameters
+    ----------
+    splats : Splats
+        The N splats of the stage.
+    keep : (N,) bool
+        Which of them survive.
+    rows : (M,) int64
+        Rows of the splats that the graph holds.
+    graph : MergeGraph
+        Reduced; its field shrinks to the changed survivors.
+    """
     own = np.arange(len(rows))
+    # (M,) each: the survivor that each splat went into, and its share of the survivor's colour.
     owner, share = own.copy(), np.ones(len(rows))
-    # Backwards, so that a splat absorbed early follows its survivor to the last one.
+    # From the last round to the first: a survivor of one round may be absorbed in a later one.
     for into, gone, kept_share in reversed(graph.merges):
         owner[gone] = owner[into]
         share[gone] = share[into] * (1.0 - kept_share)
         share[into] *= kept_share
-    changed = np.zeros(len(rows), np.bool_)
+    changed = np.zeros(len(rows), np.bool_)  # (M,), survivors that absorbed others
     changed[owner[owner != own]] = True
     changed &= graph.alive
-    place = np.cumsum(keep) - 1
-    target = place[rows[changed]]
-    members = np.flatnonzero(changed[owner])
+    place = np.cumsum(keep) - 1  # (N,), row of each survivor among the K
+    target = place[rows[changed]]  # (C,)
+    members = np.flatnonzero(changed[owner])  # all that went into one of them, themselves included
     harmonics = _Blend(rows[members], place[rows[owner[members]]], share[members])
-    # The rest of the field makes room for the survivors.
+    # Drop the rest of the field before the survivors are copied, to save memory.
     merged = graph.field = graph.field.take(np.flatnonzero(changed))
     with np.errstate(under="ignore"):
         logs, quaternions = merging.axes(merged.covariances)
@@ -236,7 +267,16 @@ def _written(
 
 
 class _Blend:
-    """Weighted means of rows, group by group; the weights of a group sum to 1."""
+    """Means of rows in groups, weighted by shares that sum to 1 in each group.
+
+    Parameters
+    ----------
+    members : (m,) int64
+        Rows to take means of.
+    targets : (m,) int64
+        To which row the mean is written that each member belongs to.
+    share : (m,) float64
+    """
 
     def __init__(self, members: Index, targets: Index, share: Array) -> None:
         order = np.argsort(targets, kind="stable")
@@ -245,10 +285,10 @@ class _Blend:
         self.targets = targets[order][self.starts]
 
     def put(self, values: NDArray[Any], kept: NDArray[Any]) -> NDArray[Any]:
-        """Write the means of `values`, (N, K, 3), over the target rows of `kept`; return it."""
+        """Write the means of `values`, (N, K, 3), to the target rows of `kept`; return `kept`."""
         if len(self.starts):
             for column in range(values.shape[1]):
-                # A column at a time bounds the memory.
+                # One column at a time, to save memory.
                 own = np.asarray(values[self.members, column], np.float64)
                 means = np.add.reduceat(own * self.share[:, None], self.starts)
                 kept[self.targets, column] = means
@@ -256,12 +296,12 @@ class _Blend:
 
 
 def _logit(opacity: Array) -> Array:
-    """Return what `splats.opacity` makes `opacity` of."""
+    """Return the logit of an opacity, (M,): the inverse of `splats.opacity`."""
     logit: Array = np.log(opacity) - np.log1p(-opacity)
     return logit
 
 
 def _put(kept: NDArray[Any], rows: Index, values: Array) -> NDArray[Any]:
-    """Write `values` over some rows of a copy; return it."""
+    """Write `values` to some rows of `kept`, which is a copy already; return it."""
     kept[rows] = values
     return kept

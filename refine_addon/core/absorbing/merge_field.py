@@ -1,4 +1,4 @@
-"""Splats as merging needs them: what the views see of each, from which side, and how finely."""
+"""Splats as merging needs them: covariance, what the views see of each, and from where."""
 
 from __future__ import annotations
 
@@ -24,21 +24,25 @@ if TYPE_CHECKING:
     Footprint = tuple[Array, Array, Array]
 
 NEAREST = 0.01
-"""Least distance of a camera to a splat, over the scene's size; nearer ones count as this near."""
+"""Least distance of a camera to a splat, over the scene's size; nearer cameras count as this near.
+"""
 
 LOOKS = 32
-"""Views, spread evenly, that tell from which directions splats are viewed."""
+"""How many views, spread evenly, decide from which directions splats are viewed."""
 
 BESIDE = 1e-6
-"""Factor on the weight of views that a splat's centre does not lie in: every splat gets a viewing
-direction, and views that contain it decide it wherever there is one."""
+"""Factor on the weight of views that a splat's centre does not lie in. Such views decide the
+viewing direction only of splats that lie in no view."""
+
+LARGEST_LENS = 1e18
+"""Largest product of the focal lengths of a view, px^2, and one over the smallest."""
 
 _CHUNK = 1 << 14
 _LOG_RANGE = 80.0  # of log scales, either way, so that squares of scales stay finite
 
 
 class ViewSums(NamedTuple):
-    """What the views see of each of N splats; both in one unit, such as pixels of all views.
+    """What the views see of each of N splats; both sums in the same unit, such as pixels.
 
     Attributes
     ----------
@@ -54,14 +58,18 @@ class ViewSums(NamedTuple):
 
 @dataclass(eq=False)
 class Field:
-    """Splats as merging needs them. Merged splats are written over those that absorb.
+    """Splats as merging needs them. A splat that absorbs another becomes the merged splat.
 
     Attributes
     ----------
     means : (N, 3) float64
+        World units.
     covariances : (N, 6) float64
-        xx, xy, xz, yy, yz, zz.
-    opacity, contribution, error : (N,) float64
+        xx, xy, xz, yy, yz, zz; world units squared.
+    opacity : (N,) float64
+        0..1.
+    contribution, error : (N,) float64
+        See `ViewSums`.
     direction, deviation : (N, 3) float64
         See `Look`.
     color : (N, 3) float64
@@ -81,13 +89,13 @@ class Field:
     blur: Array
 
     def put(self, rows: Index, other: Field) -> None:
-        """Overwrite `rows` by those of `other`."""
+        """Overwrite `rows` with the rows of `other`."""
         for item in fields(self):
             getattr(self, item.name)[rows] = getattr(other, item.name)
 
     def take(self, rows: Index) -> Field:
         """Return a copy of some rows."""
-        # Twice as fast as indexing.
+        # ndarray.take is twice as fast as indexing.
         return Field(*(getattr(self, item.name).take(rows, axis=0) for item in fields(self)))
 
 
@@ -99,8 +107,8 @@ class Look(NamedTuple):
     direction : (N, 3) float64
         Mean viewing direction, length 1.
     deviation : (N, 3) float64
-        The longest axis of one standard deviation of the directions about their mean; of two
-        opposite vectors either one.
+        Standard deviation of the viewing directions along the axis where they vary most; its sign
+        is arbitrary.
     pixel : (N,) float64
         Area of a pixel at the splat, world units squared.
     seen : (N,) float64
@@ -116,8 +124,8 @@ class Look(NamedTuple):
 def look(means: NDArray[Any], views: ViewSet, scene: Scene, *, threads: int | None = None) -> Look:
     """Return from where the views look at splats.
 
-    A view counts by the pixels that a splat covers in it, 1 / distance^2, and next to nothing where
-    the splat's centre does not lie in it (`frustum`).
+    Each view has the weight 1 / distance^2, in proportion to the pixels that a splat covers in it,
+    and nearly none where the splat's centre does not lie in it (`frustum`).
 
     Parameters
     ----------
@@ -126,13 +134,13 @@ def look(means: NDArray[Any], views: ViewSet, scene: Scene, *, threads: int | No
     views : ViewSet
         At most `LOOKS` of them are used.
     scene : Scene
-        Its size says how near is too near.
+        `NEAREST` is relative to its size.
     threads : int, optional
     """
     count = len(means)
     result = Look(np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count))
     some = views.spread(LOOKS)
-    looks = [(view, share) for view, share in zip(some, some.weights, strict=True) if share]
+    looks = [(view, counts) for view, counts in zip(some, some.weights, strict=True) if counts]
     closest = (NEAREST * scene.size) ** 2
 
     def fill(piece: slice) -> None:
@@ -147,49 +155,53 @@ def look(means: NDArray[Any], views: ViewSet, scene: Scene, *, threads: int | No
 
 
 def _look(points: Array, looks: list[tuple[View, float]], closest: float) -> Look:
-    """Return from where views, each of a weight, look at `points`, (3, M).
+    """Return from where views look at M points.
 
     Parameters
     ----------
     points : (3, M) float64
-    looks : list of view, weight
+        World units.
+    looks : list of (View, float)
+        Views and their weights.
     closest : float
         Least squared distance of a camera.
     """
     rows, columns = np.triu_indices(3)
-    total, finest, seen = np.zeros((3, points.shape[1]))
+    total, finest, seen = np.zeros((3, points.shape[1]))  # sums over views, (M,) each
     toward, second = np.zeros((3, points.shape[1])), np.zeros((6, points.shape[1]))
-    for view, share in looks:
+    for view, counts in looks:
         ray = points - view.center[:, None]  # (3, M)
         planes = frustum.clip_planes(view, closest**0.5)
         inside = frustum.contains(view, view.rotation @ ray, planes)  # (M,)
         seen += inside
         squared = np.maximum(np.einsum("ij,ij->j", ray, ray), closest)
-        weight = np.where(inside, share, share * BESIDE) / squared
+        weight = np.where(inside, counts, counts * BESIDE) / squared  # (M,)
         ray /= np.sqrt(squared)
         weighted = ray * weight
         toward += weighted
         second += weighted[rows] * ray[columns]  # xx, xy, xz, yy, yz, zz
         total += weight
-        finest += weight * (view.fx * view.fy / squared)  # pixels per squared world unit
+        # Limited, so that the area of a pixel is neither 0 nor infinite.
+        pixels = min(max(view.fx * view.fy, 1.0 / LARGEST_LENS), LARGEST_LENS)
+        finest += weight * (pixels / squared)  # pixels per squared world unit
     direction = normalized(toward.T)
     return Look(direction, _deviation(direction, (second / total).T), total / finest, seen)
 
 
 def _deviation(direction: Array, second: Array) -> Array:
-    """Return the longest axis of the distribution of viewing directions about their mean, (M, 3).
+    """Return the largest standard deviation of viewing directions as a vector, (M, 3).
 
     Parameters
     ----------
     direction : (M, 3) float64
-        Their mean, length 1.
+        Mean viewing direction, length 1.
     second : (M, 6) float64
-        Means of their products xx, xy, xz, yy, yz, zz. In the plane across the mean these are
-        variances.
+        Mean products xx, xy, xz, yy, yz, zz of the directions. In the plane at right angles to the
+        mean direction these are variances.
     """
     u, v = across(direction)
     xx, xy, yy = footprint(second, (u, v), np.zeros(len(direction)))
-    # The larger eigenvalue of a symmetric 2 x 2 matrix, and the angle of its vector.
+    # The larger eigenvalue of a symmetric 2 x 2 matrix, and the angle of its eigenvector.
     half, angle = np.hypot(0.5 * (xx - yy), xy), 0.5 * np.arctan2(2.0 * xy, xx - yy)
     longest = np.sqrt(np.maximum(0.5 * (xx + yy) + half, 0.0))
     deviation: Array = longest * (np.cos(angle) * u + np.sin(angle) * v)
@@ -207,15 +219,15 @@ def field(
 ) -> Field:
     """Return some splats as merging needs them.
 
-    What these views do not show may be in plain sight of others, so each splat gets an allowance:
-    what one more view may see of it (`_with_allowance`).
+    A splat that these views do not show may be visible from elsewhere, so each splat gets an
+    allowance for what one more view may see of it (`_with_allowance`).
 
     Parameters
     ----------
     splats : Splats
         In the frame and unit of the views.
     rows : (M,) int
-        Which of them; drawable ones.
+        Which of them; all must be drawable.
     views : ViewSet
     scene : Scene
         Of splats and views.
@@ -231,7 +243,7 @@ def field(
     def fill(piece: slice) -> None:
         chunk = splats.take(rows[piece])
         logs = np.asarray(chunk.log_scales, np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
-        axes = rotation_matrices(chunk.quaternions) * np.exp(logs)[:, None, :]
+        axes = rotation_matrices(chunk.quaternions) * np.exp(logs)[:, None, :]  # (n, 3, 3)
         covariances[piece] = (axes @ np.swapaxes(axes, 1, 2))[:, upper[0], upper[1]]
         color[piece] = 0.5 + SH_C0 * np.asarray(chunk.sh_dc, np.float64)
         if chunk.sh_degree:
@@ -239,9 +251,10 @@ def field(
             color[piece] += np.einsum("nk,nkc->nc", basis, chunk.sh_rest)
 
     for_chunks(fill, count, _CHUNK, threads=threads)
-    alpha, blur = opacity(splats.opacity_logits[rows]), LOW_PASS * looked.pixel
+    alpha, blur = opacity(splats.opacity_logits[rows]), LOW_PASS * looked.pixel  # (M,) each
     with np.errstate(under="ignore"):
-        xx, xy, yy = footprint(covariances, across(looked.direction), blur)
+        xx, xy, yy = footprint(covariances, across(looked.direction), blur)  # (M,) each
+        # In pixels of a view, over 2 pi; a constant factor does not matter here.
         mass = alpha * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / looked.pixel
         contribution = _with_allowance(sums.contribution[rows], mass, looked.seen)
         error = _with_allowance(sums.error[rows], mass * alpha, looked.seen)
@@ -261,15 +274,17 @@ def field(
 def _with_allowance(values: Array, worth: Array, seen: Array) -> Array:
     """Return `values` plus what one more view may see of each splat, (M,).
 
-    If nothing were hidden, each view that a splat's centre lies in would see its `worth`. What the
-    views did see is some share of the sum of all that; of another view the same share is expected.
-    At worst none of the n views that contain a splat showed it; then the next one does with a
-    chance of about 1 / (n + 1), by the rule of succession.
+    If nothing were hidden, each view would see the `worth` of the splats whose centre lies in it.
+    The views saw some share of that, summed over all splats, and another view is expected to see
+    the same share. If none of the n views that a splat lies in showed it, the next view shows it
+    with a probability of about 1 / (n + 1), by the rule of succession.
 
     Parameters
     ----------
-    values, worth : (M,) float64
-        As measured, summed over views, and in one view if nothing hid it.
+    values : (M,) float64
+        As measured, summed over views.
+    worth : (M,) float64
+        What one view sees of each splat if nothing hides it.
     seen : (M,) float64
         In how many views each centre lies.
     """
@@ -295,7 +310,7 @@ def across(normal: Array) -> tuple[Array, Array]:
 
 
 def footprint(covariances: Array, plane: tuple[Array, Array], blur: Array) -> Footprint:
-    """Return xx, xy, yy of ``(u, v)' C (u, v) + blur I``, (M,) each: C in a plane.
+    """Return xx, xy, yy of ``(u, v)' C (u, v) + blur I``, (M,) each: C projected to a plane.
 
     Parameters
     ----------
@@ -318,7 +333,7 @@ def footprint(covariances: Array, plane: tuple[Array, Array], blur: Array) -> Fo
 
 
 def normalized(vectors: NDArray[Any]) -> Array:
-    """Return unit vectors, (M, 3); 0 stays 0."""
+    """Return unit vectors, (M, 3); zero vectors stay 0."""
     length = np.sqrt(np.einsum("ij,ij->i", vectors, vectors))[:, None]
     unit: Array = vectors / np.where(length > 0.0, length, 1.0)
     return unit

@@ -1,4 +1,4 @@
-"""Merges and deletions carried out in order of their cost, on a graph of near splats."""
+"""Merges and deletions of splats, cheapest first, on a graph of neighbouring splats."""
 
 from __future__ import annotations
 
@@ -19,27 +19,33 @@ if TYPE_CHECKING:
     Rows = NDArray[np.int32]
 
 NEIGHBOURS = 8
-"""Nearest neighbours of each splat that it may be merged with."""
+"""How many nearest neighbours each splat may be merged with."""
 
 BATCH = 0.03
-"""Largest share of the splats that goes before costs are computed again."""
+"""Share of the splats that one round removes at most; then costs are computed again."""
 
 _CHUNK = 1 << 14
+_LARGEST = np.finfo(np.float64).max  # pairs of infinite cost are not merged
 
 
 class MergeGraph:
-    """Splats, the pairs of them that may be merged, and what each operation costs.
+    """Splats, the pairs of them that may be merged, and the cost of each operation.
 
     Attributes
     ----------
     field : Field
-        Its rows change as splats absorb others.
+        A splat that absorbs another is overwritten by the merged splat.
     alive : (N,) bool
-        Which splats have not gone.
+        Which splats are neither deleted nor absorbed.
     merges : list of (survivor, absorbed, share)
-        Rows, (M,), and the survivor's share of the colour, (M,), of each round.
+        For each round: rows of the survivors and of the splats they absorbed, (M,) each, and the
+        survivor's share of the colour, (M,).
     deleted : int
-        How many splats went without being absorbed.
+        How many splats were deleted.
+    first, second : (E,) int32
+        Rows of the pairs that may be merged.
+    cost : (E,) float64
+        Of merging each pair; infinite where it is not less than that of deleting one of the two.
     """
 
     def __init__(
@@ -50,14 +56,16 @@ class MergeGraph:
         Parameters
         ----------
         field : Field
-            Is changed.
+            Changed in place.
         scene : Scene
-            In whose frame near splats are looked for.
+            Neighbours are found in its frame.
         patience : float
             Factor on the cost of merging.
         threads : int, optional
         """
         self.field, self.scene, self.patience, self.threads = field, scene, patience, threads
+        # A splat of unknown error is not merged: without contribution it gets no pairs.
+        field.contribution[~np.isfinite(field.error)] = 0.0
         self.alive = np.ones(len(field.means), np.bool_)
         self.merges: list[tuple[Index, Index, Array]] = []
         self.deleted = 0
@@ -65,7 +73,7 @@ class MergeGraph:
         self.cost = np.empty(0)
 
     def reduce(self, goal: int, progress: Progress = silent) -> None:
-        """Merge and delete until `goal` splats are alive.
+        """Merge and delete until `goal` splats are alive; call it once.
 
         Raises
         ------
@@ -80,33 +88,33 @@ class MergeGraph:
                 self._connect(silent)
                 connected = count
             count -= self._round(min(max(int(BATCH * count), 1), count - goal))
-        # Nobody needs the pairs any more, and there are ten million of them in a large scene.
+        # The pairs are no longer needed; a large scene has ten million of them.
         self.first = self.second = np.empty(0, np.int32)
         self.cost = np.empty(0)
 
     def _connect(self, progress: Progress) -> None:
-        """Find the pairs of near splats, and price them."""
-        rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))
-        place = self.scene.place(self.field.means[rows])
-        near = nearest(place, NEIGHBOURS, progress=progress, threads=self.threads)
+        """Find the pairs of neighbouring splats, and price them."""
+        rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))  # (R,)
+        place = self.scene.place(self.field.means[rows])  # (R, 3)
+        near = nearest(place, NEIGHBOURS, progress=progress, threads=self.threads)  # (R, k)
 
         def pairs(piece: slice) -> tuple[Rows, Rows]:
-            own, others = np.arange(piece.start, piece.stop)[:, None], near[piece]
-            # A pair that is near from both sides counts once.
+            own, others = np.arange(piece.start, piece.stop)[:, None], near[piece]  # (n, 1), (n, k)
+            # Two splats that are neighbours of each other make one pair, not two.
             once = (own < others) | ~(near[others] == own[:, :, None]).any(axis=2)
             own = np.broadcast_to(own, others.shape)
             return rows[own[once]].astype(np.int32), rows[others[once]].astype(np.int32)
 
         found = for_chunks(pairs, len(rows), _CHUNK, threads=self.threads)
         none = np.empty(0, np.int32)
-        # Half the memory of other integers: no file holds two billion splats.
+        # int32 takes half the memory of int64, and no file holds two billion splats.
         self.first = np.concatenate([none, *(first for first, _ in found)])
         self.second = np.concatenate([none, *(second for _, second in found)])
         self.cost = np.empty(len(self.first))
         self._price(np.arange(len(self.first), dtype=np.int32))
 
     def _price(self, edges: Index) -> None:
-        """Compute the cost of some pairs; infinite where deleting one of the two costs less."""
+        """Set the costs of some pairs; infinite where deleting one of the two costs less."""
 
         def price(piece: slice) -> None:
             mine = edges[piece]
@@ -119,44 +127,51 @@ class MergeGraph:
         for_chunks(price, len(edges), _CHUNK, threads=self.threads)
 
     def _round(self, quota: int) -> int:
-        """Carry out at most `quota` of the cheapest disjoint operations; return how many."""
-        error = np.where(self.alive, self.field.error, np.inf)
+        """Carry out the cheapest operations that share no splat; return how many, 1 to `quota`.
+
+        A pair is merged if it is the cheapest operation for both of its splats. A splat is deleted
+        if that is cheaper than all of its pairs.
+        """
+        # With unknown errors as infinity the cheapest operation is always carried out, so that
+        # every round removes a splat; a comparison with NaN would choose none.
+        known = self.alive & ~np.isnan(self.field.error)
+        error = np.where(known, self.field.error, np.inf)  # (N,)
         costs = np.concatenate([error[self.alive], self.cost[np.isfinite(self.cost)]])
-        # More than can go, so that the best partner of a splat is among them.
+        # Look at twice the quota, since operations that share a splat exclude each other.
         last = min(2 * quota, len(costs)) - 1
         limit = np.partition(costs, last)[last]
-        edges = np.flatnonzero(self.cost <= limit)
-        first, second, cost = self.first[edges], self.second[edges], self.cost[edges]
-        best = error.copy()
+        edges = np.flatnonzero(self.cost <= min(limit, _LARGEST))  # (e,)
+        first, second, cost = self.first[edges], self.second[edges], self.cost[edges]  # (e,) each
+        best = error.copy()  # (N,), the cost of each splat's cheapest operation
         np.minimum.at(best, first, cost)
         np.minimum.at(best, second, cost)
-        mutual = (cost == best[first]) & (cost == best[second])
-        edges = edges[mutual][_disjoint(first[mutual], second[mutual])]
+        mutual = (cost == best[first]) & (cost == best[second])  # (e,)
+        edges = edges[mutual][_disjoint(first[mutual], second[mutual])]  # (m,)
         alone = self.alive & (best == error) & (error <= limit)
         alone[self.first[edges]] = False
         alone[self.second[edges]] = False
-        doomed = np.flatnonzero(alone)
-        costs = np.concatenate([error[doomed], self.cost[edges]])
+        doomed = np.flatnonzero(alone)  # (d,)
+        costs = np.concatenate([error[doomed], self.cost[edges]])  # (d + m,)
         order = np.argsort(costs, kind="stable")[:quota]
         is_merge = order >= len(doomed)
         self._carry_out(doomed[order[~is_merge]], edges[order[is_merge] - len(doomed)])
         return len(order)
 
     def _carry_out(self, doomed: Index, edges: Index) -> None:
-        """Delete splats, merge pairs, and price again what touches a merged splat."""
+        """Delete splats, merge pairs, and price the pairs of the merged splats again."""
         field, first, second = self.field, self.first[edges], self.second[edges]
         with np.errstate(under="ignore"):
             pairs = merging.price(field, first, second)
             merged = merging.merge(field, first, second, pairs)
         swap = field.contribution[second] > field.contribution[first]
-        into, gone = np.where(swap, second, first), np.where(swap, first, second)
+        into, gone = np.where(swap, second, first), np.where(swap, first, second)  # (m,) each
         self.merges.append((into, gone, np.where(swap, 1.0 - pairs.color, pairs.color)))
         field.put(into, merged)
         self.alive[doomed] = False
         self.alive[gone] = False
         self.deleted += len(doomed)
-        # The pairs of the absorbed splat are now pairs of the one that absorbed it.
-        heir = np.arange(len(self.alive), dtype=np.int32)
+        # Pairs of an absorbed splat become pairs of the splat that absorbed it.
+        heir = np.arange(len(self.alive), dtype=np.int32)  # (N,)
         heir[gone] = into
         first, second = heir[self.first], heir[self.second]
         valid = self.alive[first] & self.alive[second] & (first != second)
@@ -167,11 +182,19 @@ class MergeGraph:
 
 
 def _disjoint(first: Index, second: Index) -> Index:
-    """Return which pairs share no splat with an earlier one (those left are equally cheap)."""
+    """Return the indices of pairs that share no splat with an earlier pair, (k,).
+
+    Pairs only share a splat where their costs are equal.
+
+    Parameters
+    ----------
+    first, second : (m,) int
+        Rows of the pairs.
+    """
     own = np.arange(len(first))
-    _, ends = np.unique(np.concatenate([first, second]), return_inverse=True)
+    _, ends = np.unique(np.concatenate([first, second]), return_inverse=True)  # (2 m,)
     one, two = ends[: len(first)], ends[len(first) :]
-    earliest = np.full(len(ends), len(first))
+    earliest = np.full(len(ends), len(first))  # the first pair that holds each splat
     np.minimum.at(earliest, one, own)
     np.minimum.at(earliest, two, own)
     return np.flatnonzero((earliest[one] == own) & (earliest[two] == own))

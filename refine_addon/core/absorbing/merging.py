@@ -1,28 +1,28 @@
-"""What merging two splats costs the pictures, and the splat that comes of it.
+"""The cost of merging two splats, as an error of the pictures, and the merged splat.
 
-Every splat i changes the picture by its footprint ``f_i = alpha_i exp(-q_i / 2)`` times the
-contrast ``s_i = c_i - B`` of its colour to what lies behind it. What the views see of it is two
-sums over the pixels of all views, T being the transmittance in front of it::
+Splat i changes the picture by its footprint ``f_i = alpha_i exp(-q_i / 2)`` times the contrast
+``s_i = c_i - B`` between its colour and the colour behind it. The views measure two sums over all
+of their pixels; T is the transmittance in front of the splat::
 
     contribution  W_i = sum of T alpha              error  E_i = sum of (T alpha)^2 |s_i|^2
 
-E is what deleting the splat costs. Replacing i and j by m costs the squared error of the picture,
-with the inner products ``<f, g>`` of Gaussians in closed form, in a plane across the direction that
-the pair is viewed along (derived in docs/method.md, section 5)::
+E is the cost of deleting the splat. The cost of replacing i and j by m is the squared error of the
+picture. The inner products ``<f, g>`` of Gaussians have a closed form, in a plane at right angles
+to the direction that the pair is viewed along (derived in docs/method.md, section 5)::
 
     p = f_i - l_i f_m,  q = f_j - l_j f_m                l: share of the colour, l_i + l_j = 1
     cost = tau (|s_i|^2 <p, p> + 2 s_i.s_j <p, q> + |s_j|^2 <q, q>)
     tau  = (W_i + W_j) / (A_i + A_j)                     A: mass, the integral of f
     |s_i|^2 = E_i / (tau_i <f_i, f_i>),   2 s_i.s_j = |s_i|^2 + |s_j|^2 - |c_i - c_j|^2
 
-The merged splat has the mean and covariance of the two as one distribution, weighted by mass; their
-mean colour, weighted by contribution; and the opacity that gives it their mass less the overlap,
-``A_m = A_i + A_j - <f_i, f_j>``, since what both cover is covered once. Where that opacity would
+The merged splat has the mean and covariance of the mixture of the two, weighted by mass, and their
+mean colour, weighted by contribution. Its mass is ``A_m = A_i + A_j - <f_i, f_j>``, since the area
+that both cover is covered only once; its opacity follows from that mass. Where the opacity would
 exceed `ALPHA_MAX`, the covariance grows instead.
 
-Along the mean viewing direction two splats one behind the other merge for nothing, though other
-views see both. So a pair's cost is the mean of that from two directions, one standard deviation of
-the viewing directions to either side (`costs`).
+Seen along the mean viewing direction, merging two splats one behind the other costs nothing, though
+other views see both. So the cost of a pair is the mean of its costs from two directions: one
+standard deviation of the viewing directions to either side of their mean (`costs`).
 """
 
 from __future__ import annotations
@@ -41,28 +41,29 @@ if TYPE_CHECKING:
 __all__ = ["Field", "Pairs", "ViewSums", "axes", "costs", "merge", "price"]
 
 FLATTEST = 1e-14
-"""Least eigenvalue of a covariance over the sum of the three; less is lost in rounding."""
+"""Least eigenvalue of a covariance over the sum of the three; rounding hides smaller ones."""
 
 CHANNELS = 3
 """Red, green and blue."""
 
-_CANCELLED = 1e-6  # squared length of the mean of two unit vectors that is taken for none
-_TINY = 1e-280  # divided by instead of 0
+_CANCELLED = 1e-6  # a mean of two unit vectors with a smaller squared length counts as 0
+_TINY = 1e-280  # replaces 0 as a divisor
 
 
 class Pairs(NamedTuple):
-    """Merges of M pairs: what they cost and what becomes of them.
+    """Merges of M pairs: their costs and results.
 
     Attributes
     ----------
     cost : (M,) float64
-        Added to the squared error of the pictures, in the unit of `ViewSums`.
+        Squared error of the pictures that the merge causes, in the unit of `ViewSums`.
     position, color : (M,) float64
         Share of the first splat in the mean and covariance, and in the colour.
     opacity, growth : (M,) float64
-        Of the merged splat; growth is the factor on its covariance that keeps the opacity down.
+        Of the merged splat; growth is the factor on its covariance that keeps its opacity at most
+        `ALPHA_MAX`.
     error : (M,) float64
-        What deleting the merged splat would cost.
+        Cost of deleting the merged splat.
     """
 
     cost: Array
@@ -74,13 +75,13 @@ class Pairs(NamedTuple):
 
 
 def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pairs:
-    """Return prices and results of merges, by the equations at the top of this file.
+    """Return costs and results of merges, by the equations at the top of this file.
 
     Parameters
     ----------
     splats : Field
     first, second : (M,) int
-        Rows; both splats of a pair contribute.
+        Rows; all splats have a contribution above 0.
     tilt : float
         How many standard deviations of the viewing directions to add to their mean.
     """
@@ -88,20 +89,20 @@ def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pair
 
 
 def costs(splats: Field, first: Index, second: Index) -> Array:
-    """Return the costs of merges, (M,): the mean of those from two directions."""
+    """Return the costs of merges, (M,): the mean over two viewing directions."""
     ends = _gather(splats, first, second)
     return 0.5 * (_price(ends, -1.0).cost + _price(ends, 1.0).cost)
 
 
 class _Ends(NamedTuple):
-    """The two splats of M pairs, and what they have in common.
+    """The two splats of M pairs, and means over the two.
 
     Attributes
     ----------
     one, two : Field
         The first and the second splats.
     color, rest : (M,) float64
-        Shares of the first and of the second in the colour.
+        Shares of the first and of the second splat in the colour.
     direction, deviation : (M, 3) float64
         From where the pair is viewed; see `merge_field.Look`.
     blur : (M,) float64
@@ -121,15 +122,15 @@ class _Ends(NamedTuple):
 
 
 def _gather(splats: Field, first: Index, second: Index) -> _Ends:
-    """Return what pricing needs of pairs."""
+    """Return the ends of pairs."""
     one, two = splats.take(first), splats.take(second)
-    color, rest = _shares(one.contribution, two.contribution)
-    direction = one.direction * color[:, None]
+    color, rest = _shares(one.contribution, two.contribution)  # (M,) each
+    direction = one.direction * color[:, None]  # (M, 3)
     direction += two.direction * rest[:, None]
-    # Opposite directions cancel; both view the same plane, so the first one's will do.
-    lost = np.einsum("ij,ij->i", direction, direction) < _CANCELLED
+    # Opposite directions cancel. Both define the same plane, so the first is used.
+    lost = np.einsum("ij,ij->i", direction, direction) < _CANCELLED  # (M,)
     direction[lost] = one.direction[lost]
-    step = one.color - two.color
+    step = one.color - two.color  # (M, 3)
     return _Ends(
         one,
         two,
@@ -143,9 +144,10 @@ def _gather(splats: Field, first: Index, second: Index) -> _Ends:
 
 
 def _price(ends: _Ends, tilt: float) -> Pairs:
-    """Price merges viewed from one direction.
+    """Return costs and results of merges, viewed from one direction.
 
-    Masses and inner products are all taken over 2 pi here, which cancels.
+    All masses and inner products here are divided by 2 pi, a factor that cancels. All arrays are
+    (M,).
     """
     first, second, color, rest = ends.one, ends.two, ends.color, ends.rest
     signals = _signals(ends, tilt)
@@ -159,7 +161,7 @@ def _price(ends: _Ends, tilt: float) -> Pairs:
     tau = (first.contribution + second.contribution) / (mass_1 + mass_2)
     cost = contrasts.one * pp + 2.0 * contrasts.both * pq + contrasts.two * qq
     cost = tau * np.maximum(cost, 0.0)
-    # The merged splat's own contrast is l_i s_i + l_j s_j.
+    # The contrast of the merged splat is l_i s_i + l_j s_j.
     mixed = color * color * contrasts.one + 2.0 * color * rest * contrasts.both
     mixed += rest * rest * contrasts.two
     error = tau * np.maximum(mixed, 0.0) * products.merged
@@ -168,14 +170,14 @@ def _price(ends: _Ends, tilt: float) -> Pairs:
 
 
 class _Signals(NamedTuple):
-    """Footprints and masses of M pairs and of what they become, in the plane viewed.
+    """Footprints and masses of M pairs and of the merged splats, in the plane viewed.
 
     Attributes
     ----------
     one, two, merged : Footprint
         Covariances in the plane, low-pass included.
     x, y : (M,) float64
-        From the centre of the first to that of the second.
+        Step from the centre of the first to that of the second.
     areas : tuple of (M,) float64
         Of the first, the second and the merged footprint; see `_area`.
     masses : tuple of (M,) float64
@@ -185,7 +187,7 @@ class _Signals(NamedTuple):
     position, other : (M,) float64
         Shares of the first and of the second in the mass.
     growth : (M,) float64
-        Factor by which `merged` has grown so that its opacity is no more than `ALPHA_MAX`.
+        Factor that `merged` contains, so that its opacity is at most `ALPHA_MAX`.
     overlap : (M,) float64
         Inner product of the two.
     """
@@ -205,7 +207,7 @@ class _Signals(NamedTuple):
 
 
 def _signals(ends: _Ends, tilt: float) -> _Signals:
-    """Return footprints and masses of pairs and of what they become."""
+    """Return footprints and masses of pairs and of the merged splats."""
     one, two, x, y = _plane(ends, tilt)
     area_1, area_2 = _area(one), _area(two)
     mass_1, mass_2 = ends.one.opacity * area_1, ends.two.opacity * area_2
@@ -213,8 +215,7 @@ def _signals(ends: _Ends, tilt: float) -> _Signals:
     overlap = mass_1 * mass_2 * _product(one, two, x, y)
     between = position * other
     merged = _mixed(one, two, position, (between * x * x, between * x * y, between * y * y))
-    # The overlap of nearly opaque splats can exceed the smaller mass, which is all that one can
-    # cover of the other.
+    # The estimated overlap of nearly opaque splats can exceed the smaller mass; the true one never.
     mass = mass_1 + mass_2 - np.minimum(overlap, np.minimum(mass_1, mass_2))
     growth = np.maximum(mass / (_area(merged) * ALPHA_MAX), 1.0)
     merged = (merged[0] * growth, merged[1] * growth, merged[2] * growth)
@@ -242,11 +243,11 @@ class _Products(NamedTuple):
 
 
 def _products(signals: _Signals) -> _Products:
-    """Return the inner products of pairs and of what they become."""
+    """Return the inner products of pairs and of the merged splats."""
     merged, mass, x, y = signals.merged, signals.mass, signals.x, signals.y
     mass_1, mass_2 = signals.masses
     area_1, area_2, area = signals.areas
-    # The merged centre lies between the two: the other's share of the step away from each.
+    # The merged centre lies between the two, away from each by the other's share of the step.
     away_1, away_2 = signals.other, signals.position
     return _Products(
         mass_1 * mass_1 / (2.0 * area_1),
@@ -259,7 +260,7 @@ def _products(signals: _Signals) -> _Products:
 
 
 class _Contrasts(NamedTuple):
-    """Contrasts of M pairs to what lies behind, (M,) float64 each.
+    """Products of the contrasts of M pairs, (M,) float64 each.
 
     Attributes
     ----------
@@ -273,19 +274,19 @@ class _Contrasts(NamedTuple):
 
 
 def _contrasts(ends: _Ends, masses: tuple[Array, Array], products: _Products) -> _Contrasts:
-    """Return the contrasts that explain the measured errors of pairs."""
+    """Return the contrasts that the measured errors of pairs imply."""
     first, second = ends.one, ends.two
     one = _squared_contrast(first.error, first.contribution / masses[0] * products.one)
     two = _squared_contrast(second.error, second.contribution / masses[1] * products.two)
     both = 0.5 * (one + two - ends.apart)
-    # Measured errors and colours need not fit together: by Cauchy-Schwarz it is no larger.
+    # By Cauchy-Schwarz |s_i.s_j| is at most this; measured errors and colours can contradict it.
     limit = np.sqrt(one * two)
     both = np.clip(both, -limit, limit)
     return _Contrasts(one, two, both)
 
 
 def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
-    """Return the merged splats: mean and covariance are those of the mixture of the two.
+    """Return the merged splats; each has the mean and covariance of the mixture of its pair.
 
     ``mu = w mu_i + w' mu_j`` and ``C = w C_i + w' C_j + w w' d d'``, w + w' = 1, d = mu_j - mu_i.
     """
@@ -322,22 +323,35 @@ def axes(covariances: Array) -> tuple[Array, Array]:
 
 
 def _shares(one: Array, two: Array) -> tuple[Array, Array]:
-    """Return the shares of two positive amounts in their sum."""
+    """Return the shares of two positive amounts in their sum, (M,) each."""
     total = one + two
     return one / total, two / total
 
 
 def _squared_contrast(error: Array, whole: Array) -> Array:
-    """Return |s|^2, (M,): the error over what it would be if |s| were 1.
+    """Return |s|^2, (M,), the squared contrast that an error implies.
 
-    Colours are in 0..1, so |s|^2 is at most 1 a channel.
+    Colours are in 0..1, so |s|^2 is limited to 1 for each channel.
+
+    Parameters
+    ----------
+    error : (M,) float64
+        As measured.
+    whole : (M,) float64
+        What the error would be for |s| = 1.
     """
     squared: Array = np.minimum(error, CHANNELS * whole) / np.maximum(whole, _TINY)
     return squared
 
 
 def _plane(ends: _Ends, tilt: float) -> tuple[Footprint, Footprint, Array, Array]:
-    """Return both footprints and the step between them, across the pair's viewing direction.
+    """Return both footprints and the step between them, in the plane that the pair is viewed in.
+
+    Parameters
+    ----------
+    ends : _Ends
+    tilt : float
+        How many standard deviations of the viewing directions to add to their mean.
 
     Returns
     -------
@@ -357,14 +371,14 @@ def _plane(ends: _Ends, tilt: float) -> tuple[Footprint, Footprint, Array, Array
 
 
 def _mean_deviation(one: Array, two: Array, share: Array) -> Array:
-    """Return the mean of deviations, (M, 3); either sign of each means the same."""
+    """Return the mean of deviations, (M, 3), whose signs are arbitrary, so they are made alike."""
     sign = np.where(np.einsum("ij,ij->i", one, two) < 0.0, -1.0, 1.0)
     mean: Array = share[:, None] * one + ((1.0 - share) * sign)[:, None] * two
     return mean
 
 
 def _mixed(one: Footprint, two: Footprint, share: Array, between: Footprint) -> Footprint:
-    """Return the covariance of the mixture of two.
+    """Return the covariance of a mixture of two distributions.
 
     Parameters
     ----------
@@ -383,20 +397,21 @@ def _mixed(one: Footprint, two: Footprint, share: Array, between: Footprint) -> 
 
 
 def _determinant(footprint: Footprint) -> Array:
-    """Return the determinant, (M,), at least a little above 0 where rounding leaves none."""
+    """Return the determinant, (M,), kept above 0 where rounding would leave 0 or less."""
     xx, xy, yy = footprint
     return np.maximum(xx * yy - xy * xy, 1e-12 * xx * yy + _TINY)
 
 
 def _area(footprint: Footprint) -> Array:
-    """Return the area of the ellipse of one standard deviation over pi, (M,)."""
+    """Return the area of the ellipse of one standard deviation, divided by pi, (M,)."""
     return np.sqrt(_determinant(footprint))
 
 
 def _product(one: Footprint, other: Footprint, x: Array, y: Array) -> Array:
     """Return 2 pi times the integral of the product of two normal densities, (M,).
 
-    It is a normal density of their step `x`, `y` whose covariance is the sum of theirs.
+    The integral is a normal density at the step `x`, `y` between their centres; its covariance is
+    the sum of the two.
     """
     total = (one[0] + other[0], one[1] + other[1], one[2] + other[2])
     determinant = _determinant(total)

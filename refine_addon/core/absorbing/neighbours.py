@@ -1,10 +1,10 @@
 """Nearest neighbours of every point of a cloud, with NumPy alone.
 
-A balanced tree halves the points along their longest side until leaves of a few points are left,
-so that dense and sparse regions cost the same. The points of a leaf are compared with those of the
-`VISITED` leaves whose boxes are nearest, which a beam finds from the root down. Fixed work for
-every point, whatever the cloud: a search to the last neighbour would cost a far outlier the whole
-cloud. Exact for small clouds; of trained scenes it finds 98 to 99 % of the 8 nearest.
+A balanced tree halves the points along the longest side of their box until leaves hold a few points
+each, so dense and sparse regions cost the same. The points of a leaf are compared with those of the
+`VISITED` leaves whose boxes are nearest; a beam search from the root finds these leaves. The work
+is the same for every point. (An exact search would compare a far outlier with the whole cloud.)
+Results are exact for small clouds; in trained scenes 98 to 99 % of the 8 nearest are found.
 """
 
 from __future__ import annotations
@@ -19,17 +19,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 VISITED = 20
-"""Leaves that the points of one leaf are compared with, itself among them."""
+"""How many leaves the points of a leaf are compared with, their own included."""
 
 _LEAF = 8
-"""Points in a leaf, at least half as many."""
+"""Most points in a leaf; it holds at least half as many."""
 
-_MIDDLE = 1e-3
-"""Weight of the squared distance of the middles of two boxes, which decides among those that
+_CENTER = 1e-3
+"""Factor on the squared distance between the centres of two boxes; it decides among boxes that
 touch."""
 
 _BATCH = 256
-"""Leaves that search at once; bounds the memory."""
+"""Leaves processed at once, which limits the memory."""
 
 
 class _Tree(NamedTuple):
@@ -38,10 +38,10 @@ class _Tree(NamedTuple):
     Attributes
     ----------
     which : (leaves, size) int64
-        Which point it is; N and more where a leaf has been filled up.
+        Indices of the points; N or more for copies that fill up a leaf.
     points : (leaves, size, 3) float64
     boxes : list of (2, 3, nodes) float64
-        Lower and upper corner, from the root down to the leaves.
+        Lower and upper corners of the nodes of each level, from the root down to the leaves.
     """
 
     which: NDArray[np.int64]
@@ -56,14 +56,14 @@ def nearest(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.int32]:
-    """Return near neighbours of every point, nearly always the nearest.
+    """Return near neighbours of every point, which are nearly always the nearest.
 
     Parameters
     ----------
     points : (N, 3) float64
-        Finite, of a size whose square is finite.
+        Finite, and with finite squares.
     count : int
-        How many neighbours, up to 16; fewer where there are not as many other points.
+        How many neighbours, up to 16; fewer if there are fewer other points.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
     threads : int, optional
@@ -86,8 +86,8 @@ def nearest(
     found = np.empty((total, count), np.int32)
 
     def search(piece: slice) -> None:
-        own = tree.which[piece]
-        real = own < total
+        own = tree.which[piece]  # (leaves, size)
+        real = own < total  # (leaves, size)
         found[own[real]] = _search(tree, piece, count, total)[real]
 
     for_chunks(
@@ -98,24 +98,24 @@ def nearest(
 
 
 def _build(points: NDArray[np.float64]) -> _Tree:
-    """Halve the points until a leaf holds `_LEAF` at most."""
+    """Return the tree of points, (N, 3), which are halved until a leaf holds at most `_LEAF`."""
     total = len(points)
     depth = 0
     while total > _LEAF << depth:
         depth += 1
     size = -(-total // 2**depth)
-    # Leaves are filled up with copies of points, which change no box, and are told by their index.
+    # Leaves are filled up with copies of points; their indices start at N.
     order = np.arange(size * 2**depth)
-    copies = np.where(order < total, order, (order - total) % total)
+    copies = np.where(order < total, order, (order - total) % total)  # the point behind each index
     for level in range(depth):
-        nodes = order.reshape(2**level, -1)
-        inside = points.take(copies.take(nodes), axis=0)
-        axis = np.argmax(inside.max(axis=1) - inside.min(axis=1), axis=1)
+        nodes = order.reshape(2**level, -1)  # (nodes, n), as `along` and `halves`
+        inside = points.take(copies.take(nodes), axis=0)  # (nodes, n, 3)
+        axis = np.argmax(inside.max(axis=1) - inside.min(axis=1), axis=1)  # (nodes,)
         along = np.take_along_axis(inside, axis[:, None, None], axis=2)[..., 0]
         halves = np.argpartition(along, nodes.shape[1] // 2, axis=1)
         order = np.take_along_axis(nodes, halves, axis=1).ravel()
     which = order.reshape(2**depth, size)
-    leaves = points[copies[which]]
+    leaves = points[copies[which]]  # (leaves, size, 3)
     boxes = [np.stack([leaves.min(axis=1).T, leaves.max(axis=1).T])]
     while boxes[0].shape[2] > 1:
         low, high = boxes[0].reshape(2, 3, -1, 2)
@@ -125,11 +125,11 @@ def _build(points: NDArray[np.float64]) -> _Tree:
 
 def _search(tree: _Tree, rows: slice, count: int, total: int) -> NDArray[np.int64]:
     """Return the neighbours, (leaves, size, count), of all points of some leaves."""
-    nodes = _near_leaves(tree, rows)
-    own = tree.points[rows]
-    others = tree.points.take(nodes, axis=0).reshape(len(own), -1, 3)
-    index = tree.which.take(nodes, axis=0).reshape(len(own), 1, -1)
-    squared = np.zeros((*own.shape[:2], others.shape[1]))
+    nodes = _near_leaves(tree, rows)  # (leaves, visited)
+    own = tree.points[rows]  # (leaves, size, 3)
+    others = tree.points.take(nodes, axis=0).reshape(len(own), -1, 3)  # (leaves, v, 3)
+    index = tree.which.take(nodes, axis=0).reshape(len(own), 1, -1)  # (leaves, 1, v)
+    squared = np.zeros((*own.shape[:2], others.shape[1]))  # (leaves, size, v)
     for axis in range(3):
         step = own[:, :, None, axis] - others[:, None, :, axis]
         squared += np.multiply(step, step, out=step)
@@ -142,12 +142,12 @@ def _search(tree: _Tree, rows: slice, count: int, total: int) -> NDArray[np.int6
 
 
 def _near_leaves(tree: _Tree, rows: slice) -> NDArray[np.int64]:
-    """Return the leaves nearest to some leaves, (leaves, `VISITED`) or all where there are fewer.
+    """Return the leaves nearest to some leaves, (leaves, `VISITED`), or all if there are fewer.
 
-    A level at a time, only the `VISITED` nearest nodes are followed down.
+    A beam search: of each level, only the children of the `VISITED` nearest nodes are looked at.
     """
-    low, high = tree.boxes[-1][:, :, rows, None]
-    nodes = np.zeros((low.shape[1], 1), np.int64)
+    low, high = tree.boxes[-1][:, :, rows, None]  # (3, leaves, 1) each
+    nodes = np.zeros((low.shape[1], 1), np.int64)  # (leaves, up to 2 VISITED)
     for boxes in tree.boxes[1:]:
         nodes = np.concatenate([2 * nodes, 2 * nodes + 1], axis=1)
         if nodes.shape[1] <= VISITED:
@@ -156,8 +156,8 @@ def _near_leaves(tree: _Tree, rows: slice) -> NDArray[np.int64]:
         for axis in range(3):
             lower, upper = boxes[0, axis].take(nodes), boxes[1, axis].take(nodes)
             gap = np.maximum(lower - high[axis], low[axis] - upper)
-            middle = 0.5 * (lower + upper - low[axis] - high[axis])
-            distance += np.maximum(gap, 0.0) ** 2 + _MIDDLE * middle * middle
+            apart = 0.5 * (lower + upper - low[axis] - high[axis])
+            distance += np.maximum(gap, 0.0) ** 2 + _CENTER * apart * apart
         nearest_nodes = np.argpartition(distance, VISITED - 1, axis=1)[:, :VISITED]
         nodes = np.take_along_axis(nodes, nearest_nodes, axis=1)
     return nodes

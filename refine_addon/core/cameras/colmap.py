@@ -1,10 +1,10 @@
 """COLMAP sparse models, text and binary: ``cameras`` and ``images`` of a folder.
 
-The formats are COLMAP's "Output Format" page, the camera models those of its
+The formats are described in COLMAP's "Output Format" page, the camera models in its
 ``src/colmap/sensor/models``. Poses are world to camera, quaternions Hamilton (w, x, y, z), axes
-x right, y down, z forward; the image's upper left corner is at (0, 0) and the centre of its first
-pixel at (0.5, 0.5): all of it `View`'s own convention, so only the centre is computed. Newer
-models have ``rigs`` and ``frames`` beside these two files; ``images`` still holds every pose.
+x right, y down, z forward. The upper left corner of the image is at (0, 0), the centre of its first
+pixel at (0.5, 0.5). `View` has the same conventions, so only the camera's centre is computed. Newer
+models also have files ``rigs`` and ``frames``; ``images`` still holds every pose.
 """
 
 from __future__ import annotations
@@ -30,24 +30,25 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SUFFIXES = (".bin", ".txt")
-"""Binary is preferred, as by COLMAP itself."""
+"""Binary files are preferred, as in COLMAP itself."""
 
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
-"""Stems of the files that a model may consist of."""
+"""Names, without suffix, of the files that a model may consist of."""
 
 POINT_BYTES = 24
-"""One observation in ``images.bin``: x, y (doubles) and the point's id (64 bit)."""
+"""Size of an observation in ``images.bin``: x, y (doubles) and the point's id (64 bit)."""
 
 IMAGE_FIELDS = 10
-"""IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME."""
+"""Number of IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME."""
 
 SHORT_LINE = 400
-"""Bytes; only shorter lines of points are looked at, to notice that they are missing."""
+"""Only lines of points below this many bytes are checked: if the line of points is missing, the
+short line of the next image is in its place."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """What a COLMAP camera is to us: a pinhole, and whether it was more than that."""
+    """A COLMAP camera as a pinhole, and whether it has distortion that is ignored."""
 
     model: Model
     focal: tuple[float, float]
@@ -58,7 +59,7 @@ class Lens:
 
 @dataclass(frozen=True)
 class Image:
-    """A registered image: its pose, world to camera, and where in the file it stands."""
+    """A registered image: its pose, world to camera, and its place in the file."""
 
     place: Place
     image_id: int
@@ -88,20 +89,20 @@ def find_colmap(folder: Path) -> tuple[Path, str] | None:
 def read_colmap(folder: Path, suffix: str) -> ViewSet:
     """Return the views of a COLMAP model, sorted by image name.
 
-    COLMAP writes images in the order of their ids, which is that of registration or of a hash;
-    the order of names is the one that text, binary and the 3DGS loader agree on.
+    COLMAP writes images in the order of registration or of a hash, which may differ between text
+    and binary. The 3DGS loader sorts them by name, too.
 
     Parameters
     ----------
     folder : Path
-        Holds ``cameras`` and ``images``.
+        The folder of ``cameras`` and ``images``.
     suffix : str
         ``".bin"`` or ``".txt"``.
 
     Raises
     ------
     RefineError
-        If a file is missing, cut off or wrong; with the byte or the line.
+        If a file is missing, truncated or wrong; with the byte or the line.
     """
     cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
     if suffix == ".bin":
@@ -124,6 +125,7 @@ def read_colmap(folder: Path, suffix: str) -> ViewSet:
 
 
 def _view(image: Image, lens: Lens) -> View:
+    """Return the view of an image."""
     quaternion = _unit(image.place, image.quaternion)
     rotation = _rotation(quaternion)
     center = -rotation.T @ np.array(image.translation)
@@ -131,15 +133,17 @@ def _view(image: Image, lens: Lens) -> View:
 
 
 def _unit(place: Place, quaternion: Sequence[float]) -> list[float]:
+    """Return a quaternion scaled to length 1."""
     largest = max(map(abs, quaternion))
     if not largest:
         place.fail("expected a quaternion (w, x, y, z) of a rotation, got all zeros")
-    scaled = [value / largest for value in quaternion]  # first, so that squares stay tame
+    scaled = [value / largest for value in quaternion]  # so that squares do not overflow
     norm = sum(value * value for value in scaled) ** 0.5
     return [value / norm for value in scaled]
 
 
 def _rotation(quaternion: Sequence[float]) -> NDArray[np.float64]:
+    """Return the matrix, (3, 3), of a unit quaternion w x y z."""
     w, x, y, z = quaternion
     return np.array(
         [
@@ -151,6 +155,7 @@ def _rotation(quaternion: Sequence[float]) -> NDArray[np.float64]:
 
 
 def _lens(place: Place, model: Model, size: Sequence[object], values: Sequence[object]) -> Lens:
+    """Return the lens of a camera model, image size and parameters."""
     if not model.focals:
         place.fail(f"camera model {model.name} is a panorama, expected one with a focal length")
     width, height = (
@@ -161,13 +166,13 @@ def _lens(place: Place, model: Model, size: Sequence[object], values: Sequence[o
     cx, cy = numbers[model.focals : model.focals + 2]
     extra = numbers[model.focals + 2 :]
     if model.name == "EUCM":
-        extra = extra[:1]  # with alpha = 0 it is a pinhole, whatever beta
+        extra = extra[:1]  # with alpha = 0 it is a pinhole for every beta
     distorted = model.fisheye or any(extra)
     return Lens(model, (fx, fy), (cx, cy), (width, height), distorted)
 
 
 class _Binary:
-    """A little-endian file, read front to back; nothing is taken that is not there."""
+    """A little-endian file, read from start to end; refused where it is truncated."""
 
     def __init__(self, path: Path) -> None:
         self.file = Place(path)
@@ -177,19 +182,19 @@ class _Binary:
                 self.size = stream.seek(0, 2)
                 if not self.size:
                     self.file.fail("the file is empty, expected a COLMAP model")
-                # Mapped: most of images.bin is observations, which are skipped.
+                # Memory-mapped, since images.bin is mostly observations, which are skipped.
                 self.data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
                 refuse_pointer(path, self.data[:SHORT_LINE])
         except (OSError, ValueError) as error:
             self.file.fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
 
     def take(self, layout: str, what: str) -> tuple[Any, ...]:
-        """Return the next values."""
+        """Return the next values, of a `struct` layout."""
         start = self.skip(struct.calcsize(f"<{layout}"), what)
         return struct.unpack_from(f"<{layout}", self.data, start)
 
     def skip(self, count: int, what: str) -> int:
-        """Pass over `count` bytes; return where they started."""
+        """Skip `count` bytes; return where they start."""
         start = self.offset
         if count > self.size - start:
             self.truncated(what, f"expected {count} more bytes")
@@ -200,7 +205,7 @@ class _Binary:
         """Return the next text, which ends with a zero byte."""
         end = self.data.find(b"\0", self.offset)
         if end < 0:
-            self.truncated(what, "expected a zero byte behind the name")
+            self.truncated(what, "expected a zero byte after the name")
         raw = self.data[self.offset : end]
         self.offset = end + 1
         return raw.decode("utf-8", "replace")
@@ -216,11 +221,11 @@ class _Binary:
         return int(count)
 
     def end(self, what: str, count: int) -> None:
-        """Refuse bytes behind the last of so many things, which would be more of them."""
+        """Refuse bytes after the last of `count` things: the file holds more than it announces."""
         left = self.size - self.offset
         if left:
             self.file.at(f"byte {self.offset}").fail(
-                f"expected the end of the file behind {counted(count, what)}, got {left} more bytes"
+                f"expected the end of the file after {counted(count, what)}, got {left} more bytes"
             )
 
     def truncated(self, what: str, expected: str) -> NoReturn:
@@ -230,6 +235,7 @@ class _Binary:
 
 
 def _binary_cameras(path: Path) -> dict[int, Lens]:
+    """Return the lenses of ``cameras.bin`` by their id."""
     data = _Binary(path)
     with data.data:
         lenses: dict[int, Lens] = {}
@@ -246,6 +252,7 @@ def _binary_cameras(path: Path) -> dict[int, Lens]:
 
 
 def _binary_images(path: Path) -> list[Image]:
+    """Return the images of ``images.bin``."""
     data = _Binary(path)
     with data.data:
         images: list[Image] = []
@@ -280,6 +287,7 @@ def _lines(path: Path) -> list[tuple[Place, bytes]]:
 
 
 def _text_cameras(path: Path) -> dict[int, Lens]:
+    """Return the lenses of ``cameras.txt`` by their id."""
     lenses: dict[int, Lens] = {}
     for place, line in _lines(path):
         if not line:
@@ -301,6 +309,7 @@ def _text_cameras(path: Path) -> dict[int, Lens]:
 
 
 def _text_images(path: Path) -> list[Image]:
+    """Return the images of ``images.txt``."""
     images: list[Image] = []
     lines = iter(_lines(path))
     for place, line in lines:
@@ -335,6 +344,7 @@ def _image(place: Place, image_id: int, pose: Sequence[object], camera_id: int, 
 
 
 def _add(lenses: dict[int, Lens], place: Place, camera_id: int, lens: Lens) -> None:
+    """Add a lens; refuse an id that is there already."""
     if camera_id in lenses:
         place.fail(f"camera {camera_id} is there twice, expected each id once")
     lenses[camera_id] = lens

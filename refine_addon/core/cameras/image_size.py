@@ -1,4 +1,4 @@
-"""The size of a PNG or JPEG image, from its first bytes."""
+"""The size of a PNG or JPEG image, read from its header."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ PNG_START = b"\x89PNG\r\n\x1a\n"
 JPEG_START = b"\xff\xd8"
 
 MOST_SEGMENTS = 4096
-"""More than any camera writes ahead of the picture; fill bytes count as well."""
+"""Most segments and fill bytes that are skipped; no camera writes as many."""
 
 FILL = 0xFF
 START_OF_SCAN = 0xDA
 END_OF_IMAGE = 0xD9
 STANDALONE = {0x01, *range(0xD0, 0xD9)}
-"""JPEG markers without a segment behind them."""
+"""JPEG markers that no segment follows."""
 FRAME_MARKERS = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """JPEG start-of-frame markers: a segment with precision (1 byte), height, width (2 bytes each)."""
 
@@ -35,7 +35,7 @@ def image_size(path: Path) -> tuple[int, int] | None:
     Returns
     -------
     tuple of int or None
-        ``None`` where there is no such file, or it is no PNG and no JPEG, or is cut off.
+        ``None`` if the file does not exist, is neither PNG nor JPEG, or is truncated.
     """
     try:
         if not path.is_file():
@@ -52,7 +52,7 @@ def image_size(path: Path) -> tuple[int, int] | None:
 
 
 def _jpeg_size(stream: BinaryIO) -> tuple[int, int] | None:
-    """Walk the segments up to the first frame header."""
+    """Return the size in the first frame header; skip the segments before it."""
     stream.seek(len(JPEG_START))
     for _ in range(MOST_SEGMENTS):
         start, marker = stream.read(2)

@@ -1,4 +1,4 @@
-"""Camera models that files name, and what is told about those that are no pinholes."""
+"""Camera models that files can name, and notes about models that are not pinholes."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Model:
-    """A camera model: first its focal lengths, then cx, cy, then what is not modelled here.
+    """A camera model. Its parameters are the focal lengths, cx, cy, then those of distortion.
 
     Attributes
     ----------
     name : str
         As in ``cameras.txt``.
     focals : int
-        1 if fx = fy; 0 if there is none: a panorama.
+        Number of focal lengths: 2, 1 if fx = fy, or 0 for a panorama.
     count : int
         Number of parameters.
     fisheye : bool
-        Whether the angle, not its tangent, grows with the distance from the centre.
+        Whether the distance from the centre grows with the angle, not with its tangent.
     """
 
     name: str
@@ -57,29 +57,29 @@ MODELS_BY_NAME = {model.name: model for model in MODELS.values()}
 
 
 FISHEYE624 = Model("FISHEYE624", 1, 15, fisheye=True)
-"""nerfstudio's name for Project Aria's lenses; COLMAP has no number for it."""
+"""nerfstudio's model of Project Aria's lenses; COLMAP has no number for it."""
 
 PANORAMAS = {
     *("EQUIRECTANGULAR", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R"),
     *("VR180_L", "VR180_R", "ORTHOPHOTO"),
 }
-"""Models of nerfstudio and COLMAP that no pinhole comes near."""
+"""Models of nerfstudio and COLMAP that a pinhole cannot approximate."""
 
 
 def counted(count: int, thing: str) -> str:
-    """Return a count and what is counted, in the plural where there are several."""
+    """Return a count and a noun, with a plural s if the count is not 1."""
     return f"{count} {thing}" if count == 1 else f"{count} {thing}s"
 
 
 def lens_note(counts: Mapping[Model, int], thing: str) -> str:
-    """Return what to tell about lenses that are no pinholes, or "".
+    """Return a note about lenses that are not pinholes, or "" if there are none.
 
     Parameters
     ----------
     counts : mapping of Model to int
-        How many there are of each model.
+        How many things have each model.
     thing : str
-        Of what, in the singular.
+        What is counted, in the singular: "camera" or "frame".
     """
     notes = []
     for model, count in counts.items():

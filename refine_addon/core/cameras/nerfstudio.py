@@ -1,15 +1,15 @@
 """``transforms.json`` of nerfstudio, instant-ngp and the NeRF synthetic scenes.
 
-``transform_matrix`` is camera to world in OpenGL axes (x right, y up, z back). The poses are
-taken as they stand: nerfstudio's ``applied_transform`` and ``applied_scale`` tell what was done to
-them already, instant-ngp's ``scale``, ``offset`` and ``aabb*`` what it does inside itself. That is
-the world of a splat file trained from this file by whatever keeps its coordinates.
+``transform_matrix`` is camera to world in OpenGL axes (x right, y up, z back). Poses are used as
+stored. nerfstudio's ``applied_transform`` and ``applied_scale`` describe what was done to them
+before; instant-ngp's ``scale``, ``offset`` and ``aabb*`` what it does internally. So the views are
+in the world of a splat file that a trainer without a transform of its own makes of this file.
 
-nerfstudio's own training does not: it turns, centres and scales the poses, and ``ns-export``
-writes splats in that frame. It notes the change in ``dataparser_transforms.json`` of the run;
-put beside the ``transforms.json``, that file is applied here.
+nerfstudio's own training rotates, centres and scales the poses, and ``ns-export`` writes splats in
+that frame. The run records the change in ``dataparser_transforms.json``; if that file lies beside
+the ``transforms.json``, it is applied here.
 
-Principal points count from the image's upper left corner, pixel centres are at k + 0.5.
+Principal points are measured from the image's upper left corner, and pixel centres are at k + 0.5.
 """
 
 from __future__ import annotations
@@ -35,26 +35,26 @@ if TYPE_CHECKING:
 DATAPARSER_FILE = "dataparser_transforms.json"
 
 OPENGL_TO_OPENCV = np.array([1.0, -1.0, -1.0])
-"""Factors of a camera's axes: y up becomes y down, z back becomes z forward."""
+"""Factors on a camera's axes: y up becomes y down, z back becomes z forward."""
 
 LEAST_SCALE, LARGEST_SCALE = 1e-6, 1e6
-"""Uniform scales of a ``transform_matrix`` that are taken out of it."""
+"""Range of uniform scales that are removed from a ``transform_matrix``."""
 
 DISTORTIONS = ("k1", "k2", "k3", "k4", "p1", "p2")
 PANORAMA_KEYS = ("equirectangular", "latlong")
-"""Keys by which instant-ngp knows that there is no pinhole."""
+"""Keys that mark a panorama for instant-ngp."""
 
 LENSES = {**MODELS_BY_NAME, "FISHEYE624": FISHEYE624}
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
-"""Tried in turn where the image itself has to tell its size; NeRF synthetic names have none."""
+"""Suffixes tried when the size is read from the image; names of NeRF synthetic scenes have none."""
 
 LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
-"""What nerfstudio assumes of its older COLMAP projects, which have no ``applied_transform``."""
+"""What nerfstudio assumes for older COLMAP projects, which have no ``applied_transform``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """``p -> scale * (rotation @ p + offset)``, from the file's world to the splats'."""
+    """``p -> scale * (rotation @ p + offset)``: from the world of the file to the splats'."""
 
     rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
     offset: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
@@ -67,9 +67,9 @@ def read_transforms(path: Path, data: object) -> ViewSet:
     Parameters
     ----------
     path : Path
-        Where it was read from; images without ``w`` and ``h`` are looked for beside it.
+        The file. If ``w`` and ``h`` are missing, images are looked for beside it.
     data : object
-        What it holds.
+        Its content.
 
     Raises
     ------
@@ -88,16 +88,16 @@ def read_transforms(path: Path, data: object) -> ViewSet:
     poses: Counter[str] = Counter()
     views = []
     for index, item in enumerate(frames):
-        frame = _Frame(place.at(f"frame {index}"), shared, item, index)
-        views.append(frame.view(world))
-        lenses.update(frame.lens())
-        poses.update(frame.remarks)
+        entry = _Entry(place.at(f"frame {index}"), shared, item, index)
+        views.append(entry.view(world))
+        lenses.update(entry.lens())
+        poses.update(entry.remarks)
     notes += [f"{text} of {counted(count, 'frame')}" for text, count in poses.items()]
     return ViewSet(tuple(views), "; ".join(filter(None, (lens_note(lenses, "frame"), *notes))))
 
 
-class _Frame:
-    """One frame: its own keys come before those that all frames share."""
+class _Entry:
+    """One item of ``frames``; its own keys override those of the whole file."""
 
     def __init__(self, place: Place, shared: Mapping[str, Any], item: object, index: int) -> None:
         self.place = place
@@ -130,8 +130,8 @@ class _Frame:
     def pose(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the camera's axes (x right, y down, z forward) as columns, and its centre.
 
-        A uniform scale moves points along the rays through the centre only, so that the picture
-        is the same without it.
+        A uniform scale only moves points along rays through the centre, which does not change the
+        picture, so it is removed.
         """
         place = self.at("transform_matrix")
         matrix = place.matrix(self.own["transform_matrix"], (3, 4), 4)
@@ -145,7 +145,7 @@ class _Frame:
         return axes * OPENGL_TO_OPENCV, matrix[:3, 3]
 
     def size(self) -> tuple[int, int]:
-        """Return width and height: the keys, or else the image's own."""
+        """Return width and height by their keys, or of the image if those are missing."""
         if self.has("w") and self.has("h"):
             width, height = (self.at(key).side(self.get(key)) for key in ("w", "h"))
             return width, height
@@ -162,14 +162,14 @@ class _Frame:
         return place.side(size[0]), place.side(size[1])
 
     def focal(self, width: int, height: int) -> tuple[float, float]:
-        """Return fx and fy; where the file knows one of them, the other is the same."""
+        """Return fx and fy; if only one of them is given, both are the same."""
         fx, fy = self.axis_focal("x", width), self.axis_focal("y", height)
         if fx is None and fy is None:
             self.place.fail("missing 'fl_x', expected fl_x, fl_y, camera_angle_x or camera_angle_y")
         return fx or fy or 0.0, fy or fx or 0.0
 
     def axis_focal(self, axis: str, side: int) -> float | None:
-        """Return the focal length along an axis, by the first key that is there."""
+        """Return the focal length along an axis by the first key that exists, or None."""
         for keys in (self.own, self.shared):
             key = f"fl_{axis}"
             if key in keys:
@@ -183,7 +183,7 @@ class _Frame:
         return None
 
     def lens(self) -> list[Model]:
-        """Return the camera model if it is more than a pinhole; refuse panoramas."""
+        """Return the camera model in a list, which is empty for a pinhole; refuse panoramas."""
         distorted = any(self.has(key) and self.get(key) for key in DISTORTIONS)
         name = "OPENCV"
         if self.has("camera_model"):
@@ -195,7 +195,7 @@ class _Frame:
         panoramas = [key for key in PANORAMA_KEYS if self.has(key)]
         if name in PANORAMAS or panoramas:
             what = repr(name if name in PANORAMAS else panoramas[0])
-            self.place.fail(f"{what} cameras are no pinholes, expected a perspective camera")
+            self.place.fail(f"{what} cameras are not pinholes, expected a perspective camera")
         if name not in LENSES:
             known = ", ".join(model for model in LENSES if model not in PANORAMAS)
             self.at("camera_model").fail(f"unknown model {name[:40]!r}, expected one of {known}")
@@ -204,19 +204,19 @@ class _Frame:
 
 
 def without_scale(place: Place, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return an orthonormal matrix and the uniform scale that was in it.
+    """Return an orthonormal matrix and the uniform scale that was removed from it.
 
     Parameters
     ----------
     place : Place
         For the error.
     matrix : (3, 3) float64
-        Of finite numbers.
+        Finite numbers.
 
     Raises
     ------
     RefineError
-        If the scale is not uniform, the axes are not at right angles, or there is no scale.
+        If the scale is not uniform or out of range, or the axes are not at right angles.
     """
     if np.abs(matrix).max() <= LARGEST_SCALE:
         scale = float(np.sqrt(np.sum(matrix * matrix) / 3))
@@ -226,7 +226,7 @@ def without_scale(place: Place, matrix: NDArray[np.float64]) -> tuple[NDArray[np
 
 
 def _splat_world(place: Place, shared: Mapping[str, Any]) -> tuple[Similarity, list[str]]:
-    """Return how the world of the splats lies to that of the file, and what to tell about it."""
+    """Return the transform from the file's world to the splats', and notes about it."""
     beside = place.path.parent / DATAPARSER_FILE
     if not is_file(beside):
         hint = f"splats of ns-export need {DATAPARSER_FILE} beside it"
@@ -237,7 +237,7 @@ def _splat_world(place: Place, shared: Mapping[str, Any]) -> tuple[Similarity, l
     matrix = at.matrix(parsed["transform"], (3,), 4)
     rotation = at.rotation(matrix[:, :3])
     scale = source.at("'scale'").positive(parsed["scale"], "scale")
-    # It leads from the data before `applied_*`; what was applied is undone first.
+    # It applies to poses before `applied_transform` and `applied_scale`, so undo these first.
     at = place.at("'applied_transform'")
     applied = np.zeros((3, 4))
     applied[:, :3] = np.eye(3)

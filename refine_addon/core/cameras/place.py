@@ -1,7 +1,7 @@
-"""What every camera format needs: numbers, lists and JSON checked, with the place in the error.
+"""Checks of numbers, lists and JSON for all camera formats; errors name the place.
 
-A `Place` says where one is ("cameras.json: camera 3"), so that each check is one call and each
-error names the file, the place, what was found and what was expected.
+A `Place` is a position in a file, such as "cameras.json: camera 3". Each check is one method of it,
+and each error names the file, the place, what was found and what was expected.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LARGEST_NUMBER = 1e18
-"""No coordinate or focal length is larger: its square still fits 32-bit floating point."""
+"""Largest coordinate or focal length: its square still fits float32."""
 
 SMALLEST_LENGTH = 1e-6
-"""No focal length (pixels) or scale is smaller, so that its inverse is a tame number."""
+"""Smallest focal length (pixels) or scale."""
 
 LARGEST_SIDE = 1_000_000
-"""Pixels; no image is wider or higher."""
+"""Largest width or height of an image, pixels."""
 
 NEGLIGIBLE = 1e-30
-"""Numbers below this are read as 0: products of two of them must not underflow."""
+"""Smaller numbers are read as 0, so that products of two numbers do not underflow."""
 
 ORTHONORMAL_TOLERANCE = 1e-3
-"""Largest entry of ``R Rᵀ - I`` that is still the rounding of a text file; as in `View`."""
+"""Largest entry of ``R Rᵀ - I`` that rounding in a text file may cause; as in `View`."""
 
 SNIFFED_BYTES = 4096
-"""How much of a file is read to see whether it can be JSON at all."""
+"""How many bytes are read to find out whether a file can be JSON."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Place:
     where: str = ""
 
     def at(self, where: str) -> Place:
-        """Return a place further in."""
+        """Return a place within this one."""
         return Place(self.path, f"{self.where} {where}" if self.where else where)
 
     def fail(self, problem: str) -> NoReturn:
@@ -75,15 +75,15 @@ class Place:
         raise RefineError(msg)
 
     def number(self, value: object) -> float:
-        """Return `value` if it is a finite number of a sensible size."""
+        """Return `value` if it is a number of at most `LARGEST_NUMBER`."""
         if not isinstance(value, (int, float)) or isinstance(value, bool):
             self.fail(f"expected a number, got {described(value)}")
-        if not abs(value) <= LARGEST_NUMBER:  # also catches NaN, and integers beyond any float
+        if not abs(value) <= LARGEST_NUMBER:  # also refuses NaN, and integers too large for float
             self.fail(f"expected a finite number up to 1e18, got {described(value)}")
         return float(value) if abs(value) >= NEGLIGIBLE else 0.0
 
     def positive(self, value: object, what: str) -> float:
-        """Return `value` if it can be a length, which `what` names: 1e-6 to 1e18."""
+        """Return `value` if it is a number of 1e-6 to 1e18; `what` names it in messages."""
         number = self.number(value)
         if number < SMALLEST_LENGTH:
             self.fail(f"expected a positive {what}, got {described(value)}")
@@ -94,7 +94,7 @@ class Place:
         return self.positive(value, "focal length in pixels")
 
     def side(self, value: object) -> int:
-        """Return `value` if it can be a number of pixels: whole, though it may be written 800.0."""
+        """Return `value` if it is a whole number of pixels; it may be written as 800.0."""
         number = self.number(value)
         if not (number.is_integer() and 1 <= number <= LARGEST_SIDE):
             self.fail(
@@ -116,7 +116,7 @@ class Place:
         return [self.at(f"[{index}]").number(item) for index, item in enumerate(value)]
 
     def matrix(self, value: object, rows: Sequence[int], columns: int) -> NDArray[np.float64]:
-        """Return `value` if it is a list of lists of numbers with one of these sizes."""
+        """Return `value` if it is a list of rows of numbers; `rows` are the allowed counts."""
         sizes = " or ".join(f"{count} x {columns}" for count in rows)
         if not isinstance(value, list) or len(value) not in rows:
             self.fail(f"expected a {sizes} matrix, got {described(value)}")
@@ -149,12 +149,12 @@ class Place:
         principal: tuple[float, float],
         size: tuple[int, int],
     ) -> View:
-        """Return the view; what it refuses is refused with this place.
+        """Return a view; errors name this place.
 
         Parameters
         ----------
         name : str
-            As in the file; halves of surrogate pairs, which cannot be printed, become "?".
+            As in the file. Halves of surrogate pairs become "?", since they cannot be printed.
         rotation : (3, 3) float64
             World to camera (x right, y down, z forward).
         center : (3,) float64
@@ -174,18 +174,18 @@ class Place:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file.
+    """Return whether `path` is an existing file.
 
     Raises
     ------
     RefineError
-        If the system does not say: a name too long, a folder that may not be entered.
+        If the system cannot tell: a name too long, a folder that may not be entered.
     """
     return stat.S_ISREG(_mode(path))
 
 
 def is_folder(path: Path) -> bool:
-    """Whether there is such a folder; see `is_file`."""
+    """Return whether `path` is an existing folder; see `is_file`."""
     return stat.S_ISDIR(_mode(path))
 
 
@@ -197,7 +197,7 @@ def _mode(path: Path) -> int:
 
 
 def described(value: object) -> str:
-    """Return a short description of a value out of JSON, for messages."""
+    """Return a short description of a JSON value, for messages."""
     if isinstance(value, dict):
         return f"an object with {len(value)} keys"
     if isinstance(value, list):
@@ -207,7 +207,7 @@ def described(value: object) -> str:
 
 
 def read_json(path: Path) -> object:
-    """Return what a JSON file holds.
+    """Return the content of a JSON file.
 
     Parameters
     ----------
@@ -217,14 +217,14 @@ def read_json(path: Path) -> object:
     Raises
     ------
     RefineError
-        If it cannot be read, is empty or is no JSON; with line and column.
+        If the file cannot be read, is empty or is not JSON; with line and column.
     """
     place = Place(path)
     try:
         with path.open("rb") as stream:
             head = stream.read(SNIFFED_BYTES)
             refuse_pointer(path, head)
-            if head[:1] not in b"{[\xef \t\r\n":  # so that no splat file is read whole
+            if head[:1] not in b"{[\xef \t\r\n":  # so that a large splat file is not read
                 place.fail(
                     "not a camera file: expected JSON (cameras.json, transforms.json) "
                     f"or a COLMAP model, got a file that starts with {head[:8]!r}"

@@ -1,7 +1,7 @@
 """Cameras from files: Inria ``cameras.json``, ``transforms.json`` and COLMAP models.
 
-One rule for every format: what the file says is read as it stands, checked, and refused with the
-place where it is wrong. Nothing is guessed that would move a camera.
+The same rule holds for every format: values are read as stored and checked, and errors name the
+place in the file. Nothing that would move a camera is guessed.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 INRIA_KEYS = ("position", "rotation", "fx", "fy", "width", "height")
-"""What a camera of ``cameras.json`` cannot do without."""
+"""Keys that every camera of a ``cameras.json`` must have."""
 
 JSON_NAMES = ("cameras.json", "transforms.json", "transforms_train.json")
-"""Files looked for in a folder, in this order; a COLMAP model comes last."""
+"""Files that are looked for in a folder, in this order; a COLMAP model comes last."""
 
 
 def read_cameras(path: Path | str) -> ViewSet:
@@ -35,20 +35,20 @@ def read_cameras(path: Path | str) -> ViewSet:
     path : path-like
         A ``cameras.json`` as the reference 3DGS implementation writes it, a ``transforms.json`` of
         nerfstudio or instant-ngp, any file of a COLMAP model (text or binary), or a folder. In a
-        folder, ``cameras.json`` comes before ``transforms.json``, ``transforms_train.json`` and a
-        COLMAP model (in the folder itself, ``sparse/0``, ``sparse`` or ``colmap/sparse/0``);
-        whatever else is there is named in the note. ``~`` is the home folder.
+        folder, ``cameras.json`` is preferred to ``transforms.json``, ``transforms_train.json`` and
+        a COLMAP model (in the folder itself, ``sparse/0``, ``sparse`` or ``colmap/sparse/0``); the
+        note names those that were not read. ``~`` is the home folder.
 
     Returns
     -------
     ViewSet
-        In the order of the file; those of COLMAP by name. `ViewSet.note` tells what is not
+        In the order of the file; COLMAP's sorted by name. `ViewSet.note` tells what is not
         modelled, such as lens distortion.
 
     Raises
     ------
     RefineError
-        If there is no such file or it is wrong; the message names the file, the place, what was
+        If the file does not exist or is wrong; the message names the file, the place, what was
         found and what was expected.
     """
     path = expanded(path)
@@ -62,6 +62,7 @@ def read_cameras(path: Path | str) -> ViewSet:
 
 
 def _read_folder(folder: Path) -> ViewSet:
+    """Read the preferred cameras of a folder; the note names the others."""
     files = [folder / name for name in JSON_NAMES if is_file(folder / name)]
     colmap = find_colmap(folder)
     if not files and not colmap:
@@ -82,6 +83,7 @@ def _read_folder(folder: Path) -> ViewSet:
 
 
 def _read_json_cameras(path: Path) -> ViewSet:
+    """Read a JSON file in either of the two formats."""
     data = read_json(path)
     if isinstance(data, list):
         return read_inria(path, data)
@@ -96,21 +98,21 @@ def _read_json_cameras(path: Path) -> ViewSet:
 def read_inria(path: Path, data: list[object]) -> ViewSet:
     """Return the views of the ``cameras.json`` that the reference 3DGS implementation writes.
 
-    ``rotation`` is camera to world, its columns the camera's x (right), y (down) and z (forward);
-    ``position`` is the camera's centre. The principal point is the image's centre unless ``cx``
-    and ``cy`` (pixels), which some forks add, say otherwise.
+    ``rotation`` is camera to world; its columns are the camera's x (right), y (down) and z
+    (forward). ``position`` is the camera's centre. Some forks add the principal point as ``cx`` and
+    ``cy`` (pixels); without them it is the centre of the image.
 
     Parameters
     ----------
     path : Path
         For messages.
     data : list
-        What the file holds.
+        The content of the file.
 
     Raises
     ------
     RefineError
-        If it is empty, or a camera is wrong; with its index and key.
+        If the list is empty, or a camera is wrong; with its index and key.
     """
     place = Place(path)
     if not data:
@@ -119,6 +121,7 @@ def read_inria(path: Path, data: list[object]) -> ViewSet:
 
 
 def _inria_view(file: Place, index: int, item: object) -> View:
+    """Return the view of one camera."""
     place = file.at(f"camera {index}")
     camera = place.members(item)
     if "transform" in camera and "position" not in camera:

@@ -1,7 +1,7 @@
-"""3DGS PLY files: read through a memory map, write the kept rows and not a byte else.
+"""3DGS PLY files: read through a memory map, and written with the kept rows unchanged.
 
-Rows of fixed size are mapped, so that a file of any size costs only the columns that are looked
-at; text is read into memory.
+Binary rows are memory-mapped, so only the columns that are used are read from the disk. Text is
+read into memory.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ __all__ = [
 ]
 
 INDEXING = ("edge", "face", "tristrips")
-"""Elements that, by a PLY's convention, hold numbers of vertices."""
+"""Elements that by convention hold indices of vertices."""
 
 _NAMES_SHOWN = 12
 
@@ -53,15 +53,15 @@ class SplatFile:
     path : Path
         Where it was read from.
     rows : (N,) structured
-        The vertex element, one field a property in file order; read-only and mapped if binary.
+        The vertex element, one field for each property; read-only and mapped if binary.
     header : bytes
-        The header as it stands in the file, ``end_header`` and line end included.
+        The bytes of the header, with ``end_header`` and its line end.
     before, after : (M,) uint8
-        Bytes of the body ahead of and behind the vertex rows.
+        Bytes of the body before and after the vertex rows.
     lines : list of bytes or None
         For ASCII files, the text of each vertex row with its line end.
     indexing : tuple of str
-        Names of other elements whose rows hold numbers of splats.
+        Names of other elements whose rows hold indices of splats.
     """
 
     path: Path
@@ -78,14 +78,14 @@ class SplatFile:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes one splat takes; at most, where the rows are text."""
+        """Bytes of one splat in the file; of the longest row, if rows are text."""
         if self.lines is not None:
             return max(map(len, self.lines), default=0)
         return int(self.rows.dtype.itemsize)
 
     @property
     def changed_row_bytes(self) -> int:
-        """Bytes one splat takes at most where its numbers may become any others."""
+        """Most bytes of one splat in the file after absorbing, which may change all its numbers."""
         if self.lines is None:
             return self.row_bytes
         names = self.rows.dtype.names or ()
@@ -94,12 +94,12 @@ class SplatFile:
 
     @property
     def fixed_bytes(self) -> int:
-        """Bytes that stay however many splats go."""
+        """Bytes of everything but the splats."""
         return len(self.header) + len(self.before) + len(self.after)
 
     @property
     def format(self) -> str:
-        """What the header's format line says, such as ``binary_little_endian 1.0``."""
+        """Format as in the header, such as ``binary_little_endian 1.0``."""
         return format_of(self.header)
 
     def size(
@@ -124,7 +124,7 @@ class SplatFile:
         return len(self._new_header(keep, columns)) + len(self.before) + rows + len(self.after)
 
     def notes(self, keep: NDArray[np.bool_]) -> list[str]:
-        """Return what the user should know of a file of the kept rows, in sentences."""
+        """Return what the user should know about a file of the kept rows, in sentences."""
         return [
             f"element '{name}' beside the splats is kept as it is; "
             "its indices may point past the end"
@@ -132,7 +132,7 @@ class SplatFile:
         ]
 
     def splats(self) -> Splats:
-        """Return the rows as splats, as views of the file where its layout permits."""
+        """Return the rows as splats; the arrays are views of the file if its layout permits."""
         return splats_from_columns(self.rows)
 
     def write(
@@ -143,25 +143,25 @@ class SplatFile:
         columns: Mapping[str, NDArray[Any]] | None = None,
         overwrite: bool = False,
     ) -> None:
-        """Write the kept rows, in order, byte for byte as they were read.
+        """Write the kept rows in order; their bytes stay as they were read.
 
         Parameters
         ----------
         path : path-like
-            The file to make; written whole or not at all. ``~`` is the home folder.
+            The file to write, completely or not at all. ``~`` is the home folder.
         keep : (N,) bool, optional
             Which rows to write; all by default.
         columns : mapping of str to (N,), optional
-            Properties to set; those the file lacks are appended as the type of their array
-            (float32 -> ``float``), those it has keep their place and type.
+            Properties to set. Properties that the file has keep their place and type; new ones are
+            appended with the type of their array (float32 -> ``float``).
         overwrite : bool
-            Whether an existing file may be replaced; this one too.
+            Whether an existing file may be replaced, even this one.
 
         Raises
         ------
         RefineError
-            If the file cannot be written, or exists and may not be replaced; if `keep` or a
-            column does not fit.
+            If the file cannot be written, or exists and may not be replaced; if the shape or type
+            of `keep` or of a column is wrong.
         """
         path, columns = expanded(path), columns or {}
         if keep is not None and (keep.shape != self.rows.shape or keep.dtype != np.bool_):
@@ -185,7 +185,7 @@ class SplatFile:
     def _new_header(
         self, keep: NDArray[np.bool_] | None, columns: Mapping[str, NDArray[Any]]
     ) -> bytes:
-        """Return the header of the kept rows with these columns."""
+        """Return the header of a file of the kept rows with these columns."""
         count = len(self) if keep is None else int(np.count_nonzero(keep))
         header = with_count(self.header, count)
         declared = declarations(self.path, self.rows, columns)
@@ -203,17 +203,17 @@ def read_ply(path: Path | str) -> SplatFile:
     Returns
     -------
     SplatFile
-        Without a splat, if the file says so.
+        It may have no splats.
 
     Raises
     ------
     RefineError
-        If there is no such file, or it is no PLY, truncated, or not made of splats; the message
+        If the file does not exist, is not a PLY, is truncated, or does not hold splats; the message
         names the file, the place, what was found and what was expected.
     """
     path = expanded(path)
     try:
-        if not stat.S_ISREG(path.stat().st_mode):  # opening a pipe would wait for its other end
+        if not stat.S_ISREG(path.stat().st_mode):  # opening a pipe would wait for a writer
             msg = f"{path}: is a {'folder' if path.is_dir() else 'device'}, expected a PLY file"
             raise RefineError(msg)
         with path.open("rb") as stream:
@@ -238,6 +238,7 @@ def read_ply(path: Path | str) -> SplatFile:
 
 
 def _vertex_index(header: Header) -> int:
+    """Return the index of the vertex element; refuse files without one."""
     names = [element.name for element in header.elements]
     if "vertex" not in names:
         msg = (
@@ -249,12 +250,12 @@ def _vertex_index(header: Header) -> int:
 
 
 def _first(names: list[str]) -> str:
-    """Return the first of the file's names, none of them endless."""
+    """Return the first of some names, cut to 40 characters each, for a message."""
     return ", ".join(name[:40] for name in names[:_NAMES_SHOWN])
 
 
 def _check_properties(header: Header, vertex: int) -> None:
-    """Refuse vertices that are no splats, in words for what they seem to be."""
+    """Refuse vertices that are not splats; the message says what they seem to be."""
     kinds = {
         prop.name: "list" if isinstance(prop, plyfile.PlyListProperty) else prop.val_dtype
         for prop in header.elements[vertex].properties
@@ -290,6 +291,7 @@ def _check_properties(header: Header, vertex: int) -> None:
 
 
 def _guess(header: Header, kinds: Mapping[str, str]) -> str:
+    """Return what a file without all properties of splats seems to be."""
     if "opacity" in kinds:
         return "incomplete splats"
     if any(element.name in INDEXING for element in header.elements):

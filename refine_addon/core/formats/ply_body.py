@@ -1,4 +1,4 @@
-"""The body of a PLY file: where its splats lie, and that they are all there."""
+"""The body of a PLY file: where its splats are, and checks that it is complete."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ if TYPE_CHECKING:
 
 
 def check_counts(header: Header, available: int) -> None:
-    """Refuse counts that the file cannot back, before anything is allocated by them.
+    """Refuse a header that announces more rows than the file can hold, before memory is allocated.
 
     Parameters
     ----------
     header : Header
     available : int
-        Bytes behind the header.
+        Bytes after the header.
 
     Raises
     ------
     RefineError
-        If even the shortest rows of that number would not fit.
+        If that many rows would not fit even if each were as short as possible.
     """
     least = 0
     text = header.order == TEXT
@@ -40,7 +40,7 @@ def check_counts(header: Header, available: int) -> None:
             msg = f"{header.path}: element {shown(element.name)} has {count} rows and no property"
             raise RefineError(msg)
         least += row * count
-        if least > available + text:  # the last line of a text may lack its line end
+        if least > available + text:  # plus 1 for text, whose last line may lack its line end
             msg = (
                 f"{header.path}: truncated: the header announces {count} rows of "
                 f"{shown(element.name)}, at least {least} bytes so far, but only {available} bytes "
@@ -50,7 +50,8 @@ def check_counts(header: Header, available: int) -> None:
 
 
 def _least_bytes(element: Any, *, text: bool) -> int:  # noqa: ANN401 - plyfile has no types
-    if text:  # a digit and a separator each; of a list, its length
+    """Return the least bytes that one row of an element takes."""
+    if text:  # one digit and one separator for each number; lists may be empty, but have a length
         return 2 * len(element.properties)
     return sum(
         np.dtype(p.len_dtype if isinstance(p, plyfile.PlyListProperty) else p.val_dtype).itemsize
@@ -67,12 +68,12 @@ def vertex_range(header: Header, vertex: int, body: NDArray[np.uint8]) -> tuple[
     vertex : int
         Index of the vertex element, which has no list.
     body : (M,) uint8
-        Everything behind the header.
+        Everything after the header.
 
     Raises
     ------
     RefineError
-        If the file ends before; with the row.
+        If the file ends before the last row; with the row.
     """
     start = 0
     for element, count in zip(header.elements[:vertex], header.counts[:vertex], strict=True):
@@ -100,8 +101,8 @@ def _behind_lists(
     body: NDArray[np.uint8],
     at: int,
 ) -> int:
-    """Walk rows that hold lists; return where the last one ends."""
-    # The reader of a list's length (none for a single number) and the bytes a value takes.
+    """Return where the rows of an element with lists end; they start at `at`."""
+    # For each property: how to read the length of a list (None if it is not one), bytes of a value.
     steps = [
         (_length_reader(header, element, prop), np.dtype(prop.val_dtype).itemsize)
         for prop in element.properties
@@ -133,6 +134,7 @@ def _behind_lists(
 
 
 def _length_reader(header: Header, element: Any, prop: Any) -> struct.Struct | None:  # noqa: ANN401
+    """Return how to read the length of a list, or None for a single number."""
     if not isinstance(prop, plyfile.PlyListProperty):
         return None
     kind = np.dtype(prop.len_dtype)
@@ -156,7 +158,7 @@ def read_text(
     vertex : int
         Index of the vertex element, which has no list.
     body : bytes
-        Everything behind the header.
+        Everything after the header.
 
     Returns
     -------
@@ -164,12 +166,12 @@ def read_text(
     lines : list of bytes
         The text of each row with its line end.
     beside : tuple of bytes
-        What stands ahead of the rows and behind them.
+        The text before the rows and the text after them.
 
     Raises
     ------
     RefineError
-        If lines are missing, or one of them is not made of the numbers announced; with the row.
+        If lines are missing, or one does not hold the numbers announced; with the row.
     """
     lines = body.splitlines(keepends=True)
     start = sum(header.counts[:vertex])
@@ -188,6 +190,7 @@ def read_text(
 
 
 def _numbers(header: Header, element: Any, lines: Sequence[bytes]) -> NDArray[Any]:  # noqa: ANN401
+    """Return the numbers in lines of text; refuse the first line that is wrong."""
     dtype = element.dtype(TEXT)
     try:
         return _parsed(lines, dtype)
@@ -207,26 +210,28 @@ def _numbers(header: Header, element: Any, lines: Sequence[bytes]) -> NDArray[An
 
 
 _WRONG = (ValueError, DeprecationWarning)
-"""What NumPy raises of text that is no number of the type."""
+"""What NumPy raises for text that is not a number of the type."""
 
 _NO_SPACES = bytes.maketrans(b"\x1c\x1d\x1e\x1f", b"????")
-"""Four characters at which text is split, and bytes are not: part of a word, as in the header."""
+"""Replaces four control characters: str splits words at them, bytes and the header do not."""
 
 
 def _parsed(lines: Sequence[bytes], dtype: Any) -> NDArray[Any]:  # noqa: ANN401
+    """Return the numbers in lines of text; raise one of `_WRONG` if a line is wrong."""
     if not lines:
         return np.empty(0, dtype)
     if not all(map(bytes.strip, lines)):
-        msg = "a line without words, which NumPy would skip"
+        msg = "an empty line, which NumPy would skip"
         raise ValueError(msg)
     with warnings.catch_warnings():
-        # 1.5 where a whole number belongs is deprecated.
+        # NumPy only deprecates 1.5 for an integer property.
         warnings.simplefilter("error", DeprecationWarning)
         text = (line.translate(_NO_SPACES).decode("ascii") for line in lines)
         return np.loadtxt(text, dtype, comments=None, ndmin=1)
 
 
 def _is_number(word: bytes, dtype: Any) -> bool:  # noqa: ANN401
+    """Return whether a word is a number of a type."""
     try:
         _parsed([word], dtype)
     except _WRONG:
@@ -235,9 +240,9 @@ def _is_number(word: bytes, dtype: Any) -> bool:  # noqa: ANN401
 
 
 def _first_wrong(lines: Sequence[bytes], dtype: Any) -> int:  # noqa: ANN401
-    """Return the index of the first line that is not of that type, where one is not."""
+    """Return the index of the first wrong line, by bisection; at least one line is wrong."""
     first, beyond = 0, len(lines)
-    while beyond - first > 1:  # one of first..beyond is wrong, and none before them
+    while beyond - first > 1:  # the first wrong line is one of first..beyond - 1
         middle = (first + beyond) // 2
         try:
             _parsed(lines[first:middle], dtype)

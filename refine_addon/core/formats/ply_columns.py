@@ -1,4 +1,4 @@
-"""The properties of a 3DGS PLY by name, and the splats that they make."""
+"""The properties of a 3DGS PLY by name, converted to splats and back."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ REQUIRED = (
     *("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
     *("scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
-"""Properties without which a vertex is no splat."""
+"""Properties that every splat has."""
 
 REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 """Number of ``f_rest_*`` properties -> spherical-harmonics degree."""
@@ -29,14 +29,13 @@ def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> S
     Parameters
     ----------
     columns : structured array or mapping of str to (N,)
-        With everything in `REQUIRED`, and ``f_rest_*`` if there are any: all coefficients of red,
-        then green, then blue, as the reference implementation stores them.
+        All of `REQUIRED`, and ``f_rest_*`` if there are any: all coefficients of red, then of
+        green, then of blue, as the reference implementation stores them.
 
     Returns
     -------
     Splats
-        Views of `columns` where the fields of a group lie side by side in a structured array,
-        copies otherwise.
+        Views of a structured array where the fields of a group are adjacent, otherwise copies.
     """
     names = columns.dtype.names or () if isinstance(columns, np.ndarray) else tuple(columns)
     count = sum(name.startswith("f_rest_") for name in names)
@@ -58,9 +57,9 @@ def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> S
 
 
 def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
-    """Return views of splats, (N,) each, under the names that a 3DGS PLY gives its properties.
+    """Return views of splats, (N,) each, by the names of properties in a 3DGS PLY.
 
-    In the order of the reference implementation, without normals, and of the splats' own types.
+    The order is that of the reference implementation, without normals; types are those of `splats`.
     """
     coefficients = splats.sh_rest.shape[1]
     return {
@@ -78,8 +77,8 @@ def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
 
 
 def columns_from_splats(splats: Splats) -> dict[str, NDArray[np.float32]]:
-    """Return the float32 columns that a 3DGS PLY stores, in the reference order, no normals."""
-    with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # of double into float
+    """Return `values_by_name` as contiguous float32 arrays."""
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
         return {
             name: np.ascontiguousarray(values, np.float32)
             for name, values in values_by_name(splats).items()
@@ -87,7 +86,7 @@ def columns_from_splats(splats: Splats) -> dict[str, NDArray[np.float32]]:
 
 
 def _stack(columns: Any, names: Sequence[str]) -> NDArray[Any]:  # noqa: ANN401
-    """Return the named columns as (N, len(names)): a view if they lie side by side in a row."""
+    """Return the named columns as (N, len(names)); a view if they are adjacent in each row."""
     first = columns[names[0]]
     if isinstance(columns, np.ndarray) and columns.dtype.fields and columns.ndim == 1:
         kinds, offsets = zip(*(columns.dtype.fields[name][:2] for name in names), strict=True)
@@ -99,7 +98,7 @@ def _stack(columns: Any, names: Sequence[str]) -> NDArray[Any]:  # noqa: ANN401
             )
     kind = np.result_type(*(columns[name].dtype for name in names), np.float32)
     stacked = np.empty((len(first), len(names)), kind)
-    with np.errstate(invalid="ignore"):  # of signalling NaN put among doubles
+    with np.errstate(invalid="ignore"):  # signalling NaN converted to float64
         for index, name in enumerate(names):
             stacked[:, index] = columns[name]
     return stacked

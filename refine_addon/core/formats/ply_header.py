@@ -1,7 +1,7 @@
-"""The header of a PLY file: read with its grammar, changed without touching what stays.
+"""The header of a PLY file: parsed, and changed without touching anything else in it.
 
-plyfile knows the grammar. What it would refuse or change is kept from it: comments in any encoding,
-line ends, and counts, by which it would allocate.
+plyfile parses it. It gets the header without comments (which may be in any encoding), with plain
+line ends, and with row counts of 0, since it would allocate memory for the rows.
 """
 
 from __future__ import annotations
@@ -21,35 +21,36 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 HEADER_LIMIT = 1 << 20
-"""A header longer than this many bytes is not one of ours."""
+"""Longest header that is read, bytes."""
 
 TEXT = "="
-"""Byte order of the numbers of an ASCII file once they are read: the machine's."""
+"""Byte order for ASCII files: their numbers are stored in that of the machine."""
 
 _END = {
     b"\n": re.compile(rb"\n[ \t]*end_header[ \t]*\r?\n"),
     b"\r\n": re.compile(rb"\r\n[ \t]*end_header[ \t]*\r\n"),
     b"\r": re.compile(rb"\r[ \t]*end_header[ \t]*\r"),
 }
-"""How a header ends, by the line end of its first line: bytes of the body may look like others."""
+"""End of a header, for each kind of line end. Only that of the first line is looked for, since
+bytes of the body may look like another."""
 
 
 @dataclass(frozen=True, eq=False)
 class Header:
-    """A header and what it says.
+    """A parsed header.
 
     Attributes
     ----------
     path : Path
         The file, for messages.
     raw : bytes
-        The header as it stands in the file, ``end_header`` and its line end included.
+        The bytes of the header, with ``end_header`` and its line end.
     elements : tuple of plyfile.PlyElement
-        Names and properties; plyfile is told that there is no row.
+        Names and properties, without rows.
     counts : tuple of int
-        How many rows of each element are announced, however many there are.
+        How many rows the header announces for each element.
     order : {"<", ">", "="}
-        Byte order of the body, `TEXT` for an ASCII file.
+        Byte order of the body; `TEXT` for ASCII files.
     """
 
     path: Path
@@ -65,7 +66,7 @@ def read_header(path: Path, stream: BinaryIO) -> Header:
     Raises
     ------
     RefineError
-        If there is none, or it is wrong; with the line.
+        If the file has no header, or the header is wrong; with the line.
     """
     head = stream.read(HEADER_LIMIT)
     if not head:
@@ -91,7 +92,7 @@ def read_header(path: Path, stream: BinaryIO) -> Header:
 
 
 def format_of(raw: bytes) -> str:
-    """Return what the format line of a header says, such as ``binary_little_endian 1.0``."""
+    """Return the format that a header announces, such as ``binary_little_endian 1.0``."""
     for line in _lines(raw):
         words = line.split()
         if words[:1] == [b"format"]:
@@ -100,7 +101,7 @@ def format_of(raw: bytes) -> str:
 
 
 def with_count(raw: bytes, count: int) -> bytes:
-    """Return the header with another number of vertices; the same bytes if it says so already."""
+    """Return the header with this number of vertices; nothing else in it changes."""
     lines = _lines(raw)
     index = _vertex_line(lines)
     found = re.match(rb"(\s*element\s+vertex\s+)(\d+)", lines[index])
@@ -111,7 +112,7 @@ def with_count(raw: bytes, count: int) -> bytes:
 
 
 def with_properties(raw: bytes, declared: Sequence[bytes]) -> bytes:
-    """Return the header with lines added behind the vertex element's last property."""
+    """Return the header with lines added after the last property of the vertex element."""
     lines = _lines(raw)
     last = index = _vertex_line(lines)
     for index in range(last + 1, len(lines)):
@@ -125,12 +126,13 @@ def with_properties(raw: bytes, declared: Sequence[bytes]) -> bytes:
 
 
 def shown(word: bytes | str) -> str:
-    """Return a word of the file for a message: in quotes, and not endless."""
+    """Return a word of the file for a message: in quotes, at most 40 characters."""
     text = word if isinstance(word, str) else word.decode("ascii", "replace")
     return repr(text[:40])
 
 
 def _line_end(raw: bytes) -> bytes:
+    """Return the line end of a header's first line, "ply"."""
     return next(end for end in (b"\r\n", b"\n", b"\r") if raw.startswith(end, 3))
 
 
@@ -145,7 +147,7 @@ def _vertex_line(lines: Sequence[bytes]) -> int:
 
 
 def _plain(path: Path, raw: bytes) -> tuple[bytes, list[int]]:
-    """Return the header in the form that plyfile reads: same lines, no comment and no row."""
+    """Return the header as plyfile gets it, see the top of this file, and the counts of rows."""
     lines: list[bytes] = []
     counts: list[int] = []
     names: set[bytes] = set()
@@ -158,26 +160,28 @@ def _plain(path: Path, raw: bytes) -> tuple[bytes, list[int]]:
         elif not re.fullmatch(rb"[\t -~]*\r?", line):
             msg = f"{path}: header line {number}: expected ASCII text, got {line[:80]!r}"
             raise RefineError(msg)
-        elif keyword == b"element" and len(words) == 3:  # noqa: PLR2004 - and a name and a count
+        elif keyword == b"element" and len(words) == 3:  # noqa: PLR2004 - keyword, name, count
             counts.append(_count(path, number, words[2]))
             _refuse_double(path, number, words[1], elements)
             names = set()
             words[2] = b"0"
         elif keyword == b"property":
             _refuse_double(path, number, words[-1], names)
-        lines.append(b" ".join(words) or b" ")  # plyfile takes an empty line for the end
+        lines.append(b" ".join(words) or b" ")  # an empty line would end the header for plyfile
     return b"\n".join([*lines[:-1], b""]), counts
 
 
 def _count(path: Path, number: int, word: bytes) -> int:
+    """Return the number of rows in a word of header line `number`."""
     if not re.fullmatch(rb"[0-9]{1,30}", word):
         msg = f"{path}: header line {number}: expected a number of rows, got {shown(word)}"
         raise RefineError(msg)
     return int(word)
 
 
-def _refuse_double(path: Path, number: int, name: bytes, seen: set[bytes]) -> None:
-    if name in seen:
+def _refuse_double(path: Path, number: int, name: bytes, known: set[bytes]) -> None:
+    """Refuse a name that is in `known`; add it otherwise."""
+    if name in known:
         msg = f"{path}: header line {number}: {shown(name)} is declared twice, expected once"
         raise RefineError(msg)
-    seen.add(name)
+    known.add(name)

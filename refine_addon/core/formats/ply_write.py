@@ -1,4 +1,4 @@
-"""Writing splats: the bytes of the rows as they were read, and properties added to them."""
+"""Write rows of splats with their bytes as they were read, and with columns set or added."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ PLY_TYPES = {
     "f4": "float",
     "f8": "double",
 }
-"""NumPy's names of the types a PLY knows -> the PLY's."""
+"""Names of types in NumPy -> in PLY."""
 
 _LONGEST = {4: len("-1234567800000000.0"), 8: len("-1.2345678901234567e-308")}
-"""Bytes of a float or double -> the most characters that the shortest text for one takes."""
+"""Bytes of a float or double -> most characters of its shortest text that reads back the same."""
 
 _ROWS = 1 << 14
-"""Rows gathered at a time: 4 MB at degree 3, as fast as any more and nothing to hold."""
+"""Rows copied at a time: 4 MB at degree 3. More would not be faster."""
 
 
 def write_rows(
@@ -56,7 +56,16 @@ def write_rows(
 def _with_cells(
     chunk: NDArray[Any], dtype: np.dtype[Any], cells: Mapping[str, NDArray[Any]]
 ) -> NDArray[np.uint8]:
-    """Return rows as bytes, (n, bytes a row), with cells set where there is a place for them."""
+    """Return rows as bytes, (n, bytes of a row), with some properties set and others appended.
+
+    Parameters
+    ----------
+    chunk : (n,) void
+    dtype : structured
+        Of a row.
+    cells : mapping of str to (n,)
+        Values of the properties.
+    """
     size, fields = dtype.itemsize, dict(dtype.fields or {})
     kinds = {name: _stored(dtype, name, values.dtype) for name, values in cells.items()}
     extra = sum(kind.itemsize for name, kind in kinds.items() if name not in fields)
@@ -79,7 +88,7 @@ def text_lines(
 ) -> Iterator[bytes]:
     """Yield the kept rows of an ASCII file with `columns` set or appended.
 
-    Only the words of numbers that become other numbers are replaced; all other text stays.
+    Only the text of numbers that change is replaced; all other text stays.
 
     Parameters
     ----------
@@ -104,7 +113,7 @@ def text_lines(
     ]
     kept: Iterable[int] = range(len(lines)) if keep is None else np.flatnonzero(keep).tolist()
     for index in kept:
-        # str of a NumPy number is the shortest text that reads back as the same number.
+        # str of a NumPy number is the shortest text that reads back as that number.
         words = {
             place: str(values[index]).encode()
             for place, values, differs in replaced
@@ -115,7 +124,7 @@ def text_lines(
 
 
 def longest_line(dtype: np.dtype[Any], lines: Sequence[bytes], names: Collection[str]) -> int:
-    """Return how many bytes a line takes at most, whatever its numbers of these names become.
+    """Return the most bytes of a line after the numbers of these names have changed.
 
     Parameters
     ----------
@@ -135,14 +144,14 @@ def longest_line(dtype: np.dtype[Any], lines: Sequence[bytes], names: Collection
 
 
 def _differs(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
-    """Return where two columns of one type differ in their bits, as 0 and -0 do."""
+    """Return where two columns of one type differ in any bit, (N,); 0 and -0 differ."""
     bits = f"u{one.dtype.itemsize}"
     differs: NDArray[np.bool_] = one.view(bits) != np.ascontiguousarray(other).view(bits)
     return differs
 
 
 def _edited(line: bytes, words: Mapping[int, bytes], added: Sequence[bytes]) -> bytes:
-    """Return a line with some of its words replaced and others added; its spaces stay."""
+    """Return a line with some words replaced and others added at its end; its spaces stay."""
     parts = re.findall(rb"(\s*)(\S+)", line)
     text = b"".join(space + words.get(index, word) for index, (space, word) in enumerate(parts))
     return b" ".join([text, *added]) + line[len(line.rstrip()) :]
@@ -151,7 +160,7 @@ def _edited(line: bytes, words: Mapping[int, bytes], added: Sequence[bytes]) -> 
 def declarations(
     path: Path, rows: NDArray[Any], columns: Mapping[str, NDArray[Any]]
 ) -> list[bytes]:
-    """Return the header lines of those columns that `rows` lack.
+    """Return header lines for the columns that are not properties of `rows`.
 
     Parameters
     ----------
@@ -191,14 +200,18 @@ def declarations(
 
 
 def _stored(dtype: np.dtype[Any], name: str, kind: np.dtype[Any]) -> np.dtype[Any]:
-    """Return a column's type in the file: its property's, or its own in the file's byte order."""
+    """Return a column's type in the file.
+
+    It is the type of the property if there is one; otherwise `kind` in the file's byte order.
+    """
     if name in (dtype.names or ()):
         return dtype[name]
-    # That of the positions: single bytes, which the first property may be, have none.
+    # The byte order is that of x, since x has several bytes.
     return kind.newbyteorder(dtype["x"].byteorder)  # type: ignore[arg-type]
 
 
 def _cast(values: NDArray[Any], kind: np.dtype[Any]) -> NDArray[Any]:
-    # A double may be too large or too small for a float; a signalling NaN turns quiet.
+    """Return values in another type, without warnings."""
+    # A double may be too large or too small for a float; a signalling NaN becomes a quiet one.
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         return values.astype(kind)

@@ -1,4 +1,4 @@
-"""How much geometry, colour and opacity count in a scene: REFINE's content-adaptive weights."""
+"""Lambda: how much geometry, colour and opacity count in a scene (REFINE, Eq. 17-20)."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from dataclasses import dataclass
 TERMS = ("geometry", "color", "opacity")
 
 CALIBRATION = (10.73, 56.06, 100.67)
-"""E[.] of the three statistics over the calibration scenes of REFINE's authors: constants."""
+"""Means of the three statistics over the calibration scenes of REFINE's authors."""
 
 RATIO_LIMIT = 1e6
-"""Largest axis ratio of a splat that counts: a flat disk must not make the mean infinite."""
+"""Axis ratios above this count as this, so that one flat disk does not make the mean infinite."""
 
 _NOISE = 1e-12
-"""Below this a statistic is what rounding leaves of zero."""
+"""A smaller statistic counts as 0: rounding leaves about this much of a zero."""
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """What the weights are made of, over all drawable splats of a scene.
+    """The statistics that decide lambda, over all drawable splats of a scene.
 
     Attributes
     ----------
@@ -36,13 +36,13 @@ class Statistics:
     translucency: float
 
 
-def weights(statistics: Statistics, *, offset: float = 0.0) -> tuple[float, float, float]:
+def lambdas(statistics: Statistics, *, offset: float = 0.0) -> tuple[float, float, float]:
     """Return lambda of geometry, colour and opacity: each in [0, 1], their sum 1.
 
     ``lt_gem = ln(F_gem + offset) / 10.73``, ``lt_col = 100 F_col / 56.06`` and
     ``lt_opa = 100 F_opa / 100.67``, divided by their sum (REFINE, Eq. 17-20, with the constants of
-    the authors' code). A logarithm below zero (round splats, and an additive constant in F_gem)
-    counts as zero; where all three vanish, the weights are equal.
+    the authors' code). A negative logarithm counts as 0; it occurs where splats are round and the
+    shortest axis has an offset in F_gem. If all three are 0, all lambdas are equal.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def weights(statistics: Statistics, *, offset: float = 0.0) -> tuple[float, floa
 
     Examples
     --------
-    >>> [round(value, 3) for value in weights(Statistics(10.73, 0.05, 0.5))]
+    >>> [round(value, 3) for value in lambdas(Statistics(10.73, 0.05, 0.5))]
     [0.274, 0.111, 0.615]
     """
     geometry = statistics.anisotropy + offset

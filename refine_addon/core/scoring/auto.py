@@ -1,10 +1,10 @@
-"""The cheapest model that keeps nearly the same splats as the full one, found by probing.
+"""Method *auto*: the cheapest model that keeps nearly the same splats as the full one.
 
-Models, from cheap to full: the closed form without frustum test, with it, occlusion measured once,
-and occlusion in rounds. A few probe views rank the splats by each; the cheapest whose kept set
-differs from the full model's by no more than the tolerance is taken. Then views are added, twice as
-many each time, until the ranking has settled likewise. The full model is the last of the models,
-with all views: where nothing cheaper will do, that is what runs.
+Models, from cheap to full: the closed form without frustum test, the closed form with it, occlusion
+measured once, and occlusion in rounds. All of them score the splats by a few probe views. Auto
+takes the cheapest model whose kept set differs from the full model's by at most the tolerance. Then
+it doubles the number of views until the kept set changes by no more than the rest of the tolerance.
+If no cheaper choice agrees, auto runs the full model on all views.
 """
 
 from __future__ import annotations
@@ -32,19 +32,18 @@ if TYPE_CHECKING:
     Model = Callable[[ViewSet, Progress], Scores]
 
 PROBES = 8
-"""How many views probe; they are the farthest apart."""
+"""Number of probe views, which are spread evenly."""
 
 RATIOS = (0.3, 0.5, 0.7, 0.9)
-"""Shares removed at which kept sets are compared; the worst counts."""
-
+"""Shares removed at which kept sets are compared; the largest difference counts."""
 
 CAUTION = 4.0
-"""Factor on what the probes say. On the committed scene the kept sets of all views differed by up
-to 3.6 times what those of eight views did: with few views all models know little."""
+"""Factor on the difference that probe views show between two models. On the committed scene the
+kept sets of all views differed by up to 3.6 times as much as those of eight views."""
 
 HASTE = 1.5
-"""Factor on what further views are estimated to change. On four scenes the kept sets differed by up
-to 1.3 times the geometric series: later doublings change more than the first two promise."""
+"""Factor on the estimated change by further views. On four scenes the kept sets changed by up to
+1.3 times the estimate: later doublings change more than the first two suggest."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +55,8 @@ class Trial:
     choice : str
         What was tried.
     disagreement : float
-        Share of the kept set that would change, at the worst of `RATIOS`; between models, times
-        `CAUTION`.
+        Share of the kept set that differs, the largest over `RATIOS`; between two models multiplied
+        by `CAUTION`.
     """
 
     choice: str
@@ -98,35 +97,36 @@ def score(
     Parameters
     ----------
     splats, progress, threads
-        See `refine_addon.core.occlusion.score`.
+        See `occlusion.score`.
     views : ViewSet
-        Those of the full model.
+        The full model uses all of them.
     tolerance : float
         Share of the kept set that may differ from the full model's.
     settings : tuple of ClosedForm and Occlusion
-        What the models start from.
+        Settings of the models.
 
     Returns
     -------
     Scores
-        ``weights["auto"]`` says what was tried, chosen and estimated, ``notes`` the same in words.
+        ``facts["auto"]`` tells what was tried, chosen and estimated; ``notes`` tells it in words.
 
     Raises
     ------
     RefineError, Cancelled
-        See `refine_addon.core.occlusion.score`.
+        See `occlusion.score`.
     """
     models = _models(splats, settings, threads)
     last, probes = list(models)[-1], views.spread(PROBES)
     why = ""
     try:
         name, probed, trials = _cheapest(models, probes, tolerance, part(progress, 0.0, 0.3))
-    except RefineError:  # whether the other views see anything, the full model says
+    except RefineError:
+        # The probe views see nothing. The full model raises if all other views see nothing either.
         name, trials, total = last, [], 0.0
         scores = models[last](views, part(progress, 0.3, 1.0))
-        why = f", as the {len(probes)} that probed see nothing"
+        why = f", as none of {len(probes)} probe views sees anything"
     else:
-        # What is left of the tolerance is for the views.
+        # The model uses up a part of the tolerance; the number of views may use the rest.
         spent = trials[-1].disagreement if name != last else 0.0
         scores, estimate = _settled(
             models[name], views, probed, (tolerance - spent, trials), part(progress, 0.3, 1.0)
@@ -137,21 +137,21 @@ def score(
         other = f"estimated to keep {total:.1%} other splats than the full model"
         other += f" (tolerance {tolerance:.1%})"
     note = f"auto: {name}, {scores.views_used} of {len(views)} views{why}; {other}"
-    facts = {
+    own = {
         "model": name,
         "views": scores.views_used,
         "estimate": total,
         "tolerance": tolerance,
         "tried": {trial.choice: trial.disagreement for trial in trials},
     }
-    weights = {**scores.weights, "auto": facts}
-    return replace(scores, weights=weights, notes=(*scores.notes, note), method="auto")
+    facts = {**scores.facts, "auto": own}
+    return replace(scores, facts=facts, notes=(*scores.notes, note), method="auto")
 
 
 def _models(
     splats: Splats, settings: tuple[ClosedForm, Occlusion], threads: int | None
 ) -> dict[str, Model]:
-    """Return the models from cheap to full, by the names that the report gives them."""
+    """Return the models from cheap to full, by their names in the report."""
     form, froxels = settings
 
     def closed(changed: ClosedForm) -> Model:
@@ -175,7 +175,17 @@ def _models(
 def _cheapest(
     models: dict[str, Model], probes: ViewSet, tolerance: float, progress: Progress
 ) -> tuple[str, Scores, list[Trial]]:
-    """Return the cheapest model that agrees with the last on the probe views, and its scores."""
+    """Return the cheapest model that agrees with the full one on the probe views.
+
+    Returns
+    -------
+    name : str
+        Of the model.
+    scores : Scores
+        By that model and the probe views.
+    trials : list of Trial
+        One for each cheaper model that was tried.
+    """
     *cheaper, full = models
     reference = models[full](probes, part(progress, 0.0, 0.6))
     trials = []
@@ -183,7 +193,7 @@ def _cheapest(
         span = part(progress, 0.6 + 0.4 * index / 3, 0.6 + 0.4 * (index + 1) / 3)
         try:
             scores = models[name](probes, span)
-        except RefineError:  # it sees nothing where the full model does
+        except RefineError:  # this model sees nothing, unlike the full one
             trials.append(Trial(name, 1.0))
             continue
         trials.append(Trial(name, min(CAUTION * disagreement(reference, scores), 1.0)))
@@ -199,18 +209,29 @@ def _settled(
     allowed: tuple[float, list[Trial]],
     progress: Progress,
 ) -> tuple[Scores, float]:
-    """Return scores by the fewest views whose ranking has settled, and the estimated change.
+    """Return scores by as few views as the tolerance permits, and the estimated further change.
 
-    Each doubling of the views changes the kept set by some share, smaller each time by a factor
-    that the last two doublings tell; what those up to all views would change is the sum of a
-    geometric series. Where that says that all are needed, the doublings between are left out.
+    Each doubling of the views changes some share of the kept set. The ratio of the last two changes
+    extrapolates to all views as a geometric series. Where it predicts that all views are needed,
+    they are used at once.
+
+    Parameters
+    ----------
+    model : callable
+    views : ViewSet
+        All views.
+    scores : Scores
+        By the probe views.
+    allowed : tuple of float and list of Trial
+        The rest of the tolerance, and a list to which the comparisons are appended.
+    progress : callable
     """
     tolerance, trials = allowed
     total = sum(view.weight > 0.0 for view in views)
     change, done = 0.0, 0.0
     while scores.views_used < total:
         count = min(2 * scores.views_used, total)
-        # The cost is in proportion to the views, and those of all doublings sum to twice the last.
+        # A model costs as much as it has views; all doublings together cost twice the last one.
         step = part(progress, done, done + (1.0 - done) * 0.5)
         done += (1.0 - done) * 0.5
         fuller = model(views.spread(count), step)
@@ -224,7 +245,7 @@ def _settled(
         rest = _series(change, shrink, doublings)
         if rest <= tolerance:
             return scores, rest
-        # Whether one doubling less than all would do; whatever is known, each hardly halves it.
+        # Would half of all views be enough? After one doubling, assume that each halves the change.
         hope = shrink if before else 0.5
         saved = max(doublings - 1.0, 0.0)
         if _series(change * hope**saved, shrink, doublings - saved) > tolerance:
@@ -233,5 +254,15 @@ def _settled(
 
 
 def _series(change: float, shrink: float, doublings: float) -> float:
-    """Return what so many doublings will change, each `shrink` times the last; it was `change`."""
+    """Return the estimated change by further doublings of the views, as a share of the kept set.
+
+    Parameters
+    ----------
+    change : float
+        By the last doubling.
+    shrink : float
+        Change of each doubling over that of the one before.
+    doublings : float
+        How many are left.
+    """
     return float(HASTE * change * shrink * (1.0 - shrink**doublings) / (1.0 - shrink))

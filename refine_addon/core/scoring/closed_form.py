@@ -1,12 +1,12 @@
-"""REFINE's closed form: the error of removing each splat, with nothing hidden (T = 1).
+"""REFINE's closed form: the error of removing each splat as if nothing were hidden (T = 1).
 
     D_i   = sum over k of  lambda^k  H_i G_i^k / mean_j(H_j G_j^k)          REFINE, Eq. 20
     H_i   = alpha_i  mean over views of  inside_iv / (d_iv^2 + eta)         Eq. 13-16
     G_gem = product of the two largest scales, G_col = luma^2, G_opa = alpha^2
 
 ``d`` is the depth along the view's axis (the paper) or the distance to its centre (the authors'
-code). ``inside`` is ours: 1 where the splat's centre lies in the view's frustum. The division by
-the mean of each term is the authors' code's; it makes the terms comparable.
+code). ``inside`` is our addition: 1 where the splat's centre lies in the view's frustum, else 0.
+Each term is divided by its mean, as in the authors' code, which makes the terms comparable.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ if TYPE_CHECKING:
     from ..views import ViewSet
 
 LUMA = (0.299, 0.587, 0.114)
-"""Rec. 601 weights of red, green, blue."""
+"""Factors of red, green and blue in the luma (Rec. 601)."""
 
 ETA_RELATIVE = 0.005
 """Default eta over the squared size of the scene: the paper's .05 at a viewing distance of 3 m."""
 
 UNSEEN = 1e-6
-"""Factor on 1 / (squared distance to the views + eta), the weight of splats that no view sees: it
-orders them by distance, practically below all that is seen."""
+"""A splat that no view sees has H = this / (squared distance to the views + eta): such splats are
+ordered by distance, and nearly always below all that are seen."""
 
 _CHUNK = 4096
 _VIEW_BLOCK = 64
-_SMALLEST_AREA = -300.0
+_SMALLEST_AREA = -300.0  # natural logarithm
 
 
 @dataclass(frozen=True)
@@ -59,14 +59,14 @@ class ClosedForm:
         Added to the squared depth, squared world units; None takes `ETA_RELATIVE` times the squared
         size of the scene.
     anisotropy_offset : float or None
-        Added to the shortest axis in F_gem, world units; None compares the axes as they are, a
-        ratio without unit.
+        Added to the shortest axis in F_gem, world units; None adds nothing, so that F_gem has no
+        unit.
     frustum : bool
-        Whether only views that see a splat's centre count.
+        Whether only views in whose frustum a splat's centre lies count for it.
     margin : float
-        How far beyond the image's edge still counts as inside, in half image sizes.
+        How far outside the image still counts as inside, in half image sizes.
     visibility, projection, equal_weights : bool
-        The paper's ablations: without alpha, without 1 / (d^2 + eta), with lambda = 1/3 each.
+        The paper's ablations: H without alpha, H without 1 / (d^2 + eta), lambda = 1/3 each.
     """
 
     depth: Literal["z", "distance"] = "z"
@@ -84,7 +84,7 @@ class ClosedForm:
         Raises
         ------
         RefineError
-            If one cannot be.
+            If a value is out of range.
         """
         if self.depth not in ("z", "distance"):
             msg = f"depth is {self.depth!r}, expected 'z' or 'distance'"
@@ -100,7 +100,7 @@ class ClosedForm:
 
     @classmethod
     def published(cls, depth: Literal["z", "distance"], **changes: Any) -> ClosedForm:  # noqa: ANN401
-        """Return the published reading: the paper's for "z", its authors' code for "distance"."""
+        """Return the published constants: the paper's for "z", its authors' code's otherwise."""
         eta, offset = (0.05, 0.05) if depth == "z" else (0.5, 1e-6)
         return cls(depth, eta, offset, frustum=False, **changes)
 
@@ -129,12 +129,12 @@ def score(
     Returns
     -------
     Scores
-        ``weights`` holds lambda and the statistics it comes from.
+        ``facts`` holds lambda and the statistics that it is computed from.
 
     Raises
     ------
     RefineError
-        If there is no splat, or no view sees any.
+        If there are no splats, if none of them can be drawn, or if no view sees any.
     Cancelled
         If `progress` answers ``False``.
     """
@@ -163,7 +163,7 @@ def score(
     statistics = _statistics(np.array(tallies))
     lambdas = (1 / 3, 1 / 3, 1 / 3)
     if not settings.equal_weights:
-        lambdas = adaptive.weights(statistics, offset=settings.anisotropy_offset or 0.0)
+        lambdas = adaptive.lambdas(statistics, offset=settings.anisotropy_offset or 0.0)
     means = np.sum(sums, axis=0) / len(splats)
     factors = np.divide(lambdas, means, out=np.zeros(3), where=means > 0.0)
     for_chunks(partial(scene.add, factors), len(splats), 4 * _CHUNK, threads=threads)
@@ -172,7 +172,7 @@ def score(
         seen=scene.seen,
         views_used=len(views),
         undrawable=len(splats) - int(np.count_nonzero(scene.good)),
-        weights={
+        facts={
             "lambda": dict(zip(adaptive.TERMS, lambdas, strict=True)),
             "statistics": vars(statistics).copy(),
         },
@@ -182,10 +182,16 @@ def score(
 
 
 def _statistics(tallies: NDArray[np.float64]) -> adaptive.Statistics:
-    """Return the statistics of a scene from those of its chunks; see `_Scene.read`."""
-    count, ratios, translucency, luma, squares = tallies.T
+    """Return the statistics of a scene.
+
+    Parameters
+    ----------
+    tallies : (chunks, 5) float64
+        What `_Scene.read` returns for each chunk.
+    """
+    count, ratios, translucency, luma, squares = tallies.T  # (chunks,) each
     total = count.sum()
-    # Variance within the chunks plus variance of their means: sums of squares, so none cancel.
+    # Variance within the chunks plus variance of their means: sums of squares do not cancel.
     around = luma - luma @ count / total
     return adaptive.Statistics(
         anisotropy=float(ratios.sum() / total),
@@ -197,8 +203,24 @@ def _statistics(tallies: NDArray[np.float64]) -> adaptive.Statistics:
 class _Scene:
     """What the formula needs of N splats, filled chunk by chunk.
 
-    The splats are read once, since they may be a file larger than memory; 57 bytes of each stay.
-    H is called visibility here.
+    The splats may be a file larger than memory, so they are read once; 57 bytes of each are kept.
+
+    Attributes
+    ----------
+    origin : (3,) float64
+        Middle of the scene, world units.
+    view_variance : float
+        Median over views of their squared distance to the origin.
+    good : (N,) bool
+        Which splats can be drawn.
+    means : (N, 3) floating
+    squared : (N,) float64
+        Squared distance to the origin plus `view_variance`.
+    alpha, area, visibility : (N,) float64
+        Opacity, the product of the two largest scales, and H.
+    luma, values : (N,) float32
+        Of the base colour, 0..1 to 6e-8; the scores.
+    seen : (N,) int32
     """
 
     def __init__(self, splats: Splats, views: ViewSet, settings: ClosedForm) -> None:
@@ -209,7 +231,7 @@ class _Scene:
         self.good = np.empty(count, np.bool_)
         self.means = np.empty((count, 3), splats.means.dtype.newbyteorder("="))
         self.squared, self.alpha, self.area, self.visibility = (np.empty(count) for _ in range(4))
-        self.luma = np.empty(count, np.float32)  # in 0..1, to 6e-8
+        self.luma = np.empty(count, np.float32)
         self.values = np.empty(count, np.float32)
         self.seen = np.zeros(count, np.int32)
 
@@ -219,14 +241,14 @@ class _Scene:
         Returns
         -------
         count, ratios, translucency, luma, squares : float
-            Of those drawable: how many, the sums of axis ratio and 4 alpha (1 - alpha), the mean
-            of the luma and the sum of its squares around that mean.
+            Over the drawable splats: their number, the sums of the axis ratio and of
+            4 alpha (1 - alpha), the mean of the luma and the sum of its squared deviations.
         """
         chunk = self.splats.take(piece)
-        good = self.good[piece] = drawable(chunk)
-        means = self.means[piece] = np.where(good[:, None], chunk.means, 0.0)
+        good = self.good[piece] = drawable(chunk)  # (n,)
+        means = self.means[piece] = np.where(good[:, None], chunk.means, 0.0)  # (n, 3)
         offset = means - self.origin
-        # What underflows to 0 is negligible beside everything that counts.
+        # Values that underflow to 0 are negligible in the sums.
         with np.errstate(under="ignore"):
             self.squared[piece] = np.einsum("ij,ij->i", offset, offset) + self.view_variance
             alpha = self.alpha[piece] = opacity(np.where(good, chunk.opacity_logits, -np.inf))
@@ -240,8 +262,8 @@ class _Scene:
         return len(luma), ratio[good].sum(), np.sum(4.0 * alpha * (1.0 - alpha)), mean, squares
 
     def _axes(self, logs: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the product of the two largest scales, and longest over shortest."""
-        a, b, c = logs.T
+        """Return the product of the two largest scales, and the longest over the shortest, (n,)."""
+        a, b, c = logs.T  # (n,) each
         low, high = np.minimum(a, b), np.maximum(a, b)
         largest, smallest = np.maximum(high, c), np.minimum(low, c)
         middle = np.maximum(low, np.minimum(high, c))
@@ -255,8 +277,7 @@ class _Scene:
     def set_lengths(self) -> None:
         """Set eta and the near plane, which are multiples of the scene's size.
 
-        The size is a median over splats: it changes with the scene's unit, but not with its origin,
-        the order of its splats or a few far ones.
+        The size is a median over splats, so a few far splats hardly change it.
         """
         size = median_size(self.squared, self.good)
         eta = self.settings.eta
@@ -266,31 +287,31 @@ class _Scene:
         )
 
     def sum_views(self, piece: slice) -> list[float]:
-        """Compute H of one slice of splats, and in how many views each lies.
+        """Compute H of n splats, and in how many views each lies.
 
         Returns
         -------
         list of float
-            The sums over the slice of ``H G`` for each of the three G.
+            The sums over these splats of ``H G`` for each of the three G.
         """
-        points = np.ones((4, piece.stop - piece.start))
+        points = np.ones((4, piece.stop - piece.start))  # x, y, z, 1
         points[:3] = (self.means[piece] - self.origin).T
-        total = np.zeros(points.shape[1])
+        total = np.zeros(points.shape[1])  # (n,), H before alpha
         seen = np.zeros(points.shape[1], np.int32)
         with np.errstate(under="ignore"):
             for start in range(0, len(self.weights), _VIEW_BLOCK):
                 block = slice(start, start + _VIEW_BLOCK)
-                depth, inside = self.frustums.project(points, block)
+                depth, inside = self.frustums.project(points, block)  # (V, n) each
                 if not self.settings.frustum:
                     inside[:] = True
-                # A block has at most 64 views, so a byte can count them.
+                # A byte can count the at most 64 views of a block.
                 seen += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.uint8)
-                share = inside
+                counted = inside
                 if self.settings.projection:
                     squared = self._squared(points, depth, block)
                     squared += self.eta
-                    share = np.divide(inside, squared, out=squared)
-                total += np.einsum("v,vn->n", self.weights[block], share)
+                    counted = np.divide(inside, squared, out=squared)
+                total += np.einsum("v,vn->n", self.weights[block], counted)
             if not seen.all():
                 near = self.squared[piece] + self.eta if self.settings.projection else 1.0
                 total = np.where(seen == 0, UNSEEN / near, total)
@@ -302,7 +323,7 @@ class _Scene:
         return sums
 
     def _contents(self, piece: slice) -> tuple[NDArray[np.float64], ...]:
-        """Return the three G of one slice of splats."""
+        """Return the three G of n splats, (n,) each."""
         luma, alpha = self.luma[piece].astype(np.float64), self.alpha[piece]
         return self.area[piece], luma * luma, alpha * alpha
 
@@ -319,12 +340,12 @@ class _Scene:
         return depth
 
     def add(self, factors: NDArray[np.float64], piece: slice) -> None:
-        """Set the scores of one slice of splats: the sum of the terms, each times its factor."""
+        """Set the scores of n splats: the sum of their three terms, each times its factor."""
         visibility, good = self.visibility[piece], self.good[piece]
         with np.errstate(under="ignore"):
             terms = zip(factors, self._contents(piece), strict=True)
             values = sum(factor * (visibility * content) for factor, content in terms)
             stored = np.asarray(values, np.float32)
-        # A splat that can be drawn must never tie with one that cannot, which scores 0.
+        # Undrawable splats score 0; a drawable splat must not tie with them by underflow.
         stored[good] = np.maximum(stored[good], np.finfo(np.float32).tiny)
         self.values[piece] = stored

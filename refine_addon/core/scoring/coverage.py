@@ -1,15 +1,17 @@
-"""How far the views that score speak for views that do not: the weight of a prior.
+"""The floor of occlusion scores: what a splat may be worth to views that were not given.
 
-What no scoring view shows may be plain to see from elsewhere. So every splat gets a floor, the
-closed form, which knows nothing of occlusion; the question is how much of it. Views spread densely
-around a scene show all that can be seen, and the floor only keeps what is truly hidden; a few views
-leave much to be guessed. The views answer it themselves: an eighth of them at a time is left out,
-the others score with each weight of the floor, and the weight that loses least of what the views
-left out measured is taken. The more splats go, the more the floor may weigh: what goes first is
-next to nothing, and a floor that is little to the last is a wall to the first.
+A splat that no given view shows may be visible from elsewhere. So every splat gets a floor, the
+closed form, which ignores occlusion, times a weight. If views cover the scene densely, a small
+weight is best, since splats that no view shows are truly hidden. With few views, more is unknown
+and a larger weight is best.
 
-Views can only answer for views like them. All of them in one corner of a room agree that the rest
-of it is not worth a thing; so from half removed on there is always some floor, `LEAST_WEIGHTS`.
+The weight is chosen by cross-validation: an eighth of the views is left out, the others score with
+every weight in `FLOOR_WEIGHTS`, and the weight is taken whose order removes the least error as the
+left-out views measured it. There is one weight for each share removed (`SHARES`), since the same
+floor is negligible beside the last scores but exceeds the first ones.
+
+Left-out views resemble the others: if all views stand in one corner of a room, they agree that the
+rest of it is worth nothing. So from half removed on the weight is at least `LEAST_FLOOR_WEIGHTS`.
 """
 
 from __future__ import annotations
@@ -25,40 +27,42 @@ if TYPE_CHECKING:
 
     from .projection import Gaussians
 
-WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-5.0, 0.5, 0.5)))
-"""What is tried, of the mean of the scores for a splat of mean worth that no view looks at."""
+FLOOR_WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-5.0, 0.5, 0.5)))
+"""Weights that are tried. At weight 1, a splat of average prior that lies in no view gets a floor
+as high as the mean score."""
 
 SHARES = (0.1, 0.3, 0.5, 0.7, 0.9)
-"""Shares removed for each of which a weight is chosen, by what goes up to there."""
+"""Shares removed, each with its own weight: the one that loses least if this share is removed."""
 
-LEAST_WEIGHTS = (0.0, 0.0, 0.03, 0.03, 0.03)
-"""The least that the floor weighs at each of `SHARES`: it costs tenths of a dB on views like those
-that score, and is worth up to 20 dB on others."""
+LEAST_FLOOR_WEIGHTS = (0.0, 0.0, 0.03, 0.03, 0.03)
+"""Smallest weight for each of `SHARES`: it costs tenths of a dB on views like those given, and
+gains up to 20 dB on other views."""
 
 TIED = 0.002
-"""Weights whose losses differ by this much or less are nearly as good: what is taken is the mean of
-their logarithms, so that a change in the last digits does not jump from one to another."""
+"""Weights whose losses differ by about this much count as equally good; the mean of their
+logarithms is taken, so that a change in the last digits does not switch to another weight."""
 
 SAMPLE = 1 << 15
-"""How many splats are enough to choose by."""
+"""How many splats are enough to choose the floor weights."""
 
-_NO_WEIGHT = 10.0**-5.5  # stands for none in a mean of logarithms
-_MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio: spreads what differs little
+_NO_WEIGHT = 10.0**-5.5  # stands for 0 in a mean of logarithms
+_MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: a multiplier for hashing
 
 
 def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> NDArray[np.float64]:
-    """Return what a splat that these views do not show may be worth to others, (n,).
+    """Return what each splat may be worth to views that were not given, (n,).
 
-    Of n views that might have shown it none did: by the rule of succession the next one does with
-    a chance of about 1 / (n + 1).
+    A splat's centre lies in `seen` views. If none of them shows the splat, the next view shows it
+    with a probability of about ``1 / (1 + seen)``, by the rule of succession.
 
     Parameters
     ----------
     prior : (n,) float64
-        Worth if nothing hid anything.
+        Worth of each splat if nothing were hidden.
     seen : (n,) int32
         In how many views the centre lies.
     power : float
+        Exponent of the prior: 1 + p, as the score is ``error contribution^p``.
     """
     return np.asarray(_unit(prior**power) / (1.0 + seen))
 
@@ -66,44 +70,44 @@ def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> 
 def with_floor(
     scores: NDArray[np.float64], floors: NDArray[np.float64], weight: float
 ) -> NDArray[np.float64]:
-    """Return ``scores / mean + weight floors``, (n,)."""
+    """Return ``scores / mean(scores) + weight floors``, (n,)."""
     return _unit(scores) + weight * floors
 
 
 def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[float]:
-    """Return the weights that the floor should have, one for each of `SHARES`.
+    """Return the best weight of the floor for each of `SHARES`.
 
     Parameters
     ----------
     folds : iterable of scores, floors, errors
-        Scores by some views, floors by them, and for each of the others, (views, n), the errors
-        of removing a splat. Views that see nothing say nothing.
+        Scores, (n,), and floors, (n,), by all views but some; and the error of each splat in each
+        view left out, (views, n). Views without any error are ignored.
 
     Returns
     -------
     list of float
-        1 where no fold says anything.
+        All 1 if every view is ignored.
     """
     losses = []
     for scores, floors, errors in folds:
-        views = errors[errors.any(axis=1)]
+        views = errors[errors.any(axis=1)]  # (v, n)
         if scores.any() and len(views):
-            tried = [_losses(with_floor(scores, floors, weight), views) for weight in WEIGHTS]
-            losses.append(np.stack(tried, axis=1))
+            tried = [_losses(with_floor(scores, floors, weight), views) for weight in FLOOR_WEIGHTS]
+            losses.append(np.stack(tried, axis=1))  # (v, weights, shares)
     if not losses:
         return [1.0] * len(SHARES)
     table = np.mean(np.concatenate(losses), axis=0)  # (weights, shares)
-    nearly = np.exp(np.maximum((table.min(axis=0) - table) / TIED, -50.0))
-    logs = np.log(np.maximum(WEIGHTS, _NO_WEIGHT))
-    best = np.exp(logs @ nearly / nearly.sum(axis=0))
-    return [max(pair) for pair in zip(best.tolist(), LEAST_WEIGHTS, strict=True)]
+    nearly = np.exp(np.maximum((table.min(axis=0) - table) / TIED, -50.0))  # 1 for the best
+    logs = np.log(np.maximum(FLOOR_WEIGHTS, _NO_WEIGHT))  # (weights,)
+    best = np.exp(logs @ nearly / nearly.sum(axis=0))  # (shares,)
+    return [max(pair) for pair in zip(best.tolist(), LEAST_FLOOR_WEIGHTS, strict=True)]
 
 
 def sample(gaussians: Gaussians, count: int = SAMPLE) -> NDArray[np.int64]:
-    """Return `count` of the splats, or all, ascending: by chance, but always the same ones.
+    """Return the rows of `count` splats, or of all if there are fewer, ascending.
 
-    Which they are depends on a hash of opacity and colour, which neither the order of the splats
-    nor a motion of the scene changes.
+    They are chosen by a hash of opacity and colour, so the choice is the same every time, whatever
+    the order of the splats and the frame of the scene.
 
     Parameters
     ----------
@@ -113,11 +117,11 @@ def sample(gaussians: Gaussians, count: int = SAMPLE) -> NDArray[np.int64]:
     total = len(gaussians)
     if total <= count:
         return np.arange(total)
-    key = np.zeros(total, np.uint64)
+    key = np.zeros(total, np.uint64)  # (N,)
     for values in (gaussians.alphas, *gaussians.colors.T):
         key = (key ^ np.ascontiguousarray(values, np.float32).view(np.uint32)) * _MIX
         key ^= key >> np.uint64(29)
-    # Splats that are all alike are taken evenly from the whole scene.
+    # The lower half depends on the row, so equal splats are taken evenly from the whole scene.
     order = np.arange(total, dtype=np.uint64) * _MIX
     key = key >> np.uint64(32) << np.uint64(32) | order >> np.uint64(32)
     return np.sort(np.argpartition(key, count)[:count])
@@ -127,22 +131,22 @@ def order(
     scores: NDArray[np.float64],
     floors: NDArray[np.float64],
     ties: NDArray[np.float32],
-    weights: Sequence[float],
+    floor_weights: Sequence[float],
     stops: NDArray[np.int64],
 ) -> NDArray[np.int64]:
-    """Return all n splats in the order in which they go, exact up to the last of `stops`.
+    """Return all n rows in the order of removal, exact up to the last of `stops`.
 
     Parameters
     ----------
     scores, floors, ties : (n,) array
-        `ties` decides between those that are equal.
-    weights : sequence of float
-        Of the floor.
+        Of equal scores, the splat with the lower value in `ties` goes first.
+    floor_weights : sequence of float
+        Used one after the other.
     stops : array of int
-        How many have gone when each weight is done with; ascending.
+        For each weight, how many splats have gone when the next weight takes over; ascending.
     """
     left, going = np.arange(len(scores)), [np.arange(0)]
-    for weight, count in zip(weights, np.diff(stops, prepend=0), strict=True):
+    for weight, count in zip(floor_weights, np.diff(stops, prepend=0), strict=True):
         if count > 0:
             left = left[np.lexsort((ties[left], with_floor(scores, floors, weight)[left]))]
             going.append(left[:count])
@@ -151,12 +155,21 @@ def order(
 
 
 def _unit(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return values over their mean, (n,); zeros if the mean is 0."""
     mean = float(np.mean(values)) if len(values) else 0.0
     return values / mean if mean > 0.0 else np.zeros_like(values)
 
 
 def _losses(scores: NDArray[np.float64], errors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the logarithm of the share of each view's errors that goes, (views, SHARES)."""
-    running = np.cumsum(errors[:, np.argsort(scores, kind="stable")], axis=1)
+    """Return the logarithm of the share of each view's error that is removed, (v, shares).
+
+    Parameters
+    ----------
+    scores : (n,) float64
+        The lowest are removed first.
+    errors : (v, n) float64
+        Of each splat in each of v views.
+    """
+    running = np.cumsum(errors[:, np.argsort(scores, kind="stable")], axis=1)  # (v, n)
     places = [max(int(share * len(scores)) - 1, 0) for share in SHARES]
     return np.asarray(np.log(np.maximum(running[:, places] / running[:, -1:], 1e-12)))

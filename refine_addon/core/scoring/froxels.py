@@ -1,13 +1,13 @@
-"""What hides what in a view: points of splats, sorted by depth within the cells of the image.
+"""Occlusion in one view: points of splats, sorted by depth within the cells of the image.
 
-Each splat becomes a lattice of points over its footprint; each point carries a share of the splat's
-mass, the integral of its alpha. The image is cut into square cells. Within a cell the points are
-sorted by depth, and running sums along the depth give, for each point, the optical thickness in
-front of it and the colour behind it. (A froxel is a cell of the image times a slab of depth; sorted
-points are slabs of no thickness, so no grid of depths has to be chosen or stored.)
+Each splat is replaced by a lattice of points over its footprint; each point has a share of the
+splat's mass, which is the integral of its alpha. The image is divided into square cells. Within a
+cell the points are sorted by depth, and running sums along the depth give the optical thickness in
+front of each point and the colour behind it. (A froxel is a cell of the image times a slab of
+depth. Sorted points are slabs without thickness, so no grid of depths has to be chosen or stored.)
 
-In a cell of area A a point of mass m covers the share ``a = m / A``. Points that are independent of
-each other let ``prod (1 - a)`` through, so each has the optical thickness ``-log(1 - a)``.
+A point of mass m covers the share ``a = m / A`` of a cell of area A. Points that are independent of
+each other transmit ``prod (1 - a)``, so each has the optical thickness ``-log(1 - a)``.
 """
 
 from __future__ import annotations
@@ -37,29 +37,29 @@ pixels. The smaller the cells, the narrower the distribution: `transmittance` te
 """
 
 MAX_CELLS = 65535
-"""Cells of an image, at most: NumPy sorts numbers of 16 bits by radix, in linear time."""
+"""Most cells of an image: NumPy sorts numbers of 16 bits by radix, in linear time."""
 
 MAX_POINTS = 1 << 22
-"""Points that a view may have, as estimated: cells grow until they suffice. About 100 bytes each.
+"""Most points of a view, as estimated: cells grow until it is met. A point takes about 100 bytes.
 """
 
 LEAST_POINTS = 1.25
-"""Points that a footprint may have on average in a view of so many that `MAX_POINTS` are too few:
-each needs one at least, whatever the size of the cells."""
+"""A view has this many points a footprint where `MAX_POINTS` would be fewer: a footprint has at
+least one point, however large the cells are."""
 
 COUNTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
 """How many points a lattice may have along an axis."""
 
 FLAT = 16
-"""Points across and down the image for a splat much larger than it, instead of a lattice."""
+"""A splat much larger than the image gets this many points across and down the image instead."""
 
 Line = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
 """Points on a line and the share of the mass that each has."""
 
 _EXTENT, _WIDE_EXTENT, _WIDE = 2.4, 3.0, 8  # standard deviations; the wide one from 8 points on
-_GROWTH = 2.0**0.25  # of the side of a cell, a step
-_OUTSIDE = MAX_CELLS  # stands for a cell where a point lies beside the image
-_BLOCK = 1 << 16  # points worked on at a time, which bounds temporary memory
+_GROWTH = 2.0**0.25  # factor by which the side of a cell grows in a step
+_OUTSIDE = MAX_CELLS  # the cell number of points outside the image
+_BLOCK = 1 << 16  # points processed at a time, which limits temporary memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +82,8 @@ class Lattice:
 def lattices() -> tuple[Lattice, ...]:
     """Return all lattices: number ``i L + j`` has ``COUNTS[i]`` by ``COUNTS[j]`` points.
 
-    L is the length of `COUNTS`. The last one has `FLAT` by `FLAT` points over the image; its points
-    are in half image sizes, -1 to 1.
+    L is the length of `COUNTS`. One more at the end has `FLAT` by `FLAT` points over the image;
+    their coordinates are -1 to 1, in half image sizes.
     """
     lines = [_line(count) for count in COUNTS]
     made = [_lattice(major, minor) for major in lines for minor in lines]
@@ -93,9 +93,9 @@ def lattices() -> tuple[Lattice, ...]:
 
 
 def _lattice(major: Line, minor: Line) -> Lattice:
-    """Return the product of two lines without its corners, scaled to variance 1 again."""
+    """Return the grid of two lines without its corners, scaled to variance 1 again."""
     product = np.outer(major[1], minor[1])  # (k_major, k_minor), shares
-    place = np.broadcast_arrays(major[0][:, None], minor[0])
+    place = np.broadcast_arrays(major[0][:, None], minor[0])  # (k_major, k_minor) each
     extent = _WIDE_EXTENT if max(product.shape) >= _WIDE else _EXTENT
     keep = np.hypot(*place) <= extent + 0.1
     keep |= product.size <= 4  # noqa: PLR2004 - 2 x 2 points are all corners
@@ -107,7 +107,7 @@ def _lattice(major: Line, minor: Line) -> Lattice:
 
 
 def _line(count: int) -> Line:
-    """Return the means of bins of equal width of the normal distribution, scaled to variance 1."""
+    """Return the normal distribution as points: its mean in bins of equal width, variance 1."""
     if count == 1:
         return np.zeros(1), np.ones(1)
     extent = _WIDE_EXTENT if count >= _WIDE else _EXTENT
@@ -121,9 +121,9 @@ def _line(count: int) -> Line:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """The m points that fall in the image, cell by cell and, in each cell, front to back.
+    """The m points inside the image, cell by cell, and front to back in each cell.
 
-    Points of one splat in one cell are merged to one, so that a splat does not hide itself.
+    Points of one splat in one cell are merged into one, so that a splat does not hide itself.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class Points:
     shares : (m,) float32
         Of the splat's mass.
     columns : (C,) int64
-        How many points each of the C cells with points holds.
+        How many points lie in each of the C cells that are not empty.
     area : float
         Of a cell, px^2.
     """
@@ -143,7 +143,7 @@ class Points:
     area: float
 
     def pieces(self) -> Iterator[tuple[slice, Points]]:
-        """Yield about `_BLOCK` points at a time, in whole cells: (which points, the points)."""
+        """Yield about `_BLOCK` points at a time, in whole cells: a slice and its points."""
         for cells, place in _runs(self.columns):
             checkpoint()
             columns = self.columns[cells]
@@ -151,7 +151,17 @@ class Points:
 
 
 def _runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
-    """Cut groups of these sizes into runs of about `_BLOCK` members; yield (groups, members)."""
+    """Yield runs of consecutive groups with about `_BLOCK` members: slices of both.
+
+    Parameters
+    ----------
+    sizes : (G,) int64
+        How many members each group has.
+
+    Yields
+    ------
+    groups, members : slice
+    """
     ends = np.cumsum(sizes)
     cuts = np.searchsorted(ends, np.arange(_BLOCK, int(sizes.sum()), _BLOCK)) + 1
     start = member = 0
@@ -162,11 +172,11 @@ def _runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
 
 
 def cell_size(footprints: Footprints, view: View, cell: float, density: float) -> float:
-    """Return the side of a cell: `cell` pixels, or more where a limit asks for it."""
+    """Return the side of a cell, pixels: `cell`, or larger to keep `MAX_CELLS` and `MAX_POINTS`."""
     side = max(cell, math.sqrt(view.width * view.height / MAX_CELLS) * 1.01)
     while math.ceil(view.width / side) * math.ceil(view.height / side) > MAX_CELLS:
-        side *= _GROWTH  # an image a few pixels thin
-    # As cells grow the points needed fall to one a footprint: always below this limit.
+        side *= _GROWTH  # happens for images that are only a few pixels wide or high
+    # As cells grow, the points needed fall to one a footprint, which is below this limit.
     limit = max(MAX_POINTS, LEAST_POINTS * len(footprints.index))
     while _points_needed(footprints, side, density) > limit:
         side *= _GROWTH
@@ -200,7 +210,7 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
     for row, place in _runs(counts):
         checkpoint()
         cells[place], shares[place] = _laid(footprints, row, kinds[row], view, side)
-    # What was laid for splats much larger than the image is replaced. They are few.
+    # Replace the points of the few splats that are much larger than the image.
     vast = np.flatnonzero(kinds == len(sizes) - 1)
     if len(vast):
         at = np.cumsum(counts)[vast][:, None] - np.arange(FLAT**2, 0, -1)
@@ -212,9 +222,9 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
 def _kinds(footprints: Footprints, view: View, scale: float) -> NDArray[np.uint8]:
     """Return which of `lattices` each footprint gets, (n,); `scale`: points per pixel of sigma."""
     table = np.searchsorted(COUNTS, np.arange(COUNTS[-1] + 1)).astype(np.uint8)
-    wanted = np.ceil((footprints.sigmas * np.float32(scale)).clip(1.0, COUNTS[-1]))
-    index = table[wanted.astype(np.int64)]
-    # Where the points of the largest lattice are this far apart, none may fall in the image.
+    wanted = np.ceil((footprints.sigmas * np.float32(scale)).clip(1.0, COUNTS[-1]))  # (2, n)
+    index = table[wanted.astype(np.int64)]  # (2, n)
+    # The points of a larger lattice are so far apart that all of them could miss the image.
     spacing = footprints.sigmas[0] * (2.0 * _WIDE_EXTENT / COUNTS[-1])
     vast = spacing > max(view.width, view.height) / 8
     kinds = index[0] * np.uint8(len(COUNTS)) + index[1]
@@ -223,7 +233,7 @@ def _kinds(footprints: Footprints, view: View, scale: float) -> NDArray[np.uint8
 
 @functools.cache
 def _table() -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any], NDArray[Any]]:
-    """Return all lattices in one table: size and start of each, points (2, K) and shares (K,)."""
+    """Return all L lattices in one table: sizes (L,), starts (L,), points (2, K), shares (K,)."""
     sizes = np.array([len(lattice.shares) for lattice in lattices()])
     points = np.concatenate([lattice.points for lattice in lattices()], axis=1)
     shares = np.concatenate([lattice.shares for lattice in lattices()])
@@ -233,11 +243,11 @@ def _table() -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any], NDArra
 def _laid(
     footprints: Footprints, row: slice, kinds: NDArray[np.uint8], view: View, side: float
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
-    """Return cell and share, (p,) each, of the points of some footprints, one after the other."""
+    """Return cells and shares, (p,) each, of the points of r footprints, one after the other."""
     sizes, starts, points, shares = _table()
-    counts = sizes[kinds]
-    first = np.cumsum(counts) - counts
-    # Row of the table for each point: where its footprint's lattice starts, and on from there.
+    counts = sizes[kinds]  # (r,)
+    first = np.cumsum(counts) - counts  # (r,), number of each footprint's first point
+    # (p,), row of the table for each point: start of its footprint's lattice plus a running number.
     which = np.arange(int(counts.sum())) - np.repeat(first - starts[kinds], counts)
     along, across = points[0].take(which), points[1].take(which)
     place = []
@@ -250,14 +260,23 @@ def _laid(
 
 
 def _cells(place: list[NDArray[np.float32]], view: View, side: float) -> NDArray[np.uint16]:
-    """Return the number of the cell that each point, (p,) across and down, lies in; `_OUTSIDE`."""
+    """Return the number of each point's cell, (p,), or `_OUTSIDE` for points beside the image.
+
+    Parameters
+    ----------
+    place : list of (p,) float32
+        Across and down, pixels.
+    view : View
+    side : float
+        Of a cell, pixels.
+    """
     inside = np.ones(place[0].shape, np.bool_)
     number = np.zeros(place[0].shape, np.int32)
     for where, size in zip(place[::-1], (view.height, view.width), strict=True):
         inside &= where >= 0.0
         inside &= where < size
-        # Clipped before it becomes an integer: far outside it would not fit one, and in float32
-        # the last pixel may come out one cell too far.
+        # Clipped as floats, since far points do not fit an integer. Rounding of float32 can put
+        # the last pixel one cell too far, which the clipping corrects.
         cell = where * np.float32(1.0 / side)
         np.maximum(cell, np.float32(0.0), out=cell)
         np.minimum(cell, np.float32(math.ceil(size / side) - 1), out=cell)
@@ -271,9 +290,9 @@ def _cells(place: list[NDArray[np.float32]], view: View, side: float) -> NDArray
 def _flat(
     footprints: Footprints, row: NDArray[np.int64], view: View, side: float
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
-    """Return cells and shares of points over the image, (r, FLAT^2), for r vast footprints.
+    """Return cells, (FLAT^2,), and shares, (r, FLAT^2), for r footprints wider than the image.
 
-    The share of a point is the density of the splat's mass there times the area it stands for.
+    The share of a point is the density of the splat's mass there times the area around the point.
     """
     points = lattices()[-1].points
     u = np.float32(view.width / 2) * (points[0] + 1)
@@ -301,7 +320,7 @@ def _merged(
     Parameters
     ----------
     cells : (p,) uint16
-        `_OUTSIDE` for points beside the image, which are dropped.
+        Points of the cell `_OUTSIDE` are dropped.
     owners : (p,) int32
         Ascending, that is, front to back.
     shares : (p,) float32
@@ -309,7 +328,7 @@ def _merged(
     """
     filled = np.bincount(cells, minlength=_OUTSIDE)[:_OUTSIDE]
     filled = filled[filled > 0]  # (C,), points of each cell before merging
-    # The sort is stable, so each cell stays front to back; `_OUTSIDE` sorts last.
+    # A stable sort keeps the points of a cell front to back; those `_OUTSIDE` come last.
     order = np.argsort(cells, kind="stable")[: filled.sum()]
     checkpoint()
     if not len(order):
@@ -334,8 +353,8 @@ def thickness(
 ) -> NDArray[np.float32]:
     """Return the optical thickness of each point, (m,).
 
-    ``-log(1 - a)``, a the share of the cell that the point covers: its mass over the cell's area,
-    and no more than the splat's opacity.
+    It is ``-log(1 - a)``. a is the share of the cell that the point covers: its mass over the
+    cell's area, at most the splat's opacity.
 
     Parameters
     ----------
@@ -364,7 +383,7 @@ def paired(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[A
 def in_front(
     points: Points, thick: NDArray[np.float32], even: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the sums of two thicknesses, (m,) each, over what lies in front in the same cell."""
+    """Return the sums of two thicknesses, (m,) each, over the points in front in the same cell."""
     sums = _before(paired(thick, even), points.columns)
     return sums.real.astype(np.float32), sums.imag.astype(np.float32)
 
@@ -388,10 +407,10 @@ def _before(values: NDArray[Any], columns: NDArray[np.int64]) -> NDArray[Any]:
 
 
 def evenness(footprints: Footprints, area: float) -> NDArray[np.float32]:
-    """Return which share of each splat's thickness is uniform over a cell of such area, (n,).
+    """Return the share of each splat's thickness that counts as uniform over the cell, (n,).
 
-    ``s^2 / (s^2 + area)``, s the shorter sigma: near 0 for a splat much narrower than a cell, which
-    leaves gaps in it, near 1 for one much wider.
+    It is ``s^2 / (s^2 + area)``, with s the shorter sigma and the area of the cell: near 0 for a
+    splat much narrower than a cell, which leaves gaps, and near 1 for a much wider one.
     """
     narrow = footprints.sigmas[1] ** 2
     return np.asarray(narrow / (narrow + np.float32(area)))
@@ -402,10 +421,10 @@ def transmittance(
 ) -> NDArray[np.float32]:
     """Return the transmittance in front of each point, (m,), given the mean thickness of its cell.
 
-    Splats narrower than a cell leave gaps, so the thickness in front of a point may be more or less
-    than the cell's mean. It is taken for gamma distributed with shape k, and the transmittance for
-    its expectation, ``E[exp(-tau)] = (1 + mean / k)^-k``. (With ``exp(-mean)`` what shows through
-    foliage would count as hidden and be removed.) The even part leaves no gaps: ``exp(-even)``.
+    Splats narrower than a cell leave gaps, so the thickness in front of a point differs from the
+    cell's mean. It is modelled as gamma distributed with shape k, and the transmittance is the
+    expectation ``E[exp(-tau)] = (1 + mean / k)^-k``. (With ``exp(-mean)``, splats that show through
+    foliage would count as hidden and be removed.) The even part has no gaps: ``exp(-even)``.
 
     Parameters
     ----------
@@ -427,11 +446,12 @@ def squared_contrast(
     thick: NDArray[np.float32],
     colors: Sequence[NDArray[Any]],
 ) -> NDArray[np.float32]:
-    """Return the squared difference of colour between each point and what is behind it, (m,).
+    """Return the squared contrast of each point, (m,).
 
-    Point j shows ``T_j a_j c_j``, T the transmittance in front of it and a the share it covers.
-    Behind point k, over black, its cell has the colour ``B_k = (sum over j > k of T_j a_j c_j) /
-    T_{k+1}``; the contrast is ``c_k - B_k``, squared and summed over the channels.
+    Point j adds ``T_j a_j c_j`` to the picture; T_j is the transmittance in front of it and a_j the
+    share of the cell that it covers. The colour behind point k, over black, is
+    ``B_k = (sum over j > k of T_j a_j c_j) / T_{k+1}``. The contrast ``c_k - B_k`` is squared and
+    summed over the channels.
 
     Parameters
     ----------
@@ -444,11 +464,11 @@ def squared_contrast(
     shown = np.exp(-np.minimum(front, np.float32(60.0)))  # T_k, then T_k a_k
     left = shown * np.exp(-thick)  # T_{k+1}
     shown -= left
-    # Where less than this is left, what is behind cannot be seen anyway.
+    # Limited, since a colour behind less transmittance than this cannot be seen anyway.
     scale = np.float32(1.0) / np.maximum(left, np.float32(1e-4))
     squared = np.zeros_like(front)
     for pair in colors:
-        color = pair.take(points.owners)
+        color = pair.take(points.owners)  # (m,)
         behind = _before((shown * color)[::-1], points.columns[::-1])[::-1].astype(pair.dtype)
         behind *= scale
         behind -= color
@@ -466,7 +486,7 @@ def mean_visible(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the means over each footprint of T and of ``T^2 |c - B|^2``, both (count,).
 
-    The former is weighted by alpha, the latter by alpha^2; outside the image both count as 0.
+    The first is weighted by alpha, the second by alpha^2; both are 0 outside the image.
 
     Parameters
     ----------
@@ -481,7 +501,7 @@ def mean_visible(
     squares = shares * shares
     visible = np.bincount(owners, shares * transmittance, count)
     errors = np.bincount(owners, squares * transmittance * transmittance * squared_contrast, count)
-    # The weights alpha^2 do not sum to 1: divide by their sum, and multiply by the share of the
+    # The factors alpha^2 do not sum to 1: divide by their sum, and multiply by the share of the
     # footprint that lies in the image.
     inside = np.bincount(owners, shares, count)
     errors = errors * inside / np.maximum(np.bincount(owners, squares, count), 1e-30)
@@ -493,8 +513,8 @@ def masses(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the integrals of alpha and of alpha^2 over each footprint, (n,) each, px^2.
 
-    With S the product of the two sigmas, A the opacity, q the squared Mahalanobis distance and the
-    footprint ending where alpha is `ALPHA_CUT`::
+    S is the product of the two sigmas, A the opacity, and q the squared Mahalanobis distance. The
+    footprint ends where alpha falls to `ALPHA_CUT`::
 
         integral of A exp(-q / 2) = 2 pi S (A - cut)
         integral of A^2 exp(-q)   =   pi S (A^2 - cut^2)

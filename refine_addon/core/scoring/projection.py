@@ -1,4 +1,4 @@
-"""Where splats fall in a view: depth, centre and principal axes of their footprints, in pixels."""
+"""The footprints of splats in a view: depth, centre and principal axes, in pixels."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ REACH = 3.3
 """Standard deviations at which alpha = 1 falls to `ALPHA_CUT`: sqrt(2 ln 255) = 3.33."""
 
 _CHUNK = 1 << 14
-_FARTHEST = 1e6  # beyond so many scene sizes a splat counts as seen by nobody
+_FARTHEST = 1e6  # scene sizes; splats farther from the middle are in no view
 _LOG_SCALE_RANGE = (-16.0, 5.0)  # relative to the size of the scene; keeps float32 in range
 _LARGEST_VARIANCE = 1e12  # px^2; a footprint a million pixels wide is flat over any image
-_FARTHEST_VIEW = 1e18  # scene sizes; from there everything is one point
-_LARGEST_LENS = 1e9  # px; beyond these two float32 would not hold what is computed
-_BEYOND = 0.15  # of the image: the projection is linearised no further outside (0.3 half sizes)
+_FARTHEST_VIEW = 1e18  # scene sizes; a view farther away sees the scene as one point
+_LARGEST_LENS = 1e9  # px; beyond this or `_FARTHEST_VIEW` float32 would overflow
+_BEYOND = 0.15  # of the image's size; farther outside, the projection is linearised at this edge
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """The M splats worth projecting, in units of the scene's size, neighbours near each other.
+    """The M splats that can contribute to a picture, in scene sizes, sorted by `spatial_order`.
 
     Attributes
     ----------
     index : (M,) int64
-        Which splat it is.
+        Rows of the splats.
     means : (3, M) float32
         In the scene's frame, in scene sizes.
     covariances : (6, M) float32
@@ -49,7 +49,7 @@ class Gaussians:
     alphas : (M,) float32
         Opacity, 0..1.
     colors : (M, 3) float32
-        View-independent colour, >= 0.
+        The constant of the harmonics as a colour, >= 0: the same from all directions.
     """
 
     index: NDArray[np.int64]
@@ -73,12 +73,12 @@ class Gaussians:
 
 @dataclass(frozen=True, eq=False)
 class Footprints:
-    """The n splats that may touch an image, front to back.
+    """The n splats that may reach into an image, front to back.
 
     Attributes
     ----------
     index : (n,) int64
-        Place in the `Gaussians`.
+        Rows of the `Gaussians`.
     centers : (2, n) float32
         Column and row, pixels.
     major, minor : (2, n) float32
@@ -105,19 +105,19 @@ def prepare(
     Returns
     -------
     gaussians : Gaussians
-        Only of splats that can be drawn and whose opacity reaches `ALPHA_CUT`.
+        Of the splats that can be drawn and whose opacity exceeds `ALPHA_CUT`.
     scene : Scene
     good : (N,) bool
         Which splats can be drawn.
     """
     good = np.empty(len(splats), np.bool_)
-    worth = np.empty(len(splats), np.bool_)
+    opaque = np.empty(len(splats), np.bool_)
 
     def judge(piece: slice) -> None:
         chunk = splats.take(piece)
         good[piece] = drawable(chunk)
         logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
-        worth[piece] = opacity(logits) > ALPHA_CUT
+        opaque[piece] = opacity(logits) > ALPHA_CUT
 
     for_chunks(
         judge, len(splats), 4 * _CHUNK,
@@ -125,7 +125,7 @@ def prepare(
     )  # fmt: skip
     scene = scene_of(splats.means, good, views)
     report(progress, 0.4, "reading")
-    index = np.flatnonzero(worth)
+    index = np.flatnonzero(opaque)
     place = scene.place(splats.means[index])
     near = np.max(np.abs(place), axis=1, initial=0.0) <= _FARTHEST
     index, place = index[near], place[near]
@@ -143,7 +143,19 @@ def _activate(
     progress: Progress,
     threads: int | None,
 ) -> Gaussians:
-    """Return the splats at `index` as Gaussians, `place` being their positions in the scene."""
+    """Return some splats as Gaussians.
+
+    Parameters
+    ----------
+    splats : Splats
+    index : (M,) int64
+        Which of them.
+    place : (M, 3) float64
+        Their positions in the scene's frame, see `Scene.place`.
+    scene : Scene
+    progress : callable
+    threads : int, optional
+    """
     count = len(index)
     result = Gaussians(
         index,
@@ -158,13 +170,13 @@ def _activate(
         chunk = splats.take(index[piece])
         relative = np.asarray(chunk.log_scales, np.float64) - np.log(scene.size)
         scales = np.exp(relative.clip(*_LOG_SCALE_RANGE))
-        axes = scene.axes @ rotation_matrices(chunk.quaternions) * scales[:, None, :]
+        axes = scene.axes @ rotation_matrices(chunk.quaternions) * scales[:, None, :]  # (n, 3, 3)
         for row, (a, b) in enumerate(_PAIRS):
             result.covariances[row, piece] = np.einsum("ij,ij->i", axes[:, a], axes[:, b])
         result.largest[piece] = scales.max(axis=1)
         result.alphas[piece] = opacity(chunk.opacity_logits)
         colors = SH_C0 * np.asarray(chunk.sh_dc, np.float64) + 0.5
-        result.colors[piece] = colors.clip(0.0, 16.0)  # what is brighter is white all the same
+        result.colors[piece] = colors.clip(0.0, 16.0)  # brighter than white; kept finite
 
     with np.errstate(under="ignore"):
         for_chunks(fill, count, _CHUNK, progress=progress, what="reading", threads=threads)
@@ -172,7 +184,7 @@ def _activate(
 
 
 def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
-    """Project what may touch the image of a view.
+    """Return the footprints of the Gaussians that may reach into the image of a view.
 
     The footprint is the Gaussian of covariance ``J W S W' J' + 0.3 I`` (Zwicker et al., "EWA
     splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean.
@@ -185,11 +197,11 @@ def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
     for start in range(0, len(gaussians), _CHUNK):
         checkpoint()
         piece = slice(start, start + _CHUNK)
-        local = _local(gaussians.means[:, piece], scene, view)
+        local = _local(gaussians.means[:, piece], scene, view)  # (3, chunk)
         touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, planes))
         if len(touching):
-            local = np.take(local, touching, axis=1)
-            shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)
+            local = np.take(local, touching, axis=1)  # (3, n), as all that follows
+            shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)  # (6, n)
             inside = frustum.contains(view, local, planes)
             pieces.append((touching + start, local[2], *_ellipses(local, shape, view), inside))
     if not pieces:
@@ -206,7 +218,7 @@ def _nothing() -> Footprints:
 
 
 def _computable(scene: Scene, view: View) -> bool:
-    """Whether float32 holds what the view sees; it shows nothing of the scene where not."""
+    """Whether float32 can hold this view's coordinates; if not, the view counts as empty."""
     away = float(np.abs(view.center - scene.origin).max())
     lens = (view.fx, view.fy, abs(view.cx), abs(view.cy), view.width, view.height)
     known = min(view.fx, view.fy) >= 1.0 / _LARGEST_LENS and max(lens) <= _LARGEST_LENS
@@ -216,12 +228,12 @@ def _computable(scene: Scene, view: View) -> bool:
 def clip_planes(scene: Scene, view: View) -> tuple[float, float]:
     """Return near and far plane in scene sizes."""
     near, far = frustum.clip_planes(view, NEAR_RELATIVE * scene.size)
-    # Nearer than this a footprint's size leaves float32, and no renderer draws it.
+    # Footprints of splats nearer than 1e-5 could overflow float32; no renderer draws them.
     return min(max(near / scene.size, 1e-5), 1e30), min(far / scene.size, 1e30)
 
 
 def _local(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.float32]:
-    """Camera coordinates of centres, (3, M), scene sizes."""
+    """Return camera coordinates of centres, (3, M), scene sizes."""
     shift = (view.rotation @ ((view.center - scene.origin) / scene.size)).astype(np.float32)
     local: NDArray[np.float32] = (view.rotation @ scene.axes.T).astype(np.float32) @ means
     local -= shift[:, None]
@@ -234,14 +246,14 @@ def _touches(
     view: View,
     planes: tuple[float, float],
 ) -> NDArray[np.bool_]:
-    """Return which footprints may reach into the image, (M,): at least all that do.
+    """Return which footprints may reach into the image, (M,); some that do not are included.
 
-    It is `frustum.contains` with the image widened by how far each footprint may reach.
+    It is `frustum.contains` with the image widened by the reach of each footprint.
     """
     x, y, z = local
     touching: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
     for coordinate, (focal, offset, half) in zip((x, y), frustum.image_sides(view), strict=True):
-        # The steepest ray at which the projection is linearised bounds how long a footprint is.
+        # A footprint is longest where the ray is steepest; the projection is linearised no further.
         slope = (abs(offset) + (1.0 + 2.0 * _BEYOND) * half) / focal
         reach = REACH * focal * float(np.hypot(1.0, slope)) * largest  # (M,), px times depth
         pixels = half + REACH * LOW_PASS**0.5
@@ -250,7 +262,7 @@ def _touches(
 
 
 def _rotation6(rotation: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return the matrix that takes the 6 numbers of S to those of ``R S R'``, R a rotation."""
+    """Return the (6, 6) matrix from the 6 numbers of S to those of ``R S R'``, R a rotation."""
     r = rotation
     return np.array(
         [
@@ -291,8 +303,8 @@ def _image_covariance(
     Parameters
     ----------
     ray : (across, down, z)
-        ``x / z``, ``y / z`` and z of the centres, (n,) each. Where a centre lies far beside the
-        image, J is taken nearer to it (`_BEYOND`), for it grows without bound.
+        ``x / z``, ``y / z`` and z of the centres, (n,) each. For a centre far outside the image, J
+        is computed at the edge that `_BEYOND` sets, because J grows without bound.
     shape : (6, n) float32
         S: xx, xy, xz, yy, yz, zz.
     view : View
@@ -317,12 +329,12 @@ def _half_axes(
     """Return the half axes of ``C + LOW_PASS I`` and their lengths, (2, n) each, the longer first.
 
     With ``m = (xx + yy) / 2`` and ``r = hypot((xx - yy) / 2, xy)`` the eigenvalues of C are m + r
-    and m - r; the latter is computed as ``det C / (m + r)``, since the difference would cancel.
+    and m - r; the latter is computed as ``det C / (m + r)``, which loses no digits by cancellation.
     """
-    middle, half = (xx + yy) / 2, (xx - yy) / 2
+    mean, half = (xx + yy) / 2, (xx - yy) / 2
     root = np.sqrt(half * half + xy * xy)
-    first = np.sqrt(np.maximum(middle + root, 0.0) + LOW_PASS)
-    second = np.maximum(xx * yy - xy * xy, 0.0) / np.maximum(middle + root, 1e-30)
+    first = np.sqrt(np.maximum(mean + root, 0.0) + LOW_PASS)
+    second = np.maximum(xx * yy - xy * xy, 0.0) / np.maximum(mean + root, 1e-30)
     second = np.sqrt(second + LOW_PASS)
     c, s = _major_direction(half, xy, root)
     return first * np.stack([c, s]), second * np.stack([-s, c]), np.stack([first, second])
@@ -331,10 +343,10 @@ def _half_axes(
 def _major_direction(
     half: NDArray[np.float32], xy: NDArray[np.float32], root: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the unit vector along the major axis, (n,) across and down; (1, 0) of a circle.
+    """Return the unit vector along the major axis, (n,) across and down; (1, 0) for a circle.
 
-    ``(half + root, xy)`` and ``(xy, root - half)`` both point along it, half being (xx - yy) / 2
-    and root that of `_half_axes`. The one whose sum does not cancel is taken, turned to the right.
+    ``(half + root, xy)`` and ``(xy, root - half)`` both point along it, with half = (xx - yy) / 2
+    and root as in `_half_axes`. The one without cancellation is used, and made to point right.
     """
     wide = half >= 0.0
     c, s = np.where(wide, half + root, np.abs(xy)), np.where(wide, xy, root - half)

@@ -1,0 +1,205 @@
+"""What views see of each splat: how much of the picture it makes up, and the error without it.
+
+    contribution_i = sum over views of  integral of alpha_i  x  mean T        MesonGS, LightGaussian
+    error_i        = sum over views of  integral of alpha_i^2  x  mean of T^2 |c_i - B_i|^2
+
+T is the transmittance in front of the splat, c_i its colour and B_i the colour behind it; T and B
+come from `froxels`. The error is the squared change of the pictures when this one splat is removed,
+which is what REFINE's Hessian stands for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import RefineError
+from ..work import Progress, for_chunks
+from . import froxels, projection
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..scene import Scene
+    from ..views import View, ViewSet
+    from .projection import Gaussians
+
+_BLOCKS = 8  # of views; sums are added block by block, so they do not depend on threads
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How finely images are divided and splats sampled.
+
+    Attributes
+    ----------
+    cell : float
+        Side of a cell, pixels; larger where an image would have more than 65,535 cells.
+    density : float
+        Points per standard deviation for a splat whose standard deviation is as long as a cell.
+    """
+
+    cell: float = 4.0
+    density: float = 4.5
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises
+        ------
+        RefineError
+            If a value is not a positive number.
+        """
+        for name in ("cell", "density"):
+            value = getattr(self, name)
+            if not 0.0 < value < np.inf:
+                msg = f"{name} is {value}, expected a positive number"
+                raise RefineError(msg)
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Sums over views, for M Gaussians.
+
+    Attributes
+    ----------
+    contribution, error : (M,) float64
+        As defined at the top of this file; px^2, each view multiplied by its weight.
+    seen : (M,) int32
+        In how many views the centre lies.
+    """
+
+    contribution: NDArray[np.float64]
+    error: NDArray[np.float64]
+    seen: NDArray[np.int32]
+
+    @classmethod
+    def zero(cls, count: int) -> Measured:
+        """Return sums of no views."""
+        return cls(np.zeros(count), np.zeros(count), np.zeros(count, np.int32))
+
+    @classmethod
+    def sum(cls, parts: list[Measured]) -> Measured:
+        """Return the sums of all parts."""
+        total = cls.zero(len(parts[0].seen))
+        for other in parts:
+            total.add(other)
+        return total
+
+    def for_all(self, index: NDArray[np.int64], count: int) -> Measured:
+        """Return the sums of `count` splats: these ones at `index`, 0 for all others."""
+        every = Measured.zero(count)
+        every.contribution[index] = self.contribution
+        every.error[index] = self.error
+        every.seen[index] = self.seen
+        return every
+
+    def add(self, other: Measured) -> None:
+        """Add the sums of other views."""
+        self.contribution[:] += other.contribution
+        self.error[:] += other.error
+        self.seen[:] += other.seen
+
+
+class Measuring:
+    """The views of one scoring, ready to measure Gaussians.
+
+    Attributes
+    ----------
+    views : list of (View, float)
+        Views and their weights, see `_by_distance`.
+    """
+
+    def __init__(
+        self, scene: Scene, views: ViewSet, sampling: Sampling, threads: int | None
+    ) -> None:
+        self.scene, self.sampling, self.threads = scene, sampling, threads
+        self.views = _by_distance(views)
+
+    def measure(self, gaussians: Gaussians, progress: Progress) -> Measured:
+        """Return the sums over all views for these Gaussians, each hidden by all others."""
+        none = np.empty(0, np.int64)
+        return Measured.sum([block for block, _ in self.blocks(gaussians, none, progress)])
+
+    def blocks(
+        self, gaussians: Gaussians, sample: NDArray[np.int64], progress: Progress
+    ) -> list[tuple[Measured, NDArray[np.float64]]]:
+        """Return the sums over each block of views, and the errors of a sample in each view.
+
+        Parameters
+        ----------
+        gaussians : Gaussians
+        sample : (m,) int64
+            Rows of the Gaussians.
+        progress : callable
+
+        Returns
+        -------
+        list of Measured, (views, m) float64
+        """
+        blocks = min(_BLOCKS, len(self.views))
+
+        def block(piece: slice) -> tuple[Measured, NDArray[np.float64]]:
+            total = Measured.zero(len(gaussians))
+            errors = []
+            for view, weight in self.views[piece.start :: blocks]:
+                before = total.error[sample]  # (m,)
+                measure_view(gaussians, self.scene, view, weight, self.sampling, total)
+                errors.append(total.error[sample] - before)
+            return total, np.array(errors)
+
+        return for_chunks(block, blocks, 1, progress=progress, what="scoring", threads=self.threads)
+
+
+def measure_view(
+    gaussians: Gaussians,
+    scene: Scene,
+    view: View,
+    weight: float,
+    sampling: Sampling,
+    total: Measured,
+) -> None:
+    """Add what one view sees to `total`."""
+    with np.errstate(under="ignore"):
+        footprints = projection.project(gaussians, scene, view)
+        count = len(footprints.index)  # n
+        if not count:
+            return
+        total.seen[footprints.index[footprints.inside]] += 1
+        side = froxels.cell_size(footprints, view, sampling.cell, sampling.density)
+        points = froxels.scatter(footprints, view, side, sampling.density)
+        alphas = gaussians.alphas[footprints.index]  # (n,)
+        red, green, blue = gaussians.colors[footprints.index].T  # (n,) each
+        colors = (froxels.paired(red, green), blue.copy())
+        mass, mass_squared = froxels.masses(footprints, alphas)  # (n,) each
+        evenness = froxels.evenness(footprints, points.area)  # (n,)
+        transmittance = np.empty(len(points.owners), np.float32)  # (m,)
+        squared_contrast = np.empty(len(points.owners), np.float32)  # (m,)
+        for place, piece in points.pieces():
+            thick = froxels.thickness(piece, alphas, mass)
+            front, even = froxels.in_front(piece, thick, thick * evenness.take(piece.owners))
+            transmittance[place] = froxels.transmittance(front, even, points.area)
+            squared_contrast[place] = froxels.squared_contrast(piece, front, thick, colors)
+        visible, errors = froxels.mean_visible(points, transmittance, squared_contrast, count)
+        total.contribution[footprints.index] += weight * (mass * visible)
+        total.error[footprints.index] += weight * (mass_squared * errors)
+
+
+def _by_distance(views: ViewSet) -> list[tuple[View, float]]:
+    """Return the views of positive weight and their weights, in an order given by the scene.
+
+    They are sorted by distance from the mean of their centres, then from the view farthest from it.
+    So which block a view belongs to depends neither on the order of the list nor, unless all views
+    are alike, on the frame.
+    """
+    centers = views.centers - views.weights @ views.centers
+    order = np.lexsort((*centers.T, *views.rotations[:, 2].T))
+    for _ in range(2):
+        distance = np.einsum("ij,ij->i", centers, centers)
+        largest = float(distance.max()) or 1.0
+        # Rounded, so that distances that differ by rounding only keep their order.
+        order = order[np.argsort(np.round(distance[order] / largest, 9), kind="stable")]
+        centers = centers - centers[order[-1]]
+    return [(views[int(k)], float(views.weights[k])) for k in order if views.weights[k] > 0]
