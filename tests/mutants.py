@@ -348,16 +348,17 @@ MUTANTS = {
     ],
     "absorbing/neighbours.py": [
         (
-            "(index == tree.which[rows][:, :, None]) | (index >= total)",
-            "index >= total",
+            "key[candidates == np.arange(piece.start, piece.stop)[:, None]] = _NOBODY",
+            "",
             "a point its own neighbour",
         ),
+        ("key[:, 1:][key[:, 1:] == key[:, :-1]] = _NOBODY", "", "the same neighbour twice"),
+        ("points @ turn.T + shift", "points", "all curves the same"),
         (
-            "np.lexsort((index, np.take_along_axis(squared, chosen, axis=2)), axis=-1)",
-            "np.lexsort((np.take_along_axis(squared, chosen, axis=2), index), axis=-1)",
-            "index before distance",
+            "key |= candidates.astype(np.uint64)",
+            "key |= candidates[::-1].astype(np.uint64)",
+            "others",
         ),
-        ("np.maximum(gap, 0.0) ** 2", "np.minimum(gap, 0.0) ** 2", "the farthest leaves"),
     ],
 }
 """Module of core -> lines to change, what they become, and what is wrong then."""

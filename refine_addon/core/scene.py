@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 _CHUNK = 1 << 16
 _BITS = 21  # of each coordinate in `spatial_order`; three of them fit an int64
-_HALF_WIDTH = 4.0  # scene sizes either way in `spatial_order`; farther positions count as the edge
 _SPREAD_BITS = (
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),
@@ -156,9 +155,11 @@ def spatial_order(place: NDArray[np.float64]) -> NDArray[np.int64]:
     """
     cells = float(1 << _BITS)
     code = np.zeros(len(place), np.int64)  # (N,), bits of the three coordinates interleaved
+    # All of space is mapped into a ball, so the resolution falls with the distance.
+    with np.errstate(under="ignore"):
+        scale = cells / 2.0 / (1.0 + np.sqrt(np.einsum("ij,ij->i", place, place)))  # (N,)
     for axis in range(3):
-        along = place[:, axis] * (0.5 / _HALF_WIDTH) + 0.5
-        bits = (along * cells).clip(0.0, cells - 1.0).astype(np.int64)
+        bits = (place[:, axis] * scale + cells / 2.0).clip(0.0, cells - 1.0).astype(np.int64)
         for shift, mask in _SPREAD_BITS:
             bits = (bits | bits << shift) & mask
         code |= bits << axis

@@ -1,52 +1,44 @@
-"""Nearest neighbours of every point of a cloud, with NumPy alone.
+"""Near neighbours of every point of a cloud, with NumPy alone.
 
-A balanced tree halves the points along the longest side of their box until leaves hold a few points
-each, so dense and sparse regions cost the same. The points of a leaf are compared with those of the
-`VISITED` leaves whose boxes are nearest; a beam search from the root finds these leaves. The work
-is the same for every point. (An exact search would compare a far outlier with the whole cloud.)
-Results are exact for small clouds; in trained scenes 98 to 99 % of the 8 nearest are found.
+Points are sorted along a few space-filling curves, each turned and shifted against the others.
+Most points near a given one are within a few places of it on at least one curve, so only those
+places are looked at (Liao, Lopez and Leutenegger 2001, "High dimensional similarity search with
+space filling curves"). The work is the same for every point of any cloud. In trained scenes 87 to
+89 % of the 8 nearest are found, and 97 to 98 % of the very nearest.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..work import Progress, for_chunks, silent
+from ..scene import spatial_order
+from ..splats import rotation_matrices
+from ..work import Progress, for_chunks, part, report, silent
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
-VISITED = 20
-"""How many leaves the points of a leaf are compared with, their own included."""
+CURVES = np.array(
+    [[1.0, 0, 0, 0], [0.8, 0.3, 0.4, 0.3], [0.5, -0.6, 0.1, 0.6], [0.3, 0.5, -0.7, 0.4]]
+)
+"""How each curve is turned, w x y z."""
 
-_LEAF = 8
-"""Most points in a leaf; it holds at least half as many."""
+SHIFTS = np.array([[0.0, 0, 0], [0.21, 0.13, 0.17], [-0.11, 0.23, -0.19], [0.15, -0.27, 0.07]])
+"""How far each curve is moved, scene sizes, so that cells of all curves do not meet in one place."""
 
-_CENTER = 1e-3
-"""Factor on the squared distance between the centres of two boxes; it decides among boxes that
-touch."""
+WINDOW = 6
+"""Places looked at before and behind a point on each curve."""
 
-_BATCH = 256
-"""Leaves processed at once, which limits the memory."""
+SMALL = 128
+"""Up to this many points, all are compared with all."""
 
-
-class _Tree(NamedTuple):
-    """A balanced tree in arrays: node n of a level has the nodes 2n and 2n + 1 below it.
-
-    Attributes
-    ----------
-    which : (leaves, size) int64
-        Indices of the points; N or more for copies that fill up a leaf.
-    points : (leaves, size, 3) float64
-    boxes : list of (2, 3, nodes) float64
-        Lower and upper corners of the nodes of each level, from the root down to the leaves.
-    """
-
-    which: NDArray[np.int64]
-    points: NDArray[np.float64]
-    boxes: list[NDArray[np.float64]]
+_CHUNK = 1 << 14
+_NOBODY = np.uint64(2**64 - 1)  # sorts behind every candidate
+_INDEX = np.uint64(2**32 - 1)
 
 
 def nearest(
@@ -56,14 +48,14 @@ def nearest(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.int32]:
-    """Return near neighbours of every point, which are nearly always the nearest.
+    """Return near neighbours of every point, most of them the nearest.
 
     Parameters
     ----------
     points : (N, 3) float64
-        Finite, and with finite squares.
+        In scene sizes (`Scene.place`).
     count : int
-        How many neighbours, up to 16; fewer if there are fewer other points.
+        How many neighbours, up to 16; fewer where there are not as many other points.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
     threads : int, optional
@@ -82,82 +74,68 @@ def nearest(
     count = min(count, total - 1)
     if count <= 0:
         return np.empty((total, 0), np.int32)
-    tree = _build(np.asarray(points, np.float64))
+    around = _candidates(points, max((count + 1) // 2, WINDOW), part(progress, 0.0, 0.4))
     found = np.empty((total, count), np.int32)
 
     def search(piece: slice) -> None:
-        own = tree.which[piece]  # (leaves, size)
-        real = own < total  # (leaves, size)
-        found[own[real]] = _search(tree, piece, count, total)[real]
+        found[piece] = _nearest_of(points, piece, around(piece), count)
 
     for_chunks(
-        search, len(tree.which), _BATCH,
-        progress=progress, what="finding neighbours", threads=threads,
+        search, total, _CHUNK,
+        progress=part(progress, 0.4, 1.0), what="finding neighbours", threads=threads,
     )  # fmt: skip
     return found
 
 
-def _build(points: NDArray[np.float64]) -> _Tree:
-    """Return the tree of points, (N, 3), which are halved until a leaf holds at most `_LEAF`."""
-    total = len(points)
-    depth = 0
-    while total > _LEAF << depth:
-        depth += 1
-    size = -(-total // 2**depth)
-    # Leaves are filled up with copies of points; their indices start at N.
-    order = np.arange(size * 2**depth)
-    copies = np.where(order < total, order, (order - total) % total)  # the point behind each index
-    for level in range(depth):
-        nodes = order.reshape(2**level, -1)  # (nodes, n), as `along` and `halves`
-        inside = points.take(copies.take(nodes), axis=0)  # (nodes, n, 3)
-        axis = np.argmax(inside.max(axis=1) - inside.min(axis=1), axis=1)  # (nodes,)
-        along = np.take_along_axis(inside, axis[:, None, None], axis=2)[..., 0]
-        halves = np.argpartition(along, nodes.shape[1] // 2, axis=1)
-        order = np.take_along_axis(nodes, halves, axis=1).ravel()
-    which = order.reshape(2**depth, size)
-    leaves = points[copies[which]]  # (leaves, size, 3)
-    boxes = [np.stack([leaves.min(axis=1).T, leaves.max(axis=1).T])]
-    while boxes[0].shape[2] > 1:
-        low, high = boxes[0].reshape(2, 3, -1, 2)
-        boxes.insert(0, np.stack([low.min(axis=2), high.max(axis=2)]))
-    return _Tree(which, leaves, boxes)
+def _candidates(
+    points: NDArray[np.float64], window: int, progress: Progress
+) -> Callable[[slice], NDArray[np.int32]]:
+    """Return a function that gives the candidates of n points, (n, C) indices.
 
-
-def _search(tree: _Tree, rows: slice, count: int, total: int) -> NDArray[np.int64]:
-    """Return the neighbours, (leaves, size, count), of all points of some leaves."""
-    nodes = _near_leaves(tree, rows)  # (leaves, visited)
-    own = tree.points[rows]  # (leaves, size, 3)
-    others = tree.points.take(nodes, axis=0).reshape(len(own), -1, 3)  # (leaves, v, 3)
-    index = tree.which.take(nodes, axis=0).reshape(len(own), 1, -1)  # (leaves, 1, v)
-    squared = np.zeros((*own.shape[:2], others.shape[1]))  # (leaves, size, v)
-    for axis in range(3):
-        step = own[:, :, None, axis] - others[:, None, :, axis]
-        squared += np.multiply(step, step, out=step)
-    squared[(index == tree.which[rows][:, :, None]) | (index >= total)] = np.inf
-    index = np.broadcast_to(index, squared.shape)
-    chosen = np.argpartition(squared, count - 1, axis=2)[..., :count]
-    index = np.take_along_axis(index, chosen, axis=2)
-    order = np.lexsort((index, np.take_along_axis(squared, chosen, axis=2)), axis=-1)
-    return np.take_along_axis(index, order, axis=2)
-
-
-def _near_leaves(tree: _Tree, rows: slice) -> NDArray[np.int64]:
-    """Return the leaves nearest to some leaves, (leaves, `VISITED`), or all if there are fewer.
-
-    A beam search: of each level, only the children of the `VISITED` nearest nodes are looked at.
+    A candidate may appear more than once, and a point is among its own.
     """
-    low, high = tree.boxes[-1][:, :, rows, None]  # (3, leaves, 1) each
-    nodes = np.zeros((low.shape[1], 1), np.int64)  # (leaves, up to 2 VISITED)
-    for boxes in tree.boxes[1:]:
-        nodes = np.concatenate([2 * nodes, 2 * nodes + 1], axis=1)
-        if nodes.shape[1] <= VISITED:
-            continue
-        distance = np.zeros(nodes.shape)
+    total = len(points)
+    if total <= max(SMALL, 2 * window + 1):
+        everyone = np.arange(total, dtype=np.int32)
+        return lambda piece: np.broadcast_to(everyone, (piece.stop - piece.start, total))
+    orders, places = [], []
+    for number, (turn, shift) in enumerate(zip(rotation_matrices(CURVES), SHIFTS, strict=True)):
+        report(progress, number / len(CURVES), "finding neighbours")
+        order = spatial_order(points @ turn.T + shift).astype(np.int32)
+        place = np.empty(total, np.int32)
+        place[order] = np.arange(total, dtype=np.int32)
+        orders.append(order)
+        # At either end of a curve the window lies to one side.
+        places.append(np.clip(place - window, 0, total - 1 - 2 * window))
+
+    def around(piece: slice) -> NDArray[np.int32]:
+        steps = np.arange(2 * window + 1, dtype=np.int32)
+        windows = (
+            order.take(first[piece, None] + steps)  # (n, 2 window + 1)
+            for order, first in zip(orders, places, strict=True)
+        )
+        return np.concatenate(list(windows), axis=1)
+
+    return around
+
+
+def _nearest_of(
+    points: NDArray[np.float64], piece: slice, candidates: NDArray[np.int32], count: int
+) -> NDArray[np.int32]:
+    """Return the `count` nearest of the candidates of n points, (n, count)."""
+    squared = np.zeros(candidates.shape)  # (n, C)
+    with np.errstate(under="ignore"):
         for axis in range(3):
-            lower, upper = boxes[0, axis].take(nodes), boxes[1, axis].take(nodes)
-            gap = np.maximum(lower - high[axis], low[axis] - upper)
-            apart = 0.5 * (lower + upper - low[axis] - high[axis])
-            distance += np.maximum(gap, 0.0) ** 2 + _CENTER * apart * apart
-        nearest_nodes = np.argpartition(distance, VISITED - 1, axis=1)[:, :VISITED]
-        nodes = np.take_along_axis(nodes, nearest_nodes, axis=1)
-    return nodes
+            along = np.ascontiguousarray(points[:, axis])
+            step = along.take(candidates) - along[piece, None]
+            squared += np.multiply(step, step, out=step)
+        distance = np.minimum(squared, np.finfo(np.float32).max).astype(np.float32)
+    # The bits of numbers >= 0 sort as they do; the index behind them decides between equal ones.
+    key = distance.view(np.uint32).astype(np.uint64) << np.uint64(32)
+    key |= candidates.astype(np.uint64)
+    key[candidates == np.arange(piece.start, piece.stop)[:, None]] = _NOBODY
+    key.sort(axis=1)
+    # A candidate of several curves stands there as often.
+    key[:, 1:][key[:, 1:] == key[:, :-1]] = _NOBODY
+    key.sort(axis=1)
+    return (key[:, :count] & _INDEX).astype(np.int32)
