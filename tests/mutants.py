@@ -299,7 +299,6 @@ MUTANTS = {
         ("self.patience * merging.costs", "merging.costs", "patience ignored"),
         ("count < connected / 2", "count < 0", "never connected anew"),
         ("self.alive & ~np.isnan(self.field.error)", "self.alive", "a round that does nothing"),
-        ("min(limit, _LARGEST)", "limit", "pairs of infinite cost merged"),
     ],
     "scoring/auto.py": [
         (

@@ -25,7 +25,6 @@ BATCH = 0.03
 """Share of the splats that one round removes at most; then costs are computed again."""
 
 _CHUNK = 1 << 14
-_LARGEST = np.finfo(np.float64).max  # pairs of infinite cost are not merged
 
 
 class MergeGraph:
@@ -140,7 +139,7 @@ class MergeGraph:
         # Look at twice the quota, since operations that share a splat exclude each other.
         last = min(2 * quota, len(costs)) - 1
         limit = np.partition(costs, last)[last]
-        edges = np.flatnonzero(self.cost <= min(limit, _LARGEST))  # (e,)
+        edges = np.flatnonzero(self.cost <= limit)  # (e,)
         first, second, cost = self.first[edges], self.second[edges], self.cost[edges]  # (e,) each
         best = error.copy()  # (N,), the cost of each splat's cheapest operation
         np.minimum.at(best, first, cost)
