@@ -28,7 +28,7 @@ CURVES = np.array(
 """How each curve is turned, w x y z."""
 
 SHIFTS = np.array([[0.0, 0, 0], [0.21, 0.13, 0.17], [-0.11, 0.23, -0.19], [0.15, -0.27, 0.07]])
-"""How far each curve is moved, scene sizes, so that cells of all curves do not meet in one place."""
+"""How far each curve is moved, scene sizes, so that their cells do not meet in one place."""
 
 WINDOW = 6
 """Places looked at before and behind a point on each curve."""
