@@ -13,11 +13,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
+    from .splats import Splats
     from .views import ViewSet
+
+MIX = np.uint64(0x9E3779B97F4A7C15)
+"""2^64 over the golden ratio: its multiples spread numbers that differ little."""
 
 _CHUNK = 1 << 16
 _BITS = 21  # of each coordinate in `spatial_order`; three of them fit an int64
@@ -140,18 +144,47 @@ def _pieces(count: int) -> Iterator[slice]:
     return (slice(start, start + _CHUNK) for start in range(0, count, _CHUNK))
 
 
-def spatial_order(place: NDArray[np.float64]) -> NDArray[np.int64]:
+def fingerprint(*columns: NDArray[Any]) -> NDArray[np.uint64]:
+    """Return a hash of each row's values, (N,): the same number wherever the row stands.
+
+    Parameters
+    ----------
+    columns : (N,) floating
+        Values that a motion of the scene does not change, such as opacity and base colour; they
+        are compared in float32.
+    """
+    key = np.zeros(len(columns[0]), np.uint64)
+    for values in columns:
+        with np.errstate(over="ignore", under="ignore"):  # of float64
+            bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
+        key = (key ^ bits) * MIX
+        key ^= key >> np.uint64(29)
+    return key
+
+
+def splat_fingerprint(splats: Splats, rows: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Return the `fingerprint` of opacity and base colour of some splats, (n,)."""
+    return fingerprint(splats.opacity_logits[rows], *splats.sh_dc[rows].T)
+
+
+def spatial_order(
+    place: NDArray[np.float64],
+    ties: Callable[[NDArray[np.int64]], NDArray[np.uint64]] | None = None,
+) -> NDArray[np.int64]:
     """Return the order of positions along a Z-shaped curve, near ones together (Morton, 1966).
 
     Parameters
     ----------
     place : (N, 3) float64
         As `Scene.place` returns them.
+    ties : callable, optional
+        ``ties(rows)`` returns numbers that order rows at the same place.
 
     Returns
     -------
     (N,) int64
-        Positions that agree in 21 bits of each coordinate keep their order.
+        Positions that agree in 21 bits of each coordinate are at the same place; without `ties`
+        they keep their order.
     """
     cells = float(1 << _BITS)
     code = np.zeros(len(place), np.int64)  # (N,), bits of the three coordinates interleaved
@@ -163,4 +196,10 @@ def spatial_order(place: NDArray[np.float64]) -> NDArray[np.int64]:
         for shift, mask in _SPREAD_BITS:
             bits = (bits | bits << shift) & mask
         code |= bits << axis
-    return np.argsort(code, kind="stable")
+    order = np.argsort(code, kind="stable")
+    same = np.diff(code[order]) == 0  # (N - 1,)
+    if ties is not None and same.any():
+        tied = np.flatnonzero(np.append(same, False) | np.append(False, same))
+        rows = order[tied]
+        order[tied] = rows[np.lexsort((ties(rows), code[rows]))]
+    return order

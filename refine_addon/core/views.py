@@ -227,23 +227,21 @@ class ViewSet:
 
         Farthest-point sampling over position and viewing direction, starting from the view that is
         farthest from the middle of the set. Positions are divided by the root of `middle`'s
-        variance. The choice depends neither on the order of the set nor on its unit, and a stray
-        view takes up only one place.
+        variance. The choice depends neither on the frame and the unit of the set nor, as far as
+        names differ, on its order; a stray view takes up only one place.
 
         Parameters
         ----------
         count : int
             How many to keep; 0 keeps all.
         """
-        usable = np.array([index for index, view in enumerate(self.views) if view.weight > 0])
+        # Ties, of which regular rigs have many, go to the first name.
+        usable = np.array([index for index in self.by_name() if self.views[index].weight > 0])
         if count <= 0 or len(usable) <= count:
-            return self if len(usable) == len(self) else self.take(usable)
+            return self if len(usable) == len(self) else self.take(np.sort(usable))
         middle, variance = self.middle()
         offset = self.centers[usable] - middle
         place = np.hstack([offset / (np.sqrt(variance) or 1.0), self.rotations[usable][:, 2]])
-        # Sorted by place, so that ties do not depend on the order of the views.
-        order = np.lexsort(place.T)
-        place = place[order]
         chosen = [int(np.argmax(np.round(np.sum(place * place, axis=1), 9)))]
         distance = np.full(len(place), np.inf)
         while len(chosen) < count:
@@ -251,7 +249,14 @@ class ViewSet:
             distance = np.minimum(distance, step)
             distance[chosen] = -1.0
             chosen.append(int(np.argmax(np.round(distance, 9))))
-        return self.take(np.sort(usable[order[chosen]]))
+        return self.take(np.sort(usable[chosen]))
+
+    def by_name(self) -> list[int]:
+        """Return the indices of the views in the order of their names, of equal names in theirs.
+
+        An order that neither a motion of the scene nor another order of the set changes.
+        """
+        return sorted(range(len(self)), key=lambda index: self.views[index].name)
 
 
 def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:

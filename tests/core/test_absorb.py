@@ -613,8 +613,8 @@ def rounds(monkeypatch):
     """Fail where a round does nothing, since `reduce` would then repeat it forever."""
     carry_out = MergeGraph._round
 
-    def checked(self, quota):
-        done = carry_out(self, quota)
+    def checked(self, quota, progress):
+        done = carry_out(self, quota, progress)
         assert done > 0, "a round did nothing"
         return done
 

@@ -196,3 +196,22 @@ def test_stray_cameras_do_not_open_gaps_between_the_others(away):
         return float(np.diff(np.sort(along[along < 30.0])).max())
 
     assert largest_gap(3) <= 1.15 * largest_gap(0)
+
+
+@pytest.mark.parametrize("count", [24, 64])
+def test_of_a_regular_rig_the_same_views_are_chosen_however_it_lies(count):
+    """A ring of 72 is full of equal distances: the name decides, not a coordinate."""
+    quarter = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    views = ring(72)
+    turned = ViewSet(
+        tuple(
+            replace(view, rotation=view.rotation @ quarter.T, center=quarter @ view.center)
+            for view in views
+        )
+    )
+
+    names = [view.name for view in views.spread(count)]
+
+    assert [view.name for view in turned.spread(count)] == names
+    backwards = views.take(range(71, -1, -1)).spread(count)
+    assert sorted(view.name for view in backwards) == sorted(names)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..scene import scene_of, spatial_order
+from ..scene import scene_of, spatial_order, splat_fingerprint
 from ..splats import Splats, drawable
 from ..work import Progress, part, report, silent
 from . import merge_field, merging
@@ -210,8 +210,10 @@ def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     if excess <= 0:
         return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1)
     # Sorted by place in the scene, so that ties do not depend on the order of the file.
-    rows = rows[spatial_order(scene.place(splats.means[rows]))]
-    found = merge_field.field(splats, rows, views, scene, sums, threads=threads)
+    place = scene.place(splats.means[rows])
+    rows = rows[spatial_order(place, lambda some: splat_fingerprint(splats, rows[some]))]
+    ahead = part(progress, 0.0, 0.1)
+    found = merge_field.field(splats, rows, views, scene, sums, progress=ahead, threads=threads)
     graph = MergeGraph(found, scene, factor, threads=threads)
     graph.reduce(len(rows) - excess, part(progress, 0.1, 0.95))
     keep[rows[~graph.alive]] = False

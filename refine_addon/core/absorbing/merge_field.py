@@ -10,7 +10,7 @@ import numpy as np
 from .. import frustum, spherical_harmonics
 from ..rendering import LOW_PASS
 from ..splats import SH_C0, opacity, rotation_matrices
-from ..work import for_chunks
+from ..work import Progress, for_chunks, part, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -121,7 +121,14 @@ class Look(NamedTuple):
     seen: Array
 
 
-def look(means: NDArray[Any], views: ViewSet, scene: Scene, *, threads: int | None = None) -> Look:
+def look(
+    means: NDArray[Any],
+    views: ViewSet,
+    scene: Scene,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Look:
     """Return from where the views look at splats.
 
     Each view has the weight 1 / distance^2, in proportion to the pixels that a splat covers in it,
@@ -135,6 +142,7 @@ def look(means: NDArray[Any], views: ViewSet, scene: Scene, *, threads: int | No
         At most `LOOKS` of them are used.
     scene : Scene
         `NEAREST` is relative to its size.
+    progress : callable, optional
     threads : int, optional
     """
     count = len(means)
@@ -150,7 +158,7 @@ def look(means: NDArray[Any], views: ViewSet, scene: Scene, *, threads: int | No
         for values, part_of in zip(result, found, strict=True):
             values[piece] = part_of
 
-    for_chunks(fill, count, _CHUNK, threads=threads)
+    for_chunks(fill, count, _CHUNK, progress=progress, what="absorbing", threads=threads)
     return result
 
 
@@ -208,13 +216,14 @@ def _deviation(direction: Array, second: Array) -> Array:
     return deviation.T
 
 
-def field(
+def field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
     splats: Splats,
     rows: Index,
     views: ViewSet,
     scene: Scene,
     sums: ViewSums,
     *,
+    progress: Progress = silent,
     threads: int | None = None,
 ) -> Field:
     """Return some splats as merging needs them.
@@ -233,11 +242,19 @@ def field(
         Of splats and views.
     sums : ViewSums
         Of all splats.
+    progress : callable, optional
+        See `refine_addon.core.work.Progress`.
     threads : int, optional
+
+    Raises
+    ------
+    Cancelled
+        If `progress` answers ``False``.
     """
     count = len(rows)
     covariances, color = np.empty((count, 6)), np.empty((count, 3))
-    looked = look(splats.means[rows], views, scene, threads=threads)
+    ahead = part(progress, 0.0, 0.5)
+    looked = look(splats.means[rows], views, scene, progress=ahead, threads=threads)
     upper = np.triu_indices(3)
 
     def fill(piece: slice) -> None:
@@ -250,7 +267,8 @@ def field(
             basis = spherical_harmonics.basis(looked.direction[piece], chunk.sh_degree)[:, 1:]
             color[piece] += np.einsum("nk,nkc->nc", basis, chunk.sh_rest)
 
-    for_chunks(fill, count, _CHUNK, threads=threads)
+    ahead = part(progress, 0.5, 1.0)
+    for_chunks(fill, count, _CHUNK, progress=ahead, what="absorbing", threads=threads)
     alpha, blur = opacity(splats.opacity_logits[rows]), LOW_PASS * looked.pixel  # (M,) each
     with np.errstate(under="ignore"):
         xx, xy, yy = footprint(covariances, across(looked.direction), blur)  # (M,) each

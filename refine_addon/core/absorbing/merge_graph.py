@@ -82,11 +82,13 @@ class MergeGraph:
         start = count = connected = len(self.alive)
         self._connect(part(progress, 0.0, 0.3))
         while count > goal:
-            report(progress, 0.3 + 0.7 * (start - count) / (start - goal), "absorbing")
+            done = 0.3 + 0.7 * (start - count) / (start - goal)
+            here = part(progress, done, done)
+            report(here, 0.0, "absorbing")
             if count < connected / 2:
-                self._connect(silent)
+                self._connect(here)
                 connected = count
-            count -= self._round(min(max(int(BATCH * count), 1), count - goal))
+            count -= self._round(min(max(int(BATCH * count), 1), count - goal), here)
         # The pairs are no longer needed; a large scene has ten million of them.
         self.first = self.second = np.empty(0, np.int32)
         self.cost = np.empty(0)
@@ -95,7 +97,8 @@ class MergeGraph:
         """Find the pairs of neighbouring splats, and price them."""
         rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))  # (R,)
         place = self.scene.place(self.field.means[rows])  # (R, 3)
-        near = nearest(place, NEIGHBOURS, progress=progress, threads=self.threads)  # (R, k)
+        ahead = part(progress, 0.0, 0.4)
+        near = nearest(place, NEIGHBOURS, progress=ahead, threads=self.threads)  # (R, k)
 
         def pairs(piece: slice) -> tuple[Rows, Rows]:
             own, others = np.arange(piece.start, piece.stop)[:, None], near[piece]  # (n, 1), (n, k)
@@ -104,15 +107,18 @@ class MergeGraph:
             own = np.broadcast_to(own, others.shape)
             return rows[own[once]].astype(np.int32), rows[others[once]].astype(np.int32)
 
-        found = for_chunks(pairs, len(rows), _CHUNK, threads=self.threads)
+        ahead = part(progress, 0.4, 0.5)
+        found = for_chunks(
+            pairs, len(rows), _CHUNK, progress=ahead, what="absorbing", threads=self.threads
+        )
         none = np.empty(0, np.int32)
         # int32 takes half the memory of int64, and no file holds two billion splats.
         self.first = np.concatenate([none, *(first for first, _ in found)])
         self.second = np.concatenate([none, *(second for _, second in found)])
         self.cost = np.empty(len(self.first))
-        self._price(np.arange(len(self.first), dtype=np.int32))
+        self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.5, 1.0))
 
-    def _price(self, edges: Index) -> None:
+    def _price(self, edges: Index, progress: Progress) -> None:
         """Set the costs of some pairs; infinite where deleting one of the two costs less."""
 
         def price(piece: slice) -> None:
@@ -123,9 +129,11 @@ class MergeGraph:
             least = np.minimum(self.field.error[first], self.field.error[second])
             self.cost[mine] = np.where(cost < least, cost, np.inf)
 
-        for_chunks(price, len(edges), _CHUNK, threads=self.threads)
+        for_chunks(
+            price, len(edges), _CHUNK, progress=progress, what="absorbing", threads=self.threads
+        )
 
-    def _round(self, quota: int) -> int:
+    def _round(self, quota: int, progress: Progress = silent) -> int:
         """Carry out the cheapest operations that share no splat; return how many, 1 to `quota`.
 
         A pair is merged if it is the cheapest operation for both of its splats. A splat is deleted
@@ -153,10 +161,10 @@ class MergeGraph:
         costs = np.concatenate([error[doomed], self.cost[edges]])  # (d + m,)
         order = np.argsort(costs, kind="stable")[:quota]
         is_merge = order >= len(doomed)
-        self._carry_out(doomed[order[~is_merge]], edges[order[is_merge] - len(doomed)])
+        self._carry_out(doomed[order[~is_merge]], edges[order[is_merge] - len(doomed)], progress)
         return len(order)
 
-    def _carry_out(self, doomed: Index, edges: Index) -> None:
+    def _carry_out(self, doomed: Index, edges: Index, progress: Progress) -> None:
         """Delete splats, merge pairs, and price the pairs of the merged splats again."""
         field, first, second = self.field, self.first[edges], self.second[edges]
         with np.errstate(under="ignore"):
@@ -177,7 +185,7 @@ class MergeGraph:
         self.first, self.second, self.cost = first[valid], second[valid], self.cost[valid]
         touched = np.zeros(len(self.alive), np.bool_)
         touched[into] = True
-        self._price(np.flatnonzero(touched[self.first] | touched[self.second]))
+        self._price(np.flatnonzero(touched[self.first] | touched[self.second]), progress)
 
 
 def _disjoint(first: Index, second: Index) -> Index:

@@ -131,7 +131,8 @@ def _nearest_of(
             squared += np.multiply(step, step, out=step)
         distance = np.minimum(squared, np.finfo(np.float32).max).astype(np.float32)
     # The bits of numbers >= 0 sort as they do; the index behind them decides between equal ones.
-    key = distance.view(np.uint32).astype(np.uint64) << np.uint64(32)
+    # Without the last four bits, what differs by rounding alone is equal.
+    key = (distance.view(np.uint32) >> np.uint32(4)).astype(np.uint64) << np.uint64(32)
     key |= candidates.astype(np.uint64)
     key[candidates == np.arange(piece.start, piece.stop)[:, None]] = _NOBODY
     key.sort(axis=1)

@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..scene import MIX, fingerprint
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
@@ -42,11 +44,10 @@ TIED = 0.002
 """Weights whose losses differ by about this much count as equally good; the mean of their
 logarithms is taken, so that a change in the last digits does not switch to another weight."""
 
-SAMPLE = 1 << 15
+SAMPLE = 1 << 16
 """How many splats are enough to choose the floor weights."""
 
 _NO_WEIGHT = 10.0**-5.5  # stands for 0 in a mean of logarithms
-_MIX = np.uint64(0x9E3779B97F4A7C15)  # 2^64 / golden ratio: a multiplier for hashing
 
 
 def floor(prior: NDArray[np.float64], seen: NDArray[np.int32], power: float) -> NDArray[np.float64]:
@@ -117,12 +118,9 @@ def sample(gaussians: Gaussians, count: int = SAMPLE) -> NDArray[np.int64]:
     total = len(gaussians)
     if total <= count:
         return np.arange(total)
-    key = np.zeros(total, np.uint64)  # (N,)
-    for values in (gaussians.alphas, *gaussians.colors.T):
-        key = (key ^ np.ascontiguousarray(values, np.float32).view(np.uint32)) * _MIX
-        key ^= key >> np.uint64(29)
+    key = fingerprint(gaussians.alphas, *gaussians.colors.T)  # (N,)
     # The lower half depends on the row, so equal splats are taken evenly from the whole scene.
-    order = np.arange(total, dtype=np.uint64) * _MIX
+    order = np.arange(total, dtype=np.uint64) * MIX
     key = key >> np.uint64(32) << np.uint64(32) | order >> np.uint64(32)
     return np.sort(np.argpartition(key, count)[:count])
 
@@ -148,9 +146,13 @@ def order(
     left, going = np.arange(len(scores)), [np.arange(0)]
     for weight, count in zip(floor_weights, np.diff(stops, prepend=0), strict=True):
         if count > 0:
-            left = left[np.lexsort((ties[left], with_floor(scores, floors, weight)[left]))]
-            going.append(left[:count])
-            left = left[count:]
+            values = with_floor(scores, floors, weight)[left]
+            # Only those that may go need to be sorted.
+            low = values <= np.partition(values, count - 1)[count - 1]
+            rows, values = left[low], values[low]
+            rows = rows[np.lexsort((ties[rows], values))]
+            going.append(rows[:count])
+            left = np.concatenate([rows[count:], left[~low]])
     return np.concatenate([*going, left])
 
 

@@ -190,12 +190,11 @@ def measure_view(
 def _by_distance(views: ViewSet) -> list[tuple[View, float]]:
     """Return the views of positive weight and their weights, in an order given by the scene.
 
-    They are sorted by distance from the mean of their centres, then from the view farthest from it.
-    So which block a view belongs to depends neither on the order of the list nor, unless all views
-    are alike, on the frame.
+    They are sorted by distance from their middle, then from the view farthest from it, equal ones
+    by name. So which block a view belongs to depends neither on the frame nor on the order.
     """
-    centers = views.centers - views.weights @ views.centers
-    order = np.lexsort((*centers.T, *views.rotations[:, 2].T))
+    centers = views.centers - views.middle()[0]
+    order = np.array(views.by_name())
     for _ in range(2):
         distance = np.einsum("ij,ij->i", centers, centers)
         largest = float(distance.max()) or 1.0

@@ -9,7 +9,7 @@ import numpy as np
 
 from .. import frustum
 from ..rendering import ALPHA_CUT, LOW_PASS, NEAR_RELATIVE
-from ..scene import Scene, scene_of, spatial_order
+from ..scene import Scene, scene_of, spatial_order, splat_fingerprint
 from ..splats import SH_C0, drawable, opacity, rotation_matrices
 from ..work import Progress, checkpoint, for_chunks, part, report, silent
 
@@ -130,7 +130,7 @@ def prepare(
     near = np.max(np.abs(place), axis=1, initial=0.0) <= _FARTHEST
     index, place = index[near], place[near]
     report(progress, 0.4, "reading")
-    order = spatial_order(place)
+    order = spatial_order(place, lambda rows: splat_fingerprint(splats, index[rows]))
     ahead = part(progress, 0.4, 1.0)
     return _activate(splats, index[order], place[order], scene, ahead, threads), scene, good
 
