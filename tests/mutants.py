@@ -56,7 +56,7 @@ MUTANTS = {
         ("> 0 else -rotation", "> 0 else rotation", "mirror not undone"),
     ],
     "views.py": [
-        ("place = place[order]", "", "spread in order of views"),
+        ("key=lambda index: self.views[index].name", "key=lambda index: index", "ties by index"),
         (
             "reach = _median(distance, weights)",
             "reach = distance.max()",
@@ -345,6 +345,11 @@ MUTANTS = {
             "survivors of other rows",
         ),
     ],
+    "scene.py": [
+        ("np.where(first @ vectors < 0.0, -1.0, 1.0)", "1.0", "axes of either sign"),
+        ("order[tied] = rows[np.lexsort((ties(rows), code[rows]))]", "pass", "ties by row"),
+        ("+ views_squared", "", "views forgotten"),
+    ],
     "absorbing/neighbours.py": [
         (
             "key[candidates == np.arange(piece.start, piece.stop)[:, None]] = _NOBODY",
@@ -371,6 +376,7 @@ TESTS = {
         "scoring/coverage.py",
     ],
     "absorb": ["absorbing/merge_field.py", "absorbing/merging.py", "absorbing/merge_graph.py"],
+    "invariance": ["scene.py"],
     "affine": ["spherical_harmonics.py"],
     "ply": ["formats/ply_columns.py", "formats/ply_write.py"],
 }
