@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from .. import frustum, spherical_harmonics
-from ..rendering import LOW_PASS
+from ..rendering import LOW_PASS, NEAR_RELATIVE
 from ..splats import SH_C0, opacity, rotation_matrices
 from ..work import Progress, for_chunks, part, silent
 
@@ -22,10 +22,6 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
     Index = NDArray[np.int64] | NDArray[np.int32]
     Footprint = tuple[Array, Array, Array]
-
-NEAREST = 0.01
-"""Least distance of a camera to a splat, over the scene's size; nearer cameras count as this near.
-"""
 
 LOOKS = 32
 """How many views, spread evenly, decide from which directions splats are viewed."""
@@ -141,7 +137,7 @@ def look(
     views : ViewSet
         At most `LOOKS` of them are used.
     scene : Scene
-        `NEAREST` is relative to its size.
+        A camera is at least `NEAR_RELATIVE` of its size away from a splat.
     progress : callable, optional
     threads : int, optional
     """
@@ -149,7 +145,7 @@ def look(
     result = Look(np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count))
     some = views.spread(LOOKS)
     looks = [(view, counts) for view, counts in zip(some, some.weights, strict=True) if counts]
-    closest = (NEAREST * scene.size) ** 2
+    closest = (NEAR_RELATIVE * scene.size) ** 2
 
     def fill(piece: slice) -> None:
         points = np.asarray(means[piece], np.float64).T

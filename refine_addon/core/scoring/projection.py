@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..views import View, ViewSet
 
 REACH = 3.3
-"""Standard deviations at which alpha = 1 falls to `ALPHA_CUT`: sqrt(2 ln 255) = 3.33."""
+"""Standard deviations to which a footprint is followed; alpha = 1 falls to `ALPHA_CUT` at 3.33."""
 
 _CHUNK = 1 << 14
 _FARTHEST = 1e6  # scene sizes; splats farther from the middle are in no view
