@@ -13,13 +13,10 @@ def main() -> int:
     """
     try:
         # Only here: Ctrl-C may come while these load.
-        import signal  # noqa: PLC0415
-
         from . import command  # noqa: PLC0415
 
-        code = command.main(sys.argv[1:])
-        # Done, and said: from here on it would only break into Python's own tidying up.
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        # Afterwards a signal would only break into Python's own tidying up.
+        code = command.main(sys.argv[1:], last=True)
     except KeyboardInterrupt:  # when the command does not listen yet, or no more
         print("refine: error: cancelled; nothing was left half-written", file=sys.stderr)
         return 130

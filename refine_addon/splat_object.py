@@ -8,7 +8,6 @@ leaves the scene as it was.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -22,7 +21,7 @@ from .core.formats.ply import columns_from_splats
 from .core.report import Clock, Files, complete_report
 from .core.survivors import survivor_columns
 from .core.task import DEFAULTS, Result, Settings, Task
-from .core.whole_file import refuse_existing
+from .core.whole_file import expanded, refuse_existing
 from .core.work import Progress, part, silent
 from .mesh import attributes as mesh_attributes
 from .mesh import edit as mesh_edit
@@ -31,6 +30,8 @@ from .mesh.layout import SplatObject, check
 from .mesh.scores import RECORD, store, stored_scores
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from .core.absorbing.absorb import Absorbed
@@ -247,7 +248,7 @@ def export_object(
         If the object's scale is uneven and is to be applied, or the file cannot be written; nothing
         is written then.
     """
-    target = Path(path).expanduser()
+    target = expanded(path)
     refuse_existing(target, overwrite=overwrite)
     file = mesh_attributes.file_from_object(
         checked, _world_columns(checked) if apply_transform else columns
@@ -300,7 +301,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     """
     clock = Clock()
     checked = check(find(name))
-    target = None if output is None or dry_run else Path(output).expanduser()
+    target = None if output is None or dry_run else expanded(output)
     if target is not None:
         refuse_existing(target, overwrite=overwrite)
     if save and not dry_run:

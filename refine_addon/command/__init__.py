@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-def main(arguments: Sequence[str], *, scene: bool = False) -> int:
+def main(arguments: Sequence[str], *, scene: bool = False, last: bool = False) -> int:
     """Run the command.
 
     Parameters
@@ -28,6 +28,8 @@ def main(arguments: Sequence[str], *, scene: bool = False) -> int:
         What stands behind ``refine`` on the command line.
     scene : bool
         Whether this runs in Blender, whose open scene has objects and cameras.
+    last : bool
+        Whether the process ends after this: signals come too late then, and are ignored.
 
     Returns
     -------
@@ -35,7 +37,7 @@ def main(arguments: Sequence[str], *, scene: bool = False) -> int:
         Exit code: 0 done, 1 failed on an input, 2 wrong usage; 128 and the signal's number where
         one stopped it, 130 for Ctrl-C.
     """
-    with Listener() as listener:
+    with Listener(last=last) as listener:
         try:
             # Loads NumPy, which takes longer than many a run; a signal waits until it is there.
             from . import flow  # noqa: PLC0415

@@ -18,24 +18,28 @@ def describe(file: SplatFile) -> dict[str, Any]:
     whole = file.splats()
     broken = undrawable = 0
     for start in range(0, len(file), 1 << 16):
-        rows = file.rows[start : start + (1 << 16)]
+        piece = file.rows[start : start + (1 << 16)]
         splats = whole.take(slice(start, start + (1 << 16)))
-        finite = np.ones(len(rows), np.bool_)
-        for name in rows.dtype.names or ():
-            finite &= np.isfinite(rows[name])
+        finite = np.ones(len(piece), np.bool_)
+        for name in piece.dtype.names or ():
+            finite &= np.isfinite(piece[name])
         broken += int(np.count_nonzero(~finite))
         undrawable += int(np.count_nonzero(~drawable(splats)))
         means = splats.means[np.isfinite(splats.means).all(axis=1)].astype(np.float64)
         low = np.minimum(low, means.min(axis=0, initial=np.inf))
         high = np.maximum(high, means.max(axis=0, initial=-np.inf))
-    names = file.rows.dtype.names or ()
+    names, lengths = file.rows.dtype.names or (), file.row_bytes
+    if isinstance(lengths, int):
+        average: float = lengths
+    else:
+        average = round(int(lengths.sum()) / max(len(lengths), 1), 1)
     known = ("x", "y", "z", "nx", "ny", "nz", "opacity")
     extra = [n for n in names if n not in known and not n.startswith(("f_", "scale_", "rot_"))]
     return {
         "splats": len(file),
         "sh_degree": whole.sh_degree,
         "bytes": file.size(),
-        "bytes_per_splat": round(file.row_bytes, 1),
+        "bytes_per_splat": average,
         "format": file.format,
         "extent_low": low.tolist() if np.isfinite(low).all() else None,
         "extent_high": high.tolist() if np.isfinite(high).all() else None,

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import zipfile
 import zlib
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING
 
 from .errors import RefineError
@@ -52,21 +54,44 @@ def refuse_foreign_splats(path: Path, head: bytes) -> None:
         If it is one of them; with advice.
     """
     refuse_pointer(path, head)
+    problem = foreign_kind(path, head)
+    if problem:
+        msg = f"{path}: {problem}"
+        raise RefineError(msg)
+
+
+def foreign_kind(path: Path, head: bytes) -> str:
+    """Return what a file in another format is and what to do with it; "" if it is not known.
+
+    Parameters
+    ----------
+    path, head
+        See `refuse_foreign_splats`.
+    """
     suffix = path.suffix.lower()
     if suffix in _UNSIGNED:
-        problem = f"a {suffix} file: {_CONVERT}"
-    elif head.startswith(_SPZ) or _unpacked(head).startswith(_SPZ):
-        problem = f"an SPZ file: {_CONVERT}"
-    elif head.startswith(_GZIP):
-        problem = "compressed with gzip: unpack it first"
-    elif head.startswith(_ZIP) and (suffix == ".sog" or b"meta.json" in head):
-        problem = f"a SOG file: {_CONVERT}"
-    elif head.startswith(_ZIP):
-        problem = "a ZIP archive: unpack it first"
-    else:
-        return
-    msg = f"{path}: {problem}"
-    raise RefineError(msg)
+        return f"a {suffix} file: {_CONVERT}"
+    if head.startswith(_SPZ) or _unpacked(head).startswith(_SPZ):
+        return f"an SPZ file: {_CONVERT}"
+    if head.startswith(_GZIP):
+        return "compressed with gzip: unpack it first"
+    if head.startswith(_ZIP) and (suffix == ".sog" or _lists_sog(path)):
+        return f"a SOG file: {_CONVERT}"
+    if head.startswith(_ZIP):
+        return "a ZIP archive: unpack it first"
+    return ""
+
+
+def _lists_sog(path: Path) -> bool:
+    """Return whether a ZIP archive lists what SOG is made of: meta.json and images."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            names = [PurePosixPath(name) for name in archive.namelist()]
+    except (OSError, ValueError, ArithmeticError, NotImplementedError, zipfile.BadZipFile):
+        return False
+    return any(name.name == "meta.json" for name in names) and any(
+        name.suffix == ".webp" for name in names
+    )
 
 
 def _unpacked(head: bytes) -> bytes:

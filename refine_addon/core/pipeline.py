@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from .absorbing.absorb import Absorbed
     from .scores import Scores
     from .scoring.measuring import Measured
+    from .selection import RowBytes
     from .splats import Splats
     from .views import ViewSet
 
@@ -105,7 +106,7 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
     *,
     protected: NDArray[np.bool_] | None = None,
     absorb: bool = False,
-    row_bytes: float = 0.0,
+    row_bytes: RowBytes = 0.0,
     fixed_bytes: int = 0,
     progress: Progress = silent,
     threads: int | None = None,
@@ -349,13 +350,16 @@ def prune_file(  # noqa: PLR0913 - as `prune`
         refuse_existing(target, overwrite=overwrite)
         refuse_mapped(target, expanded(source))
     file = read_ply(source)
+    row_bytes: RowBytes = file.row_bytes
+    if absorb and budget.removals(len(file), row_bytes, file.fixed_bytes) != 0:
+        row_bytes = file.changed_row_bytes  # how long each becomes is not known before
     task = Task(
         budget=budget,
         settings=settings,
         splats=file.splats(),
         views=views,
         absorb=absorb,
-        row_bytes=file.changed_row_bytes if absorb else file.row_bytes,
+        row_bytes=row_bytes,
         fixed_bytes=file.fixed_bytes,
     )
     clock.lap("read_s")

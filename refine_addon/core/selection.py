@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from .scores import Scores
 
+    RowBytes = float | NDArray[np.int64]
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -102,15 +104,17 @@ class Budget:
             msg = "without the frustum test every view sees every splat: min_seen would remove none"
             raise RefineError(msg)
 
-    def removals(self, count: int, row_bytes: float = 0.0, fixed_bytes: int = 0) -> int | None:
+    def removals(self, count: int, row_bytes: RowBytes = 0.0, fixed_bytes: int = 0) -> int | None:
         """Return how many of `count` splats are removed, or None if that depends on the scores.
 
         Parameters
         ----------
         count : int
             Number of splats.
-        row_bytes, fixed_bytes : float, int
-            Size of one splat in the file, and of everything else in it; for `max_mb`.
+        row_bytes : float or (N,) int64
+            Size of a splat in the file, or of each of them; for `max_mb`.
+        fixed_bytes : int
+            Size of everything else in the file.
 
         Raises
         ------
@@ -123,16 +127,28 @@ class Budget:
         if self.keep is not None:
             return max(count - int(self.keep), 0)
         if self.max_mb is not None:
-            if not row_bytes:
+            room = self.room(fixed_bytes)
+            if isinstance(row_bytes, np.ndarray):
+                if not count or row_bytes.sum() <= room:
+                    return 0
+                shortest: float = row_bytes.min()
+            else:
+                shortest = row_bytes
+            if not shortest:
                 msg = "max_mb needs to know how many bytes a splat takes in the file"
                 raise RefineError(msg)
-            size = Fraction(repr(float(self.max_mb))) * 10**6  # the decimal, as above
-            fitting = math.floor((size - fixed_bytes) / Fraction(row_bytes))
-            if fitting < 1:
-                msg = f"max_mb is {self.max_mb}, too small for one splat of {row_bytes:.0f} bytes"
+            if room < shortest:
+                msg = f"max_mb is {self.max_mb}, too small for one splat of {shortest:.0f} bytes"
                 raise RefineError(msg)
-            return max(count - fitting, 0)
+            if isinstance(row_bytes, np.ndarray):
+                return None
+            return max(count - math.floor(room / Fraction(row_bytes)), 0)
         return None
+
+    def room(self, fixed_bytes: int) -> int:
+        """Return how many bytes `max_mb` leaves for rows; `fixed_bytes` are taken."""
+        size = Fraction(repr(float(self.max_mb or 0))) * 10**6  # the decimal, as in `removals`
+        return math.floor(size) - fixed_bytes
 
 
 def select(
@@ -140,13 +156,14 @@ def select(
     budget: Budget,
     *,
     protected: NDArray[np.bool_] | None = None,
-    row_bytes: float = 0.0,
+    row_bytes: RowBytes = 0.0,
     fixed_bytes: int = 0,
 ) -> NDArray[np.bool_]:
     """Return which splats stay.
 
     The splats with the lowest scores are removed; of equal scores, the first in the file. Protected
-    splats always stay, and others are removed instead, as far as there are any.
+    splats always stay, and others are removed instead, as far as there are any. Of rows of several
+    lengths, as many are removed in that order as it takes until the others fit.
 
     Parameters
     ----------
@@ -180,6 +197,8 @@ def select(
         keep[free & (scores.seen < math.ceil(least))] = False
     elif removals:
         _remove_lowest(keep, values, free, min(removals, int(np.count_nonzero(free))))
+    elif removals is None:
+        _remove_until_fitting(keep, values, free, budget, np.asarray(row_bytes), fixed_bytes)
     if not keep.any():
         msg = f"{budget.kind} would remove all {len(values)} splats; nothing was removed"
         raise RefineError(msg)
@@ -198,6 +217,22 @@ def _remove_lowest(
     keep[below] = False
     ties = np.flatnonzero(free & (values == edge))
     keep[ties[: count - int(np.count_nonzero(below))]] = False
+
+
+def _remove_until_fitting(
+    keep: NDArray[np.bool_],
+    values: NDArray[np.float32],
+    free: NDArray[np.bool_],
+    budget: Budget,
+    lengths: NDArray[np.int64],
+    fixed_bytes: int,
+) -> None:
+    """Set `keep` to False for the lowest `free` values until the rows that stay fit."""
+    places = np.flatnonzero(free)
+    order = places[np.argsort(values[places], kind="stable")]
+    excess = int(lengths.sum()) - budget.room(fixed_bytes)
+    count = int(np.searchsorted(np.cumsum(lengths[order]), excess)) + 1
+    keep[order[:count]] = False
 
 
 def rank(values: NDArray[np.float32]) -> NDArray[np.float64]:

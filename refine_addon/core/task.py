@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from .absorbing.absorb import Absorbed
     from .scores import Scores
-    from .selection import Budget
+    from .selection import Budget, RowBytes
     from .splats import Splats
     from .views import ViewSet
 
@@ -94,7 +94,7 @@ class Task:
     absorb : bool
         Whether survivors absorb the splats that are removed. Then the budget only decides how many
         survive; which ones, and their new values, come from merging, whatever the method.
-    row_bytes, fixed_bytes : float, int
+    row_bytes, fixed_bytes : float or (N,) int64, int
         See `Budget.removals`.
     """
 
@@ -105,7 +105,7 @@ class Task:
     scores: Scores | None = None
     protected: NDArray[np.bool_] | None = None
     absorb: bool = False
-    row_bytes: float = 0.0
+    row_bytes: RowBytes = 0.0
     fixed_bytes: int = 0
 
     def scene(self) -> tuple[Splats, ViewSet]:

@@ -127,10 +127,12 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
             temporary, mode, stream = _new_temporary(target, held)
             with stream:
                 yield stream
-            replaced = mode_of(target)
-            mode = stat.S_IMODE(replaced) if replaced else mode
-            if stat.S_IMODE(mode_of(temporary)) != mode:
-                temporary.chmod(mode)
+                stream.flush()  # before the permissions: a write would take setuid away
+                mode = _inherited(target, stream.fileno(), mode)
+                if stat.S_IMODE(os.fstat(stream.fileno()).st_mode) != mode:
+                    # By descriptor: whoever owns the folder may have put a link of that name.
+                    named = stream.fileno() if os.chmod in os.supports_fd else temporary
+                    os.chmod(named, mode)  # noqa: PTH101 - pathlib takes no descriptor
             if overwrite:
                 temporary.replace(target)
             else:
@@ -186,6 +188,37 @@ def _new_temporary(target: Path, held: contextlib.ExitStack) -> tuple[Path, int,
             taken = False  # this file system has no locks, so no run removes files here
         if not taken:
             return temporary, mode, stream
+
+
+def _inherited(target: Path, descriptor: int, mode: int) -> int:
+    """Give an open file the owner and group of `target`, as far as this process may.
+
+    Returns
+    -------
+    int
+        The permissions that the file is to have: those of `target`, without setuid and setgid where
+        it could not be given; `mode` if there is no such file.
+    """
+    try:
+        old = target.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return mode
+    owner, permissions = (old.st_uid, old.st_gid), stat.S_IMODE(old.st_mode)
+    if fcntl is None or owner == _owner(descriptor):
+        return permissions
+    for user in (old.st_uid, -1):  # -1: the group alone
+        with contextlib.suppress(OSError):
+            os.fchown(descriptor, user, old.st_gid)
+            break
+    if owner == _owner(descriptor):
+        return permissions
+    return permissions & ~(stat.S_ISUID | stat.S_ISGID)
+
+
+def _owner(descriptor: int) -> tuple[int, int]:
+    """Return the user and the group that own an open file."""
+    found = os.fstat(descriptor)
+    return found.st_uid, found.st_gid
 
 
 def _opener(mode: int) -> Callable[[str, int], int]:

@@ -18,7 +18,7 @@ from ..core.errors import RefineError
 from ..core.formats.ply import read_ply
 from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
-from .on_thread import Answer, fail
+from .on_thread import FAILURES, Answer, described, fail
 
 UPRIGHT_TEXT = (
     "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "
@@ -59,16 +59,17 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Import the files; one that cannot be read does not stop the others."""
-        errors, imported = [], []
+        errors: list[Exception] = []
+        imported = []
         for path in self._paths():
             try:
                 imported.append(self._import(context, path))
-            except RefineError as error:
+            except FAILURES as error:
                 errors.append(error)
         if not imported:
             return fail(self, errors[0] if len(errors) == 1 else RefineError(_joined(errors)))
         for error in errors:
-            self.report({"WARNING"}, str(error))
+            self.report({"WARNING"}, described(error))
         for obj in context.selected_objects:
             obj.select_set(False)
         for obj in imported:
@@ -130,7 +131,7 @@ class REFINE_OT_import_cameras(_InObjectMode, bpy.types.Operator, ImportHelper):
         path = Path(bpy.path.abspath(self.filepath))
         try:
             views = read_cameras(_model_folder(path))
-        except RefineError as error:
+        except FAILURES as error:
             return fail(self, error)
         scene = context.scene
         collection = bpy.data.collections.new(f"Cameras {path.stem}")
@@ -174,5 +175,5 @@ def _model_folder(path: Path) -> Path:
     return path.parent if path.suffix in {".bin", ".txt"} else path
 
 
-def _joined(errors: list[RefineError]) -> str:
-    return "; ".join(str(error) for error in errors)
+def _joined(errors: list[Exception]) -> str:
+    return "; ".join(described(error) for error in errors)

@@ -16,11 +16,21 @@ from .worker import Worker
 
 Answer = set[str]
 
+FAILURES = (RefineError, MemoryError)
+"""What an operator reports as an error; all else is a fault of the program."""
+
 
 def fail(operator: bpy.types.Operator, error: Exception) -> Answer:
     """Report an error to the user, and return that nothing was done."""
-    operator.report({"ERROR"}, str(error))
+    operator.report({"ERROR"}, described(error))
     return {"CANCELLED"}
+
+
+def described(error: Exception) -> str:
+    """Return one of `FAILURES` as a sentence."""
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({error})" if str(error) else "not enough memory"
+    return str(error)
 
 
 @dataclass
@@ -62,7 +72,7 @@ class OnThread:
             checked = mesh_layout.check(context.object)
             job = self.prepare(context, checked)
             return self.finish(context, checked, job, self.work(job, silent))
-        except RefineError as error:
+        except FAILURES as error:
             return fail(self, error)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
@@ -71,7 +81,7 @@ class OnThread:
             return self.execute(context)
         try:
             job = self.prepare(context, mesh_layout.check(context.object))
-        except RefineError as error:
+        except FAILURES as error:
             return fail(self, error)
         self.start(context, job)
         return {"RUNNING_MODAL"}
@@ -109,7 +119,7 @@ class OnThread:
         except Cancelled:
             self.report({"INFO"}, f"{self.doing} cancelled; nothing was changed")
             return {"CANCELLED"}
-        except RefineError as error:
+        except FAILURES as error:
             return fail(self, error)
 
     def cancel(self, context: bpy.types.Context) -> None:

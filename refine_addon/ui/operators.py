@@ -16,13 +16,12 @@ from bpy_extras.io_utils import ExportHelper
 from .. import splat_object
 from ..cameras.sets import views_from_scene
 from ..core import pipeline
-from ..core.errors import RefineError
 from ..core.report import scoring_notes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from . import plans, preview, staleness
-from .on_thread import Answer, OnThread, fail
+from .on_thread import FAILURES, Answer, OnThread, fail
 
 if TYPE_CHECKING:
     from ..core.scores import Scores
@@ -232,7 +231,7 @@ class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
                 preview.hide(obj)
             else:
                 preview.show(obj, self.mode, hide_removed=self.hide_removed)
-        except RefineError as error:
+        except FAILURES as error:
             return fail(self, error)
         shading = getattr(context.space_data, "shading", None)
         # Solid mode draws every point in one grey.
@@ -280,7 +279,7 @@ class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
                 apply_transform=self.apply_transform,
                 overwrite=self.overwrite,
             )
-        except RefineError as error:
+        except FAILURES as error:
             return fail(self, error)
         self.report({"INFO"}, f"Wrote {len(file):,} splats to {self.filepath}")
         return {"FINISHED"}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from operator import attrgetter
 from pathlib import Path
 
 import bpy
@@ -532,3 +534,46 @@ def test_linked_objects_are_refused(addon, room, room_cameras, score, tmp_path):
         score(room, views)
     addon.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
     assert _bytes(tmp_path / "out.ply") == _bytes(ROOM / "point_cloud.ply")
+
+
+@pytest.mark.usefixtures("room")
+def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
+    """By the export as by the command; Python's own error would end in a traceback."""
+    with pytest.raises(RuntimeError, match=r"^Error: ~nouser/x\.ply: cannot be found"):
+        bpy.ops.refine.export_ply(filepath="~nouser/x.ply")
+    core = addon.core
+    views = core.read_cameras(ROOM / "cameras.json")
+    with pytest.raises(core.RefineError, match=r"^~nouser/x\.ply: cannot be found"):
+        addon.splat_object.prune_object(
+            "room", views, core.Budget(ratio=0.5), core.Settings(), output=Path("~nouser/x.ply")
+        )
+
+
+@pytest.mark.parametrize(
+    ("module", "function", "operator", "arguments"),
+    [
+        ("core.pipeline", "score", "score", {}),
+        ("core.pipeline", "decide", "apply", {}),
+        ("ui.import_operators", "read_ply", "import_ply", {"filepath": "in.ply"}),
+        ("ui.import_operators", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),
+        ("splat_object", "export_object", "export_ply", {"filepath": "out.ply"}),
+        ("ui.preview", "show", "preview", {}),
+    ],
+)
+@pytest.mark.usefixtures("room_cameras")
+@pytest.mark.parametrize("said", ["", "Unable to allocate 9 GiB"])
+def test_too_little_memory_is_a_sentence(  # noqa: PLR0917
+    addon, room, room_views, score, monkeypatch, module, function, operator,
+    arguments, said
+):  # fmt: skip
+    """NumPy says how much it was; Python itself says nothing at all."""
+
+    def refuse(*_, **__):
+        raise MemoryError(said)
+
+    score(room, room_views)
+    monkeypatch.setattr(attrgetter(module)(addon), function, refuse)
+
+    expected = "not enough memory" + (f" ({said})" if said else "")
+    with pytest.raises(RuntimeError, match=f"^Error: {re.escape(expected)}\n$"):
+        getattr(bpy.ops.refine, operator)(**arguments)

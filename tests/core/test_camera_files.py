@@ -363,8 +363,10 @@ def test_what_a_view_refuses_is_refused_with_the_place():
 def test_a_named_pipe_is_refused_rather_than_waited_for(tmp_path):
     os.mkfifo(tmp_path / "cameras.json")
 
-    with pytest.raises(RefineError, match="no such file or folder"):
+    with pytest.raises(RefineError, match=r"json: is neither a file nor a folder, expected came"):
         read_cameras(tmp_path / "cameras.json")
+    with pytest.raises(RefineError, match="no such file or folder, expected cameras"):
+        read_cameras(tmp_path / "other.json")
 
 
 # transforms.json -------------------------------------------------------------------------------

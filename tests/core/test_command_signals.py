@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import subprocess
@@ -225,6 +226,57 @@ def test_a_signal_that_is_ignored_stays_ignored(folder, halfway):
 
     assert (process.returncode, errors) == (130, CANCELLED)
     assert list(folder.iterdir()) == []
+
+
+AT_ONCE = """
+import ctypes, os, sys
+from refine_addon import command
+from refine_addon.command import flow
+
+def run(*_, **__):
+    # One call of C for both: Python looks for signals only when it is over.
+    list(map(ctypes.PyDLL(None).kill, [os.getpid()] * 2, map(int, sys.argv[1:])))
+
+flow.run = run
+sys.exit(command.main([], last=True))
+"""
+
+
+@pytest.mark.usefixtures("folder")
+def test_of_two_signals_at_once_the_first_says_the_code():
+    """Python calls handlers by the signals' numbers: 1, 2, 15, whichever came first."""
+    numbers = (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
+    for first, second in itertools.permutations(numbers, 2):
+        with start("-c", AT_ONCE, str(int(first)), str(int(second))) as process:
+            _, errors = process.communicate(timeout=30)
+
+        assert process.returncode == 128 + first, (first, second)
+        assert errors.count(b"nothing was left half-written\n") == 1
+
+
+LEAVING = """
+import atexit, sys, time
+from refine_addon.__main__ import main
+
+def leave():
+    print("leaving", flush=True)
+    time.sleep(0.5)
+
+atexit.register(leave)
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", 0)])
+def test_a_signal_while_python_tidies_up_comes_too_late(folder, number):
+    """All is written and said: the code is 0."""
+    with start("-c", LEAVING, *WRITE, "--quiet") as process:
+        assert process.stdout.readline() == b"leaving\n"
+        process.send_signal(number)
+        said = process.communicate(timeout=30)
+
+    assert (process.returncode, *said) == (0, b"", b"")
+    assert [path.name for path in folder.iterdir()] == ["out.ply"]
 
 
 def handlers() -> list[object]:

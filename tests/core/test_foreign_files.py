@@ -41,6 +41,15 @@ FOREIGN = {
     "spz without compression around it": ("in.spz", SPZ, f"an SPZ file: {CONVERT}"),
     "sog": ("in.sog", zipped("means_l.webp", "meta.json"), f"a SOG file: {CONVERT}"),
     "sog by its content": ("in.ply", zipped("meta.json", "sh0.webp"), f"a SOG file: {CONVERT}"),
+    "sog, longer than what is looked into": (
+        "in.ply",
+        zipped("a.txt", *(f"{'x' * 200}{i}.webp" for i in range(10_000)), "meta.json"),
+        f"a SOG file: {CONVERT}",
+    ),
+    "sog in a folder": ("in.ply", zipped("a/meta.json", "a/b.webp"), f"a SOG file: {CONVERT}"),
+    "zip with some meta.json": ("in.zip", zipped("meta.json", "in.ply"), "a ZIP archive: unpack"),
+    "zip that says meta.json": ("in.zip", zipped("my-meta.json.webp"), "a ZIP archive: unpack"),
+    "zip, cut": ("in.zip", zipped("meta.json", "a.webp")[:60], "a ZIP archive: unpack it first"),
     "zip": ("in.zip", zipped("in.ply"), "a ZIP archive: unpack it first"),
     "gzip": ("in.ply.gz", gzip.compress(plain_ply()), "compressed with gzip: unpack it first"),
     "gzip, broken": ("in.ply", b"\x1f\x8b\xff" + bytes(9), "compressed with gzip: unpack it first"),
@@ -57,6 +66,19 @@ def test_a_known_format_is_named_and_so_is_what_to_do(tmp_path, name):
         read_ply(tmp_path / file)
 
     assert str(caught.value).startswith(f"{tmp_path / file}: {expected}")
+
+
+@pytest.mark.parametrize("name", [name for name in FOREIGN if "pointer" not in name])
+def test_splats_given_as_cameras_are_named_too(tmp_path, name):
+    """Whoever mixes up the two reads the same: what it is, and what to do."""
+    file, data, expected = FOREIGN[name]
+    (tmp_path / file).write_bytes(data)
+
+    with pytest.raises(RefineError) as caught:
+        read_cameras(tmp_path / file)
+
+    said = str(caught.value)
+    assert said.startswith(f"{tmp_path / file}: not a camera file: {expected.split(':')[0]}")
 
 
 def test_a_ply_is_one_whatever_it_is_called(tmp_path):

@@ -21,6 +21,7 @@ from refine_addon.core import (
     Scores,
     Settings,
     Splats,
+    View,
     ViewSet,
     prune,
     prune_file,
@@ -35,7 +36,7 @@ from refine_addon.core.scoring.adaptive import Statistics, lambdas
 from refine_addon.core.scoring.closed_form import LUMA
 from refine_addon.core.selection import rank
 from refine_addon.core.task import Task
-from tests.strategies import plain_header, ply_of
+from tests.strategies import plain_header, ply_of, splat_names
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 PLY = ROOM / "point_cloud.ply"
@@ -50,6 +51,13 @@ def file():
 def views():
     names = json.loads((ROOM / "split.json").read_text())["train"]
     return read_cameras(ROOM / "cameras.json").select(names)
+
+
+@pytest.fixture(scope="module")
+def front():
+    """One camera at the origin, which looks along z."""
+    view = View(np.eye(3), np.zeros(3), 100.0, 100.0, 64.0, 64.0, 128, 128)
+    return ViewSet((view,))
 
 
 @pytest.mark.parametrize("ratio", [0.0, 0.1, 0.29, 0.5, 0.9, 0.9999])
@@ -380,6 +388,42 @@ def test_a_size_in_megabytes_holds_for_text_whose_rows_grow(text, views, tmp_pat
     prune_file(text, tmp_path / "out.ply", views, Budget(max_mb=0.3), absorb=True)
 
     assert 0.1e6 < (tmp_path / "out.ply").stat().st_size <= 0.3e6
+
+
+@pytest.fixture(scope="module")
+def uneven(tmp_path_factory):
+    """Write a text file of 40 splats, one of which is written with 2,000 spaces."""
+    numbers = np.random.default_rng(6).normal(size=(40, 14)).round(3)
+    numbers[:, :3] += (0.0, 0.0, 4.0)
+    rows = [b" ".join(str(value).encode() for value in row) + b"\n" for row in numbers]
+    rows[7] = rows[7].replace(b" ", b" " * 2000, 1)
+    path = tmp_path_factory.mktemp("uneven") / "in.ply"
+    path.write_bytes(plain_header(len(rows), splat_names(0), "ascii") + b"".join(rows))
+    return path
+
+
+@pytest.mark.parametrize("absorb", [False, True])
+def test_a_text_file_that_fits_loses_nothing(uneven, front, tmp_path, absorb):
+    """However long its longest row is: its limit is its own size, byte by byte."""
+    size = uneven.stat().st_size
+
+    prune_file(uneven, tmp_path / "out.ply", front, Budget(max_mb=size / 1e6), absorb=absorb)
+
+    assert (tmp_path / "out.ply").read_bytes() == uneven.read_bytes()
+
+
+def test_a_text_file_is_cut_to_its_limit_by_no_more_than_one_row(uneven, front, tmp_path):
+    """The next splat in the order of removal would not have fit any more."""
+    file, limit = read_ply(uneven), 3000
+    result = prune_file(uneven, tmp_path / "out.ply", front, Budget(max_mb=limit / 1e6))
+    order = np.argsort(rank(result.scores.values), kind="stable")
+    last = order[~result.keep[order]][-1]
+    more = result.keep.copy()
+    more[last] = True
+
+    assert (tmp_path / "out.ply").stat().st_size == file.size(result.keep) <= limit
+    assert file.size(more) > limit
+    assert result.keep[order].tolist() == sorted(result.keep)
 
 
 @pytest.mark.slow

@@ -10,6 +10,7 @@ import signal
 import stat
 import subprocess
 import sys
+import tempfile
 import threading
 from pathlib import Path
 
@@ -21,7 +22,7 @@ from refine_addon.core import whole_file as whole_files
 from refine_addon.core.formats import ply
 from refine_addon.core.whole_file import expanded, refuse_existing, whole_file
 from tests.strategies import plain_header, plain_ply, splat_names
-from tests.users import closed_folder
+from tests.users import NOBODY, closed_folder
 
 posix = pytest.mark.skipif(os.name != "posix", reason="needs fork, links and signals")
 
@@ -327,6 +328,30 @@ def test_nobody_else_may_read_a_file_that_is_not_whole(tmp_path, monkeypatch, ov
 
     assert while_written == 0o600
     assert not overwrite or made == [0o600]
+
+
+@posix
+@pytest.mark.skipif(os.name == "posix" and os.geteuid() != 0, reason="needs the root user")
+@pytest.mark.parametrize("root", [True, False])
+def test_a_file_of_somebody_else_stays_theirs_or_loses_its_powers(root):
+    """The root user gives it back with its mode; nobody may not, and a setuid file would be his."""
+    with tempfile.TemporaryDirectory() as made:
+        Path(made).chmod(0o777)
+        path = Path(made) / "tool"
+        path.write_bytes(b"old")
+        os.chown(path, 1234, 1235)
+        path.chmod(0o6755)
+        os.seteuid(0 if root else NOBODY)
+        try:
+            with whole_file(path, overwrite=True) as stream:
+                stream.write(b"new")
+        finally:
+            os.seteuid(0)
+        found = path.stat()
+
+    owner = (1234, 1235) if root else (NOBODY, os.getegid())
+    assert (found.st_uid, found.st_gid) == owner
+    assert stat.S_IMODE(found.st_mode) == (0o6755 if root else 0o755)
 
 
 @posix

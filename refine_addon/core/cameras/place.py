@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import numpy as np
 
 from ..errors import RefineError
-from ..foreign_files import refuse_pointer
+from ..foreign_files import foreign_kind, refuse_pointer
 from ..views import View
 from ..whole_file import mode_of
 
@@ -189,6 +189,11 @@ def is_folder(path: Path) -> bool:
     return stat.S_ISDIR(_mode(path))
 
 
+def exists(path: Path) -> bool:
+    """Return whether there is anything at `path`; see `is_file`."""
+    return bool(_mode(path))
+
+
 def _mode(path: Path) -> int:
     try:
         return mode_of(path)
@@ -225,10 +230,11 @@ def read_json(path: Path) -> object:
             head = stream.read(SNIFFED_BYTES)
             refuse_pointer(path, head)
             if head[:1] not in b"{[\xef \t\r\n":  # so that a large splat file is not read
-                place.fail(
-                    "not a camera file: expected JSON (cameras.json, transforms.json) "
+                problem = foreign_kind(path, head) or (
+                    "expected JSON (cameras.json, transforms.json) "
                     f"or a COLMAP model, got a file that starts with {head[:8]!r}"
                 )
+                place.fail(f"not a camera file: {problem}")
             text = (head + stream.read()).decode("utf-8-sig")
     except (OSError, ValueError) as error:
         if isinstance(error, UnicodeDecodeError):

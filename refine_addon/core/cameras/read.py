@@ -15,7 +15,7 @@ from ..views import View, ViewSet
 from ..whole_file import expanded
 from .colmap import MODEL_FILES, SUFFIXES, find_colmap, read_colmap
 from .nerfstudio import read_transforms
-from .place import Place, described, is_file, is_folder, read_json
+from .place import Place, described, exists, is_file, is_folder, read_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -55,7 +55,8 @@ def read_cameras(path: Path | str) -> ViewSet:
     if is_folder(path):
         return _read_folder(path)
     if not is_file(path):
-        Place(path).fail("no such file or folder, expected cameras")
+        problem = "is neither a file nor a folder" if exists(path) else "no such file or folder"
+        Place(path).fail(f"{problem}, expected cameras")
     if path.suffix in SUFFIXES and path.stem in MODEL_FILES:
         return read_colmap(path.parent, path.suffix)
     return _read_json_cameras(path)

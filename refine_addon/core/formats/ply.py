@@ -77,17 +77,17 @@ class SplatFile:
         return len(self.rows)
 
     @property
-    def row_bytes(self) -> int:
-        """Bytes of one splat in the file; of the longest row, if rows are text."""
+    def row_bytes(self) -> int | NDArray[np.int64]:
+        """Bytes of one splat in the file; of each of them, (N,), if rows are text."""
         if self.lines is not None:
-            return max(map(len, self.lines), default=0)
+            return np.fromiter(map(len, self.lines), np.int64, len(self.lines))
         return int(self.rows.dtype.itemsize)
 
     @property
     def changed_row_bytes(self) -> int:
         """Most bytes of one splat in the file after absorbing, which may change all its numbers."""
         if self.lines is None:
-            return self.row_bytes
+            return int(self.rows.dtype.itemsize)
         names = self.rows.dtype.names or ()
         ours = [name for name in names if name in REQUIRED or name.startswith("f_rest_")]
         return longest_line(self.rows.dtype, self.lines, ours)
@@ -118,7 +118,7 @@ class SplatFile:
         if self.lines is None:
             count = len(self) if keep is None else int(np.count_nonzero(keep))
             kinds = [v.dtype for n, v in columns.items() if n not in (self.rows.dtype.names or ())]
-            rows = count * (self.row_bytes + sum(kind.itemsize for kind in kinds))
+            rows = count * (self.rows.dtype.itemsize + sum(kind.itemsize for kind in kinds))
         else:
             rows = sum(map(len, text_lines(self.rows, self.lines, keep, columns)))
         return len(self._new_header(keep, columns)) + len(self.before) + rows + len(self.after)
