@@ -386,13 +386,16 @@ SECONDS = 900
 """A mutant that makes the tests take longer is caught: it hangs."""
 
 
-def tests_of(module: str) -> list[str]:
-    """Return the files of tests to run: that of the module, then all others."""
+def stages_of(module: str) -> list[list[str]]:
+    """Return what pytest is to run, stage by stage: the module's tests, all quick ones, all."""
     names = [name for name, modules in TESTS.items() if module in modules]
     own = f"test_{names[0] if names else Path(module).stem}.py"
-    paths = sorted(PROJECT.glob("tests/core/test_*.py"), key=lambda path: path.name != own)
     # What the documents name does not depend on any line of core.
-    return [str(path.relative_to(PROJECT)) for path in paths if path.name != "test_documents.py"]
+    apart = {own, "test_documents.py"}
+    paths = [path.relative_to(PROJECT) for path in sorted(PROJECT.glob("tests/core/test_*.py"))]
+    others = [str(path) for path in paths if path.name not in apart]
+    mine = [str(path) for path in paths if path.name == own]
+    return [*([mine] if mine else []), [*others, "-m", "not slow"], [*others, "-m", "slow"]]
 
 
 def outcome(module: str, old: str, new: str) -> str:
@@ -415,20 +418,29 @@ def outcome(module: str, old: str, new: str) -> str:
             msg = f"expected {old!r} once, found it {text.count(old)} times"
             raise ValueError(msg)
         path.write_text(text.replace(old, new), "utf-8")
-        tests = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider"]
-        # Those that race against a clock could catch a fault by chance.
-        tests += [*tests_of(module), "-k", "not interrupted and not killed"]
-        try:
-            done = subprocess.run(
-                tests, cwd=copy, capture_output=True, text=True, check=False, timeout=SECONDS
-            )
-        except subprocess.TimeoutExpired:
-            return f"more than {SECONDS} s"
+        for stage in stages_of(module):
+            caught = _caught(copy, stage)
+            if caught:
+                return caught
+    return ""
+
+
+def _caught(copy: Path, stage: list[str]) -> str:
+    """Return the first of some tests that fails in a copy of the project, or ""."""
+    tests = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *stage]
+    # Those that race against a clock could catch a fault by chance.
+    tests += ["-k", "not interrupted and not killed"]
+    try:
+        done = subprocess.run(
+            tests, cwd=copy, capture_output=True, text=True, check=False, timeout=SECONDS
+        )
+    except subprocess.TimeoutExpired:
+        return f"more than {SECONDS} s"
+    if done.returncode == 0:
+        return ""
     if "error" in done.stdout.splitlines()[-1]:
         raise ValueError(done.stdout[-2000:])  # a test that cannot be collected catches nothing
     found = re.search(r"^FAILED \S*?/?([^/\s]+?)(?:\[| |$)", done.stdout, re.MULTILINE)
-    if done.returncode == 0:
-        return ""
     return found[1] if found else done.stdout[-200:]
 
 
