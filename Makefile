@@ -14,7 +14,7 @@ test: $(BENCH)        ## core, add-on and benchmark tests, all of them
 	$(PY) -m pytest
 
 test-core: $(DEV)     ## core alone, in seconds: without slow tests, few random examples
-	$(PY) -m pytest tests/core -m "not slow" --hypothesis-profile=quick
+	$(PY) -m pytest tests/core -m "not slow" --hypothesis-profile=quick -n auto
 
 test-numpy: $(DEV)    ## core on the oldest and the newest NumPy that a supported Blender carries
 	$(PY) .ci/numpy_ends.py
