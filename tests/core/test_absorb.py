@@ -772,3 +772,17 @@ def test_patience_falls_with_the_share_that_goes():
 def test_absorbing_can_be_cancelled():
     with pytest.raises(Cancelled):
         absorb(cloud(100), around(), measure, 50, progress=lambda fraction, _: fraction < 0.5)
+
+
+def test_what_absorbed_in_any_stage_is_said_to_have_changed():
+    """500 to 50 takes five stages: all that is not said to have changed is as it was, to the bit."""
+    splats = cloud(500)
+
+    result = absorb(splats, around(), lambda now, _: measure(now), 50)
+
+    same = ~result.changed
+    rows = np.flatnonzero(result.keep)[same]
+    assert result.merged > np.count_nonzero(result.changed) > 0
+    for name in FIELDS:
+        found = getattr(result.splats, name)[same]
+        np.testing.assert_array_equal(found, getattr(splats, name)[rows])
