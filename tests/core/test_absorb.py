@@ -775,10 +775,10 @@ def test_absorbing_can_be_cancelled():
 
 
 def test_what_absorbed_in_any_stage_is_said_to_have_changed():
-    """500 to 50 takes five stages: all that is not said to have changed is as it was, to the bit."""
+    """From 500 to 50 in five stages: what is not said to have changed is the same to the bit."""
     splats = cloud(500)
 
-    result = absorb(splats, around(), lambda now, _: measure(now), 50)
+    result = absorb(splats, around(), measure, 50)
 
     same = ~result.changed
     rows = np.flatnonzero(result.keep)[same]
