@@ -408,6 +408,20 @@ def test_without_planes_what_is_nearer_than_a_hundredth_of_the_scene_is_not_seen
     assert measured(splats, look_along_z()).seen.tolist() == [0, 1, 1, 1]
 
 
+@pytest.mark.parametrize("center", [(0, 0, -1e20), (0, 0, -1e-3)])
+@pytest.mark.parametrize("focal", [30.0, 1e-12])
+def test_a_view_that_float32_cannot_hold_counts_as_empty(center, focal):
+    """1e20 scene sizes away, or with a lens that projects all to a point: only neither is seen."""
+    splats = splats_of([[0, 0, 2], [0, 0, 3], [0, 0, 4]])
+    odd = look_along_z(center, fx=focal, fy=focal, name="odd")
+
+    with np.errstate(all="raise", under="ignore"):
+        found = measured(splats, *[look_along_z()] * 3, odd)
+
+    seen_by_odd = center[2] > -1 and focal > 1
+    assert found.seen.tolist() == [4 if seen_by_odd else 3] * 3
+
+
 @pytest.mark.parametrize(("cx", "cy"), [(4.0, 30.0), (76.0, 30.0), (40.0, 3.0), (40.0, 57.0)])
 def test_all_of_an_image_is_seen_wherever_its_principal_point_lies(cx, cy):
     """Small splats in its corners and on its middle."""
