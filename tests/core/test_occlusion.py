@@ -74,7 +74,8 @@ def ring(count=5) -> ViewSet:
         forward = np.array([-math.cos(angle), -math.sin(angle), 0.0])
         down = np.array([0.0, 0.0, -1.0])
         rotation = np.stack([np.cross(down, forward), down, forward])
-        views.append(replace(look_along_z(), rotation=rotation, center=-5.0 * forward))
+        view = replace(look_along_z(), rotation=rotation, center=-5.0 * forward)
+        views.append(replace(view, name=f"{index:02}"))
     return ViewSet(tuple(views))
 
 
@@ -195,19 +196,18 @@ def test_what_has_the_colour_of_what_is_behind_it_has_no_error():
     assert other.error[-1] == pytest.approx(expected, rel=0.02)
 
 
-@pytest.mark.parametrize("side", [2.0, 4.0, 8.0])
-def test_transmittance_is_the_mean_of_exp_of_a_gamma_distributed_thickness(side):
-    """Numerically: exp(-tau) over many draws of mean 0, .5 and 3; shape 12 over the side.
+def test_transmittance_is_the_mean_of_exp_of_a_gamma_distributed_thickness():
+    """Numerically: exp(-tau) over many draws of mean 0, .5 and 3.
 
     What is even before it takes its exact share of that.
     """
-    shape = froxels.GAMMA_SHAPE / side
+    shape = froxels.GAMMA_SHAPE
     draws = np.random.default_rng(1).gamma(shape, size=400_000) / shape
     mean = np.array([0.0, 0.5, 3.0], np.float32)
     even = np.array([0.0, 0.5, 1.0], np.float32)
 
-    loose = froxels.transmittance(mean, np.zeros_like(mean), side * side)
-    partly = froxels.transmittance(mean + even, even, side * side)
+    loose = froxels.transmittance(mean, np.zeros_like(mean))
+    partly = froxels.transmittance(mean + even, even)
 
     np.testing.assert_allclose(loose, [np.exp(-m * draws).mean() for m in mean], atol=2e-3)
     np.testing.assert_allclose(partly, loose * np.exp(-even), rtol=1e-5)
@@ -318,7 +318,8 @@ def test_a_splat_covers_no_more_of_a_cell_than_its_opacity():
     alone = measured(front.take(slice(1, 2)), square(), settings=settings)
 
     even = (2.0**2 + 0.3) / (2.0**2 + 0.3 + 16.0)
-    passed = 2.0**-even * (1.0 + (1.0 - even) * math.log(2.0) / 3.0) ** -3
+    k = froxels.GAMMA_SHAPE
+    passed = 2.0**-even * (1.0 + (1.0 - even) * math.log(2.0) / k) ** -k
     assert found.contribution[1] / alone.contribution[0] == pytest.approx(passed, rel=1e-3)
 
 
@@ -697,6 +698,26 @@ def test_cells_grow_until_the_points_of_a_view_fit_the_memory(monkeypatch):
 
     assert free == 4.0
     assert len(froxels.scatter(footprints, view, side, 3.2).owners) <= 2 * 20_000
+
+
+@pytest.mark.parametrize("scale", [1, 4, 16])
+@pytest.mark.parametrize("count", [100, 60_000])
+def test_cells_follow_the_footprints_not_the_pixels(count, scale):
+    """Of 400 x 300 px: cells of 4 px, 7,500 of them; FEW_CELLS or a third of the footprints do.
+
+    100 footprints get 4,096 cells, 5.4 px at that size; 60,000 get up to 20,000, 2.4 px: 4 stay
+    there. In images of 4 and 16 times the pixels a side, the same numbers of cells.
+    """
+    sigmas = np.full((2, count), 1.0, np.float32)
+    footprints = projection.Footprints(
+        np.arange(count), sigmas, sigmas, sigmas, sigmas, np.ones(count, bool)
+    )
+    view = look_along_z(width=400 * scale, height=300 * scale)
+
+    side = froxels.cell_size(footprints, view, 4.0, 1.0)
+
+    cells = max(froxels.FEW_CELLS, count / froxels.FOOTPRINTS)
+    assert side == pytest.approx(max(4.0, 1.01 * math.sqrt(view.width * view.height / cells)))
 
 
 def test_a_view_of_many_splats_is_cancelled_within(monkeypatch):

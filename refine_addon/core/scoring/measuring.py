@@ -20,13 +20,16 @@ from ..work import Progress, for_chunks
 from . import froxels, projection
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from ..scene import Scene
     from ..views import View, ViewSet
     from .projection import Gaussians
 
-_BLOCKS = 8  # of views; sums are added block by block, so they do not depend on threads
+BLOCKS = 8
+"""Of views; sums are added block by block, so they do not depend on threads."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +39,14 @@ class Sampling:
     Attributes
     ----------
     cell : float
-        Side of a cell, pixels; larger where an image would have more than 65,535 cells.
+        Least side of a cell, pixels; `froxels.cell_size` chooses a larger one where the splats need
+        no finer cells.
     density : float
         Points per standard deviation for a splat whose standard deviation is as long as a cell.
     """
 
     cell: float = 4.0
-    density: float = 4.5
+    density: float = 3.7
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -96,6 +100,10 @@ class Measured:
         every.seen[index] = self.seen
         return every
 
+    def take(self, rows: NDArray[np.int64]) -> Measured:
+        """Return the sums of some Gaussians."""
+        return Measured(self.contribution[rows], self.error[rows], self.seen[rows])
+
     def add(self, other: Measured) -> None:
         """Add the sums of other views."""
         self.contribution[:] += other.contribution
@@ -124,7 +132,11 @@ class Measuring:
         return Measured.sum([block for block, _ in self.blocks(gaussians, none, progress)])
 
     def blocks(
-        self, gaussians: Gaussians, sample: NDArray[np.int64], progress: Progress
+        self,
+        gaussians: Gaussians,
+        sample: NDArray[np.int64],
+        progress: Progress,
+        which: Sequence[int] | None = None,
     ) -> list[tuple[Measured, NDArray[np.float64]]]:
         """Return the sums over each block of views, and the errors of a sample in each view.
 
@@ -134,23 +146,29 @@ class Measuring:
         sample : (m,) int64
             Rows of the Gaussians.
         progress : callable
+        which : sequence of int, optional
+            The blocks to measure; by default all, that is, ``min(BLOCKS, len(self.views))``.
 
         Returns
         -------
         list of Measured, (views, m) float64
+            For each of these blocks.
         """
-        blocks = min(_BLOCKS, len(self.views))
+        blocks = min(BLOCKS, len(self.views))
+        chosen = range(blocks) if which is None else which
 
         def block(piece: slice) -> tuple[Measured, NDArray[np.float64]]:
             total = Measured.zero(len(gaussians))
             errors = []
-            for view, weight in self.views[piece.start :: blocks]:
+            for view, weight in self.views[chosen[piece.start] :: blocks]:
                 before = total.error[sample]  # (m,)
                 measure_view(gaussians, self.scene, view, weight, self.sampling, total)
                 errors.append(total.error[sample] - before)
             return total, np.array(errors)
 
-        return for_chunks(block, blocks, 1, progress=progress, what="scoring", threads=self.threads)
+        return for_chunks(
+            block, len(chosen), 1, progress=progress, what="scoring", threads=self.threads
+        )
 
 
 def measure_view(
@@ -180,7 +198,7 @@ def measure_view(
         for place, piece in points.pieces():
             thick = froxels.thickness(piece, alphas, mass)
             front, even = froxels.in_front(piece, thick, thick * evenness.take(piece.owners))
-            transmittance[place] = froxels.transmittance(front, even, points.area)
+            transmittance[place] = froxels.transmittance(front, even)
             squared_contrast[place] = froxels.squared_contrast(piece, front, thick, colors)
         visible, errors = froxels.mean_visible(points, transmittance, squared_contrast, count)
         total.contribution[footprints.index] += weight * (mass * visible)

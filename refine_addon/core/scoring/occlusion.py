@@ -39,6 +39,13 @@ if TYPE_CHECKING:
 LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
 
+ROUND_COST = 0.15
+"""A round after the first measures about as many blocks of views as cost this share of the first;
+at least two."""
+
+FIRST_COST = 0.5
+"""Share of the time that is still ahead that a round takes, for the display of progress."""
+
 PRIOR = closed_form.ClosedForm("distance", frustum=False)
 """Model of the floor. It has no frustum test, since splats that no view shows also need a floor."""
 
@@ -222,6 +229,10 @@ class _Run:
         The splats that can contribute to a picture, before any is removed.
     measured : Measured
         Of these Gaussians, in the first round.
+    blocks : list of Measured
+        Of the splats left, over each block of views, as measured last.
+    turn : int
+        How many blocks were measured after the first round.
     floor_weights : list of float
         The weight of the floor up to each of `coverage.SHARES`; chosen in the first round.
     """
@@ -229,6 +240,8 @@ class _Run:
     def __init__(self, gaussians: Gaussians, measuring: Measuring, rounds: int) -> None:
         self.gaussians, self.measuring, self.rounds = gaussians, measuring, rounds
         self.measured = Measured.zero(len(gaussians))
+        self.blocks: list[Measured] = []
+        self.turn = 0
         self.floor_weights = [0.0] * len(coverage.SHARES)
 
     def rank(
@@ -248,20 +261,51 @@ class _Run:
         removal.add(undrawn[np.argsort(prior[undrawn], kind="stable")])
         seen, done = np.zeros(count, np.int32), 0.0
         for number, stay in enumerate(_survivors(count, self.rounds)):
-            # A round costs views x splats left. All six rounds cost about three first rounds.
-            end = done + (1.0 - done) * max(1.0 / (self.rounds - number), 0.25)
+            # The first round costs about as much as all others.
+            end = 1.0 if number == self.rounds - 1 else done + (1.0 - done) * FIRST_COST
             ahead, done = part(progress, done, end), end
             if number == 0:
-                measured = self.measured = self._measure_first(prior, ahead)
-                seen[left.index] = measured.seen
+                self._measure_first(prior, ahead)
+                seen[left.index] = self.measured.seen
             else:
-                measured = self.measuring.measure(left, ahead)
+                self._measure_again(left, ahead)
             report(ahead, 1.0, "scoring")
+            measured = Measured.sum(self.blocks)
             go = max(len(left) - stay, 0)
             order = self._order(measured, prior[left.index], removal, go)
             removal.add(left.index[order[:go]])
-            left = left.take(np.sort(order[go:]))
+            rows = np.sort(order[go:])
+            left = left.take(rows)
+            self.blocks = [block.take(rows) for block in self.blocks]
         return removal.values, seen
+
+    def _measure_again(self, left: Gaussians, progress: Progress) -> None:
+        """Measure the splats left in some blocks of views, which take turns.
+
+        The sums of the other blocks are from an earlier round, when more was hidden. They are
+        raised by what the sums of these blocks have grown by on average.
+
+        Parameters
+        ----------
+        left : Gaussians
+        progress : callable
+        """
+        blocks = len(self.blocks)
+        # An even number, since an odd one leaves one of two cores idle.
+        pairs = max(round(ROUND_COST * len(self.gaussians) / max(len(left), 1) * blocks / 2), 1)
+        count = min(2 * pairs, blocks)
+        which = [(self.turn + step) % blocks for step in range(count)]
+        self.turn += count
+        none = np.empty(0, np.int64)
+        found = [block for block, _ in self.measuring.blocks(left, none, progress, which)]
+        before, now = (Measured.sum(some) for some in ([self.blocks[k] for k in which], found))
+        contribution = _ratio(now.contribution.sum(), before.contribution.sum())
+        error = _ratio(now.error.sum(), before.error.sum())
+        for block in self.blocks:
+            block.contribution[:] *= contribution
+            block.error[:] *= error
+        for k, block in zip(which, found, strict=True):
+            self.blocks[k] = block
 
     def _order(
         self, measured: Measured, prior: NDArray[np.float32], removal: _Removal, go: int
@@ -288,11 +332,12 @@ class _Run:
         scores = combined(measured, share)
         return coverage.order(scores, floors, prior, self.floor_weights, stops)
 
-    def _measure_first(self, prior: NDArray[np.float32], progress: Progress) -> Measured:
+    def _measure_first(self, prior: NDArray[np.float32], progress: Progress) -> None:
         """Measure all Gaussians, and choose the weights of the floor by leaving views out."""
         sample = coverage.sample(self.gaussians)  # (m,)
         blocks = self.measuring.blocks(self.gaussians, sample, progress)
-        measured = Measured.sum([block for block, _ in blocks])
+        self.blocks = [block for block, _ in blocks]
+        measured = self.measured = Measured.sum(self.blocks)
         worth = prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)
 
         def folds() -> Iterator[tuple[NDArray[np.float64], ...]]:
@@ -308,7 +353,6 @@ class _Run:
                 yield combined(others, 0.0), floors, errors
 
         self.floor_weights = coverage.floor_weights(folds())
-        return measured
 
 
 class _Removal:
@@ -345,6 +389,11 @@ def combined(measured: Measured, gone: float) -> NDArray[np.float64]:
     much of the picture the splat covers, whatever lies behind it.
     """
     return np.asarray(measured.error * measured.contribution ** _exponent(gone))
+
+
+def _ratio(now: float, before: float) -> float:
+    """Return `now` over `before`; 1 where nothing was seen before."""
+    return now / before if before > 0.0 else 1.0
 
 
 def _exponent(gone: float) -> float:
