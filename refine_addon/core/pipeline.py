@@ -7,6 +7,7 @@ absorb the others, as many survivors are found again, by merging.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -40,6 +41,10 @@ if TYPE_CHECKING:
 FIRST = 0.1
 """Share of the splats that is deleted before any are merged: those with the lowest scores, whose
 deletion changes the pictures less than any merge."""
+
+PARTS = 2
+"""While splats are merged, they are measured again in one of so many parts of the views, which take
+turns; what the other views see is carried over."""
 
 
 def score(
@@ -290,12 +295,18 @@ def absorb_removed(  # noqa: PLR0913 - as `prune`
     # The deleted splats hid almost nothing, so the first stage need not measure again.
     at_first = [ViewSums(measured.contribution[rest], measured.error[rest])]
     del known, scores, measured
+    turns = itertools.count()
 
-    def measure(now: Splats, ahead: Progress) -> ViewSums:
-        if at_first:
+    def measure(now: Splats, expected: ViewSums | None, ahead: Progress) -> ViewSums:
+        if expected is None:
             return at_first.pop()
-        found = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
-        return ViewSums(found.contribution, found.error)
+        found, share = occlusion.measure_part(
+            now, used, settings.occlusion, next(turns), PARTS, progress=ahead, threads=threads
+        )
+        return ViewSums(
+            found.contribution + (1.0 - share) * expected.contribution,
+            found.error + (1.0 - share) * expected.error,
+        )
 
     with np.errstate(under="ignore"):  # as in `score`
         absorbed = absorbing.absorb(

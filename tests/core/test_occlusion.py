@@ -11,9 +11,10 @@ import pytest
 from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet, work
 from refine_addon.core.affine import transformed
 from refine_addon.core.scoring import coverage, froxels, measuring, occlusion, projection
-from refine_addon.core.scoring.measuring import Measured
+from refine_addon.core.scoring.measuring import Measured, Measuring
 from refine_addon.core.scoring.occlusion import Occlusion
 from refine_addon.core.splats import SH_C0, rotation_matrices
+from refine_addon.core.work import silent
 
 ONCE = Occlusion(rounds=1)
 CUT = 1.0 / 255.0
@@ -451,6 +452,66 @@ def test_a_view_of_thrice_the_weight_counts_thrice():
         np.testing.assert_allclose(
             getattr(both, name), 0.25 * first + 0.75 * second, rtol=1e-3, atol=1e-3 * first.max()
         )
+
+
+def test_parts_of_the_views_take_turns_and_make_up_the_whole():
+    """Eleven views in eight blocks; one of weight 3 has 3 of 13. A fourth turn is the first."""
+    splats, views = cloud(), ring(11)
+    views = ViewSet((*views.views[:4], replace(views[4], weight=3.0), *views.views[5:]))
+
+    found = [occlusion.measure_part(splats, views, ONCE, turn, 3) for turn in range(4)]
+
+    whole = occlusion.measure(splats, views)
+    for name in ("contribution", "error", "seen"):
+        total = sum(getattr(part, name) for part, _ in found[:3])
+        np.testing.assert_allclose(total, getattr(whole, name), rtol=1e-12)
+        np.testing.assert_array_equal(getattr(found[3][0], name), getattr(found[0][0], name))
+    assert sum(share for _, share in found[:3]) == pytest.approx(1.0)
+    assert {round(share * 13) for _, share in found} <= {3, 4, 5, 6}
+    assert occlusion.measure_part(splats, ring(1), ONCE, 5, 3)[1] == 1.0
+
+
+def test_rounds_measure_blocks_of_views_in_turns(monkeypatch):
+    """At first all 8; then as many as .16 of that costs, in pairs.
+
+    Of 63, 40, 25, 16 and 10 % of the splats these are 2, 3.2, 5.1, 8 and 13 blocks.
+    """
+    asked = []
+
+    def blocks(self, gaussians, sample, progress, which=None, original=Measuring.blocks):
+        asked.append(which)
+        return original(self, gaussians, sample, progress, which)
+
+    monkeypatch.setattr(Measuring, "blocks", blocks)
+    occlusion.score(cloud(1000), ring(11), threads=1)
+
+    everything = list(range(8))
+    after = [sorted(which) for which in asked[1:]]
+    assert asked[0] is None
+    assert after == [[0, 1], [2, 3, 4, 5], [0, 1, 2, 3, 6, 7], everything, everything]
+
+
+def test_blocks_of_views_that_were_not_measured_again_are_raised():
+    """Eight times the same view: what one block has grown by, all have grown by.
+
+    A third of a cloud goes, which showed less of the rest.
+    """
+    splats = cloud(300)
+    views = ViewSet(tuple(replace(ring()[0], name=str(k)) for k in range(8)))
+    gaussians, scene, _ = projection.prepare(splats, views)
+    run = occlusion._Run(gaussians, Measuring(scene, views, Occlusion(), 1), 6)
+    run._measure_first(np.ones(len(splats), np.float32), silent)
+    left = np.flatnonzero(np.arange(len(gaussians)) % 3 > 0)
+    run.blocks = [block.take(left) for block in run.blocks]
+    before = run.blocks[7].error.sum()
+
+    run._measure_again(gaussians.take(left), silent)
+
+    assert run.turn == 2
+    assert run.blocks[0].error.sum() > 1.05 * before
+    for name in ("contribution", "error"):
+        sums = [getattr(block, name).sum() for block in run.blocks]
+        np.testing.assert_allclose(sums, sums[0], rtol=1e-9)
 
 
 def test_two_rounds_order_nine_tenths_at_first_and_measure_the_last_tenth_anew():

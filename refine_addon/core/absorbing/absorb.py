@@ -30,8 +30,12 @@ if TYPE_CHECKING:
     from ..views import ViewSet
     from .merge_field import Array, Index
 
-Measure = Callable[[Splats, Progress], ViewSums]
-"""``measure(splats, progress)`` returns what the views see of each of the splats it is given."""
+Measure = Callable[[Splats, "ViewSums | None", Progress], ViewSums]
+"""``measure(splats, expected, progress)`` returns what the views see of each of these splats.
+
+`expected` is what they would see by the measuring before, if merging and deleting had not changed
+what is hidden; None before the first stage.
+"""
 
 STAGE = 0.6
 """A stage leaves at least this share of its splats."""
@@ -147,11 +151,12 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     origin, members = np.arange(count), np.ones(count, np.int64)
     factor = patience(1.0 - goal / max(count, 1))
     stages = math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE)) if goal < count else 0
+    sums: ViewSums | None = None
     for stage in range(stages):
         ahead = part(progress, stage / stages, (stage + 1) / stages)
         left = round(count * (goal / count) ** ((stage + 1) / stages))
-        sums = measure(splats, part(ahead, 0.0, 0.5))
-        splats, kept, taken = _absorb_once(
+        sums = measure(splats, sums, part(ahead, 0.0, 0.5))
+        splats, kept, taken, sums = _absorb_once(
             splats, views, scene, sums, max(left, goal), protected=spared[origin],
             factor=factor, progress=part(ahead, 0.5, 1.0), threads=threads,
         )  # fmt: skip
@@ -175,7 +180,7 @@ def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     factor: float,
     progress: Progress = silent,
     threads: int | None = None,
-) -> tuple[Splats, NDArray[np.bool_], Index]:
+) -> tuple[Splats, NDArray[np.bool_], Index, ViewSums]:
     """Do one stage of `absorb`.
 
     Parameters
@@ -196,6 +201,8 @@ def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
         Which splats survive.
     taken : (N,) int64
         Which of the K survivors each splat is, or was absorbed by; -1 if it was deleted.
+    expected : ViewSums
+        Of the K survivors, as far as these sums and the costs of the merges tell.
     """
     sums = ViewSums(np.asarray(sums.contribution, np.float64), np.asarray(sums.error, np.float64))
     good, free = drawable(splats), ~protected
@@ -208,7 +215,7 @@ def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     excess = min(excess, len(rows))
     report(progress, 0.0, "absorbing")
     if excess <= 0:
-        return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1)
+        return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1), sums.take(keep)
     # Sorted by place in the scene, so that ties do not depend on the order of the file.
     place = scene.place(splats.means[rows])
     rows = rows[spatial_order(place, lambda some: splat_fingerprint(splats, rows[some]))]
@@ -217,18 +224,18 @@ def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     graph = MergeGraph(found, scene, factor, threads=threads)
     graph.reduce(len(rows) - excess, part(progress, 0.1, 0.95))
     keep[rows[~graph.alive]] = False
-    return _written(splats, keep, rows, graph)
+    return _written(splats, sums, keep, rows, graph)
 
 
 def _written(
-    splats: Splats, keep: NDArray[np.bool_], rows: Index, graph: MergeGraph
-) -> tuple[Splats, NDArray[np.bool_], Index]:
+    splats: Splats, sums: ViewSums, keep: NDArray[np.bool_], rows: Index, graph: MergeGraph
+) -> tuple[Splats, NDArray[np.bool_], Index, ViewSums]:
     """Return the results of `_absorb_once`, with the merged splats in place of the survivors.
 
     Parameters
     ----------
-    splats : Splats
-        The N splats of the stage.
+    splats, sums : Splats, ViewSums
+        The N splats of the stage, and what the views see of them.
     keep : (N,) bool
         Which of them survive.
     rows : (M,) int64
@@ -265,7 +272,9 @@ def _written(
         )
     taken = np.where(keep, place, -1)
     taken[rows] = np.where(graph.alive[owner], place[rows[owner]], -1)
-    return result, keep, taken
+    expected = sums.take(keep)
+    expected.contribution[target], expected.error[target] = merged.contribution, merged.error
+    return result, keep, taken, expected
 
 
 class _Blend:

@@ -427,9 +427,7 @@ def evenness(footprints: Footprints, area: float) -> NDArray[np.float32]:
     return np.asarray(narrow / (narrow + np.float32(area)))
 
 
-def transmittance(
-    front: NDArray[np.float32], even: NDArray[np.float32]
-) -> NDArray[np.float32]:
+def transmittance(front: NDArray[np.float32], even: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the transmittance in front of each point, (m,), given the mean thickness of its cell.
 
     Splats narrower than a cell leave gaps, so the thickness in front of a point differs from the

@@ -10,6 +10,7 @@ which is what REFINE's Hessian stands for.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -126,10 +127,16 @@ class Measuring:
         self.scene, self.sampling, self.threads = scene, sampling, threads
         self.views = _by_distance(views)
 
-    def measure(self, gaussians: Gaussians, progress: Progress) -> Measured:
-        """Return the sums over all views for these Gaussians, each hidden by all others."""
-        none = np.empty(0, np.int64)
-        return Measured.sum([block for block, _ in self.blocks(gaussians, none, progress)])
+    @property
+    def count(self) -> int:
+        """Number of blocks."""
+        return min(BLOCKS, len(self.views))
+
+    def share(self, which: Sequence[int]) -> float:
+        """Return the share of the weights of all views that some blocks have."""
+        weights = [weight for _, weight in self.views]
+        mine = (weight for k in which for weight in weights[k :: self.count])
+        return math.fsum(mine) / math.fsum(weights)
 
     def blocks(
         self,
@@ -147,20 +154,19 @@ class Measuring:
             Rows of the Gaussians.
         progress : callable
         which : sequence of int, optional
-            The blocks to measure; by default all, that is, ``min(BLOCKS, len(self.views))``.
+            The blocks to measure; by default all `count` of them.
 
         Returns
         -------
         list of Measured, (views, m) float64
             For each of these blocks.
         """
-        blocks = min(BLOCKS, len(self.views))
-        chosen = range(blocks) if which is None else which
+        chosen = range(self.count) if which is None else which
 
         def block(piece: slice) -> tuple[Measured, NDArray[np.float64]]:
             total = Measured.zero(len(gaussians))
             errors = []
-            for view, weight in self.views[chosen[piece.start] :: blocks]:
+            for view, weight in self.views[chosen[piece.start] :: self.count]:
                 before = total.error[sample]  # (m,)
                 measure_view(gaussians, self.scene, view, weight, self.sampling, total)
                 errors.append(total.error[sample] - before)

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
 
-ROUND_COST = 0.15
+ROUND_COST = 0.16
 """A round after the first measures about as many blocks of views as cost this share of the first;
 at least two."""
 
@@ -212,12 +212,51 @@ def measure(
     Cancelled
         If `progress` answers ``False``.
     """
+    return measure_part(splats, views, settings, 0, 1, progress=progress, threads=threads)[0]
+
+
+def measure_part(  # noqa: PLR0913 - as `measure`, and which part
+    splats: Splats,
+    views: ViewSet,
+    settings: Occlusion,
+    turn: int,
+    parts: int,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> tuple[Measured, float]:
+    """Measure what one part of the views sees of each splat.
+
+    Parameters
+    ----------
+    splats, views, settings, progress, threads
+        See `measure`.
+    turn, parts : int
+        The views are divided into so many parts, or into fewer if there are fewer views; each part
+        is spread over all of them. Turn 0 measures the first, and so on, and then the first again.
+
+    Returns
+    -------
+    Measured
+        See `measure`.
+    share : float
+        Of the weights of all views, those of this part.
+
+    Raises
+    ------
+    Cancelled
+        If `progress` answers ``False``.
+    """
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.1), threads=threads
     )
     measuring = Measuring(scene, views, settings, threads)
-    found = measuring.measure(gaussians, part(progress, 0.1, 1.0))
-    return found.for_all(gaussians.index, len(splats))
+    blocks = measuring.count
+    parts = min(parts, blocks)
+    which = range(turn % parts, blocks, parts)
+    none, ahead = np.empty(0, np.int64), part(progress, 0.1, 1.0)
+    found = [block for block, _ in measuring.blocks(gaussians, none, ahead, which)]
+    return Measured.sum(found).for_all(gaussians.index, len(splats)), measuring.share(which)
 
 
 class _Run:
