@@ -16,7 +16,7 @@ def test_the_size_is_that_of_splats_and_views_together():
 
     A splat that cannot be drawn does not count, wherever it is.
     """
-    centers = np.array([[3, 0, 0], [-3, 0, 0], [0, 3, 0], [0, -3, 0]]) + [10.0, 0.0, 0.0]
+    centers = np.array([[13.0, 0, 0], [7, 0, 0], [10, 3, 0], [10, -3, 0]])
     views = ViewSet(tuple(View(np.eye(3), center, **LENS) for center in centers))
     means = np.array([[10, 0, 0], [10, 0, 4], [10, 4, 0], [1e6, 0, 0]])
 
