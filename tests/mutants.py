@@ -273,8 +273,8 @@ MUTANTS = {
         ),
         ("    both = np.clip(both, -limit, limit)\n", "", "contrasts beyond 1"),
         (
-            "0.5 * (_price(ends, -1.0).cost + _price(ends, 1.0).cost)",
-            "0.5 * (_price(ends, 1.0).cost + _price(ends, 1.0).cost)",
+            "0.5 * _price(ends, -1.0).cost",
+            "0.5 * _price(ends, 1.0).cost",
             "one side only",
         ),
         (

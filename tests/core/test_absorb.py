@@ -560,7 +560,7 @@ def test_no_merge_is_carried_out_that_costs_more_than_deleting():
 
     (into, gone, _), *_ = graph.merges
     assert len(into)
-    costs = 2.0 * merging.costs(before, into, gone)
+    costs = 2.0 * merging.costs(before, into, gone, np.inf)
     assert (costs < np.minimum(before.error[into], before.error[gone])).all()
 
 
@@ -570,7 +570,7 @@ def cheapest_first(field, patience, goal):
     while len(alive) > goal:
         operations = [(field.error[row], row, None) for row in alive]
         for pair in itertools.combinations(alive, 2):
-            cost = patience * merging.costs(field, *(np.array([row]) for row in pair))[0]
+            cost = patience * merging.costs(field, *(np.array([row]) for row in pair), np.inf)[0]
             operations.append((cost, *pair))
         _, one, other = min(operations, key=lambda operation: operation[0])
         if other is None:

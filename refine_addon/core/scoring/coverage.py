@@ -168,10 +168,11 @@ def _losses(scores: NDArray[np.float64], errors: NDArray[np.float64]) -> NDArray
     Parameters
     ----------
     scores : (n,) float64
-        The lowest are removed first.
+        The lowest are removed first, equal ones together.
     errors : (v, n) float64
         Of each splat in each of v views.
     """
-    running = np.cumsum(errors[:, np.argsort(scores, kind="stable")], axis=1)  # (v, n)
     places = [max(int(share * len(scores)) - 1, 0) for share in SHARES]
-    return np.asarray(np.log(np.maximum(running[:, places] / running[:, -1:], 1e-12)))
+    last = np.partition(scores, places)[places]  # (shares,), the highest score that is removed
+    removed = errors @ (scores[:, None] <= last).astype(np.float64)  # (v, shares)
+    return np.asarray(np.log(np.maximum(removed / errors.sum(axis=1)[:, None], 1e-12)))
