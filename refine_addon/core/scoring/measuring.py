@@ -24,7 +24,8 @@ if TYPE_CHECKING:
 
     from ..scene import Scene
     from ..views import View, ViewSet
-    from .projection import Gaussians
+    from .projection import Footprints, Gaussians
+    from .sight_lines import SightLines
 
 _BLOCKS = 8  # of views; sums are added block by block, so they do not depend on threads
 
@@ -109,14 +110,14 @@ class Measuring:
     Attributes
     ----------
     views : list of (View, float)
-        Views and their weights, see `_by_distance`.
+        Views and their weights, see `by_distance`.
     """
 
     def __init__(
         self, scene: Scene, views: ViewSet, sampling: Sampling, threads: int | None
     ) -> None:
         self.scene, self.sampling, self.threads = scene, sampling, threads
-        self.views = _by_distance(views)
+        self.views = by_distance(views)
 
     def measure(self, gaussians: Gaussians, progress: Progress) -> Measured:
         """Return the sums over all views for these Gaussians, each hidden by all others."""
@@ -124,7 +125,11 @@ class Measuring:
         return Measured.sum([block for block, _ in self.blocks(gaussians, none, progress)])
 
     def blocks(
-        self, gaussians: Gaussians, sample: NDArray[np.int64], progress: Progress
+        self,
+        gaussians: Gaussians,
+        sample: NDArray[np.int64],
+        progress: Progress,
+        sights: SightLines | None = None,
     ) -> list[tuple[Measured, NDArray[np.float64]]]:
         """Return the sums over each block of views, and the errors of a sample in each view.
 
@@ -134,6 +139,8 @@ class Measuring:
         sample : (m,) int64
             Rows of the Gaussians.
         progress : callable
+        sights : SightLines, optional
+            Notes what its lines meet.
 
         Returns
         -------
@@ -144,9 +151,12 @@ class Measuring:
         def block(piece: slice) -> tuple[Measured, NDArray[np.float64]]:
             total = Measured.zero(len(gaussians))
             errors = []
-            for view, weight in self.views[piece.start :: blocks]:
+            for number in range(piece.start, len(self.views), blocks):
+                view, weight = self.views[number]
                 before = total.error[sample]  # (m,)
-                measure_view(gaussians, self.scene, view, weight, self.sampling, total)
+                footprints = measure_view(gaussians, self.scene, view, weight, self.sampling, total)
+                if sights is not None:
+                    sights.look(number, gaussians, footprints)
                 errors.append(total.error[sample] - before)
             return total, np.array(errors)
 
@@ -160,13 +170,13 @@ def measure_view(
     weight: float,
     sampling: Sampling,
     total: Measured,
-) -> None:
-    """Add what one view sees to `total`."""
+) -> Footprints:
+    """Add what one view sees to `total`; return the footprints in it."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
         count = len(footprints.index)  # n
         if not count:
-            return
+            return footprints
         total.seen[footprints.index[footprints.inside]] += 1
         side = froxels.cell_size(footprints, view, sampling.cell, sampling.density)
         points = froxels.scatter(footprints, view, side, sampling.density)
@@ -185,9 +195,10 @@ def measure_view(
         visible, errors = froxels.mean_visible(points, transmittance, squared_contrast, count)
         total.contribution[footprints.index] += weight * (mass * visible)
         total.error[footprints.index] += weight * (mass_squared * errors)
+    return footprints
 
 
-def _by_distance(views: ViewSet) -> list[tuple[View, float]]:
+def by_distance(views: ViewSet) -> list[tuple[View, float]]:
     """Return the views of positive weight and their weights, in an order given by the scene.
 
     They are sorted by distance from their middle, then from the view farthest from it, equal ones

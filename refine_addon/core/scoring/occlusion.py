@@ -26,6 +26,7 @@ from ..scores import Scores, shares_gone
 from ..work import Progress, part, report, silent
 from . import closed_form, coverage, projection
 from .measuring import Measured, Measuring, Sampling
+from .sight_lines import SightLines
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -176,6 +177,7 @@ def _scored(
         undrawable=int(np.count_nonzero(~good)),
         facts={"floor": run.floor_weights},
         method="occlusion",
+        sights=run.sights,
     )
     return scores, run
 
@@ -224,12 +226,15 @@ class _Run:
         Of these Gaussians, in the first round.
     floor_weights : list of float
         The weight of the floor up to each of `coverage.SHARES`; chosen in the first round.
+    sights : SightLines
+        What the views' lines of sight meet; noted in the first round.
     """
 
     def __init__(self, gaussians: Gaussians, measuring: Measuring, rounds: int) -> None:
         self.gaussians, self.measuring, self.rounds = gaussians, measuring, rounds
         self.measured = Measured.zero(len(gaussians))
         self.floor_weights = [0.0] * len(coverage.SHARES)
+        self.sights = SightLines(measuring.views, gaussians)
 
     def rank(
         self, prior: NDArray[np.float32], progress: Progress
@@ -291,7 +296,7 @@ class _Run:
     def _measure_first(self, prior: NDArray[np.float32], progress: Progress) -> Measured:
         """Measure all Gaussians, and choose the weights of the floor by leaving views out."""
         sample = coverage.sample(self.gaussians)  # (m,)
-        blocks = self.measuring.blocks(self.gaussians, sample, progress)
+        blocks = self.measuring.blocks(self.gaussians, sample, progress, self.sights)
         measured = Measured.sum([block for block, _ in blocks])
         worth = prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)
 
