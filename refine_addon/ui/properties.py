@@ -37,6 +37,7 @@ BUDGETS = (
     ("max_mb", "File Size", "Keep as many splats as fit in a file of this size"),
     ("threshold", "Score", "Remove splats that score below this"),
     ("min_seen", "Views", "Remove splats that lie in fewer than this share of the views"),
+    ("psnr", "Quality", "Remove as many splats as leave the pictures this close to the unpruned"),
 )
 """Kinds of budget, by the names that core gives them."""
 
@@ -174,6 +175,15 @@ class RefineSettings(bpy.types.PropertyGroup):
         default=1.0,
         min=0.0,
         max=100.0,
+        update=_plan_again,
+    )
+    psnr: FloatProperty(
+        name="PSNR",
+        description="How close the pictures of the cameras stay to those of all splats, in dB: 40 "
+        "is hard to tell apart, 30 is seen",
+        default=40.0,
+        min=1.0,
+        max=99.0,
         update=_plan_again,
     )
     absorb: BoolProperty(

@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
     from ..scene import Scene
     from ..views import View, ViewSet
-    from .projection import Gaussians
+    from .projection import Footprints, Gaussians
+    from .sight_lines import SightLines
 
 BLOCKS = 8
 """Of views; sums are added block by block, so they do not depend on threads."""
@@ -118,14 +119,14 @@ class Measuring:
     Attributes
     ----------
     views : list of (View, float)
-        Views and their weights, see `_by_distance`.
+        Views and their weights, see `by_distance`.
     """
 
     def __init__(
         self, scene: Scene, views: ViewSet, sampling: Sampling, threads: int | None
     ) -> None:
         self.scene, self.sampling, self.threads = scene, sampling, threads
-        self.views = _by_distance(views)
+        self.views = by_distance(views)
 
     @property
     def count(self) -> int:
@@ -144,6 +145,7 @@ class Measuring:
         sample: NDArray[np.int64],
         progress: Progress,
         which: Sequence[int] | None = None,
+        sights: SightLines | None = None,
     ) -> list[tuple[Measured, NDArray[np.float64]]]:
         """Return the sums over each block of views, and the errors of a sample in each view.
 
@@ -155,6 +157,8 @@ class Measuring:
         progress : callable
         which : sequence of int, optional
             The blocks to measure; by default all `count` of them.
+        sights : SightLines, optional
+            Notes what its lines meet.
 
         Returns
         -------
@@ -166,9 +170,12 @@ class Measuring:
         def block(piece: slice) -> tuple[Measured, NDArray[np.float64]]:
             total = Measured.zero(len(gaussians))
             errors = []
-            for view, weight in self.views[chosen[piece.start] :: self.count]:
+            for number in range(chosen[piece.start], len(self.views), self.count):
+                view, weight = self.views[number]
                 before = total.error[sample]  # (m,)
-                measure_view(gaussians, self.scene, view, weight, self.sampling, total)
+                footprints = measure_view(gaussians, self.scene, view, weight, self.sampling, total)
+                if sights is not None:
+                    sights.look(number, gaussians, footprints)
                 errors.append(total.error[sample] - before)
             return total, np.array(errors)
 
@@ -184,13 +191,13 @@ def measure_view(
     weight: float,
     sampling: Sampling,
     total: Measured,
-) -> None:
-    """Add what one view sees to `total`."""
+) -> Footprints:
+    """Add what one view sees to `total`; return the footprints in it."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
         count = len(footprints.index)  # n
         if not count:
-            return
+            return footprints
         total.seen[footprints.index[footprints.inside]] += 1
         side = froxels.cell_size(footprints, view, sampling.cell, sampling.density)
         points = froxels.scatter(footprints, view, side, sampling.density)
@@ -209,9 +216,10 @@ def measure_view(
         visible, errors = froxels.mean_visible(points, transmittance, squared_contrast, count)
         total.contribution[footprints.index] += weight * (mass * visible)
         total.error[footprints.index] += weight * (mass_squared * errors)
+    return footprints
 
 
-def _by_distance(views: ViewSet) -> list[tuple[View, float]]:
+def by_distance(views: ViewSet) -> list[tuple[View, float]]:
     """Return the views of positive weight and their weights, in an order given by the scene.
 
     They are sorted by distance from their middle, then from the view farthest from it, equal ones

@@ -26,6 +26,7 @@ from ..scores import Scores, shares_gone
 from ..work import Progress, part, report, silent
 from . import closed_form, coverage, projection
 from .measuring import Measured, Measuring, Sampling
+from .sight_lines import SightLines
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -183,6 +184,7 @@ def _scored(
         undrawable=int(np.count_nonzero(~good)),
         facts={"floor": run.floor_weights},
         method="occlusion",
+        sights=run.sights,
     )
     return scores, run
 
@@ -255,7 +257,7 @@ def measure_part(  # noqa: PLR0913 - as `measure`, and which part
     parts = min(parts, blocks)
     which = range(turn % parts, blocks, parts)
     none, ahead = np.empty(0, np.int64), part(progress, 0.1, 1.0)
-    found = [block for block, _ in measuring.blocks(gaussians, none, ahead, which)]
+    found = [block for block, _ in measuring.blocks(gaussians, none, ahead, which=which)]
     return Measured.sum(found).for_all(gaussians.index, len(splats)), measuring.share(which)
 
 
@@ -274,6 +276,8 @@ class _Run:
         How many blocks were measured after the first round.
     floor_weights : list of float
         The weight of the floor up to each of `coverage.SHARES`; chosen in the first round.
+    sights : SightLines
+        What the views' lines of sight meet; noted in the first round.
     """
 
     def __init__(self, gaussians: Gaussians, measuring: Measuring, rounds: int) -> None:
@@ -282,6 +286,7 @@ class _Run:
         self.blocks: list[Measured] = []
         self.turn = 0
         self.floor_weights = [0.0] * len(coverage.SHARES)
+        self.sights = SightLines(measuring.views, gaussians)
 
     def rank(
         self, prior: NDArray[np.float32], progress: Progress
@@ -336,7 +341,7 @@ class _Run:
         which = [(self.turn + step) % blocks for step in range(count)]
         self.turn += count
         none = np.empty(0, np.int64)
-        found = [block for block, _ in self.measuring.blocks(left, none, progress, which)]
+        found = [block for block, _ in self.measuring.blocks(left, none, progress, which=which)]
         before, now = (Measured.sum(some) for some in ([self.blocks[k] for k in which], found))
         contribution = _ratio(now.contribution.sum(), before.contribution.sum())
         error = _ratio(now.error.sum(), before.error.sum())
@@ -374,7 +379,7 @@ class _Run:
     def _measure_first(self, prior: NDArray[np.float32], progress: Progress) -> None:
         """Measure all Gaussians, and choose the weights of the floor by leaving views out."""
         sample = coverage.sample(self.gaussians)  # (m,)
-        blocks = self.measuring.blocks(self.gaussians, sample, progress)
+        blocks = self.measuring.blocks(self.gaussians, sample, progress, sights=self.sights)
         self.blocks = [block for block, _ in blocks]
         measured = self.measured = Measured.sum(self.blocks)
         worth = prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)
