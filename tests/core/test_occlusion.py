@@ -764,10 +764,10 @@ def test_cells_grow_until_the_points_of_a_view_fit_the_memory(monkeypatch):
 @pytest.mark.parametrize("scale", [1, 4, 16])
 @pytest.mark.parametrize("count", [100, 60_000])
 def test_cells_follow_the_footprints_not_the_pixels(count, scale):
-    """Of 400 x 300 px: cells of 4 px, 7,500 of them; FEW_CELLS or a third of the footprints do.
+    """An image of 400 x 300 px has 7,500 cells of 4 px.
 
-    100 footprints get 4,096 cells, 5.4 px at that size; 60,000 get up to 20,000, 2.4 px: 4 stay
-    there. In images of 4 and 16 times the pixels a side, the same numbers of cells.
+    Those of 4 and 16 times the pixels a side have `FEW_CELLS` of them for 100 footprints, and a
+    third as many as footprints for 60,000.
     """
     sigmas = np.full((2, count), 1.0, np.float32)
     footprints = projection.Footprints(

@@ -35,7 +35,7 @@ GAMMA_SHAPE = 2.3
 """Shape of the gamma distribution of the thickness in front of a point. The larger it is, the
 narrower the distribution: `transmittance` tends to exp(-mean)."""
 
-FEW_CELLS = 4096
+FEW_CELLS = 10_000
 """An image may have this many cells however few footprints it has."""
 
 FOOTPRINTS = 3.0

@@ -44,6 +44,9 @@ ROUND_COST = 0.16
 """A round after the first measures about as many blocks of views as cost this share of the first;
 at least two."""
 
+COMMON = 0.1
+"""Weight of what all splats have grown by, as a share of a splat's sum over all views."""
+
 FIRST_COST = 0.5
 """Share of the time that is still ahead that a round takes, for the display of progress."""
 
@@ -343,8 +346,9 @@ class _Run:
         none = np.empty(0, np.int64)
         found = [block for block, _ in self.measuring.blocks(left, none, progress, which=which)]
         before, now = (Measured.sum(some) for some in ([self.blocks[k] for k in which], found))
-        contribution = _ratio(now.contribution.sum(), before.contribution.sum())
-        error = _ratio(now.error.sum(), before.error.sum())
+        every = Measured.sum(self.blocks)
+        contribution = _growth(now.contribution, before.contribution, every.contribution)
+        error = _growth(now.error, before.error, every.error)
         for block in self.blocks:
             block.contribution[:] *= contribution
             block.error[:] *= error
@@ -435,9 +439,24 @@ def combined(measured: Measured, gone: float) -> NDArray[np.float64]:
     return np.asarray(measured.error * measured.contribution ** _exponent(gone))
 
 
-def _ratio(now: float, before: float) -> float:
-    """Return `now` over `before`; 1 where nothing was seen before."""
-    return now / before if before > 0.0 else 1.0
+def _growth(
+    now: NDArray[np.float64], before: NDArray[np.float64], every: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return by which factor the sum of each splat has grown, (n,), as some blocks of views tell.
+
+    Where these blocks hardly saw a splat, it is the factor of all splats.
+
+    Parameters
+    ----------
+    now, before : (n,) float64
+        The sums over these blocks.
+    every : (n,) float64
+        The sums over all blocks, as measured before.
+    """
+    total = float(before.sum())
+    common = float(now.sum()) / total if total > 0.0 else 1.0
+    prior = COMMON * every  # (n,)
+    return np.divide(now + prior * common, before + prior, out=np.ones_like(now), where=prior > 0.0)
 
 
 def _exponent(gone: float) -> float:
