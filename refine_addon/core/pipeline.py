@@ -344,7 +344,7 @@ def _absorbed(
         psnr = None
         if scores.sights is not None:
             psnr = scores.sights.against(
-                splats, absorbed.splats, used, progress=part(ahead, 0.95, 1.0), threads=threads
+                absorbed.splats, used, progress=part(ahead, 0.95, 1.0), threads=threads
             )
         if goal is None or psnr is None:
             return absorbed, psnr
