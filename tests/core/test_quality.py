@@ -22,12 +22,12 @@ from refine_addon.core import (
     score,
     select,
 )
-from refine_addon.core.quality import PSNR_CAP, SHARES, Quality
+from refine_addon.core.quality import PSNR_CAP, SHARES, Quality, absorbed_from
 from refine_addon.core.scoring import projection, sight_lines
 from refine_addon.core.splats import opacity
 from tests.core.test_occlusion import cloud, look_along_z, ring, splats_of
 
-CURVE = Quality(np.array([0.2, 0.5, 0.8]), np.array([50.0, 40.0, 30.0]))
+CURVE = Quality(*np.array([[0.2, 0.5, 0.8], [50.0, 40.0, 30.0], [52.0, 47.0, 38.0]]))
 CUT = 1.0 / 255.0
 
 
@@ -272,21 +272,51 @@ def test_a_curve_ends_where_it_was_not_estimated():
 
 def test_where_the_curve_is_flat_as_much_goes_as_can():
     """Three equal points: the last of them."""
-    flat = Quality(np.array([0.2, 0.5, 0.8]), np.array([40.0, 40.0, 40.0]))
+    flat = Quality(CURVE.shares, np.full(3, 40.0), np.full(3, 40.0))
 
     assert flat.share(40.0) == 0.8
 
 
-def test_absorbing_is_expected_to_be_better_and_never_worse():
-    """By `GAIN`: at half removed 7 dB; the curve never rises, nor exceeds the cap."""
-    shares = np.linspace(0.05, 0.95, 19)
-
+def test_the_curve_of_absorbing_is_read_in_the_same_way():
+    """At the points what was put in."""
     assert CURVE.at(0.5, absorb=True) == pytest.approx(47.0)
-    values = [CURVE.at(float(share), absorb=True) for share in shares]
-    assert np.all(np.diff(values) <= 1e-9)
-    assert CURVE.share(47.0, absorb=True) == pytest.approx(0.5)
-    near = Quality(CURVE.shares, np.array([99.0, 98.0, 97.0]))
-    assert max(near.at(float(share), absorb=True) for share in shares) <= PSNR_CAP
+    assert CURVE.share(38.0, absorb=True) == pytest.approx(0.8)
+
+
+def test_absorbing_is_expected_to_be_better_and_never_worse():
+    """Up to a tenth it is deletion; at half removed 4.5 + .55 * 2 dB better; never above the cap."""
+    psnr = np.linspace(100.0, 10.0, len(SHARES))
+
+    found = absorbed_from(psnr, np.full(4, 2.0))
+
+    assert np.array_equal(found[:2], psnr[:2])
+    assert found[SHARES.index(0.5)] == pytest.approx(psnr[SHARES.index(0.5)] + 5.6)
+    assert np.all(np.diff(found) <= 0.0)
+    assert np.all(found >= psnr)
+    assert absorbed_from(np.full(len(SHARES), 99.0), np.full(4, 9.0)).max() <= PSNR_CAP
+    assert np.array_equal(absorbed_from(psnr, np.full(4, -50.0)), psnr)
+
+
+def test_on_a_line_the_nearest_that_stays_takes_over():
+    """Red, green, blue, one behind the other, alpha .5: weights .5, .25, .125 of what is seen.
+
+    Without green, red or blue is as near: the one behind takes over. Without red and green, blue.
+    Without all, nothing does.
+    """
+    line, alpha = np.zeros(3, np.int32), np.full(3, 0.5, np.float32)
+    lines = sight_lines.Lines(
+        np.arange(1), np.arange(1), line, np.arange(3, dtype=np.int32), alpha, np.log1p(-alpha),
+        np.arange(3),
+    )  # fmt: skip
+
+    def seen(*keep):
+        return lines.taken_over(np.eye(3), np.array(keep)).tolist()[0]
+
+    assert seen(True, True, True) == pytest.approx([0.5, 0.25, 0.125])
+    assert seen(True, False, True) == pytest.approx([0.5, 0.0, 0.375])
+    assert seen(False, False, True) == pytest.approx([0.0, 0.0, 0.875])
+    assert seen(True, False, False) == pytest.approx([0.875, 0.0, 0.0])
+    assert seen(False, False, False) == [0.0, 0.0, 0.0]
 
 
 def test_a_curve_comes_back_from_json():
@@ -297,8 +327,9 @@ def test_a_curve_comes_back_from_json():
     assert again is not None
     assert np.array_equal(again.shares, CURVE.shares)
     assert np.array_equal(again.psnr, CURVE.psnr)
-    for wrong in (None, {}, {"shares": [0.5]}, {"shares": [0.5], "psnr": [1.0, 2.0]},
-                  {"shares": [], "psnr": []}, {"shares": ["x"], "psnr": [3.0]}, 3):  # fmt: skip
+    assert np.array_equal(again.absorbed, CURVE.absorbed)
+    for wrong in (None, {}, {"shares": [0.5]}, facts | {"psnr": [1.0]}, facts | {"psnr": ["x"]},
+                  {name: [] for name in facts}, 3):  # fmt: skip
         assert Quality.from_facts(wrong) is None
 
 

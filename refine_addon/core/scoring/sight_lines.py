@@ -15,13 +15,13 @@ scoring takes them, the estimate was 1.2 dB too high on an outdoor scene.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..quality import PSNR_CAP, SHARES, Quality
+from ..quality import PSNR_CAP, SHARES, TAKEN_OVER, Quality, absorbed_from
 from ..rendering import ALPHA_CUT, ALPHA_MAX
 from ..spherical_harmonics import basis
 from ..work import Progress, checkpoint, for_chunks, part, silent
@@ -51,7 +51,7 @@ ENOUGH = 256
 """So many lines must meet a splat at least, or nothing is estimated."""
 
 JUDGES = 24
-"""At most about so many views judge splats that have to be projected for it."""
+"""At most about so many views judge what takes more time than splats that are deleted."""
 
 _BLOCK = 1 << 17  # pairs of footprint and pixel at a time, which limits temporary memory
 _DARK = -9.3  # logarithm of the transmittance below which nothing is seen, 1e-4
@@ -149,6 +149,35 @@ class Lines:
         count = len(self.columns) * len(self.rows)
         channels = [np.bincount(line, weight * channel, count) for channel in own.T]
         return np.stack(channels, axis=1).clip(0.0, 1.0)
+
+    def taken_over(
+        self, colors: NDArray[np.float64], keep: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
+        """Return the colour that each line sees if survivors take over what goes, (P, 3), 0..1.
+
+        What goes is as opaque as it was, in the colour of the nearest splat on the line that stays.
+
+        Parameters
+        ----------
+        colors : (u, 3) float64
+            Of the splats that are met.
+        keep : (u,) bool
+            Which of them stay.
+        """
+        stays, here = keep.take(self.owner), np.arange(len(self.owner))
+        first = np.flatnonzero(np.diff(self.line, prepend=-1))
+        counts = np.diff(np.append(first, len(here)))
+        low = np.repeat(first, counts)  # (h,), the first on the same line
+        high = low + np.repeat(counts, counts)  # and the one behind the last
+        before = np.maximum.accumulate(np.where(stays, here, -1))
+        after = np.minimum.accumulate(np.where(stays, here, len(here))[::-1])[::-1]
+        back = np.where(before >= low, here - before, len(here))  # steps to the nearest in front
+        on = np.where(after < high, after - here, len(here))
+        near = np.where(back < on, before, after)
+        alone = np.minimum(back, on) == len(here)  # nothing on this line stays
+        owner = self.owner.take(np.where(alone, here, near))
+        changed = replace(self, owner=np.where(alone, len(colors), owner))
+        return changed.colors(np.concatenate([colors, np.zeros((1, 3))]))
 
     @property
     def meeting(self) -> int:
@@ -256,10 +285,19 @@ class SightLines:
         place = np.empty(len(order), np.int64)
         place[order] = np.arange(len(order))
         counts = [math.floor(share * len(values)) for share in SHARES]
-        found = self._removing(place[self.index], counts, progress, threads)
+        ahead = part(progress, 0.0, 0.5)
+        found = self._removing(place[self.index], counts, ahead, threads)
         if found is None:
             return None
-        return Quality(np.array(SHARES), np.minimum.accumulate(found))
+        gains = self._taking_over(
+            place[self.index],
+            [math.floor(share * len(values)) for share in TAKEN_OVER],
+            part(progress, 0.5, 1.0),
+            threads,
+        )
+        assert gains is not None  # noqa: S101 - the same lines tell it
+        found = np.minimum.accumulate(found)
+        return Quality(np.array(SHARES), found, absorbed_from(found, gains))
 
     def against(
         self,
@@ -287,7 +325,6 @@ class SightLines:
         """
         ahead = part(progress, 0.0, 0.2)
         gaussians, scene, _ = projection.prepare(splats, views, progress=ahead, threads=threads)
-        step = math.ceil(len(self._seen()) / JUDGES)
 
         def compare(number: int, lines: Lines) -> NDArray[np.float64]:
             view = self.views[number][0]
@@ -298,7 +335,7 @@ class SightLines:
                 whole = lines.colors(_colors(self.splats, self.index[lines.met], view))
             return np.array([psnr_of(seen, whole, view)])
 
-        found = self._mean(compare, self._seen()[::step], part(progress, 0.2, 1.0), threads)
+        found = self._mean(compare, self._judges(), part(progress, 0.2, 1.0), threads)
         return None if found is None else float(found[0])
 
     def _removing(
@@ -333,6 +370,37 @@ class SightLines:
             return np.array(values)
 
         return self._mean(compare, self._seen(), progress, threads)
+
+    def _taking_over(
+        self,
+        place: NDArray[np.int64],
+        counts: Sequence[int],
+        progress: Progress,
+        threads: int | None,
+    ) -> NDArray[np.float64] | None:
+        """Return by how much the PSNR is higher, (L,), if survivors take over what goes.
+
+        At most about `JUDGES` views tell it; parameters as `_removing`.
+        """
+
+        def compare(number: int, lines: Lines) -> NDArray[np.float64]:
+            view = self.views[number][0]
+            with np.errstate(under="ignore"):
+                colors = _colors(self.splats, self.index[lines.met], view)
+            whole, own, gains = lines.colors(colors), place.take(lines.met), []
+            for count in counts:
+                keep = own >= count  # (u,)
+                left = lines.keeping(keep.take(lines.owner)).colors(colors)
+                taken = lines.taken_over(colors, keep)
+                gains.append(psnr_of(taken, whole, view) - psnr_of(left, whole, view))
+            return np.array(gains)
+
+        return self._mean(compare, self._judges(), progress, threads)
+
+    def _judges(self) -> list[int]:
+        """Return the numbers of the views that judge where not all can."""
+        seen = self._seen()
+        return seen[:: max(math.ceil(len(seen) / JUDGES), 1)]
 
     def _seen(self) -> list[int]:
         """Return the numbers of the views whose lines meet a splat."""
