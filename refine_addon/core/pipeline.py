@@ -88,7 +88,7 @@ def score(
     Cancelled
         If `progress` answers ``False``.
     """
-    quality = quality or settings.method != "closed-form"
+    quality = quality or settings.estimates
     whole, progress = progress, part(progress, 0.0, 0.9 if quality else 1.0)
     # Numbers that underflow to 0 are negligible in all sums.
     with np.errstate(under="ignore"):

@@ -284,7 +284,7 @@ def test_the_curve_of_absorbing_is_read_in_the_same_way():
 
 
 def test_absorbing_is_expected_to_be_better_and_never_worse():
-    """Up to a tenth it is deletion; at half removed 4.5 + .55 * 2 dB better; never above the cap."""
+    """Up to a tenth it is deletion; at half removed 4.5 + .55 * 2 dB better; never above 100."""
     psnr = np.linspace(100.0, 10.0, len(SHARES))
 
     found = absorbed_from(psnr, np.full(4, 2.0))
