@@ -93,7 +93,7 @@ def score(
     Cancelled
         If `progress` answers ``False``.
     """
-    quality = quality or settings.method != "closed-form"
+    quality = quality or settings.estimates
     whole, progress = progress, part(progress, 0.0, 0.9 if quality else 1.0)
     # Numbers that underflow to 0 are negligible in all sums.
     with np.errstate(under="ignore"):
@@ -349,7 +349,7 @@ def _absorbed(
         psnr = None
         if scores.sights is not None:
             psnr = scores.sights.against(
-                splats, absorbed.splats, used, progress=part(ahead, 0.95, 1.0), threads=threads
+                absorbed.splats, used, progress=part(ahead, 0.95, 1.0), threads=threads
             )
         if goal is None or psnr is None:
             return absorbed, psnr

@@ -22,9 +22,15 @@ PSNR_CAP = 100.0
 SHARES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 """Shares of the splats removed at which the estimate is made; between them it is interpolated."""
 
-GAIN = (0.1, 0.3, 0.5, 0.7, 0.9), (0.0, 5.0, 7.0, 8.0, 9.0)
-"""By how many dB absorbing is better than deleting, at shares removed: the mean of four scenes, of
-which the scenes differ by up to 4 dB."""
+TAKEN_OVER = (0.3, 0.5, 0.7, 0.9)
+"""Shares removed at which it is looked at what survivors could take over; see `absorbed_from`."""
+
+GAIN = (3.0, 4.5, 4.5, 4.3), (0.5, 0.55, 0.7, 0.85)
+"""What absorbing gains over deleting at those shares, dB: a constant, and a part of what it gains
+on lines of sight."""
+
+PLAIN = 0.1
+"""Share removed up to which absorbing is plain deletion."""
 
 UNSEEN = 60.0
 """PSNR in dB above which pictures are the same to the eye: rounding to 8 bits alone makes 59."""
@@ -42,16 +48,19 @@ class Quality:
         Ascending, between 0 and 1.
     psnr : (L,) float64
         With these shares deleted, lowest scores first; dB, never rising.
+    absorbed : (L,) float64
+        About what absorbing reaches with as many survivors; dB, never rising.
 
     Examples
     --------
-    >>> curve = Quality(np.array([0.2, 0.5, 0.8]), np.array([50.0, 40.0, 30.0]))
+    >>> curve = Quality(np.array([0.2, 0.5, 0.8]), np.array([50.0, 40.0, 30.0]), np.zeros(3))
     >>> curve.at(0.5), curve.share(40.0)
     (40.0, 0.5)
     """
 
     shares: NDArray[np.float64]
     psnr: NDArray[np.float64]
+    absorbed: NDArray[np.float64]
 
     def at(self, share: float, *, absorb: bool = False) -> float:
         """Return the PSNR with a share of the splats removed, dB; with `absorb`, about.
@@ -78,10 +87,7 @@ class Quality:
 
     def _points(self, *, absorb: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the curve with its beginning, where nothing is removed: odds and PSNR."""
-        values = self.psnr
-        if absorb:
-            better = np.minimum(values + np.interp(self.shares, *GAIN), PSNR_CAP)
-            values = np.minimum.accumulate(better)
+        values = self.absorbed if absorb else self.psnr
         odds = np.concatenate([[_log_odds(0.0)], [_log_odds(float(s)) for s in self.shares]])
         return odds, np.concatenate([[PSNR_CAP], values])
 
@@ -90,18 +96,39 @@ class Quality:
         return {
             "shares": self.shares.tolist(),
             "psnr": self.psnr.tolist(),
+            "absorbed": self.absorbed.tolist(),
         }
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any] | None) -> Quality | None:
         """Return the curve that `facts` made; None of what is none."""
-        names = ("shares", "psnr")
+        names = ("shares", "psnr", "absorbed")
         try:
-            shares, psnr = (np.array((facts or {})[name], np.float64) for name in names)
+            shares, psnr, absorbed = (np.array((facts or {})[name], np.float64) for name in names)
         except (KeyError, TypeError, ValueError):
             return None
-        whole = len(shares) and shares.shape == psnr.shape == (len(shares),)
-        return cls(shares, psnr) if whole else None
+        whole = len(shares) and shares.shape == psnr.shape == absorbed.shape == (len(shares),)
+        return cls(shares, psnr, absorbed) if whole else None
+
+
+def absorbed_from(psnr: NDArray[np.float64], gains: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return about what absorbing reaches at `SHARES`, (L,), without absorbing; dB.
+
+    On lines of sight it is known what the pictures would be if what goes stayed as opaque as it is
+    and took the colour of the nearest splat that stays. That is neither an upper nor a lower bound
+    of what absorbing reaches, but goes up and down with it from scene to scene.
+
+    Parameters
+    ----------
+    psnr : (L,) float64
+        With the splats deleted, at `SHARES`.
+    gains : (4,) float64
+        By how much it is higher with them taken over in that way, at `TAKEN_OVER`.
+    """
+    constant, part = np.array(GAIN)
+    found = (constant + part * gains).clip(0.0)
+    gain = np.interp(SHARES, (PLAIN, *TAKEN_OVER), np.concatenate([[0.0], found]))
+    return np.minimum.accumulate(np.minimum(psnr + gain, PSNR_CAP))
 
 
 def in_words(psnr: float) -> str:

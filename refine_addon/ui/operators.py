@@ -98,8 +98,8 @@ class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
         """Gather splats, views and settings."""
         settings, views = context.scene.refine.to_settings(), _views(context)
         mesh_edit.check_writable(checked.obj)
-        splats = splat_object.gather(checked)
-        quality = context.scene.refine.budget == "psnr"
+        quality = settings.estimates or context.scene.refine.budget == "psnr"
+        splats = splat_object.gather(checked, whole=None if quality else False)
         origin = staleness.origin(context, checked.obj)
         return _Scoring(splats, views, settings, quality, origin)
 

@@ -63,7 +63,7 @@ def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(addon, 
 @pytest.mark.parametrize(
     ("kind", "value"),
     [("ratio", 0.29), ("ratio", 0.7), ("keep", 1234), ("max_mb", 2.5), ("threshold", 0.1),
-     ("min_seen", 20.0), ("ratio", 0.0)],
+     ("min_seen", 20.0), ("ratio", 0.0), ("psnr", 38.5)],
 )  # fmt: skip
 def test_every_budget_keeps_the_rows_that_core_keeps(addon, room, room_cameras, kind, value):  # noqa: ARG001
     """Blender stores 0.29 as 0.28999999165534973; floor(.29 * 39755) must still go."""

@@ -25,7 +25,7 @@ from ..errors import RefineError
 from ..scores import Scores, shares_gone
 from ..work import Progress, part, report, silent
 from . import closed_form, coverage, projection
-from .measuring import Measured, Measuring, Sampling
+from .measuring import Measured, Measuring, Sampling, by_distance
 from .sight_lines import SightLines
 
 if TYPE_CHECKING:
@@ -168,7 +168,8 @@ def _scored(
     if not good.any():
         msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
         raise RefineError(msg)
-    run = _Run(gaussians, Measuring(scene, views, settings, threads), settings.rounds)
+    sights = SightLines(by_distance(views), gaussians, splats)
+    run = _Run(gaussians, Measuring(scene, views, settings, threads), settings.rounds, sights)
     prior = closed_form.score(
         splats, views, PRIOR, progress=part(progress, 0.05, 0.1), threads=threads
     )
@@ -280,16 +281,18 @@ class _Run:
     floor_weights : list of float
         The weight of the floor up to each of `coverage.SHARES`; chosen in the first round.
     sights : SightLines
-        What the views' lines of sight meet; noted in the first round.
+        Note what the views' lines of sight meet, in the first round.
     """
 
-    def __init__(self, gaussians: Gaussians, measuring: Measuring, rounds: int) -> None:
+    def __init__(
+        self, gaussians: Gaussians, measuring: Measuring, rounds: int, sights: SightLines
+    ) -> None:
         self.gaussians, self.measuring, self.rounds = gaussians, measuring, rounds
         self.measured = Measured.zero(len(gaussians))
         self.blocks: list[Measured] = []
         self.turn = 0
         self.floor_weights = [0.0] * len(coverage.SHARES)
-        self.sights = SightLines(measuring.views, gaussians)
+        self.sights = sights
 
     def rank(
         self, prior: NDArray[np.float32], progress: Progress
