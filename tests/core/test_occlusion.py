@@ -767,7 +767,7 @@ def test_cells_follow_the_footprints_not_the_pixels(count, scale):
     """An image of 400 x 300 px has 7,500 cells of 4 px.
 
     Those of 4 and 16 times the pixels a side have `FEW_CELLS` of them for 100 footprints, and a
-    third as many as footprints for 60,000.
+    quarter as many as footprints for 60,000.
     """
     sigmas = np.full((2, count), 1.0, np.float32)
     footprints = projection.Footprints(

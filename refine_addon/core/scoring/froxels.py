@@ -38,7 +38,7 @@ narrower the distribution: `transmittance` tends to exp(-mean)."""
 FEW_CELLS = 10_000
 """An image may have this many cells however few footprints it has."""
 
-FOOTPRINTS = 3.0
+FOOTPRINTS = 4.0
 """An image of more than `FEW_CELLS` cells has at least this many footprints for each of them. So
 the cells follow the splats, not the pixels: finer ones show nothing that the splats have."""
 
