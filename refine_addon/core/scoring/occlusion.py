@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
 
-PRIOR = closed_form.ClosedForm("distance", frustum=False)
+PRIOR = closed_form.ClosedForm("distance", frustum=False, local=False)
 """Model of the floor. It has no frustum test, since splats that no view shows also need a floor."""
 
 
