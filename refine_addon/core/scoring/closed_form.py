@@ -454,7 +454,7 @@ class _Scene:
                 place = frame.place(self.means[piece])  # (n, 3)
                 # All of space is mapped into a ball, so cells grow with the distance.
                 place *= CELLS / 2 / (1.0 + np.sqrt(np.einsum("ij,ij->i", place, place)))[:, None]
-            index = (place + CELLS / 2).clip(0, CELLS - 1).astype(np.int32)
+            index = np.minimum((place + CELLS / 2).astype(np.int32), CELLS - 1)
             cells[piece] = (index[:, 0] * CELLS + index[:, 1]) * CELLS + index[:, 2]
 
         for_chunks(locate, len(cells), 4 * _CHUNK, threads=threads)
