@@ -26,7 +26,7 @@ import numpy as np
 from ..errors import RefineError
 from ..frustum import Frustums
 from ..rendering import NEAR_RELATIVE
-from ..scene import Scene, median_size, principal_axes
+from ..scene import median_size, principal_axes
 from ..scores import Scores
 from ..splats import base_color, drawable, opacity
 from ..work import Progress, for_chunks, part, silent
@@ -162,7 +162,7 @@ def score(
     if not scene.good.any():
         msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
         raise RefineError(msg)
-    scene.set_lengths()
+    scene.set_frame(np.sum([moments for _, moments in read], axis=0))
     sums = for_chunks(
         scene.sum_views, len(splats), _CHUNK,
         progress=part(progress, 0.2, 0.95), what="scoring", threads=threads,
@@ -181,7 +181,7 @@ def score(
     factors = np.divide(lambdas, means, out=np.zeros(3), where=means > 0.0)
     for_chunks(partial(scene.add, factors), len(splats), 4 * _CHUNK, threads=threads)
     if settings.local:
-        scene.compare(np.sum([moments for _, moments in read], axis=0), threads)
+        scene.compare(threads)
     return Scores(
         values=scene.values,
         seen=scene.seen,
@@ -256,7 +256,8 @@ class _Scene:
         How far outside an image a splat still counts, world units.
     luma, values : (N,) float32
         Of the base colour, 0..1 to 6e-8; the scores.
-    seen : (N,) int32
+    seen, cells : (N,) int32
+        In how many views each lies; its neighbourhood.
     """
 
     def __init__(self, splats: Splats, views: ViewSet, settings: ClosedForm) -> None:
@@ -271,6 +272,7 @@ class _Scene:
         self.luma = np.empty(count, np.float32)
         self.values = np.empty(count, np.float32)
         self.seen = np.zeros(count, np.int32)
+        self.cells = np.empty(count, np.int32)
 
     def read(self, piece: slice) -> tuple[tuple[float, ...], NDArray[np.float64]]:
         """Activate one slice of splats.
@@ -322,12 +324,18 @@ class _Scene:
             return area, ratio, longest
         return area, longest / (np.exp(smallest) + offset), longest
 
-    def set_lengths(self) -> None:
-        """Set size, eta and the near plane; the latter two are multiples of the former.
+    def set_frame(self, moments: NDArray[np.float64]) -> None:
+        """Set axes, and eta and the near plane, which are multiples of the scene's size.
 
         The size is a median over splats, so a few far splats hardly change it.
+
+        Parameters
+        ----------
+        moments : (4, 3) float64
+            As `read` returns them, of all splats.
         """
-        self.size = size = median_size(self.squared, self.good)
+        size = median_size(self.squared, self.good)
+        self.axes = principal_axes(moments[:3], moments[3]) / size  # (3, 3)
         eta = self.settings.eta
         self.eta = ETA_RELATIVE * size * size if eta is None else eta
         self.frustums = Frustums(self.views, self.origin, NEAR_RELATIVE * size)
@@ -365,8 +373,18 @@ class _Scene:
                 total *= self.alpha[piece]
             visibility = self.visibility[piece] = total * self.good[piece]
             sums = [float(np.sum(visibility * content)) for content in self._contents(piece)]
+            if self.settings.local:
+                self.cells[piece] = self._cells(points)
         self.seen[piece] = seen * self.good[piece]
         return sums
+
+    def _cells(self, points: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Return which neighbourhood each of n points lies in, (n,)."""
+        place = self.axes @ points[:3]  # (3, n), scene sizes
+        # All of space is mapped into a ball, so cells grow with the distance.
+        place *= CELLS / 2 / (1.0 + np.sqrt(np.einsum("in,in->n", place, place)))
+        x, y, z = np.minimum((place + CELLS / 2).astype(np.int32), CELLS - 1)
+        return np.asarray((x * CELLS + y) * CELLS + z)
 
     def _block(
         self,
@@ -437,27 +455,9 @@ class _Scene:
             terms = zip(factors, self._contents(piece), strict=True)
             self._store(sum(factor * (visibility * content) for factor, content in terms), piece)
 
-    def compare(self, moments: NDArray[np.float64], threads: int | None) -> None:
-        """Divide each score by a power of the mean score around it.
-
-        Parameters
-        ----------
-        moments : (4, 3) float64
-            As `read` returns them, of all splats.
-        threads : int or None
-        """
-        frame = Scene(self.origin, self.size, principal_axes(moments[:3], moments[3]))
-        cells = np.empty(len(self.values), np.int32)
-
-        def locate(piece: slice) -> None:
-            with np.errstate(under="ignore"):
-                place = frame.place(self.means[piece])  # (n, 3)
-                # All of space is mapped into a ball, so cells grow with the distance.
-                place *= CELLS / 2 / (1.0 + np.sqrt(np.einsum("ij,ij->i", place, place)))[:, None]
-            index = np.minimum((place + CELLS / 2).astype(np.int32), CELLS - 1)
-            cells[piece] = (index[:, 0] * CELLS + index[:, 1]) * CELLS + index[:, 2]
-
-        for_chunks(locate, len(cells), 4 * _CHUNK, threads=threads)
+    def compare(self, threads: int | None) -> None:
+        """Divide each score by a power of the mean score around it."""
+        cells = self.cells
         sums = np.bincount(cells, self.values)
         count = np.bincount(cells, self.good)
         overall = sums.sum() / count.sum()
