@@ -99,15 +99,8 @@ class RefineSettings(bpy.types.PropertyGroup):
     )
     frustum: BoolProperty(
         name="Only in Frame",
-        description="Count a view only for the splats that lie in its frame",
+        description="Count a view only for the splats that lie in its frame or reach into it",
         default=True,
-    )
-    margin: FloatProperty(
-        name="Margin",
-        description="How far beyond the edge of the image still counts, in half image sizes",
-        default=0.15,
-        min=0.0,
-        soft_max=1.0,
     )
     views: IntProperty(
         name="Views",
@@ -210,7 +203,7 @@ class RefineSettings(bpy.types.PropertyGroup):
         if self.published:
             form = ClosedForm.published(self.depth)
         else:
-            form = ClosedForm(self.depth, frustum=self.frustum, margin=decimal(self.margin))
+            form = ClosedForm(self.depth, frustum=self.frustum)
         return Settings(self.method, self.views, form, tolerance=decimal(self.tolerance))
 
     def to_budget(self) -> Budget:

@@ -92,9 +92,9 @@ def test_settings_reach_core_as_they_were_typed(addon):
     assert settings.to_settings() == core.Settings()
     assert settings.to_budget() == core.Budget(ratio=0.5)
 
-    settings.depth, settings.views, settings.margin = "distance", 7, 0.3
+    settings.depth, settings.views, settings.frustum = "distance", 7, False
     assert settings.to_settings() == core.Settings(
-        views=7, closed_form=core.ClosedForm("distance", margin=0.3)
+        views=7, closed_form=core.ClosedForm("distance", frustum=False)
     )
 
     settings.published = True

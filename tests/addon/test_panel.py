@@ -133,16 +133,16 @@ def test_while_scoring_a_bar_takes_the_place_of_the_button(draw, room):  # noqa:
 
 @pytest.mark.parametrize(
     ("method", "expected"),
-    [("closed-form", {"views", "depth", "published", "frustum", "margin"}),
+    [("closed-form", {"views", "depth", "published", "frustum"}),
      ("occlusion", {"views"}),
-     ("auto", {"views", "depth", "published", "frustum", "margin", "tolerance"})],
+     ("auto", {"views", "depth", "published", "frustum", "tolerance"})],
 )  # fmt: skip
 def test_only_settings_that_the_method_looks_at_are_drawn(draw, method, expected):
     """Occlusion has none in the panel but the number of views."""
     bpy.context.scene.refine.method = method
     drawn = draw()
 
-    every = {"views", "depth", "published", "frustum", "margin", "tolerance"}
+    every = {"views", "depth", "published", "frustum", "tolerance"}
     assert every & set(drawn) == expected
 
 

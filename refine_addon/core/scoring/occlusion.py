@@ -50,7 +50,7 @@ COMMON = 0.1
 FIRST_COST = 0.5
 """Share of the time that is still ahead that a round takes, for the display of progress."""
 
-PRIOR = closed_form.ClosedForm("distance", frustum=False)
+PRIOR = closed_form.ClosedForm("distance", frustum=False, local=False)
 """Model of the floor. It has no frustum test, since splats that no view shows also need a floor."""
 
 
