@@ -15,7 +15,7 @@ import numpy as np
 
 from .cameras.objects import world_matrix
 from .core import pipeline
-from .core.affine import transformed
+from .core.affine import is_uniform, transformed
 from .core.errors import RefineError
 from .core.formats.ply import columns_from_splats
 from .core.report import Clock, Files, complete_report
@@ -59,7 +59,7 @@ class Plan:
     bytes_after: int
 
 
-def gather(checked: SplatObject, *, whole: bool = False) -> Splats:
+def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
     """Return an object's splats as they stand in the world, for scoring.
 
     Modifiers are not looked at: what is scored is what is exported.
@@ -67,8 +67,9 @@ def gather(checked: SplatObject, *, whole: bool = False) -> Splats:
     Parameters
     ----------
     checked : SplatObject
-    whole : bool
+    whole : bool or None
         Whether to bring view-dependent colour along, for absorbing; the scale must be uniform then.
+        None brings it if it is, for an estimate of the pictures' quality.
 
     Raises
     ------
@@ -76,6 +77,7 @@ def gather(checked: SplatObject, *, whole: bool = False) -> Splats:
         If the object's matrix cannot be applied.
     """
     matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
+    whole = is_uniform(matrix) if whole is None else whole
     splats = mesh_attributes.splats_from_object(checked, sh_rest=whole)
     if np.array_equal(matrix, np.eye(4)):
         return splats
@@ -307,10 +309,11 @@ def prune_object(  # noqa: PLR0913 - the command's options
     if save and not dry_run:
         _check_savable(checked.obj)
     row_bytes, fixed_bytes = mesh_attributes.file_size(checked)
+    estimates = settings.estimates or budget.psnr is not None
     task = Task(
         budget=budget,
         settings=settings,
-        splats=gather(checked, whole=absorb),
+        splats=gather(checked, whole=absorb or (None if estimates else False)),
         views=views,
         absorb=absorb,
         row_bytes=row_bytes,

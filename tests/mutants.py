@@ -25,7 +25,8 @@ MUTANTS = {
     "frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
         ("(near if np.ptp(near) > 0.0 else near[0, 0])", "0.0", "near plane ignored"),
-        ("inside &= depth <= far", "inside &= depth < far", "far plane excluded"),
+        ("between &= depth <= far", "between &= depth < far", "far plane excluded"),
+        ("np.hypot(1.0, slope)", "slope", "reach along the image only"),
         ("view.cx - view.width / 2", "view.width / 2 - view.cx", "shift mirrored"),
         ("view.height / 2)", "view.width / 2)", "axes swapped"),
         ("<= side.half * z", "<= side.half", "image of another depth"),
@@ -35,6 +36,14 @@ MUTANTS = {
         ("total *= self.alpha[piece]", "total *= self.alpha[piece] ** 2", "opacity twice"),
         ("LUMA = (0.299, 0.587, 0.114)", "LUMA = (0.114, 0.587, 0.299)", "BGR"),
         ("largest + middle", "largest + smallest", "wrong two scales"),
+        ("share = 1.0 - away", "share = 1.0 - 0.0 * away", "all that reaches inside counts whole"),
+        ("depth.ravel()[index] + away", "depth.ravel()[index]", "depth beside the camera"),
+        ("between > inside", "beyond > 0.0", "planes forgotten outside the image"),
+        (
+            "weight * powers[cells[piece]]",
+            "powers[cells[piece]]",
+            "neighbours count from the first",
+        ),
     ],
     "scoring/adaptive.py": [
         ("math.log(geometry)", "math.log(1 + geometry)", "wrong logarithm"),
@@ -99,7 +108,11 @@ MUTANTS = {
             "LEAST ** ((number - 1) / (rounds - 1))",
             "a round late",
         ),
-        ('ClosedForm("distance", frustum=False)', 'ClosedForm("distance")', "prior with a frustum"),
+        (
+            'ClosedForm("distance", frustum=False, local=False)',
+            'ClosedForm("distance")',
+            "prior with a frustum",
+        ),
         (
             'removal.add(undrawn[np.argsort(prior[undrawn], kind="stable")])',
             "removal.add(undrawn)",
@@ -273,8 +286,8 @@ MUTANTS = {
         ),
         ("    both = np.clip(both, -limit, limit)\n", "", "contrasts beyond 1"),
         (
-            "0.5 * (_price(ends, -1.0).cost + _price(ends, 1.0).cost)",
-            "0.5 * (_price(ends, 1.0).cost + _price(ends, 1.0).cost)",
+            "0.5 * _price(ends, -1.0).cost",
+            "0.5 * _price(ends, 1.0).cost",
             "one side only",
         ),
         (

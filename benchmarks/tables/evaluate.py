@@ -40,6 +40,7 @@ from refine_addon.core.pipeline import Settings, score
 from refine_addon.core.scores import Scores
 from refine_addon.core.selection import Budget, select
 
+from ..baselines import rap
 from ..baselines.rendered import BASELINES, RENDERED
 from ..renderer import rasterizer
 
@@ -286,8 +287,12 @@ def _split(file: Path, names: Sequence[str]) -> tuple[list[str], list[str]]:
         raise RefineError(msg) from error
 
 
-def scores_of(method: str, scene: Scene, statistics: Statistics | None) -> Scores:
+def scores_of(
+    method: str, scene: Scene, statistics: Statistics | None, weights: Path | None = None
+) -> Scores:
     """Score a scene by a baseline, or by a method of the core under its name.
+
+    `weights` are those of the baseline "rap", which is not there without them.
 
     Raises
     ------
@@ -296,8 +301,11 @@ def scores_of(method: str, scene: Scene, statistics: Statistics | None) -> Score
     """
     if method in BASELINES:
         values = BASELINES[method](scene.splats, scene.train, statistics)
-        return Scores(values, np.zeros(len(values), np.int32), len(scene.train), 0)
-    return score(scene.splats, scene.train, Settings(method=method))
+    elif method == "rap" and weights is not None:
+        values = rap.score(scene.splats, weights)
+    else:
+        return score(scene.splats, scene.train, Settings(method=method))
+    return Scores(values, np.zeros(len(values), np.int32), len(scene.train), 0)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -329,6 +337,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
         default=[Settings().method],
         help=f"of the core, or {', '.join(BASELINES)}; default: %(default)s",
     )
+    parser.add_argument("--rap", type=Path, metavar="FILE", help="trained weights: measure RAP too")
     parser.add_argument("--metrics", nargs="+", choices=METRICS, default=list(METRICS))
     parser.add_argument("--threads", type=int, help="for rendering; default: all")
     return parser.parse_args(arguments)
@@ -350,9 +359,9 @@ def _measure(options: argparse.Namespace) -> None:
         start = time.perf_counter()
         statistics = rasterizer.accumulate_statistics(scene.splats, scene.train)
         rendering = time.perf_counter() - start
-    for method in options.method:
+    for method in [*options.method, *(["rap"] if options.rap else [])]:
         start = time.perf_counter()
-        scores = scores_of(method, scene, statistics)
+        scores = scores_of(method, scene, statistics, options.rap)
         seconds = time.perf_counter() - start + (rendering if method in RENDERED else 0.0)
         for ratio in options.ratios:
             keep = select(scores, Budget(ratio=ratio))

@@ -29,13 +29,16 @@ if TYPE_CHECKING:
 
     from refine_addon.core.views import ViewSet
 
+READINGS = ("z", "distance", "default")
 ANALYTIC = {
-    "x', y', z: three rows of four products and three sums": {"z": 21, "distance": 21},
-    "abs(x'), abs(y'), their maximum, two comparisons: the frustum": {"z": 5, "distance": 5},
-    "d^2: z z, or three differences, products and sums": {"z": 1, "distance": 9},
-    "+ eta, the division, weight and sum": {"z": 4, "distance": 4},
+    "x', y', z: three rows of four products and three sums": (21, 21, 21),
+    "abs(x'), abs(y'), their maximum less z, a comparison: the frustum": (5, 5, 5),
+    "two comparisons: what is inside, and what reaches inside": (0, 0, 2),
+    "d^2: z z, or three differences, products and sums": (1, 9, 1),
+    "+ eta, the division, weight and sum": (4, 4, 4),
 }
-"""Term -> operations of a splat and a view, for each reading of the depth."""
+"""Term -> operations of a splat and a view, for both published readings and the default; the few
+splats that reach into a view from outside are left out."""
 
 PER_HIT = 34
 """Operations of the reference renderer for a splat in a pixel, least: 16 for alpha (offset 4, form

@@ -21,7 +21,7 @@ from refine_addon.core.scoring.closed_form import ClosedForm
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import Splats
 
-from ..baselines import merging, splat_transform
+from ..baselines import merging, rap, splat_transform
 from ..baselines.rendered import BASELINES, RENDERED
 
 if TYPE_CHECKING:
@@ -109,6 +109,16 @@ def _baselines() -> list[Method]:
         about = ABOUT.get(name, name)
         methods.append(Method(name, LITERATURE, about, score=score, rendered=name in RENDERED))
     return methods
+
+
+def rap_network(weights: Path) -> Method:
+    """Return RAP, whose trained network the project does not have."""
+
+    def score(task: Task, statistics: Statistics | None) -> Scores:
+        del statistics
+        return as_scores(rap.score(task.splats, weights), len(task.views))
+
+    return Method("rap", LITERATURE, "RAP: a trained network, which sees no cameras", score=score)
 
 
 def _merging() -> list[Method]:

@@ -179,10 +179,11 @@ def _measure_methods(
     task: Task, judge: Judge, found: Measured, options: argparse.Namespace
 ) -> None:
     """Measure all methods, or those asked for."""
+    offered = methods.everything()
+    if options.rap is not None:
+        offered.append(methods.rap_network(options.rap))
     chosen = [
-        method
-        for method in methods.everything()
-        if options.methods is None or method.name in options.methods
+        method for method in offered if options.methods is None or method.name in options.methods
     ]
     _warm_up(task, chosen)
     rendering: tuple[Statistics | None, Cost] = (None, Cost(0.0, options.runs, None))
@@ -233,6 +234,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("scenes", type=Path, nargs="*", metavar="SCENE_DIR", default=[ROOM])
     parser.add_argument("--ratios", type=float, nargs="+", default=[0.3, 0.5, 0.7, 0.9])
     parser.add_argument("--methods", nargs="+", metavar="NAME", help="default: all")
+    parser.add_argument("--rap", type=Path, metavar="FILE", help="trained weights: measure RAP too")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--metrics", nargs="+", choices=evaluate.METRICS,
                         default=list(evaluate.METRICS))  # fmt: skip

@@ -226,9 +226,9 @@ def _flops_table(scene: Measured) -> list[str]:
     counts = scene.flops
     if counts is None:
         return []
-    rows = [[term, str(n["z"]), str(n["distance"])] for term, n in flops.ANALYTIC.items()]
-    total = {r: sum(n[r] for n in flops.ANALYTIC.values()) for r in ("z", "distance")}
-    rows.append(["sum, by hand", str(total["z"]), str(total["distance"])])
+    rows = [[term, *map(str, numbers)] for term, numbers in flops.ANALYTIC.items()]
+    total = np.sum(list(flops.ANALYTIC.values()), axis=0)
+    rows.append(["sum, by hand", *map(str, total)])
     everything = counts.splats * counts.views / 1e9
     body = [
         [one.method, f"{one.per_splat:.0f}", f"{one.per_splat_view:.1f}",
@@ -241,7 +241,7 @@ def _flops_table(scene: Measured) -> list[str]:
     failed = [f"- {name} could not be counted: {why}" for name, why in counts.failed.items()]
     return ["", f"### {scene.name}: floating-point operations", "",
             "The closed form, a splat and a view, by hand (a test counts them):", "",
-            *_table(["operations", "z", "distance"], rows), "",
+            *_table(["operations", *flops.READINGS], rows), "",
             ("Counted by running the code with arrays that count (`tables/flops.py`); the last "
             f"column is for all {counts.splats:,} splats and {counts.views} views. Rendering pays "
             f"for pixels: a splat is drawn in {counts.hits_per_splat_view:.1f} pixels of a view on "

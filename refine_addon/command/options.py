@@ -67,6 +67,13 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     amount.add_argument(
         "--min-seen", type=float, metavar="P", help="remove what fewer than P %% of the views see"
     )
+    amount.add_argument(
+        "--psnr",
+        type=float,
+        metavar="DB",
+        help="remove as much as leaves the cameras' pictures this close to the unpruned ones: 40 "
+        "is hard to tell apart, 30 is seen",
+    )
     _add_scoring(prune)
     prune.add_argument(
         "--absorb",
@@ -171,6 +178,6 @@ def settings(options: argparse.Namespace) -> Settings:
 
 def budget(options: argparse.Namespace) -> Budget:
     """Return how much goes, or raise `RefineError` where a value cannot be."""
-    names = ("ratio", "keep", "max_mb", "threshold", "min_seen")
+    names = ("ratio", "keep", "max_mb", "threshold", "min_seen", "psnr")
     given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
     return Budget(**(given or {"ratio": DEFAULT_RATIO}))

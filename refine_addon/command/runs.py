@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..core import RefineError, prune_file, read_cameras, read_ply, score
 from ..core.errors import printable
+from ..core.quality import UNSEEN, in_words
 from ..core.report import scoring_notes
 from ..core.whole_file import refuse_existing
 from . import report
@@ -152,8 +153,22 @@ def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
     ]
     target = f" -> {files['output']}" if files["output"] else ""
     run.terminal.say(f"{label}: {', '.join(parts)}{target}")
+    quality = _quality(done)
+    if quality:
+        run.terminal.say(f"  quality: {quality}")
     for note in done["notes"]:
         run.terminal.say(f"  note: {note}")
+
+
+def _quality(done: dict[str, Any]) -> str:
+    """Return what is estimated of the pictures, in words; "" where nothing is."""
+    psnr, absorbed = done["estimated_psnr"], done["estimated_psnr_absorbed"]
+    if psnr is None:
+        return ""
+    words = f"{in_words(psnr)} in these views"
+    if absorbed is None or "absorbed" in done or psnr > UNSEEN:
+        return words
+    return f"{words}; with --absorb {in_words(absorbed)}"
 
 
 def _score(run: _Run) -> None:

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 _STACK = 16
 """Rows of one matrix product: so few that BLAS starts no threads, which would slow down ours."""
 
+_STEEPEST = 1e100
+"""Limit of a focal length over half the image: its product with any length can be squared."""
+
 
 class Side(NamedTuple):
     """An image across or down, pixels.
@@ -86,20 +89,22 @@ class Frustums:
         zero keeps its digits.
     near : float
         Near plane of views that have none of their own, world units, > 0.
-    margin : float
-        How far outside the image still counts as inside, in half image sizes.
 
     Attributes
     ----------
     centers : (V, 3) float64
         Of the views, relative to the origin.
+    steepness : (V, 1) float64
+        By how much `beyond` of `project` grows with a step straight away from a side, for an image
+        as high as wide and of the same area.
     """
 
-    def __init__(
-        self, views: ViewSet, origin: NDArray[np.float64], near: float, margin: float
-    ) -> None:
+    def __init__(self, views: ViewSet, origin: NDArray[np.float64], near: float) -> None:
         self.centers = views.centers - origin
-        self._rows = _rows(views, self.centers, margin)
+        self._rows = _rows(views, self.centers)
+        slopes = [[side.focal / side.half for side in image_sides(view)] for view in views]
+        slope = np.minimum(np.prod(np.sqrt(slopes), axis=1, keepdims=True), _STEEPEST)
+        self.steepness = np.hypot(1.0, slope)
         planes = np.array([clip_planes(view, near) for view in views])
         self._near, self._far = planes[:, :1], planes[:, 1:]
         # One buffer a thread is reused, since allocating one costs as much as the product.
@@ -107,8 +112,8 @@ class Frustums:
 
     def project(
         self, points: NDArray[np.float64], block: slice
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Return depths, and which points lie inside.
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """Return how deep points lie in views, and where.
 
         Parameters
         ----------
@@ -120,9 +125,14 @@ class Frustums:
         Returns
         -------
         depth : (b, n) float64
-            Along each view's axis, world units; overwritten by this thread's next call.
-        inside : (b, n) bool
-            Between near and far plane and within the widened image, edges included.
+            Along each view's axis, world units.
+        beyond : (b, n) float64
+            ``max(|x'|, |y'|) - depth`` with x' and y' from the centre of the image, in half sizes
+            of it at depth 1, world units: at most 0 in the image, edges included.
+        between : (b, n) bool
+            Between near and far plane, planes included.
+
+        The first two are overwritten by this thread's next call.
         """
         rows = self._rows[:, block].reshape(-1, 4)  # (3 b, 4)
         stack = np.zeros((-(-len(rows) // _STACK), _STACK, 4))
@@ -131,13 +141,13 @@ class Frustums:
         np.matmul(stack, points, out=product)
         x, y, depth = np.split(product.reshape(-1, points.shape[1])[: len(rows)], 3)
         np.maximum(np.abs(x, out=x), np.abs(y, out=y), out=x)
-        inside = np.less_equal(x, depth)
+        x -= depth
         near, far = self._near[block], self._far[block]
         # Comparing with a single number is twice as fast as with one for each view.
-        inside &= depth >= (near if np.ptp(near) > 0.0 else near[0, 0])
+        between = depth >= (near if np.ptp(near) > 0.0 else near[0, 0])
         if np.isfinite(far).any():
-            inside &= depth <= far
-        return depth, inside
+            between &= depth <= far
+        return depth, x, between
 
     def _memory(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
         """Return this thread's buffer in a shape; its content is arbitrary."""
@@ -148,11 +158,11 @@ class Frustums:
         return held[:size].reshape(shape)
 
 
-def _rows(views: ViewSet, centers: NDArray[np.float64], margin: float) -> NDArray[np.float64]:
+def _rows(views: ViewSet, centers: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return rows whose products with ``(p, 1)`` are x', y' and z of every view.
 
-    x' and y' contain the principal point and the half image size, so a point p lies in the image,
-    widened by `margin`, where ``|x'| <= z`` and ``|y'| <= z``.
+    x' and y' contain the principal point and the half image size, so a point p lies in the image
+    where ``|x'| <= z`` and ``|y'| <= z``.
 
     Returns
     -------
@@ -162,7 +172,6 @@ def _rows(views: ViewSet, centers: NDArray[np.float64], margin: float) -> NDArra
     for index, (view, center) in enumerate(zip(views, centers, strict=True)):
         *axes, forward = np.column_stack([view.rotation, -view.rotation @ center])  # (4,) each
         for row, axis, side in zip(rows, axes, image_sides(view), strict=False):
-            half = side.half * (1 + margin)
-            row[index] = (side.focal * axis + side.offset * forward) / half
+            row[index] = (side.focal * axis + side.offset * forward) / side.half
         rows[2, index] = forward
     return rows

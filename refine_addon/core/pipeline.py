@@ -7,6 +7,7 @@ absorb the others, as many survivors are found again, by merging.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -18,7 +19,7 @@ from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
 from .formats.ply import read_ply
 from .report import Clock, Files, complete_report, make_report
-from .scoring import auto, closed_form, occlusion
+from .scoring import auto, closed_form, occlusion, sight_lines
 from .selection import Budget
 from .survivors import survivor_columns
 from .task import DEFAULTS, Result, Settings, Task
@@ -27,6 +28,7 @@ from .work import Progress, part, report, silent
 
 if TYPE_CHECKING:
     from pathlib import Path
+    from typing import Any
 
     from numpy.typing import NDArray
 
@@ -37,9 +39,23 @@ if TYPE_CHECKING:
     from .splats import Splats
     from .views import ViewSet
 
+UNSEEN = "the views see too little for an estimate of the pictures' quality"
+UNESTIMATED = "the closed form estimates the pictures' quality only if a PSNR is the budget"
+"""Why there is no estimate: notes of the report."""
+
+TRIES = 3
+"""How often absorbing is done at most to reach a PSNR."""
+
+CLOSE = 0.7
+"""How close to a PSNR the estimate for a result must be, dB, or absorbing is done again."""
+
 FIRST = 0.1
 """Share of the splats that is deleted before any are merged: those with the lowest scores, whose
 deletion changes the pictures less than any merge."""
+
+PARTS = 2
+"""While splats are merged, they are measured again in one of so many parts of the views, which take
+turns; what the other views see is carried over."""
 
 
 def score(
@@ -47,6 +63,7 @@ def score(
     views: ViewSet,
     settings: Settings = DEFAULTS,
     *,
+    quality: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
@@ -58,6 +75,9 @@ def score(
         In the frame of the views.
     views : ViewSet
     settings : Settings
+    quality : bool
+        Whether the scores get an estimate of the pictures' quality even if that takes longer than
+        scoring by the closed form; all other methods always give one.
     progress : callable, optional
         ``progress(fraction, what)``; returning ``False`` cancels.
     threads : int, optional
@@ -73,6 +93,8 @@ def score(
     Cancelled
         If `progress` answers ``False``.
     """
+    quality = quality or settings.estimates
+    whole, progress = progress, part(progress, 0.0, 0.9 if quality else 1.0)
     # Numbers that underflow to 0 are negligible in all sums.
     with np.errstate(under="ignore"):
         used = views.spread(settings.views)
@@ -89,7 +111,37 @@ def score(
             scores = closed_form.score(
                 splats, used, settings.closed_form, progress=progress, threads=threads
             )
-    return _with_views(scores, views)
+        if quality and scores.sights is None:
+            ahead = part(whole, 0.9, 0.95)
+            found = sight_lines.sights(splats, used, progress=ahead, threads=threads)
+            scores = replace(scores, sights=found)
+    scores = _with_views(scores, views)
+    return with_quality(scores, progress=part(whole, 0.95, 1.0), threads=threads)
+
+
+def with_quality(
+    scores: Scores,
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Scores:
+    """Return scores with the curve of the estimated PSNR, as far as their lines of sight tell it.
+
+    Parameters
+    ----------
+    scores : Scores
+    protected : (N,) bool, optional
+        Splats that are not removed.
+    progress : callable, optional
+    threads : int, optional
+    """
+    if scores.sights is None:
+        return scores
+    curve = scores.sights.curve(
+        scores.values, protected=protected, progress=progress, threads=threads
+    )
+    return replace(scores, quality=curve)
 
 
 def _with_views(scores: Scores, views: ViewSet) -> Scores:
@@ -180,26 +232,34 @@ def decide(
     clock = clock or Clock()
     scored = 0.2 if task.absorb else 0.95
     scores, known = _scores_of(task, part(progress, 0.0, scored), threads)
+    if task.budget.psnr is not None and task.protected is not None:
+        scores = with_quality(scores, protected=task.protected, threads=threads)
     clock.lap("score_s")
     report(progress, scored, "selecting")
-    keep = selection.select(
-        scores,
-        task.budget,
-        protected=task.protected,
-        row_bytes=task.row_bytes,
-        fixed_bytes=task.fixed_bytes,
-    )
+    if task.absorb and task.budget.psnr is not None:
+        keep = np.ones(len(scores.values), np.bool_)  # how many survive is found by absorbing
+    else:
+        keep = selection.select(
+            scores,
+            task.budget,
+            protected=task.protected,
+            row_bytes=task.row_bytes,
+            fixed_bytes=task.fixed_bytes,
+        )
     clock.lap("select_s")
     absorbed = None
     if task.absorb:
-        splats, views = task.scene()
-        absorbed = absorb_removed(
-            splats, views, int(np.count_nonzero(keep)), task.settings, known=known,
-            protected=task.protected, progress=part(progress, 0.2, 1.0), threads=threads,
-        )  # fmt: skip
+        count = int(np.count_nonzero(keep))
+        ahead = part(progress, 0.2, 1.0)
+        absorbed, psnr = _absorbed(task, count, known, ahead, threads)
         keep = absorbed.keep
         clock.lap("absorb_s")
+    else:
+        psnr = _estimated(scores, keep, threads)
     facts = make_report(scores, keep, task.budget, task.settings, clock)
+    facts |= _quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
+    if psnr is None and scores.sights is not None:
+        facts["notes"].append(UNSEEN)
     if absorbed:
         facts["absorbed"] = absorbed.facts()
         facts["notes"].append(absorbed.note())
@@ -207,6 +267,100 @@ def decide(
             name = task.settings.method
             facts["notes"].append(f"absorbing measures by occlusion: {name} was not used")
     return Result(keep, scores, facts, absorbed)
+
+
+def _quality_facts(
+    scores: Scores, keep: NDArray[np.bool_], psnr: float | None, *, absorbed: bool
+) -> dict[str, Any]:
+    """Return what a report says about the quality of the pictures.
+
+    Parameters
+    ----------
+    scores : Scores
+    keep : (N,) bool
+    psnr : float or None
+        The estimate for the result, dB.
+    absorbed : bool
+        Whether survivors absorbed the others.
+    """
+    curve, other = scores.quality, psnr if absorbed else None
+    if curve is not None and not absorbed:
+        other = curve.at(1.0 - float(np.mean(keep)), absorb=True)
+    why = None
+    if psnr is None:
+        why = UNESTIMATED if scores.sights is None else UNSEEN
+    return {
+        "estimated_psnr": None if psnr is None else round(psnr, 2),
+        "estimated_psnr_absorbed": None if other is None else round(other, 2),
+        "estimated_psnr_note": why,
+        "quality": curve.facts() if curve is not None else None,
+    }
+
+
+def _estimated(scores: Scores, keep: NDArray[np.bool_], threads: int | None) -> float | None:
+    """Return the estimated PSNR with some splats deleted, dB; None where nothing tells it."""
+    if scores.sights is not None:
+        return scores.sights.psnr(keep, threads=threads)
+    if scores.quality is not None:
+        return scores.quality.at(1.0 - float(np.mean(keep)))
+    return None
+
+
+def _absorbed(
+    task: Task,
+    count: int,
+    known: tuple[Scores, Measured] | None,
+    progress: Progress,
+    threads: int | None,
+) -> tuple[Absorbed, float | None]:
+    """Return what absorbing makes of a task, and the estimated PSNR of it, dB.
+
+    Parameters
+    ----------
+    task : Task
+    count : int
+        How many survive, unless the budget is a PSNR: then as few as keep it. What a number of
+        survivors reaches is expected first, and put right by what it reached.
+    known : tuple of Scores and Measured, optional
+        See `absorb_removed`.
+    progress : callable
+    threads : int, optional
+    """
+    splats, views = task.scene()
+    start = 0.0 if known else 0.2
+    known = known or _score_once(splats, views, task.settings, part(progress, 0.0, start), threads)
+    scores, goal = known[0], task.budget.psnr
+    if goal is not None and scores.quality is None:
+        scores = with_quality(scores, threads=threads)
+    used = views.spread(task.settings.views)
+    best: tuple[Absorbed, float | None] | None = None
+    offset, tries = 0.0, 1 if goal is None else TRIES
+    for number in range(tries):
+        if goal is not None:
+            curve = selection.quality_of(scores)
+            share = curve.share(goal - offset, absorb=True)
+            count = len(splats) - math.floor(share * len(splats))
+        low, high = (start + (1.0 - start) * (number + k) / tries for k in (0, 1))
+        ahead = part(progress, low, high)
+        absorbed = absorb_removed(
+            splats, views, count, task.settings, known=known, protected=task.protected,
+            progress=part(ahead, 0.0, 0.95), threads=threads,
+        )  # fmt: skip
+        psnr = None
+        if scores.sights is not None:
+            psnr = scores.sights.against(
+                absorbed.splats, used, progress=part(ahead, 0.95, 1.0), threads=threads
+            )
+        if goal is None or psnr is None:
+            return absorbed, psnr
+        if best is None or abs(psnr - goal) < abs((best[1] or 0.0) - goal):
+            best = absorbed, psnr
+        if abs(psnr - goal) <= CLOSE:
+            break
+        gone = 1.0 - len(absorbed.splats) / len(splats)
+        offset = psnr - curve.at(gone, absorb=True)
+    assert best is not None  # noqa: S101 - every try gives one
+    return best
 
 
 def _scores_of(
@@ -226,10 +380,20 @@ def _scores_of(
     if task.absorb and not task.budget.needs_scores:
         # The number of survivors does not depend on scores, so the scores for absorbing are enough.
         known = _score_once(splats, views, task.settings, progress, threads)
+        if task.budget.psnr is not None:
+            known = with_quality(known[0], threads=threads), known[1]
         return known[0], known
     # `select` checks this too, but only after the work.
     task.budget.refuse_meaningless(task.settings.method, frustum=task.settings.frustum)
-    return score(splats, views, task.settings, progress=progress, threads=threads), None
+    scores = score(
+        splats,
+        views,
+        task.settings,
+        quality=task.budget.psnr is not None,
+        progress=progress,
+        threads=threads,
+    )
+    return scores, None
 
 
 def _score_once(
@@ -290,12 +454,18 @@ def absorb_removed(  # noqa: PLR0913 - as `prune`
     # The deleted splats hid almost nothing, so the first stage need not measure again.
     at_first = [ViewSums(measured.contribution[rest], measured.error[rest])]
     del known, scores, measured
+    turns = itertools.count()
 
-    def measure(now: Splats, ahead: Progress) -> ViewSums:
-        if at_first:
+    def measure(now: Splats, expected: ViewSums | None, ahead: Progress) -> ViewSums:
+        if expected is None:
             return at_first.pop()
-        found = occlusion.measure(now, used, settings.occlusion, progress=ahead, threads=threads)
-        return ViewSums(found.contribution, found.error)
+        found, share = occlusion.measure_part(
+            now, used, settings.occlusion, next(turns), PARTS, progress=ahead, threads=threads
+        )
+        return ViewSums(
+            found.contribution + (1.0 - share) * expected.contribution,
+            found.error + (1.0 - share) * expected.error,
+        )
 
     with np.errstate(under="ignore"):  # as in `score`
         absorbed = absorbing.absorb(

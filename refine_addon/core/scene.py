@@ -132,6 +132,19 @@ def _principal_axes(
         weighted = place * nearness[:, None]
         second += weighted.T @ place
         first += weighted.sum(axis=0)
+    return principal_axes(second, first)
+
+
+def principal_axes(second: NDArray[np.float64], first: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the axes of a cloud as the rows of a rotation, the least variance first.
+
+    Parameters
+    ----------
+    second : (3, 3) float64
+        Weighted sum over the cloud of the products of coordinates.
+    first : (3,) float64
+        Weighted sum of the coordinates: axes point to where there are more.
+    """
     _, vectors = np.linalg.eigh(second)  # in columns
     axes = (vectors * np.where(first @ vectors < 0.0, -1.0, 1.0)).T
     if np.linalg.det(axes) < 0.0:

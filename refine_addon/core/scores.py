@@ -10,6 +10,9 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from .quality import Quality
+    from .scoring.sight_lines import SightLines
+
 _DISTINCT = 1 << 24
 """Largest number of equal steps from 0 to 1 that are distinct in float32."""
 
@@ -39,6 +42,10 @@ class Scores:
         counts for every splat.
     views_given : int
         How many views were given; those used were chosen from them.
+    sights : SightLines, optional
+        What the views' lines of sight meet, from which any choice of splats can be judged.
+    quality : Quality, optional
+        How close the pictures stay with ever more splats removed in the order of these scores.
     """
 
     values: NDArray[np.float32]
@@ -50,6 +57,8 @@ class Scores:
     method: str = ""
     frustum: bool = True
     views_given: int = 0
+    sights: SightLines | None = None
+    quality: Quality | None = None
 
 
 def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:

@@ -10,12 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .errors import RefineError
+from .quality import PSNR_CAP
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
+    from .quality import Quality
     from .scores import Scores
 
     RowBytes = float | NDArray[np.int64]
@@ -37,6 +39,9 @@ class Budget:
         Splats with a lower score are removed.
     min_seen : float, optional
         Splats that lie in fewer than this percentage of the views are removed.
+    psnr : float, optional
+        As many splats are removed as the pictures of the views allow: their estimated PSNR against
+        those of the unpruned splats stays at least this, dB; see `quality`.
 
     Examples
     --------
@@ -49,6 +54,7 @@ class Budget:
     max_mb: float | None = None
     threshold: float | None = None
     min_seen: float | None = None
+    psnr: float | None = None
 
     def __post_init__(self) -> None:
         """Check that exactly one value is given, and that it is in range.
@@ -60,7 +66,8 @@ class Budget:
         """
         given = [item.name for item in fields(self) if getattr(self, item.name) is not None]
         if len(given) != 1:
-            msg = f"expected one of ratio, keep, max_mb, threshold, min_seen, got {given or 'none'}"
+            names = ", ".join(item.name for item in fields(self))
+            msg = f"expected one of {names}, got {given or 'none'}"
             raise RefineError(msg)
         value = getattr(self, given[0])
         # Functions, so that only the check of the given value runs.
@@ -70,6 +77,7 @@ class Budget:
             "max_mb": ("a positive number", lambda: 0 < value < math.inf),
             "threshold": ("a number", lambda: -math.inf < value < math.inf),
             "min_seen": ("a percentage, 0 to 100", lambda: 0 <= value <= 100),  # noqa: PLR2004
+            "psnr": (f"more than 0 and less than {PSNR_CAP:g} dB", lambda: 0 < value < PSNR_CAP),
         }
         expected, holds = checks[given[0]]
         if not holds():
@@ -83,7 +91,7 @@ class Budget:
 
     @property
     def needs_scores(self) -> bool:
-        """Whether the number of splats that are removed depends on their scores."""
+        """Whether the number of splats that are removed depends on the scores of a method."""
         return self.threshold is not None or self.min_seen is not None
 
     def refuse_meaningless(self, method: str, *, frustum: bool = True) -> None:
@@ -181,14 +189,16 @@ def select(
     Raises
     ------
     RefineError
-        If the budget has no meaning for these scores (`Budget.refuse_meaningless`), or if no splat
-        would be left.
+        If the budget has no meaning for these scores (`Budget.refuse_meaningless`), if it is a PSNR
+        and the scores have no estimate of it, or if no splat would be left.
     """
     budget.refuse_meaningless(scores.method, frustum=scores.frustum)
     values = scores.values
     keep = np.ones(len(values), np.bool_)  # (N,), as `free`
     free = np.ones(len(values), np.bool_) if protected is None else ~protected
     removals = budget.removals(len(values), row_bytes, fixed_bytes)
+    if budget.psnr is not None:
+        removals = math.floor(quality_of(scores).share(budget.psnr) * len(values))
     if budget.threshold is not None:
         keep[free & (values < budget.threshold)] = False
     elif budget.min_seen is not None:
@@ -203,6 +213,23 @@ def select(
         msg = f"{budget.kind} would remove all {len(values)} splats; nothing was removed"
         raise RefineError(msg)
     return keep
+
+
+def quality_of(scores: Scores) -> Quality:
+    """Return the curve of the estimated PSNR.
+
+    Raises
+    ------
+    RefineError
+        If the scores have none.
+    """
+    if scores.quality is None:
+        msg = (
+            "these scores have no estimate of the pictures' quality: score again with a PSNR as "
+            "budget, or choose another budget where the views see too little"
+        )
+        raise RefineError(msg)
+    return scores.quality
 
 
 def _remove_lowest(

@@ -69,6 +69,14 @@ class Settings:
         """Whether `Scores.seen` counts only views in whose frustum a splat lies; see `Scores`."""
         return self.method != "closed-form" or self.closed_form.frustum
 
+    @property
+    def estimates(self) -> bool:
+        """Whether scores by this method always estimate how close the pictures stay.
+
+        The closed form only does where it is asked to, since that takes longer than scoring.
+        """
+        return self.method != "closed-form"
+
 
 DEFAULTS = Settings()
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.errors import RefineError
+from ..core.quality import Quality
 from ..core.scores import Scores
 from ..core.selection import rank
 from . import attributes as mesh_attributes
@@ -73,6 +74,7 @@ def store(
             "undrawable": scores.undrawable,
             "weights": scores.facts,
             "notes": scores.notes,
+            "quality": scores.quality.facts() if scores.quality else None,
             "origin": origin,
         }
     )
@@ -114,6 +116,8 @@ def stored_scores(checked: SplatObject) -> Scores:
             f"{max(unscored, 0)} of them without a score; score it again"
         )
         raise RefineError(msg)
+    # The curve is that of all splats that were scored.
+    whole = len(values) == noted["splats"]
     return Scores(
         values=values,
         seen=mesh_attributes.read_attribute(mesh, SEEN),
@@ -124,4 +128,5 @@ def stored_scores(checked: SplatObject) -> Scores:
         method=noted.get("method", ""),
         frustum=noted.get("frustum", True),
         views_given=noted["views_given"],
+        quality=Quality.from_facts(noted.get("quality")) if whole else None,
     )

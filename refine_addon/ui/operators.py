@@ -16,6 +16,7 @@ from bpy_extras.io_utils import ExportHelper
 from .. import splat_object
 from ..cameras.sets import views_from_scene
 from ..core import pipeline
+from ..core.quality import in_words
 from ..core.report import scoring_notes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
@@ -81,6 +82,7 @@ class _Scoring:
     splats: Splats
     views: ViewSet
     settings: Settings
+    quality: bool
     origin: dict[str, Any]
 
 
@@ -96,13 +98,17 @@ class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
         """Gather splats, views and settings."""
         settings, views = context.scene.refine.to_settings(), _views(context)
         mesh_edit.check_writable(checked.obj)
-        splats = splat_object.gather(checked)
-        return _Scoring(splats, views, settings, staleness.origin(context, checked.obj))
+        quality = settings.estimates or context.scene.refine.budget == "psnr"
+        splats = splat_object.gather(checked, whole=None if quality else False)
+        origin = staleness.origin(context, checked.obj)
+        return _Scoring(splats, views, settings, quality, origin)
 
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> Scores:
         """Score."""
-        return pipeline.score(job.splats, job.views, job.settings, progress=progress)
+        return pipeline.score(
+            job.splats, job.views, job.settings, quality=job.quality, progress=progress
+        )
 
     def finish(
         self, context: bpy.types.Context, checked: SplatObject, job: _Scoring, scores: Scores
@@ -175,10 +181,12 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
             changed = []  # nothing went by the scores
         done = splat_object.apply_object(checked, result)
         plans.forget(checked.mesh)
+        psnr = result.report["estimated_psnr"]
         self.report(
             {"INFO"},
             f"Kept {done.kept:,} splats, removed {done.removed:,}: "
-            f"{done.bytes_before / 1e6:,.1f} -> {done.bytes_after / 1e6:,.1f} MB",
+            f"{done.bytes_before / 1e6:,.1f} -> {done.bytes_after / 1e6:,.1f} MB"
+            + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
         if result.absorbed:
             self.report({"WARNING"}, result.absorbed.note())

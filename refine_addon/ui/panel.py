@@ -120,9 +120,6 @@ class REFINE_PT_advanced(_InSidebar, bpy.types.Panel):
         column = layout.column()
         column.enabled = not settings.published
         column.prop(settings, "frustum")
-        row = column.row()
-        row.enabled = settings.frustum
-        row.prop(settings, "margin")
 
 
 class REFINE_PT_preview(_InSidebar, bpy.types.Panel):

@@ -37,6 +37,7 @@ BUDGETS = (
     ("max_mb", "File Size", "Keep as many splats as fit in a file of this size"),
     ("threshold", "Score", "Remove splats that score below this"),
     ("min_seen", "Views", "Remove splats that lie in fewer than this share of the views"),
+    ("psnr", "Quality", "Remove as many splats as leave the pictures this close to the unpruned"),
 )
 """Kinds of budget, by the names that core gives them."""
 
@@ -98,15 +99,8 @@ class RefineSettings(bpy.types.PropertyGroup):
     )
     frustum: BoolProperty(
         name="Only in Frame",
-        description="Count a view only for the splats that lie in its frame",
+        description="Count a view only for the splats that lie in its frame or reach into it",
         default=True,
-    )
-    margin: FloatProperty(
-        name="Margin",
-        description="How far beyond the edge of the image still counts, in half image sizes",
-        default=0.15,
-        min=0.0,
-        soft_max=1.0,
     )
     views: IntProperty(
         name="Views",
@@ -176,6 +170,15 @@ class RefineSettings(bpy.types.PropertyGroup):
         max=100.0,
         update=_plan_again,
     )
+    psnr: FloatProperty(
+        name="PSNR",
+        description="How close the pictures of the cameras stay to those of all splats, in dB: 40 "
+        "is hard to tell apart, 30 is seen",
+        default=40.0,
+        min=1.0,
+        max=99.0,
+        update=_plan_again,
+    )
     absorb: BoolProperty(
         name="Absorb",
         description="Survivors take over what is removed, by what the cameras see of it: far "
@@ -200,7 +203,7 @@ class RefineSettings(bpy.types.PropertyGroup):
         if self.published:
             form = ClosedForm.published(self.depth)
         else:
-            form = ClosedForm(self.depth, frustum=self.frustum, margin=decimal(self.margin))
+            form = ClosedForm(self.depth, frustum=self.frustum)
         return Settings(self.method, self.views, form, tolerance=decimal(self.tolerance))
 
     def to_budget(self) -> Budget:

@@ -63,7 +63,7 @@ def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(addon, 
 @pytest.mark.parametrize(
     ("kind", "value"),
     [("ratio", 0.29), ("ratio", 0.7), ("keep", 1234), ("max_mb", 2.5), ("threshold", 0.1),
-     ("min_seen", 20.0), ("ratio", 0.0)],
+     ("min_seen", 20.0), ("ratio", 0.0), ("psnr", 38.5)],
 )  # fmt: skip
 def test_every_budget_keeps_the_rows_that_core_keeps(addon, room, room_cameras, kind, value):  # noqa: ARG001
     """Blender stores 0.29 as 0.28999999165534973; floor(.29 * 39755) must still go."""
@@ -92,9 +92,9 @@ def test_settings_reach_core_as_they_were_typed(addon):
     assert settings.to_settings() == core.Settings()
     assert settings.to_budget() == core.Budget(ratio=0.5)
 
-    settings.depth, settings.views, settings.margin = "distance", 7, 0.3
+    settings.depth, settings.views, settings.frustum = "distance", 7, False
     assert settings.to_settings() == core.Settings(
-        views=7, closed_form=core.ClosedForm("distance", margin=0.3)
+        views=7, closed_form=core.ClosedForm("distance", frustum=False)
     )
 
     settings.published = True

@@ -133,16 +133,16 @@ def test_while_scoring_a_bar_takes_the_place_of_the_button(draw, room):  # noqa:
 
 @pytest.mark.parametrize(
     ("method", "expected"),
-    [("closed-form", {"views", "depth", "published", "frustum", "margin"}),
+    [("closed-form", {"views", "depth", "published", "frustum"}),
      ("occlusion", {"views"}),
-     ("auto", {"views", "depth", "published", "frustum", "margin", "tolerance"})],
+     ("auto", {"views", "depth", "published", "frustum", "tolerance"})],
 )  # fmt: skip
 def test_only_settings_that_the_method_looks_at_are_drawn(draw, method, expected):
     """Occlusion has none in the panel but the number of views."""
     bpy.context.scene.refine.method = method
     drawn = draw()
 
-    every = {"views", "depth", "published", "frustum", "margin", "tolerance"}
+    every = {"views", "depth", "published", "frustum", "tolerance"}
     assert every & set(drawn) == expected
 
 
@@ -154,3 +154,18 @@ def test_every_source_of_cameras_is_drawn(draw, source):
 
     assert ("25 frames" in drawn) == (source == "FRAMES")
     assert ("collection" in drawn) == (source == "COLLECTION")
+
+
+def test_the_quality_of_the_pictures_is_a_budget(draw, addon, room, room_cameras):  # noqa: ARG001
+    """Its own number is drawn; scores made without an estimate say what to do."""
+    settings = bpy.context.scene.refine
+    bpy.ops.refine.score()
+    settings.budget = "psnr"
+
+    assert "psnr" in draw()
+    assert any("score again with a PSNR as budget" in text for text in draw())
+
+    bpy.ops.refine.score()
+    stored = addon.mesh.scores.stored_scores(addon.mesh.layout.check(room))
+    assert stored.quality is not None
+    assert any(text.startswith("Stay: ") for text in draw())

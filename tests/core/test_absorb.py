@@ -85,7 +85,7 @@ def around(count=4, distance=6.0, matrix=None):
     return ViewSet(tuple(views))
 
 
-def measure(splats, _progress=None):
+def measure(splats, _expected=None, _progress=None):
     """Stand in for what renders: alpha times the geometric-mean area, no occlusion, one contrast.
 
     Of no unit: the pixels of the views do not change with the scene's scale.
@@ -306,7 +306,7 @@ def three_of_five(order=(0, 1, 2, 3, 4)):
     splats.sh_rest[:] = np.arange(5)[:, None, None] * 0.1
     splats = splats.take(np.array(order))
     contribution = np.array([1.0, 2, 5, 9, 9])[list(order)]
-    return splats, lambda _splats, _progress: ViewSums(contribution, contribution * 0.005)
+    return splats, lambda *_: ViewSums(contribution, contribution * 0.005)
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3, 4), (2, 4, 1, 0, 3), (1, 3, 2, 0, 4)])
@@ -343,14 +343,40 @@ def test_each_stage_leaves_three_fifths_and_is_measured_anew():
     """From 500 to 50: what hides what has changed by then."""
     sizes = []
 
-    def counting(splats, progress):
+    def counting(splats, _expected, _progress):
         sizes.append(len(splats))
-        return measure(splats, progress)
+        return measure(splats)
 
     absorb(cloud(500), around(), counting, 50)
 
     assert sizes[0] == 500
     assert all(after >= 0.6 * before - 1 for before, after in itertools.pairwise([*sizes, 50]))
+
+
+def test_later_stages_know_what_the_sums_before_let_expect():
+    """What a survivor is expected to contribute is what all that it stands for contributed.
+
+    But for the allowance, a share of at most 1 / (1 + 12 views), and for what was deleted. Splats
+    that did not change expect what was measured of them, to the bit.
+    """
+    told = []
+
+    def listening(splats, expected, _progress):
+        told.append((splats, measure(splats), expected))
+        return told[-1][1]
+
+    absorb(cloud(500), around(), listening, 200)
+
+    (before, first, none), (after, _, expected) = told[:2]
+    assert none is None
+    assert len(expected.contribution) == len(expected.error) == len(after.means)
+    assert 0.8 < expected.contribution.sum() / first.contribution.sum() < 1.1
+    same = {tuple(mean): row for row, mean in enumerate(before.means)}
+    kept = [(row, same[tuple(mean)]) for row, mean in enumerate(after.means) if tuple(mean) in same]
+    assert 0 < len(kept) < len(after.means)
+    rows, origins = np.array(kept).T
+    np.testing.assert_array_equal(expected.contribution[rows], first.contribution[origins])
+    np.testing.assert_array_equal(expected.error[rows], first.error[origins])
 
 
 def test_protected_splats_stay_though_nobody_sees_them_or_can_draw_them():
@@ -360,8 +386,8 @@ def test_protected_splats_stay_though_nobody_sees_them_or_can_draw_them():
     protected = np.zeros(100, bool)
     protected[[5, 50, 51]] = True
 
-    def partly(left, progress):
-        seen = measure(left, progress)
+    def partly(left, _expected, _progress):
+        seen = measure(left)
         seen.contribution[~np.isin(np.arange(len(left)), range(20, 45))] = 0.0
         seen.error[:] = 0.0
         return seen
@@ -486,7 +512,7 @@ def test_where_nothing_is_seen_absorbing_is_deleting_the_lowest_errors():
     error = np.random.default_rng(5).permutation(200).astype(float)
     table = {tuple(mean): value for mean, value in zip(splats.means, error, strict=True)}
 
-    def unseen(left, _progress):
+    def unseen(left, _expected, _progress):
         return ViewSums(np.zeros(len(left)), np.array([table[tuple(mean)] for mean in left.means]))
 
     result = absorb(splats, around(), unseen, 120)
@@ -534,7 +560,7 @@ def test_no_merge_is_carried_out_that_costs_more_than_deleting():
 
     (into, gone, _), *_ = graph.merges
     assert len(into)
-    costs = 2.0 * merging.costs(before, into, gone)
+    costs = 2.0 * merging.costs(before, into, gone, np.inf)
     assert (costs < np.minimum(before.error[into], before.error[gone])).all()
 
 
@@ -544,7 +570,7 @@ def cheapest_first(field, patience, goal):
     while len(alive) > goal:
         operations = [(field.error[row], row, None) for row in alive]
         for pair in itertools.combinations(alive, 2):
-            cost = patience * merging.costs(field, *(np.array([row]) for row in pair))[0]
+            cost = patience * merging.costs(field, *(np.array([row]) for row in pair), np.inf)[0]
             operations.append((cost, *pair))
         _, one, other = min(operations, key=lambda operation: operation[0])
         if other is None:
@@ -664,7 +690,7 @@ def test_undrawable_splats_go_first():
     splats.means[7] = np.nan
     splats.log_scales[11] = np.inf
 
-    def careful(left, _progress):
+    def careful(left, _expected, _progress):
         seen = measure(left)
         return ViewSums(*(np.nan_to_num(values, nan=0.0, posinf=0.0) for values in seen))
 
@@ -748,7 +774,7 @@ def test_extreme_splats_raise_no_warning_and_stay_drawable():
     splats.means[100:110] = 1e15
     splats.quaternions[::7] = 0.0
 
-    def wild(left, _progress):
+    def wild(left, _expected, _progress):
         return ViewSums(
             np.exp(np.linspace(-300, 300, len(left))), np.exp(np.linspace(300, -300, len(left)))
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core import ClosedForm, RefineError, Splats, View, ViewSet
+from refine_addon.core.scene import principal_axes
 from refine_addon.core.scoring import closed_form
 
 READINGS = [
@@ -20,7 +22,8 @@ READINGS = [
     ClosedForm.published("z"),
     ClosedForm.published("distance"),
     ClosedForm(frustum=False),
-    ClosedForm(margin=0.0, eta=2.0),
+    ClosedForm(local=False),
+    ClosedForm("distance", local=False, eta=2.0),
     ClosedForm(visibility=False),
     ClosedForm(projection=False),
     ClosedForm(equal_weights=True),
@@ -110,23 +113,25 @@ def reference(splats: Splats, views: ViewSet, settings: ClosedForm) -> np.ndarra
             ratios.append(min(s[2] / s[0], 1e6))
         else:
             ratios.append(s[2] / (s[0] + settings.anisotropy_offset))
-        weight, seen = 0.0, 0
+        weight = 0.0
         for w, view in zip(weights, views, strict=True):
             x, y, z = view.rotation @ (means[i] - view.center)
+            share, across = 1.0, z
             if settings.frustum:
                 near = view.near if view.near > 0 else 0.01 * size
-                half_x = view.width / 2 * (1 + settings.margin)
-                half_y = view.height / 2 * (1 + settings.margin)
                 if not (near <= z <= view.far):
                     continue
-                if abs(view.fx * x / z + view.cx - view.width / 2) > half_x:
+                half_x, half_y = view.width / 2, view.height / 2
+                edge_x = abs(view.fx * x + (view.cx - half_x) * z) / half_x
+                edge_y = abs(view.fy * y + (view.cy - half_y) * z) / half_y
+                across = max(edge_x, edge_y, z)
+                steepness = math.sqrt(1 + view.fx * view.fy / (half_x * half_y))
+                share = 1 - (across - z) / (2 * s[2] * steepness)
+                if share <= 0:
                     continue
-                if abs(view.fy * y / z + view.cy - view.height / 2) > half_y:
-                    continue
-            seen += 1
-            d2 = z * z if settings.depth == "z" else x * x + y * y + z * z
-            weight += w / (d2 + eta) if settings.projection else w
-        if settings.frustum and not seen:
+            d2 = across * across if settings.depth == "z" else x * x + y * y + z * z
+            weight += w * share / (d2 + eta) if settings.projection else w * share
+        if weight == 0:
             weight = 1e-6 / (squared[i] + eta) if settings.projection else 1e-6
         if settings.visibility:
             weight *= alpha[i]
@@ -139,7 +144,28 @@ def reference(splats: Splats, views: ViewSet, settings: ClosedForm) -> np.ndarra
         ]
     )
     lambdas = np.full(3, 1 / 3) if settings.equal_weights else raw / raw.sum()
-    return lambdas @ (terms / terms.mean(axis=1, keepdims=True))
+    scores = lambdas @ (terms / terms.mean(axis=1, keepdims=True))
+    if not settings.local:
+        return scores
+    offset = means - middle
+    weighted = offset / np.array(squared)[:, None]
+    axes = principal_axes(weighted.T @ offset, weighted.sum(axis=0))
+    return beside_their_neighbours(scores, offset @ axes.T / size)
+
+
+def beside_their_neighbours(scores, place) -> np.ndarray:
+    """Divide each score by a power of the mean in its cell, of 64 along each axis of a ball."""
+    ball = place / (1 + np.linalg.norm(place, axis=1, keepdims=True))
+    cells = defaultdict(list)
+    for i, cell in enumerate(np.floor((ball + 1) * 32).astype(int)):
+        cells[tuple(cell)].append(i)
+    overall, changed = scores.mean(), scores.copy()
+    for members in cells.values():
+        mean = scores[members].mean() / overall
+        for i in members:
+            weight = scores[i] / (scores[i] + 0.05 * overall)
+            changed[i] = scores[i] / mean ** (weight / 2)
+    return changed
 
 
 @pytest.mark.parametrize("settings", READINGS)
@@ -195,13 +221,76 @@ def test_both_published_readings_give_the_numbers_worked_out_by_hand(depth, eta,
 
 
 def test_only_splats_inside_the_frustum_are_seen():
-    """A 90 degree view of margin 0.15 sees |x| <= 1.15 z; near is .01 of the size of the scene."""
-    places = [[0, 0, 2], [2.29, 0, 2], [2.31, 0, 2], [0, -2.31, 2], [0, 0, -2], [0, 0, 0.001]]
+    """A 90 degree view sees the centres with |x| <= z; near is .01 of the size of the scene.
+
+    Of scale 1 each, all reach into the image: that is no part of being seen.
+    """
+    places = [[0, 0, 2], [2, 0, 2], [2.01, 0, 2], [0, -2.01, 2], [0, 0, -2], [0, 0, 0.001]]
     splats = splats_of(places, 0.0, 0.0)
 
-    scores = closed_form.score(splats, ViewSet((view_at(),)), ClosedForm(margin=0.15))
+    scores = closed_form.score(splats, ViewSet((view_at(),)))
 
     assert scores.seen.tolist() == [1, 1, 0, 0, 0, 0]
+
+
+def test_a_splat_counts_by_the_share_that_lies_inside_of_its_two_standard_deviations():
+    """A 90 degree view, splats at depth 2 and x = 2, 3, 4, 5 whose longest axis is s.
+
+    The side of the frustum is the plane x = z, which lies (x - z) / sqrt(2) away: with s =
+    sqrt(2) / 2, twice which is sqrt(2), a splat with x - z = 1 is half outside of its reach and
+    one with x - z = 2 just out of it. H is share / max(x, z)^2, eta being next to nothing, so
+    1/4 and (1/2) / 9. Those out of reach have the millionth of what no view sees.
+    """
+    places = [[x, 0, 2] for x in (2, 3, 4, 5)]
+    splats = splats_of(places, 0.0, np.log([0.1, np.sqrt(0.5), 0.1]))
+    only = ClosedForm(eta=1e-12, local=False, equal_weights=True)
+
+    values = closed_form.score(splats, ViewSet((view_at(),)), only).values
+
+    assert values[1] / values[0] == pytest.approx((1 / 2 / 9) / (1 / 4), rel=1e-5)
+    assert (values[2:] < 1e-5 * values[1]).all()
+
+
+def test_a_splat_around_the_camera_does_not_outshine_what_is_in_the_image():
+    """A wide splat whose centre lies just before the camera, far to the side of the image.
+
+    Its depth of .05 alone would give it 1 / .05^2 = 400; where the image is wide enough to show its
+    centre, the depth is 3, so that at most 1 / 9 remains of it.
+    """
+    splats = splats_of([[0, 0, 3], [3, 0, 0.05]], 0.0, np.log([1.0, 4.0, 1.0]))
+    only = ClosedForm(eta=1e-12, local=False)
+
+    values = closed_form.score(splats, ViewSet((view_at(near=0.01),)), only).values
+
+    assert 0.0 < values[1] < values[0]
+
+
+def crowd() -> tuple[Splats, ViewSet]:
+    """Return 50 splats close together, each as good as the next, and one alone, half as opaque.
+
+    All are at the same depth, of the same size and colour.
+    """
+    rng = np.random.default_rng(2)
+    means = np.column_stack([rng.uniform(0.1, 0.11, (50, 2)), np.full(50, 2.0)])
+    alphas = np.append(np.full(50, 0.6), 0.5)
+    logits = np.log(alphas / (1 - alphas))
+    splats = splats_of(np.vstack([means, [[-1.0, -1.0, 2.0]]]), logits, -5.0)
+    return splats, ViewSet((view_at(),))
+
+
+def test_a_splat_alone_gains_on_those_of_a_crowd():
+    """Scores a bit below the mean of all stand out less where those around are as low.
+
+    Of 50 equal ones the mean is their own score d, and alone it is the splat's own, e. So the
+    scores become d^(1 - w/2) and e^(1 - w/2) with w near 1, and e / d comes nearer to 1.
+    """
+    splats, views = crowd()
+
+    plain = closed_form.score(splats, views, ClosedForm(local=False)).values
+    values = closed_form.score(splats, views).values
+
+    assert plain[50] < 0.9 * plain[:50].min()
+    assert values[50] / values[:50].min() > (plain[50] / plain[:50].min()) ** 0.6
 
 
 def test_near_and_far_of_the_view_are_honoured():
@@ -323,7 +412,7 @@ def test_no_splats_are_refused_with_a_sentence():
 
 @pytest.mark.parametrize(
     "changes",
-    [{"depth": "x"}, {"eta": 0.0}, {"eta": math.nan}, {"anisotropy_offset": -1.0}, {"margin": -1}],
+    [{"depth": "x"}, {"eta": 0.0}, {"eta": math.nan}, {"anisotropy_offset": -1.0}],
 )
 def test_settings_that_cannot_be_are_refused(changes):
     """Each message names the setting."""

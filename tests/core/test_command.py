@@ -83,6 +83,7 @@ def contents(folder: Path) -> dict[Path, bytes]:
         (["--max-mb", ".004"], Budget(max_mb=0.004), Settings()),
         (["--threshold", "0.8"], Budget(threshold=0.8), Settings()),
         (["--min-seen", "70"], Budget(min_seen=70), Settings()),
+        (["--psnr", "30"], Budget(psnr=30), Settings()),
         (["--views", "2"], Budget(ratio=0.5), Settings(views=2)),
         (["--views", "0"], Budget(ratio=0.5), Settings(views=0)),
         (["--method", "closed-form"], Budget(ratio=0.5), Settings()),
@@ -356,6 +357,33 @@ def test_the_summary_says_what_went_and_where_it_is(capsys):
     assert said.err == ""
 
 
+@pytest.mark.usefixtures("folder")
+def test_the_summary_says_how_close_the_pictures_stay(capsys):
+    """As the report does, in whole decibels; and what absorbing would reach, or did."""
+    for options, pattern in (
+        (
+            ["--method", "occlusion"],
+            r"  quality: about \d+ dB in these views; with --absorb about ",
+        ),
+        (["--absorb"], r"  quality: about \d+ dB in these views$"),
+        (["--method", "occlusion", "--ratio", "0"], r"  quality: more than 60 dB in these views$"),
+    ):
+        assert command.main([*PRUNE, "-o", "out.ply", "--overwrite", *options]) == 0
+
+        assert re.search(pattern, capsys.readouterr().out, re.MULTILINE)
+
+
+def test_a_psnr_is_kept_by_every_method(folder):
+    """By the estimate in the report, to the next of 60 splats; the closed form makes one too."""
+    for options in ([], ["--method", "occlusion"]):
+        arguments = [*PRUNE, "-o", "out.ply", "--overwrite", "--report", "r.json", *options]
+        assert command.main([*arguments, "--psnr", "30"]) == 0
+
+        (entry,) = json.loads((folder / "r.json").read_text())["results"]
+        assert entry["budget"] == {"psnr": 30.0}
+        assert entry["estimated_psnr"] == pytest.approx(30.0, abs=2.0)
+
+
 @pytest.mark.parametrize(
     "arguments", [[*PRUNE, "-o", "out.ply"], [*SCORE, "-o", "out.ply"], ["info", "in.ply"]]
 )
@@ -419,6 +447,8 @@ USAGE = {
     "no megabytes": [*PRUNE, "-o", "out.ply", "--max-mb", "0"],
     "endless megabytes": [*PRUNE, "-o", "out.ply", "--max-mb", "inf"],
     "endless threshold": [*PRUNE, "-o", "out.ply", "--threshold", "inf"],
+    "equal pictures": [*PRUNE, "-o", "out.ply", "--psnr", "100"],
+    "no pictures": [*PRUNE, "-o", "out.ply", "--psnr", "0"],
     "seen by too many": [*PRUNE, "-o", "out.ply", "--min-seen", "101"],
     "a score of any method": [*PRUNE, "-o", "out.ply", "--method", "auto", "--threshold", "1"],
     "a count of all views": [*PRUNE, "-o", "out.ply", "--published", "--min-seen", "5"],

@@ -284,6 +284,17 @@ def handlers() -> list[object]:
     return [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
 
 
+@pytest.fixture
+def _none_ignored():
+    """Ignore no signal: ``nohup make test`` does, and what is ignored is not listened to."""
+    before = {n: signal.signal(n, signal.SIG_DFL) for n in (signal.SIGTERM, signal.SIGHUP)}
+    before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.mark.usefixtures("_none_ignored")
 @pytest.mark.parametrize("outcome", [0, KeyboardInterrupt(), ValueError("a fault of ours")])
 def test_whoever_listened_before_listens_afterwards(monkeypatch, outcome):
     """Blender and the tests call the command among other things; a fault passes through."""

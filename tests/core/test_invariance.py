@@ -58,17 +58,21 @@ def room():
     return splats, read_cameras(ROOM / "cameras.json")
 
 
-def kept(splats, views, ratio, *, absorb):
+def kept(splats, views, ratio, *, absorb, method="occlusion"):
     if absorb:
         return prune(splats, views, Budget(ratio=ratio), absorb=True).keep
-    scores = prune(splats, views, Budget(ratio=ratio), Settings("occlusion")).scores
+    scores = prune(splats, views, Budget(ratio=ratio), Settings(method)).scores
     return np.stack([select(scores, Budget(ratio=share)) for share in (0.5, 0.9)])
 
 
-@pytest.fixture(scope="module", params=["occlusion", "absorb at 50 %", "absorb at 90 %"])
+@pytest.fixture(
+    scope="module", params=["closed-form", "occlusion", "absorb at 50 %", "absorb at 90 %"]
+)
 def how(request, room):
     """Return what decides, and the kept set of the scene as it is."""
     words = {"ratio": 0.9 if "90" in request.param else 0.5, "absorb": "absorb" in request.param}
+    if request.param == "closed-form":
+        words["method"] = "closed-form"
     return words, kept(*room, **words)
 
 

@@ -601,7 +601,7 @@ def square_of_views() -> ViewSet:
 
 
 def reference(splats: Splats, views: ViewSet, *, paper: bool) -> list:
-    """Evaluate the paper's reading, or the default one, in 50 digits."""
+    """Evaluate the paper's reading, or the default but for neighbourhoods, in 50 digits."""
     mpmath.mp.dps = 50
     real = mpmath.mpf
     middle = [real(0), real(0), real(-1)]  # of `square_of_views`
@@ -617,22 +617,22 @@ def reference(splats: Splats, views: ViewSet, *, paper: bool) -> list:
     near = real(0) if paper else real("0.01") * mpmath.sqrt(size2)
     terms, lumas, alphas, ratios = [], [], [], []
     for i, place in enumerate(places):
-        total, seen = real(0), 0
+        total = real(0)
+        s = sorted(mpmath.exp(real(float(x))) for x in splats.log_scales[i])
         for one in views:
             x, y, z = (a - real(float(b)) for a, b in zip(place, one.center, strict=True))
-            if not paper and (
-                z < near
-                or abs(real(one.fx) * x) > real("1.15") * one.width / 2 * z
-                or abs(real(one.fy) * y) > real("1.15") * one.height / 2 * z
-            ):
-                continue
-            seen += 1
-            total += 1 / (z * z + eta) / len(views)
-        if not seen:
+            share, across = 1, z
+            if not paper:
+                slopes = [real(one.fx) * 2 / one.width, real(one.fy) * 2 / one.height]
+                across = max(slopes[0] * abs(x), slopes[1] * abs(y), z)
+                share = 1 - (across - z) / (2 * s[2] * mpmath.sqrt(1 + slopes[0] * slopes[1]))
+                if z < near or share <= 0:
+                    continue
+            total += share / (across * across + eta) / len(views)
+        if not total:
             total = real("1e-6") / (squared[i] + eta)
         alpha = 1 / (1 + mpmath.exp(-real(float(splats.opacity_logits[i]))))
         weight = alpha * total
-        s = sorted(mpmath.exp(real(float(x))) for x in splats.log_scales[i])
         color = [
             min(max(real(float(c)) / (2 * mpmath.sqrt(mpmath.pi)) + real("0.5"), 0), 1)
             for c in splats.sh_dc[i]
@@ -670,7 +670,8 @@ def test_scores_equal_fifty_digits_over_the_range(spread, steep, reading):
     )
     views = square_of_views()
     expected = np.array([float(v) for v in reference(splats, views, paper=reading == "paper")])
-    settings = READINGS["paper"] if reading == "paper" else METHODS["closed form"]
+    default = Settings(closed_form=ClosedForm(local=False))
+    settings = READINGS["paper"] if reading == "paper" else default
 
     values = scored(splats, views, settings).values
 

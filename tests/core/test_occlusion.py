@@ -11,9 +11,11 @@ import pytest
 from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet, work
 from refine_addon.core.affine import transformed
 from refine_addon.core.scoring import coverage, froxels, measuring, occlusion, projection
-from refine_addon.core.scoring.measuring import Measured
+from refine_addon.core.scoring.measuring import Measured, Measuring
 from refine_addon.core.scoring.occlusion import Occlusion
+from refine_addon.core.scoring.sight_lines import SightLines
 from refine_addon.core.splats import SH_C0, rotation_matrices
+from refine_addon.core.work import silent
 
 ONCE = Occlusion(rounds=1)
 CUT = 1.0 / 255.0
@@ -74,7 +76,8 @@ def ring(count=5) -> ViewSet:
         forward = np.array([-math.cos(angle), -math.sin(angle), 0.0])
         down = np.array([0.0, 0.0, -1.0])
         rotation = np.stack([np.cross(down, forward), down, forward])
-        views.append(replace(look_along_z(), rotation=rotation, center=-5.0 * forward))
+        view = replace(look_along_z(), rotation=rotation, center=-5.0 * forward)
+        views.append(replace(view, name=f"{index:02}"))
     return ViewSet(tuple(views))
 
 
@@ -195,19 +198,18 @@ def test_what_has_the_colour_of_what_is_behind_it_has_no_error():
     assert other.error[-1] == pytest.approx(expected, rel=0.02)
 
 
-@pytest.mark.parametrize("side", [2.0, 4.0, 8.0])
-def test_transmittance_is_the_mean_of_exp_of_a_gamma_distributed_thickness(side):
-    """Numerically: exp(-tau) over many draws of mean 0, .5 and 3; shape 12 over the side.
+def test_transmittance_is_the_mean_of_exp_of_a_gamma_distributed_thickness():
+    """Numerically: exp(-tau) over many draws of mean 0, .5 and 3.
 
     What is even before it takes its exact share of that.
     """
-    shape = froxels.GAMMA_SHAPE / side
+    shape = froxels.GAMMA_SHAPE
     draws = np.random.default_rng(1).gamma(shape, size=400_000) / shape
     mean = np.array([0.0, 0.5, 3.0], np.float32)
     even = np.array([0.0, 0.5, 1.0], np.float32)
 
-    loose = froxels.transmittance(mean, np.zeros_like(mean), side * side)
-    partly = froxels.transmittance(mean + even, even, side * side)
+    loose = froxels.transmittance(mean, np.zeros_like(mean))
+    partly = froxels.transmittance(mean + even, even)
 
     np.testing.assert_allclose(loose, [np.exp(-m * draws).mean() for m in mean], atol=2e-3)
     np.testing.assert_allclose(partly, loose * np.exp(-even), rtol=1e-5)
@@ -318,7 +320,8 @@ def test_a_splat_covers_no_more_of_a_cell_than_its_opacity():
     alone = measured(front.take(slice(1, 2)), square(), settings=settings)
 
     even = (2.0**2 + 0.3) / (2.0**2 + 0.3 + 16.0)
-    passed = 2.0**-even * (1.0 + (1.0 - even) * math.log(2.0) / 3.0) ** -3
+    k = froxels.GAMMA_SHAPE
+    passed = 2.0**-even * (1.0 + (1.0 - even) * math.log(2.0) / k) ** -k
     assert found.contribution[1] / alone.contribution[0] == pytest.approx(passed, rel=1e-3)
 
 
@@ -466,6 +469,68 @@ def test_a_view_of_thrice_the_weight_counts_thrice():
         )
 
 
+def test_parts_of_the_views_take_turns_and_make_up_the_whole():
+    """Eleven views in eight blocks; one of weight 3 has 3 of 13. A fourth turn is the first."""
+    splats, views = cloud(), ring(11)
+    views = ViewSet((*views.views[:4], replace(views[4], weight=3.0), *views.views[5:]))
+
+    found = [occlusion.measure_part(splats, views, ONCE, turn, 3) for turn in range(4)]
+
+    whole = occlusion.measure(splats, views)
+    for name in ("contribution", "error", "seen"):
+        total = sum(getattr(part, name) for part, _ in found[:3])
+        np.testing.assert_allclose(total, getattr(whole, name), rtol=1e-12)
+        np.testing.assert_array_equal(getattr(found[3][0], name), getattr(found[0][0], name))
+    assert sum(share for _, share in found[:3]) == pytest.approx(1.0)
+    assert {round(share * 13) for _, share in found} <= {3, 4, 5, 6}
+    assert occlusion.measure_part(splats, ring(1), ONCE, 5, 3)[1] == 1.0
+
+
+def test_rounds_measure_blocks_of_views_in_turns(monkeypatch):
+    """At first all 8; then as many as .16 of that costs, in pairs.
+
+    Of 63, 40, 25, 16 and 10 % of the splats these are 2, 3.2, 5.1, 8 and 13 blocks.
+    """
+    asked = []
+
+    def blocks(self, *args, which=None, original=Measuring.blocks, **changes):
+        asked.append(which)
+        return original(self, *args, which=which, **changes)
+
+    monkeypatch.setattr(Measuring, "blocks", blocks)
+    occlusion.score(cloud(1000), ring(11), threads=1)
+
+    everything = list(range(8))
+    after = [sorted(which) for which in asked[1:]]
+    assert asked[0] is None
+    assert after == [[0, 1], [2, 3, 4, 5], [0, 1, 2, 3, 6, 7], everything, everything]
+
+
+def test_blocks_of_views_that_were_not_measured_again_are_raised():
+    """Eight times the same view: what one block has grown by, all have grown by.
+
+    A third of a cloud goes, which showed less of the rest.
+    """
+    splats = cloud(300)
+    views = ViewSet(tuple(replace(ring()[0], name=str(k)) for k in range(8)))
+    gaussians, scene, _ = projection.prepare(splats, views)
+    measuring_all = Measuring(scene, views, Occlusion(), 1)
+    sights = SightLines(measuring_all.views, gaussians, splats)
+    run = occlusion._Run(gaussians, measuring_all, 6, sights)
+    run._measure_first(np.ones(len(splats), np.float32), silent)
+    left = np.flatnonzero(np.arange(len(gaussians)) % 3 > 0)
+    run.blocks = [block.take(left) for block in run.blocks]
+    before = run.blocks[7].error.sum()
+
+    run._measure_again(gaussians.take(left), silent)
+
+    assert run.turn == 2
+    assert run.blocks[0].error.sum() > 1.05 * before
+    for name in ("contribution", "error"):
+        sums = [getattr(block, name).sum() for block in run.blocks]
+        np.testing.assert_allclose(sums, sums[0], rtol=1e-9)
+
+
 def test_two_rounds_order_nine_tenths_at_first_and_measure_the_last_tenth_anew():
     """That tenth is all that is left by then; what hid it has gone."""
     splats, views = cloud(), ring()
@@ -535,12 +600,13 @@ def test_the_floor_weighs_what_loses_least_of_what_the_left_out_views_saw():
     np.testing.assert_array_equal(np.sort(tenth), np.sort(np.argsort(right)[:20]))
     assert found[2:] == list(coverage.LEAST_FLOOR_WEIGHTS)[2:]
     most = coverage.floor_weights([(wrong, right, errors)])
-    assert min(most) == pytest.approx(max(coverage.FLOOR_WEIGHTS))
+    assert min(most[:2]) > 0.3
+    assert min(most[2:]) == pytest.approx(max(coverage.FLOOR_WEIGHTS))
     assert coverage.floor_weights([]) == [1.0] * len(coverage.SHARES)
     assert coverage.floor_weights([(right, wrong, dark)]) == [1.0] * len(coverage.SHARES)
     plain, glare = (np.vstack([errors, wrong * bright]) for bright in (1.0, 1e6))
-    assert coverage.floor_weights([(right, wrong, plain)]) == coverage.floor_weights(
-        [(right, wrong, glare)]
+    assert coverage.floor_weights([(right, wrong, plain)]) == pytest.approx(
+        coverage.floor_weights([(right, wrong, glare)])
     )
 
 
@@ -560,7 +626,8 @@ def test_each_share_has_the_weight_that_is_right_up_to_there():
     """Scores tell the tenth that is worth least apart, floors all others."""
     rng = np.random.default_rng(8)
     truth = rng.permutation(400) + 1.0
-    scores, floors = np.minimum(truth, 41.0), np.where(truth <= 40, 41.0, truth)
+    scores = np.where(truth <= 40, truth, rng.uniform(41.0, 400.0, 400))
+    floors = np.where(truth <= 40, 41.0, truth)
     errors = np.stack([truth * rng.uniform(0.9, 1.1, 400) for _ in range(4)])
 
     found = coverage.floor_weights([(scores, floors, errors)])
@@ -711,6 +778,26 @@ def test_cells_grow_until_the_points_of_a_view_fit_the_memory(monkeypatch):
 
     assert free == 4.0
     assert len(froxels.scatter(footprints, view, side, 3.2).owners) <= 2 * 20_000
+
+
+@pytest.mark.parametrize("scale", [1, 4, 16])
+@pytest.mark.parametrize("count", [100, 60_000])
+def test_cells_follow_the_footprints_not_the_pixels(count, scale):
+    """An image of 400 x 300 px has 7,500 cells of 4 px.
+
+    Those of 4 and 16 times the pixels a side have `FEW_CELLS` of them for 100 footprints, and a
+    quarter as many as footprints for 60,000.
+    """
+    sigmas = np.full((2, count), 1.0, np.float32)
+    footprints = projection.Footprints(
+        np.arange(count), sigmas, sigmas, sigmas, sigmas, np.ones(count, bool)
+    )
+    view = look_along_z(width=400 * scale, height=300 * scale)
+
+    side = froxels.cell_size(footprints, view, 4.0, 1.0)
+
+    cells = max(froxels.FEW_CELLS, count / froxels.FOOTPRINTS)
+    assert side == pytest.approx(max(4.0, 1.01 * math.sqrt(view.width * view.height / cells)))
 
 
 def test_a_view_of_many_splats_is_cancelled_within(monkeypatch):

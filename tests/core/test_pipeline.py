@@ -31,6 +31,7 @@ from refine_addon.core import (
     select,
 )
 from refine_addon.core.pipeline import decide
+from refine_addon.core.scene import principal_axes
 from refine_addon.core.scoring import froxels, projection
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
 from refine_addon.core.scoring.closed_form import LUMA
@@ -200,14 +201,19 @@ def in_doubles(splats: Splats, views: ViewSet) -> Scores:
     squared = np.sum((means - middle) ** 2, axis=1) + spread
     size = np.sqrt(np.median(squared))
     total, seen = np.zeros(len(means)), np.zeros(len(means), np.int32)
+    longest = np.exp(splats.log_scales.astype(np.float64).max(axis=1))
     for view, weight in zip(views, views.weights, strict=True):
         x, y, z = view.rotation @ (means - view.center).T
-        inside = (z >= (view.near or 0.01 * size)) & (z <= view.far)
-        inside &= np.abs(view.fx * x + (view.cx - view.width / 2) * z) <= 0.575 * view.width * z
-        inside &= np.abs(view.fy * y + (view.cy - view.height / 2) * z) <= 0.575 * view.height * z
-        total += np.where(inside, weight / (z * z + 0.005 * size * size), 0.0)
-        seen += inside
-    total = np.where(seen == 0, 1e-6 / (squared + 0.005 * size * size), total)
+        half_x, half_y = view.width / 2, view.height / 2
+        between = (z >= (view.near or 0.01 * size)) & (z <= view.far)
+        edge_x = np.abs(view.fx * x + (view.cx - half_x) * z) / half_x
+        edge_y = np.abs(view.fy * y + (view.cy - half_y) * z) / half_y
+        across = np.maximum(np.maximum(edge_x, edge_y), z)
+        steepness = np.sqrt(1 + view.fx * view.fy / (half_x * half_y))
+        share = np.clip(1 - (across - z) / (2 * longest * steepness), 0, 1) * between
+        total += weight * share / (across**2 + 0.005 * size * size)
+        seen += between & (across == z)
+    total = np.where(total == 0, 1e-6 / (squared + 0.005 * size * size), total)
     alpha = 1.0 / (1.0 + np.exp(-splats.opacity_logits.astype(np.float64)))
     low, middle_one, high = np.sort(splats.log_scales.astype(np.float64), axis=1).T
     luma = (0.28209479177387814 * splats.sh_dc.astype(np.float64) + 0.5).clip(0, 1) @ LUMA
@@ -222,6 +228,14 @@ def in_doubles(splats: Splats, views: ViewSet) -> Scores:
     for share, content in zip(factors, (np.exp(middle_one + high), luma**2, alpha**2), strict=True):
         term = alpha * total * content
         values += share * term / term.mean()
+    weighted = (means - middle) / squared[:, None]
+    axes = principal_axes(weighted.T @ (means - middle), weighted.sum(axis=0))
+    place = (means - middle) @ axes.T / size
+    ball = place / (1 + np.linalg.norm(place, axis=1, keepdims=True))
+    _, own = np.unique(np.floor((ball + 1) * 32).astype(int), axis=0, return_inverse=True)
+    own = own.ravel()
+    around = (np.bincount(own, values) / np.bincount(own))[own]
+    values *= (around / values.mean()) ** (-0.5 * values / (values + 0.05 * values.mean()))
     return Scores(values, seen, len(views), 0)
 
 

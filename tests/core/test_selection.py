@@ -221,6 +221,7 @@ NAN, INF = float("nan"), float("inf")
         ("max_mb", (0, -1, NAN, INF), "expected a positive number"),
         ("threshold", (NAN, INF, -INF), "expected a number"),
         ("min_seen", (-1, 100.5, NAN, INF), "expected a percentage, 0 to 100"),
+        ("psnr", (-1, 0, 100, NAN, INF), "expected more than 0 and less than 100 dB"),
     ],
 )
 def test_a_number_that_cannot_be_is_refused_with_its_name(name, values, expected):
@@ -231,7 +232,12 @@ def test_a_number_that_cannot_be_is_refused_with_its_name(name, values, expected
 
 
 def test_only_a_threshold_and_a_number_of_views_need_scores_to_count_what_goes():
-    """The others say a number: `removals` is one exactly where no scores are needed."""
+    """The others say a number: `removals` is one exactly where no scores are needed.
+
+    A PSNR depends on the pictures, and means the same whatever the method.
+    """
+    assert not Budget(psnr=40.0).needs_scores
+    assert Budget(psnr=40.0).removals(10, 248) is None
     for kind, value in (("ratio", 0.5), ("keep", 2), ("max_mb", 1.0), ("threshold", 0.1),
                         ("min_seen", 3.0)):  # fmt: skip
         budget = Budget(**{kind: value})

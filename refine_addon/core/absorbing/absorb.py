@@ -16,7 +16,7 @@ import numpy as np
 
 from ..scene import scene_of, spatial_order, splat_fingerprint
 from ..splats import Splats, drawable
-from ..work import Progress, part, report, silent
+from ..work import Progress, for_chunks, part, report, silent
 from . import merge_field, merging
 from .merge_field import ViewSums
 from .merge_graph import MergeGraph
@@ -30,11 +30,17 @@ if TYPE_CHECKING:
     from ..views import ViewSet
     from .merge_field import Array, Index
 
-Measure = Callable[[Splats, Progress], ViewSums]
-"""``measure(splats, progress)`` returns what the views see of each of the splats it is given."""
+Measure = Callable[[Splats, "ViewSums | None", Progress], ViewSums]
+"""``measure(splats, expected, progress)`` returns what the views see of each of these splats.
+
+`expected` is what they would see by the measuring before, if merging and deleting had not changed
+what is hidden; None before the first stage.
+"""
 
 STAGE = 0.6
 """A stage leaves at least this share of its splats."""
+
+_CHUNK = 1 << 14
 
 PATIENCE = 2.0
 """Factor on the cost of merging if half of the splats go; see `patience`."""
@@ -139,19 +145,22 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     spared = np.zeros(count, np.bool_) if protected is None else np.array(protected, np.bool_)
     goal = max(keep_count, int(np.count_nonzero(spared)), 0)
     # In float64, since merged splats merge again, and rounding between would depend on the frame.
-    splats = Splats(
-        **{name: np.asarray(values, np.float64) for name, values in vars(splats).items()}
-    )
+    columns = {}
+    for name, values in vars(splats).items():
+        report(progress, 0.0, "absorbing")
+        columns[name] = np.asarray(values, np.float64)
+    splats = Splats(**columns)
     scene = scene_of(splats.means, drawable(splats), views)
     # Of each splat left: its row among the N, and how many of the N it stands for.
     origin, members = np.arange(count), np.ones(count, np.int64)
     factor = patience(1.0 - goal / max(count, 1))
     stages = math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE)) if goal < count else 0
+    sums: ViewSums | None = None
     for stage in range(stages):
         ahead = part(progress, stage / stages, (stage + 1) / stages)
         left = round(count * (goal / count) ** ((stage + 1) / stages))
-        sums = measure(splats, part(ahead, 0.0, 0.5))
-        splats, kept, taken = _absorb_once(
+        sums = measure(splats, sums, part(ahead, 0.0, 0.5))
+        splats, kept, taken, sums = _absorb_once(
             splats, views, scene, sums, max(left, goal), protected=spared[origin],
             factor=factor, progress=part(ahead, 0.5, 1.0), threads=threads,
         )  # fmt: skip
@@ -175,7 +184,7 @@ def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     factor: float,
     progress: Progress = silent,
     threads: int | None = None,
-) -> tuple[Splats, NDArray[np.bool_], Index]:
+) -> tuple[Splats, NDArray[np.bool_], Index, ViewSums]:
     """Do one stage of `absorb`.
 
     Parameters
@@ -196,6 +205,8 @@ def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
         Which splats survive.
     taken : (N,) int64
         Which of the K survivors each splat is, or was absorbed by; -1 if it was deleted.
+    expected : ViewSums
+        Of the K survivors, as far as these sums and the costs of the merges tell.
     """
     sums = ViewSums(np.asarray(sums.contribution, np.float64), np.asarray(sums.error, np.float64))
     good, free = drawable(splats), ~protected
@@ -208,7 +219,7 @@ def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     excess = min(excess, len(rows))
     report(progress, 0.0, "absorbing")
     if excess <= 0:
-        return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1)
+        return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1), sums.take(keep)
     # Sorted by place in the scene, so that ties do not depend on the order of the file.
     place = scene.place(splats.means[rows])
     rows = rows[spatial_order(place, lambda some: splat_fingerprint(splats, rows[some]))]
@@ -217,24 +228,30 @@ def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     graph = MergeGraph(found, scene, factor, threads=threads)
     graph.reduce(len(rows) - excess, part(progress, 0.1, 0.95))
     keep[rows[~graph.alive]] = False
-    return _written(splats, keep, rows, graph)
+    return _written(splats, sums, keep, rows, graph, part(progress, 0.95, 1.0))
 
 
 def _written(
-    splats: Splats, keep: NDArray[np.bool_], rows: Index, graph: MergeGraph
-) -> tuple[Splats, NDArray[np.bool_], Index]:
+    splats: Splats,
+    sums: ViewSums,
+    keep: NDArray[np.bool_],
+    rows: Index,
+    graph: MergeGraph,
+    progress: Progress,
+) -> tuple[Splats, NDArray[np.bool_], Index, ViewSums]:
     """Return the results of `_absorb_once`, with the merged splats in place of the survivors.
 
     Parameters
     ----------
-    splats : Splats
-        The N splats of the stage.
+    splats, sums : Splats, ViewSums
+        The N splats of the stage, and what the views see of them.
     keep : (N,) bool
         Which of them survive.
     rows : (M,) int64
         Rows of the splats that the graph holds.
     graph : MergeGraph
         Reduced; its field shrinks to the changed survivors.
+    progress : callable
     """
     own = np.arange(len(rows))
     # (M,) each: the survivor that each splat went into, and its share of the survivor's colour.
@@ -253,19 +270,23 @@ def _written(
     harmonics = _Blend(rows[members], place[rows[owner[members]]], share[members])
     # Drop the rest of the field before the survivors are copied, to save memory.
     merged = graph.field = graph.field.take(np.flatnonzero(changed))
+    report(progress, 0.0, "absorbing")
     with np.errstate(under="ignore"):
-        logs, quaternions = merging.axes(merged.covariances)
+        logs, quaternions = _axes(merged.covariances, part(progress, 0.0, 0.3))
+        ahead = part(progress, 0.3, 1.0)
         result = Splats(
             _put(splats.means[keep], target, merged.means),
             _put(splats.log_scales[keep], target, logs),
             _put(splats.quaternions[keep], target, quaternions),
             _put(splats.opacity_logits[keep], target, _logit(merged.opacity)),
-            harmonics.put(splats.sh_dc[:, None], splats.sh_dc[keep][:, None])[:, 0],
-            harmonics.put(splats.sh_rest, splats.sh_rest[keep]),
+            harmonics.put(splats.sh_dc[:, None], splats.sh_dc[keep][:, None], ahead)[:, 0],
+            harmonics.put(splats.sh_rest, splats.sh_rest[keep], ahead),
         )
     taken = np.where(keep, place, -1)
     taken[rows] = np.where(graph.alive[owner], place[rows[owner]], -1)
-    return result, keep, taken
+    expected = sums.take(keep)
+    expected.contribution[target], expected.error[target] = merged.contribution, merged.error
+    return result, keep, taken, expected
 
 
 class _Blend:
@@ -286,15 +307,27 @@ class _Blend:
         self.starts = np.flatnonzero(np.diff(targets[order], prepend=-1))
         self.targets = targets[order][self.starts]
 
-    def put(self, values: NDArray[Any], kept: NDArray[Any]) -> NDArray[Any]:
+    def put(self, values: NDArray[Any], kept: NDArray[Any], progress: Progress) -> NDArray[Any]:
         """Write the means of `values`, (N, K, 3), to the target rows of `kept`; return `kept`."""
         if len(self.starts):
             for column in range(values.shape[1]):
                 # One column at a time, to save memory.
+                report(progress, column / values.shape[1], "absorbing")
                 own = np.asarray(values[self.members, column], np.float64)
                 means = np.add.reduceat(own * self.share[:, None], self.starts)
                 kept[self.targets, column] = means
         return kept
+
+
+def _axes(covariances: Array, progress: Progress) -> tuple[Array, Array]:
+    """Return `merging.axes` of M covariances, computed in chunks."""
+    logs, quaternions = np.empty((len(covariances), 3)), np.empty((len(covariances), 4))
+
+    def fill(piece: slice) -> None:
+        logs[piece], quaternions[piece] = merging.axes(covariances[piece])
+
+    for_chunks(fill, len(covariances), _CHUNK, progress=progress, what="absorbing", threads=1)
+    return logs, quaternions
 
 
 def _logit(opacity: Array) -> Array:

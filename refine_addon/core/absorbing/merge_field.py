@@ -51,6 +51,10 @@ class ViewSums(NamedTuple):
     contribution: Array
     error: Array
 
+    def take(self, rows: NDArray[Any]) -> ViewSums:
+        """Return a copy of some rows (a mask or integers)."""
+        return ViewSums(self.contribution[rows], self.error[rows])
+
 
 @dataclass(eq=False)
 class Field:

@@ -124,10 +124,10 @@ class MergeGraph:
         def price(piece: slice) -> None:
             mine = edges[piece]
             first, second = self.first[mine], self.second[mine]
-            with np.errstate(under="ignore"):
-                cost = self.patience * merging.costs(self.field, first, second)
             least = np.minimum(self.field.error[first], self.field.error[second])
-            self.cost[mine] = np.where(cost < least, cost, np.inf)
+            with np.errstate(under="ignore"):
+                cost = merging.costs(self.field, first, second, least / self.patience)
+            self.cost[mine] = self.patience * cost
 
         for_chunks(
             price, len(edges), _CHUNK, progress=progress, what="absorbing", threads=self.threads

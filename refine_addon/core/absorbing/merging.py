@@ -88,10 +88,22 @@ def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pair
     return _price(_gather(splats, first, second), tilt)
 
 
-def costs(splats: Field, first: Index, second: Index) -> Array:
-    """Return the costs of merges, (M,): the mean over two viewing directions."""
+def costs(splats: Field, first: Index, second: Index, limit: Array | float) -> Array:
+    """Return the costs of merges, (M,): the mean over two viewing directions.
+
+    Parameters
+    ----------
+    splats, first, second
+        See `price`.
+    limit : (M,) float64, or float
+        Costs of at least this much are given as infinity, which takes less time.
+    """
     ends = _gather(splats, first, second)
-    return 0.5 * (_price(ends, -1.0).cost + _price(ends, 1.0).cost)
+    cost = 0.5 * _price(ends, -1.0).cost
+    cheap = np.flatnonzero(cost < limit)
+    cost[cheap] += 0.5 * _price(ends.take(cheap), 1.0).cost
+    cost[~(cost < limit)] = np.inf
+    return cost
 
 
 class _Ends(NamedTuple):
@@ -119,6 +131,19 @@ class _Ends(NamedTuple):
     deviation: Array
     blur: Array
     apart: Array
+
+    def take(self, rows: Index) -> _Ends:
+        """Return the ends of some pairs."""
+        return _Ends(
+            self.one.take(rows),
+            self.two.take(rows),
+            self.color[rows],
+            self.rest[rows],
+            self.direction[rows],
+            self.deviation[rows],
+            self.blur[rows],
+            self.apart[rows],
+        )
 
 
 def _gather(splats: Field, first: Index, second: Index) -> _Ends:

@@ -16,6 +16,7 @@ rest of it is worth nothing. So from half removed on the weight is at least `LEA
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,6 +44,11 @@ gains up to 20 dB on other views."""
 TIED = 0.002
 """Weights whose losses differ by about this much count as equally good; the mean of their
 logarithms is taken, so that a change in the last digits does not switch to another weight."""
+
+DOUBTS = (0.03, 0.03, 0.0, 0.0, 0.0)
+"""What a weight ten times as large must gain to be preferred, as a share of the error removed, for
+each of `SHARES`: the first losses are uncertain by as much, and a floor that is not needed costs
+quality."""
 
 SAMPLE = 1 << 16
 """How many splats are enough to choose the floor weights."""
@@ -98,8 +104,9 @@ def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[floa
     if not losses:
         return [1.0] * len(SHARES)
     table = np.mean(np.concatenate(losses), axis=0)  # (weights, shares)
-    nearly = np.exp(np.maximum((table.min(axis=0) - table) / TIED, -50.0))  # 1 for the best
     logs = np.log(np.maximum(FLOOR_WEIGHTS, _NO_WEIGHT))  # (weights,)
+    table += np.outer(logs / math.log(10.0), DOUBTS)
+    nearly = np.exp(np.maximum((table.min(axis=0) - table) / TIED, -50.0))  # 1 for the best
     best = np.exp(logs @ nearly / nearly.sum(axis=0))  # (shares,)
     return [max(pair) for pair in zip(best.tolist(), LEAST_FLOOR_WEIGHTS, strict=True)]
 
@@ -168,10 +175,11 @@ def _losses(scores: NDArray[np.float64], errors: NDArray[np.float64]) -> NDArray
     Parameters
     ----------
     scores : (n,) float64
-        The lowest are removed first.
+        The lowest are removed first, equal ones together.
     errors : (v, n) float64
         Of each splat in each of v views.
     """
-    running = np.cumsum(errors[:, np.argsort(scores, kind="stable")], axis=1)  # (v, n)
     places = [max(int(share * len(scores)) - 1, 0) for share in SHARES]
-    return np.asarray(np.log(np.maximum(running[:, places] / running[:, -1:], 1e-12)))
+    last = np.partition(scores, places)[places]  # (shares,), the highest score that is removed
+    removed = errors @ (scores[:, None] <= last).astype(np.float64)  # (v, shares)
+    return np.asarray(np.log(np.maximum(removed / errors.sum(axis=1)[:, None], 1e-12)))

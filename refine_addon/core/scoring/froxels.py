@@ -31,10 +31,16 @@ if TYPE_CHECKING:
     from ..views import View
     from .projection import Footprints
 
-GAMMA_SHAPE = 12.0
-"""Shape of the gamma distribution of the thickness in front of a point, times the side of a cell in
-pixels. The smaller the cells, the narrower the distribution: `transmittance` tends to exp(-mean).
-"""
+GAMMA_SHAPE = 2.3
+"""Shape of the gamma distribution of the thickness in front of a point. The larger it is, the
+narrower the distribution: `transmittance` tends to exp(-mean)."""
+
+FEW_CELLS = 10_000
+"""An image may have this many cells however few footprints it has."""
+
+FOOTPRINTS = 4.0
+"""An image of more than `FEW_CELLS` cells has at least this many footprints for each of them. So
+the cells follow the splats, not the pixels: finer ones show nothing that the splats have."""
 
 MAX_CELLS = 65535
 """Most cells of an image: NumPy sorts numbers of 16 bits by radix, in linear time."""
@@ -172,8 +178,13 @@ def _runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
 
 
 def cell_size(footprints: Footprints, view: View, cell: float, density: float) -> float:
-    """Return the side of a cell, pixels: `cell`, or larger to keep `MAX_CELLS` and `MAX_POINTS`."""
-    side = max(cell, math.sqrt(view.width * view.height / MAX_CELLS) * 1.01)
+    """Return the side of a cell, pixels: `cell`, or larger, which saves points.
+
+    It is larger where the image would have more cells than the footprints need (`FOOTPRINTS`), or
+    more than `MAX_CELLS`, and where the footprints would have more than `MAX_POINTS` points.
+    """
+    needed = max(FEW_CELLS, len(footprints.index) / FOOTPRINTS)
+    side = max(cell, math.sqrt(view.width * view.height / min(needed, MAX_CELLS)) * 1.01)
     while math.ceil(view.width / side) * math.ceil(view.height / side) > MAX_CELLS:
         side *= _GROWTH  # happens for images that are only a few pixels wide or high
     # As cells grow, the points needed fall to one a footprint, which is below this limit.
@@ -416,9 +427,7 @@ def evenness(footprints: Footprints, area: float) -> NDArray[np.float32]:
     return np.asarray(narrow / (narrow + np.float32(area)))
 
 
-def transmittance(
-    front: NDArray[np.float32], even: NDArray[np.float32], area: float
-) -> NDArray[np.float32]:
+def transmittance(front: NDArray[np.float32], even: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the transmittance in front of each point, (m,), given the mean thickness of its cell.
 
     Splats narrower than a cell leave gaps, so the thickness in front of a point differs from the
@@ -432,10 +441,8 @@ def transmittance(
         Mean thickness in front of each point.
     even : (m,) float32
         The part of it that is uniform over the cell; see `evenness`.
-    area : float
-        Of a cell, px^2.
     """
-    shape = np.float32(GAMMA_SHAPE / math.sqrt(area))
+    shape = np.float32(GAMMA_SHAPE)
     gaps = np.maximum(front - even, np.float32(0.0))
     return np.asarray(np.exp(-even) * (np.float32(1.0) + gaps / shape) ** -shape)
 

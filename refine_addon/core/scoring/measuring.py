@@ -10,6 +10,7 @@ which is what REFINE's Hessian stands for.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -20,13 +21,17 @@ from ..work import Progress, for_chunks
 from . import froxels, projection
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from ..scene import Scene
     from ..views import View, ViewSet
-    from .projection import Gaussians
+    from .projection import Footprints, Gaussians
+    from .sight_lines import SightLines
 
-_BLOCKS = 8  # of views; sums are added block by block, so they do not depend on threads
+BLOCKS = 8
+"""Of views; sums are added block by block, so they do not depend on threads."""
 
 
 @dataclass(frozen=True)
@@ -36,13 +41,14 @@ class Sampling:
     Attributes
     ----------
     cell : float
-        Side of a cell, pixels; larger where an image would have more than 65,535 cells.
+        Least side of a cell, pixels; `froxels.cell_size` chooses a larger one where the splats need
+        no finer cells.
     density : float
         Points per standard deviation for a splat whose standard deviation is as long as a cell.
     """
 
     cell: float = 4.0
-    density: float = 4.5
+    density: float = 3.7
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -96,6 +102,10 @@ class Measured:
         every.seen[index] = self.seen
         return every
 
+    def take(self, rows: NDArray[np.int64]) -> Measured:
+        """Return the sums of some Gaussians."""
+        return Measured(self.contribution[rows], self.error[rows], self.seen[rows])
+
     def add(self, other: Measured) -> None:
         """Add the sums of other views."""
         self.contribution[:] += other.contribution
@@ -109,22 +119,33 @@ class Measuring:
     Attributes
     ----------
     views : list of (View, float)
-        Views and their weights, see `_by_distance`.
+        Views and their weights, see `by_distance`.
     """
 
     def __init__(
         self, scene: Scene, views: ViewSet, sampling: Sampling, threads: int | None
     ) -> None:
         self.scene, self.sampling, self.threads = scene, sampling, threads
-        self.views = _by_distance(views)
+        self.views = by_distance(views)
 
-    def measure(self, gaussians: Gaussians, progress: Progress) -> Measured:
-        """Return the sums over all views for these Gaussians, each hidden by all others."""
-        none = np.empty(0, np.int64)
-        return Measured.sum([block for block, _ in self.blocks(gaussians, none, progress)])
+    @property
+    def count(self) -> int:
+        """Number of blocks."""
+        return min(BLOCKS, len(self.views))
+
+    def share(self, which: Sequence[int]) -> float:
+        """Return the share of the weights of all views that some blocks have."""
+        weights = [weight for _, weight in self.views]
+        mine = (weight for k in which for weight in weights[k :: self.count])
+        return math.fsum(mine) / math.fsum(weights)
 
     def blocks(
-        self, gaussians: Gaussians, sample: NDArray[np.int64], progress: Progress
+        self,
+        gaussians: Gaussians,
+        sample: NDArray[np.int64],
+        progress: Progress,
+        which: Sequence[int] | None = None,
+        sights: SightLines | None = None,
     ) -> list[tuple[Measured, NDArray[np.float64]]]:
         """Return the sums over each block of views, and the errors of a sample in each view.
 
@@ -134,23 +155,33 @@ class Measuring:
         sample : (m,) int64
             Rows of the Gaussians.
         progress : callable
+        which : sequence of int, optional
+            The blocks to measure; by default all `count` of them.
+        sights : SightLines, optional
+            Notes what its lines meet.
 
         Returns
         -------
         list of Measured, (views, m) float64
+            For each of these blocks.
         """
-        blocks = min(_BLOCKS, len(self.views))
+        chosen = range(self.count) if which is None else which
 
         def block(piece: slice) -> tuple[Measured, NDArray[np.float64]]:
             total = Measured.zero(len(gaussians))
             errors = []
-            for view, weight in self.views[piece.start :: blocks]:
+            for number in range(chosen[piece.start], len(self.views), self.count):
+                view, weight = self.views[number]
                 before = total.error[sample]  # (m,)
-                measure_view(gaussians, self.scene, view, weight, self.sampling, total)
+                footprints = measure_view(gaussians, self.scene, view, weight, self.sampling, total)
+                if sights is not None:
+                    sights.look(number, gaussians, footprints)
                 errors.append(total.error[sample] - before)
             return total, np.array(errors)
 
-        return for_chunks(block, blocks, 1, progress=progress, what="scoring", threads=self.threads)
+        return for_chunks(
+            block, len(chosen), 1, progress=progress, what="scoring", threads=self.threads
+        )
 
 
 def measure_view(
@@ -160,13 +191,13 @@ def measure_view(
     weight: float,
     sampling: Sampling,
     total: Measured,
-) -> None:
-    """Add what one view sees to `total`."""
+) -> Footprints:
+    """Add what one view sees to `total`; return the footprints in it."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
         count = len(footprints.index)  # n
         if not count:
-            return
+            return footprints
         total.seen[footprints.index[footprints.inside]] += 1
         side = froxels.cell_size(footprints, view, sampling.cell, sampling.density)
         points = froxels.scatter(footprints, view, side, sampling.density)
@@ -180,14 +211,15 @@ def measure_view(
         for place, piece in points.pieces():
             thick = froxels.thickness(piece, alphas, mass)
             front, even = froxels.in_front(piece, thick, thick * evenness.take(piece.owners))
-            transmittance[place] = froxels.transmittance(front, even, points.area)
+            transmittance[place] = froxels.transmittance(front, even)
             squared_contrast[place] = froxels.squared_contrast(piece, front, thick, colors)
         visible, errors = froxels.mean_visible(points, transmittance, squared_contrast, count)
         total.contribution[footprints.index] += weight * (mass * visible)
         total.error[footprints.index] += weight * (mass_squared * errors)
+    return footprints
 
 
-def _by_distance(views: ViewSet) -> list[tuple[View, float]]:
+def by_distance(views: ViewSet) -> list[tuple[View, float]]:
     """Return the views of positive weight and their weights, in an order given by the scene.
 
     They are sorted by distance from their middle, then from the view farthest from it, equal ones

@@ -25,7 +25,8 @@ from ..errors import RefineError
 from ..scores import Scores, shares_gone
 from ..work import Progress, part, report, silent
 from . import closed_form, coverage, projection
-from .measuring import Measured, Measuring, Sampling
+from .measuring import Measured, Measuring, Sampling, by_distance
+from .sight_lines import SightLines
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -39,7 +40,17 @@ if TYPE_CHECKING:
 LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
 
-PRIOR = closed_form.ClosedForm("distance", frustum=False)
+ROUND_COST = 0.16
+"""A round after the first measures about as many blocks of views as cost this share of the first;
+at least two."""
+
+COMMON = 0.1
+"""Weight of what all splats have grown by, as a share of a splat's sum over all views."""
+
+FIRST_COST = 0.5
+"""Share of the time that is still ahead that a round takes, for the display of progress."""
+
+PRIOR = closed_form.ClosedForm("distance", frustum=False, local=False)
 """Model of the floor. It has no frustum test, since splats that no view shows also need a floor."""
 
 
@@ -157,7 +168,8 @@ def _scored(
     if not good.any():
         msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
         raise RefineError(msg)
-    run = _Run(gaussians, Measuring(scene, views, settings, threads), settings.rounds)
+    sights = SightLines(by_distance(views), gaussians, splats)
+    run = _Run(gaussians, Measuring(scene, views, settings, threads), settings.rounds, sights)
     prior = closed_form.score(
         splats, views, PRIOR, progress=part(progress, 0.05, 0.1), threads=threads
     )
@@ -176,6 +188,7 @@ def _scored(
         undrawable=int(np.count_nonzero(~good)),
         facts={"floor": run.floor_weights},
         method="occlusion",
+        sights=run.sights,
     )
     return scores, run
 
@@ -205,12 +218,51 @@ def measure(
     Cancelled
         If `progress` answers ``False``.
     """
+    return measure_part(splats, views, settings, 0, 1, progress=progress, threads=threads)[0]
+
+
+def measure_part(  # noqa: PLR0913 - as `measure`, and which part
+    splats: Splats,
+    views: ViewSet,
+    settings: Occlusion,
+    turn: int,
+    parts: int,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> tuple[Measured, float]:
+    """Measure what one part of the views sees of each splat.
+
+    Parameters
+    ----------
+    splats, views, settings, progress, threads
+        See `measure`.
+    turn, parts : int
+        The views are divided into so many parts, or into fewer if there are fewer views; each part
+        is spread over all of them. Turn 0 measures the first, and so on, and then the first again.
+
+    Returns
+    -------
+    Measured
+        See `measure`.
+    share : float
+        Of the weights of all views, those of this part.
+
+    Raises
+    ------
+    Cancelled
+        If `progress` answers ``False``.
+    """
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.1), threads=threads
     )
     measuring = Measuring(scene, views, settings, threads)
-    found = measuring.measure(gaussians, part(progress, 0.1, 1.0))
-    return found.for_all(gaussians.index, len(splats))
+    blocks = measuring.count
+    parts = min(parts, blocks)
+    which = range(turn % parts, blocks, parts)
+    none, ahead = np.empty(0, np.int64), part(progress, 0.1, 1.0)
+    found = [block for block, _ in measuring.blocks(gaussians, none, ahead, which=which)]
+    return Measured.sum(found).for_all(gaussians.index, len(splats)), measuring.share(which)
 
 
 class _Run:
@@ -222,14 +274,25 @@ class _Run:
         The splats that can contribute to a picture, before any is removed.
     measured : Measured
         Of these Gaussians, in the first round.
+    blocks : list of Measured
+        Of the splats left, over each block of views, as measured last.
+    turn : int
+        How many blocks were measured after the first round.
     floor_weights : list of float
         The weight of the floor up to each of `coverage.SHARES`; chosen in the first round.
+    sights : SightLines
+        Note what the views' lines of sight meet, in the first round.
     """
 
-    def __init__(self, gaussians: Gaussians, measuring: Measuring, rounds: int) -> None:
+    def __init__(
+        self, gaussians: Gaussians, measuring: Measuring, rounds: int, sights: SightLines
+    ) -> None:
         self.gaussians, self.measuring, self.rounds = gaussians, measuring, rounds
         self.measured = Measured.zero(len(gaussians))
+        self.blocks: list[Measured] = []
+        self.turn = 0
         self.floor_weights = [0.0] * len(coverage.SHARES)
+        self.sights = sights
 
     def rank(
         self, prior: NDArray[np.float32], progress: Progress
@@ -248,20 +311,52 @@ class _Run:
         removal.add(undrawn[np.argsort(prior[undrawn], kind="stable")])
         seen, done = np.zeros(count, np.int32), 0.0
         for number, stay in enumerate(_survivors(count, self.rounds)):
-            # A round costs views x splats left. All six rounds cost about three first rounds.
-            end = done + (1.0 - done) * max(1.0 / (self.rounds - number), 0.25)
+            # The first round costs about as much as all others.
+            end = 1.0 if number == self.rounds - 1 else done + (1.0 - done) * FIRST_COST
             ahead, done = part(progress, done, end), end
             if number == 0:
-                measured = self.measured = self._measure_first(prior, ahead)
-                seen[left.index] = measured.seen
+                self._measure_first(prior, ahead)
+                seen[left.index] = self.measured.seen
             else:
-                measured = self.measuring.measure(left, ahead)
+                self._measure_again(left, ahead)
             report(ahead, 1.0, "scoring")
+            measured = Measured.sum(self.blocks)
             go = max(len(left) - stay, 0)
             order = self._order(measured, prior[left.index], removal, go)
             removal.add(left.index[order[:go]])
-            left = left.take(np.sort(order[go:]))
+            rows = np.sort(order[go:])
+            left = left.take(rows)
+            self.blocks = [block.take(rows) for block in self.blocks]
         return removal.values, seen
+
+    def _measure_again(self, left: Gaussians, progress: Progress) -> None:
+        """Measure the splats left in some blocks of views, which take turns.
+
+        The sums of the other blocks are from an earlier round, when more was hidden. They are
+        raised by what the sums of these blocks have grown by on average.
+
+        Parameters
+        ----------
+        left : Gaussians
+        progress : callable
+        """
+        blocks = len(self.blocks)
+        # An even number, since an odd one leaves one of two cores idle.
+        pairs = max(round(ROUND_COST * len(self.gaussians) / max(len(left), 1) * blocks / 2), 1)
+        count = min(2 * pairs, blocks)
+        which = [(self.turn + step) % blocks for step in range(count)]
+        self.turn += count
+        none = np.empty(0, np.int64)
+        found = [block for block, _ in self.measuring.blocks(left, none, progress, which=which)]
+        before, now = (Measured.sum(some) for some in ([self.blocks[k] for k in which], found))
+        every = Measured.sum(self.blocks)
+        contribution = _growth(now.contribution, before.contribution, every.contribution)
+        error = _growth(now.error, before.error, every.error)
+        for block in self.blocks:
+            block.contribution[:] *= contribution
+            block.error[:] *= error
+        for k, block in zip(which, found, strict=True):
+            self.blocks[k] = block
 
     def _order(
         self, measured: Measured, prior: NDArray[np.float32], removal: _Removal, go: int
@@ -288,11 +383,12 @@ class _Run:
         scores = combined(measured, share)
         return coverage.order(scores, floors, prior, self.floor_weights, stops)
 
-    def _measure_first(self, prior: NDArray[np.float32], progress: Progress) -> Measured:
+    def _measure_first(self, prior: NDArray[np.float32], progress: Progress) -> None:
         """Measure all Gaussians, and choose the weights of the floor by leaving views out."""
         sample = coverage.sample(self.gaussians)  # (m,)
-        blocks = self.measuring.blocks(self.gaussians, sample, progress)
-        measured = Measured.sum([block for block, _ in blocks])
+        blocks = self.measuring.blocks(self.gaussians, sample, progress, sights=self.sights)
+        self.blocks = [block for block, _ in blocks]
+        measured = self.measured = Measured.sum(self.blocks)
         worth = prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)
 
         def folds() -> Iterator[tuple[NDArray[np.float64], ...]]:
@@ -308,7 +404,6 @@ class _Run:
                 yield combined(others, 0.0), floors, errors
 
         self.floor_weights = coverage.floor_weights(folds())
-        return measured
 
 
 class _Removal:
@@ -345,6 +440,26 @@ def combined(measured: Measured, gone: float) -> NDArray[np.float64]:
     much of the picture the splat covers, whatever lies behind it.
     """
     return np.asarray(measured.error * measured.contribution ** _exponent(gone))
+
+
+def _growth(
+    now: NDArray[np.float64], before: NDArray[np.float64], every: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return by which factor the sum of each splat has grown, (n,), as some blocks of views tell.
+
+    Where these blocks hardly saw a splat, it is the factor of all splats.
+
+    Parameters
+    ----------
+    now, before : (n,) float64
+        The sums over these blocks.
+    every : (n,) float64
+        The sums over all blocks, as measured before.
+    """
+    total = float(before.sum())
+    common = float(now.sum()) / total if total > 0.0 else 1.0
+    prior = COMMON * every  # (n,)
+    return np.divide(now + prior * common, before + prior, out=np.ones_like(now), where=prior > 0.0)
 
 
 def _exponent(gone: float) -> float:

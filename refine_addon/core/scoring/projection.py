@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 REACH = 3.3
 """Standard deviations to which a footprint is followed; alpha = 1 falls to `ALPHA_CUT` at 3.33."""
 
+BRIGHTEST = 16.0
+"""Brightest colour that is told apart, where white is 1; keeps sums finite."""
+
 _CHUNK = 1 << 14
 _FARTHEST = 1e6  # scene sizes; splats farther from the middle are in no view
 _LOG_SCALE_RANGE = (-16.0, 5.0)  # relative to the size of the scene; keeps float32 in range
@@ -176,7 +179,7 @@ def _activate(
         result.largest[piece] = scales.max(axis=1)
         result.alphas[piece] = opacity(chunk.opacity_logits)
         colors = SH_C0 * np.asarray(chunk.sh_dc, np.float64) + 0.5
-        result.colors[piece] = colors.clip(0.0, 16.0)  # brighter than white; kept finite
+        result.colors[piece] = colors.clip(0.0, BRIGHTEST)
 
     with np.errstate(under="ignore"):
         for_chunks(fill, count, _CHUNK, progress=progress, what="reading", threads=threads)

@@ -1,0 +1,145 @@
+"""How close the pictures of the views stay to those of the unpruned splats, as a curve.
+
+The measure is PSNR in dB of pictures clipped to 0..1, as a screen shows them: of each view by
+itself, at most 100, and of these the mean. `scoring.sight_lines` estimates it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+PSNR_CAP = 100.0
+"""What equal pictures count as, dB, and the most that any estimate says."""
+
+SHARES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+"""Shares of the splats removed at which the estimate is made; between them it is interpolated."""
+
+TAKEN_OVER = (0.3, 0.5, 0.7, 0.9)
+"""Shares removed at which it is looked at what survivors could take over; see `absorbed_from`."""
+
+GAIN = (3.0, 4.5, 4.5, 4.3), (0.5, 0.55, 0.7, 0.85)
+"""What absorbing gains over deleting at those shares, dB: a constant, and a part of what it gains
+on lines of sight."""
+
+PLAIN = 0.1
+"""Share removed up to which absorbing is plain deletion."""
+
+UNSEEN = 60.0
+"""PSNR in dB above which pictures are the same to the eye: rounding to 8 bits alone makes 59."""
+
+_LEAST_SHARE = 1e-6  # the place of "nothing removed" on the curve's axis, where that is infinite
+
+
+@dataclass(frozen=True, eq=False)
+class Quality:
+    """A curve from the share of the splats that is removed to the estimated PSNR.
+
+    Attributes
+    ----------
+    shares : (L,) float64
+        Ascending, between 0 and 1.
+    psnr : (L,) float64
+        With these shares deleted, lowest scores first; dB, never rising.
+    absorbed : (L,) float64
+        About what absorbing reaches with as many survivors; dB, never rising.
+
+    Examples
+    --------
+    >>> curve = Quality(np.array([0.2, 0.5, 0.8]), np.array([50.0, 40.0, 30.0]), np.zeros(3))
+    >>> curve.at(0.5), curve.share(40.0)
+    (40.0, 0.5)
+    """
+
+    shares: NDArray[np.float64]
+    psnr: NDArray[np.float64]
+    absorbed: NDArray[np.float64]
+
+    def at(self, share: float, *, absorb: bool = False) -> float:
+        """Return the PSNR with a share of the splats removed, dB; with `absorb`, about.
+
+        Between the shares of the curve the PSNR is taken as linear in the logarithm of the odds
+        ``share / (1 - share)``, which it nearly is; beyond the last it stays.
+        """
+        return float(np.interp(_log_odds(share), *self._points(absorb=absorb)))
+
+    def share(self, psnr: float, *, absorb: bool = False) -> float:
+        """Return the largest share that can go while the PSNR is at least `psnr`, dB; or 0.
+
+        It is at most the last share of the curve.
+        """
+        odds, values = self._points(absorb=absorb)
+        if psnr > PSNR_CAP:
+            return 0.0
+        if psnr <= values[-1]:
+            return float(self.shares[-1])
+        right = int(np.flatnonzero(values >= psnr)[-1])  # the last point that is good enough
+        step = (values[right] - psnr) / (values[right] - values[right + 1])
+        place = odds[right] + step * (odds[right + 1] - odds[right])
+        return float(1.0 / (1.0 + np.exp(-place)))
+
+    def _points(self, *, absorb: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the curve with its beginning, where nothing is removed: odds and PSNR."""
+        values = self.absorbed if absorb else self.psnr
+        odds = np.concatenate([[_log_odds(0.0)], [_log_odds(float(s)) for s in self.shares]])
+        return odds, np.concatenate([[PSNR_CAP], values])
+
+    def facts(self) -> dict[str, list[float]]:
+        """Return the curve as plain JSON values."""
+        return {
+            "shares": self.shares.tolist(),
+            "psnr": self.psnr.tolist(),
+            "absorbed": self.absorbed.tolist(),
+        }
+
+    @classmethod
+    def from_facts(cls, facts: Mapping[str, Any] | None) -> Quality | None:
+        """Return the curve that `facts` made; None of what is none."""
+        names = ("shares", "psnr", "absorbed")
+        try:
+            shares, psnr, absorbed = (np.array((facts or {})[name], np.float64) for name in names)
+        except (KeyError, TypeError, ValueError):
+            return None
+        whole = len(shares) and shares.shape == psnr.shape == absorbed.shape == (len(shares),)
+        return cls(shares, psnr, absorbed) if whole else None
+
+
+def absorbed_from(psnr: NDArray[np.float64], gains: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return about what absorbing reaches at `SHARES`, (L,), without absorbing; dB.
+
+    On lines of sight it is known what the pictures would be if what goes stayed as opaque as it is
+    and took the colour of the nearest splat that stays. That is neither an upper nor a lower bound
+    of what absorbing reaches, but goes up and down with it from scene to scene.
+
+    Parameters
+    ----------
+    psnr : (L,) float64
+        With the splats deleted, at `SHARES`.
+    gains : (4,) float64
+        By how much it is higher with them taken over in that way, at `TAKEN_OVER`.
+    """
+    constant, part = np.array(GAIN)
+    found = (constant + part * gains).clip(0.0)
+    gain = np.interp(SHARES, (PLAIN, *TAKEN_OVER), np.concatenate([[0.0], found]))
+    return np.minimum.accumulate(np.minimum(psnr + gain, PSNR_CAP))
+
+
+def in_words(psnr: float) -> str:
+    """Return an estimate as a user needs it.
+
+    >>> in_words(38.4), in_words(72.0)
+    ('about 38 dB', 'more than 60 dB')
+    """
+    return f"more than {UNSEEN:.0f} dB" if psnr > UNSEEN else f"about {psnr:.0f} dB"
+
+
+def _log_odds(share: float) -> float:
+    share = min(max(share, _LEAST_SHARE), 1.0 - _LEAST_SHARE)
+    return float(np.log(share / (1.0 - share)))

@@ -1,0 +1,460 @@
+"""The estimate of the pictures' quality against pictures by hand, and a PSNR as budget."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from refine_addon.core import (
+    Budget,
+    Cancelled,
+    ClosedForm,
+    RefineError,
+    Scores,
+    Settings,
+    View,
+    ViewSet,
+    prune,
+    score,
+    select,
+)
+from refine_addon.core.quality import PSNR_CAP, SHARES, Quality, absorbed_from
+from refine_addon.core.scoring import projection, sight_lines
+from refine_addon.core.splats import opacity
+from tests.core.test_occlusion import cloud, look_along_z, ring, splats_of
+
+CURVE = Quality(*np.array([[0.2, 0.5, 0.8], [50.0, 40.0, 30.0], [52.0, 47.0, 38.0]]))
+CUT = 1.0 / 255.0
+
+
+def picture(splats, view: View, views: ViewSet) -> np.ndarray:
+    """Draw every pixel of a view, splat by splat, front to back."""
+    gaussians, scene, _ = projection.prepare(splats, views)
+    footprints = projection.project(gaussians, scene, view)
+    across, down = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    image, through = np.zeros((view.height, view.width, 3)), np.ones((view.height, view.width))
+    for k, row in enumerate(footprints.index):
+        dx, dy = across - footprints.centers[0, k], down - footprints.centers[1, k]
+        squared = sum(
+            ((dx * half[0, k] + dy * half[1, k]) / length[k] ** 2) ** 2
+            for half, length in zip(
+                (footprints.major, footprints.minor), footprints.sigmas, strict=True
+            )
+        )
+        alpha = gaussians.alphas[row] * np.exp(-squared / 2)
+        alpha = np.where(alpha < CUT, 0.0, np.minimum(alpha, 0.99))
+        image += (through * alpha)[..., None] * color(splats, gaussians.index[row], view)
+        through *= 1.0 - alpha
+    return image.clip(0.0, 1.0)
+
+
+def color(splats, row: int, view: View) -> np.ndarray:
+    """Return the colour of a splat: bands 0 and 1, 1 / 2 sqrt(1 / pi) and 1 / 2 sqrt(3 / pi).
+
+    0.5 + C0 f_0 - C1 y f_1 + C1 z f_2 - C1 x f_3, as the reference implementation has it.
+    """
+    x, y, z = (splats.means[row] - view.center) / np.linalg.norm(splats.means[row] - view.center)
+    found = 0.5 + 0.28209479 * splats.sh_dc[row]
+    if splats.sh_rest.shape[1]:
+        found = found + 0.48860251 * np.array([-y, z, -x]) @ splats.sh_rest[row]
+    return np.maximum(found, 0.0)
+
+
+def psnr(splats, keep, views: ViewSet) -> float:
+    """Return the mean PSNR of whole pictures."""
+    found = []
+    for view in views:
+        whole = picture(splats, view, views)
+        error = np.mean((picture(splats.take(keep), view, views) - whole) ** 2)
+        found.append(min(-10 * math.log10(error), PSNR_CAP) if error else PSNR_CAP)
+    return float(np.mean(found))
+
+
+def half(count: int) -> np.ndarray:
+    return np.random.default_rng(5).random(count) < 0.5
+
+
+def test_lines_through_all_pixels_tell_the_psnr_of_the_picture():
+    """Five views of 80 x 60 have 24,000 pixels; with as many lines nothing is left to chance."""
+    splats, views, keep = cloud(), ring(), half(300)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(sight_lines, "LINES", 1 << 20)
+        found = sight_lines.sights(splats, views)
+
+    assert [len(lines.columns) * len(lines.rows) for lines in found.lines] == [80 * 60] * 5
+    assert found.psnr(keep) == pytest.approx(psnr(splats, keep, views), abs=0.01)
+
+
+def test_a_third_of_the_pixels_tell_it_nearly(monkeypatch):
+    """8,192 of 24,000 pixels, of an error that is smooth over many pixels: within a quarter dB."""
+    splats, views, keep = cloud(), ring(), half(300)
+    monkeypatch.setattr(sight_lines, "LINES", 1 << 13)
+
+    found = sight_lines.sights(splats, views)
+
+    assert sum(len(lines.columns) * len(lines.rows) for lines in found.lines) < 8800
+    assert found.psnr(keep) == pytest.approx(psnr(splats, keep, views), abs=0.25)
+
+
+def test_lines_meet_what_their_pixels_show():
+    """Each line sees the colour of its pixel in the whole picture."""
+    splats, views = cloud(), ring()
+    gaussians, scene, _ = projection.prepare(splats, views)
+    view = views[1]
+    columns, rows = sight_lines.spread(80, 9, 0.3), sight_lines.spread(60, 7, 0.8)
+
+    lines = sight_lines.meet(gaussians, projection.project(gaussians, scene, view), columns, rows)
+
+    colors = np.array([color(splats, row, view) for row in gaussians.index[lines.met]])
+    whole = picture(splats, view, views)
+    assert np.allclose(lines.colors(colors), whole[rows][:, columns].reshape(-1, 3), atol=1e-5)
+
+
+def test_few_lines_are_right_on_average():
+    """Minus the logarithm of a mean is too high, by half the mean's relative variance, on average.
+
+    The square of an exponential variable has 5 times its squared mean as variance (24 - 4 over 4),
+    so the mean of 50 lines is too high by 10 / ln 10 * 5 / 50 / 2 = .22 dB, and mended.
+    """
+    errors = np.random.default_rng(0).exponential(size=(2000, 50)) ** 2 / 2e4
+    view = look_along_z(width=1000, height=1000)
+    colors = np.sqrt(errors)[:, :, None] * np.ones(3)
+    true = -10 * math.log10(np.mean(errors))
+
+    found = np.mean([sight_lines.psnr_of(seen, 0 * seen, view) for seen in colors])
+    plain = np.mean([-10 * math.log10(np.mean(row)) for row in errors])
+
+    assert plain - true == pytest.approx(0.22, abs=0.06)
+    assert found == pytest.approx(true, abs=0.1)
+
+
+def test_lines_that_differ_from_place_to_place_are_not_taken_for_chance():
+    """An error that rises evenly from one end of the picture to the other is well sampled."""
+    errors = np.linspace(0.0, 2e-4, 50)
+    colors = np.sqrt(errors)[:, None] * np.ones(3)
+
+    found = sight_lines.psnr_of(colors, 0 * colors, look_along_z(width=1000, height=1000))
+
+    assert found == pytest.approx(40.0, abs=0.01)
+
+
+def test_a_splat_behind_others_counts_by_what_shows_through():
+    """Alpha .5 in front of alpha .5: with both .5 c + .25 c, without the one in front .5 c.
+
+    Both splats are much wider than the picture, so all pixels change by .25 c = .125.
+    """
+    splats = splats_of([[0, 0, 2.0], [0, 0, 3.0]], alphas=0.5, scales=100.0, gray=0.5)
+    found = sight_lines.sights(splats, ViewSet((look_along_z(),)))
+
+    for keep in ([True, False], [False, True]):
+        assert found.psnr(np.array(keep)) == pytest.approx(-20 * math.log10(0.125), abs=0.01)
+
+
+def test_where_nothing_goes_the_estimate_is_the_cap():
+    """Equal pictures count as 100 dB."""
+    assert sight_lines.sights(cloud(), ring()).psnr(np.ones(300, np.bool_)) == PSNR_CAP
+
+
+def test_views_count_by_their_weights_and_those_that_see_nothing_do_not():
+    """A view of weight 3 counts three times; one that looks away is no equal picture."""
+    splats, (one, other, *_), keep = cloud(), ring(), half(300)
+    each = [sight_lines.sights(splats, ViewSet((view,))).psnr(keep) for view in (one, other)]
+    away = replace(one, rotation=np.diag([-1.0, 1.0, -1.0]) @ one.rotation, name="away")
+    weighted = ViewSet((replace(one, weight=3.0, name="one"), replace(other, name="other"), away))
+
+    found = sight_lines.sights(splats, weighted).psnr(keep)
+
+    assert found == pytest.approx((3 * each[0] + each[1]) / 4, abs=0.3)
+
+
+def test_where_too_few_lines_meet_a_splat_nothing_is_estimated():
+    """One small splat in the picture is met by a few dozen of 4,800 lines: too few to say."""
+    splats = splats_of([[0, 0, 2.0]], scales=0.02)
+    views = ViewSet((look_along_z(),))
+
+    assert sight_lines.sights(splats, views).psnr(np.zeros(1, np.bool_)) is None
+    result = prune(splats_of([[0, 0, 2.0]] * 4, scales=0.02), views, Budget(ratio=0.5),
+                   Settings("occlusion"))  # fmt: skip
+    assert result.report["estimated_psnr"] is None
+    assert any("too little" in note for note in result.report["notes"])
+
+
+def test_in_dense_scenes_there_are_fewer_lines(monkeypatch):
+    """300 splats wider than the picture: each line meets all of them."""
+    splats = splats_of(np.tile([[0, 0, 2.0]], (300, 1)), scales=100.0)
+    views = ViewSet((look_along_z(),))
+    monkeypatch.setattr(sight_lines, "MOST_MET", 300 * 500)
+
+    (lines,) = sight_lines.sights(splats, views).lines
+
+    assert len(lines.line) == pytest.approx(300 * 500, rel=0.1)
+
+
+@pytest.mark.parametrize("count", [0, 1, 16, 200])
+def test_a_view_has_lines_whatever_its_shape(count):
+    """Between one and all of its pixels, each once."""
+    for width, height in ((1, 1), (1, 5000), (5000, 1), (17, 3)):
+        view = look_along_z(width=width, height=height)
+        found = sight_lines.SightLines([(view, 1.0)], gaussians_of(cloud()), cloud())
+        columns, rows = found.pixels(0, float(count))
+        assert 1 <= len(columns) * len(rows) <= width * height
+        assert len(set(columns.tolist())) == len(columns)
+        assert set(columns.tolist()) <= set(range(width))
+        assert set(rows.tolist()) <= set(range(height))
+
+
+def gaussians_of(splats):
+    return projection.prepare(splats, ring())[0]
+
+
+def test_the_curve_is_what_each_share_reaches():
+    """Each point is the estimate for the lowest scores removed, as `select` removes them."""
+    splats, views = cloud(), ring()
+    scores = score(splats, views, Settings("occlusion"))
+
+    assert scores.quality is not None
+    assert scores.sights is not None
+    assert scores.quality.shares.tolist() == list(SHARES)
+    for share, value in zip(SHARES, scores.quality.psnr, strict=True):
+        keep = select(scores, Budget(ratio=share))
+        assert scores.sights.psnr(keep) == pytest.approx(value, abs=1e-9)
+
+
+@pytest.mark.parametrize("method", ["closed-form", "occlusion", "auto"])
+def test_the_estimate_depends_on_nothing_but_the_scene(method):
+    """Order of splats and of views, and threads: only the last digits may differ."""
+    splats, views = cloud(), ring()
+    order = np.random.default_rng(1).permutation(len(splats))
+    turned = ViewSet(tuple(views)[::-1])
+    named = [
+        ViewSet(tuple(replace(view, name=f"{view.center.round(3)}") for view in some))
+        for some in (views, turned)
+    ]
+
+    one = score(splats, named[0], Settings(method), quality=True, threads=1)
+    other = score(splats.take(order), named[1], Settings(method), quality=True, threads=3)
+
+    assert one.quality is not None
+    assert other.quality is not None
+    assert np.allclose(one.quality.psnr, other.quality.psnr, atol=0.05)
+
+
+def test_the_estimate_does_not_change_the_scores():
+    """The closed form ranks the same whether or not an estimate is asked for."""
+    with_curve, without = (score(cloud(), ring(), quality=asked) for asked in (True, False))
+
+    assert np.array_equal(with_curve.values, without.values)
+    assert with_curve.quality is not None
+    assert without.quality is None
+
+
+def test_a_curve_is_read_between_its_points_and_back():
+    """Linear in the logarithm of the odds; at the points what was put in."""
+    assert [CURVE.at(share) for share in (0.2, 0.5, 0.8)] == pytest.approx([50.0, 40.0, 30.0])
+    assert [CURVE.share(value) for value in (50.0, 40.0, 30.0)] == pytest.approx([0.2, 0.5, 0.8])
+    # Odds of 1 to 2: halfway between 1 to 4 and 1 to 1 on a scale of logarithms.
+    assert CURVE.at(1 / 3) == pytest.approx(45.0)
+    assert CURVE.share(45.0) == pytest.approx(1 / 3)
+
+
+def test_a_curve_ends_where_it_was_not_estimated():
+    """Nothing removed is the cap; beyond the last share nothing more is removed."""
+    assert CURVE.at(0.0) == PSNR_CAP
+    assert CURVE.at(0.99) == 30.0
+    assert CURVE.share(5.0) == 0.8
+    assert 0.0 < CURVE.share(90.0) < 0.01
+    assert CURVE.share(200.0) == 0.0
+
+
+def test_where_the_curve_is_flat_as_much_goes_as_can():
+    """Three equal points: the last of them."""
+    flat = Quality(CURVE.shares, np.full(3, 40.0), np.full(3, 40.0))
+
+    assert flat.share(40.0) == 0.8
+
+
+def test_the_curve_of_absorbing_is_read_in_the_same_way():
+    """At the points what was put in."""
+    assert CURVE.at(0.5, absorb=True) == pytest.approx(47.0)
+    assert CURVE.share(38.0, absorb=True) == pytest.approx(0.8)
+
+
+def test_absorbing_is_expected_to_be_better_and_never_worse():
+    """Up to a tenth it is deletion; at half removed 4.5 + .55 * 2 dB better; never above 100."""
+    psnr = np.linspace(100.0, 10.0, len(SHARES))
+
+    found = absorbed_from(psnr, np.full(4, 2.0))
+
+    assert np.array_equal(found[:2], psnr[:2])
+    assert found[SHARES.index(0.5)] == pytest.approx(psnr[SHARES.index(0.5)] + 5.6)
+    assert np.all(np.diff(found) <= 0.0)
+    assert np.all(found >= psnr)
+    assert absorbed_from(np.full(len(SHARES), 99.0), np.full(4, 9.0)).max() <= PSNR_CAP
+    assert np.array_equal(absorbed_from(psnr, np.full(4, -50.0)), psnr)
+
+
+def test_on_a_line_the_nearest_that_stays_takes_over():
+    """Red, green, blue, one behind the other, alpha .5: weights .5, .25, .125 of what is seen.
+
+    Without green, red or blue is as near: the one behind takes over. Without red and green, blue.
+    Without all, nothing does.
+    """
+    line, alpha = np.zeros(3, np.int32), np.full(3, 0.5, np.float32)
+    lines = sight_lines.Lines(
+        np.arange(1), np.arange(1), line, np.arange(3, dtype=np.int32), alpha, np.log1p(-alpha),
+        np.arange(3),
+    )  # fmt: skip
+
+    def seen(*keep):
+        return lines.taken_over(np.eye(3), np.array(keep)).tolist()[0]
+
+    assert seen(True, True, True) == pytest.approx([0.5, 0.25, 0.125])
+    assert seen(True, False, True) == pytest.approx([0.5, 0.0, 0.375])
+    assert seen(False, False, True) == pytest.approx([0.0, 0.0, 0.875])
+    assert seen(True, False, False) == pytest.approx([0.875, 0.0, 0.0])
+    assert seen(False, False, False) == [0.0, 0.0, 0.0]
+
+
+def test_a_curve_comes_back_from_json():
+    """As the mesh and the report keep it; what is none gives none."""
+    facts = json.loads(json.dumps(CURVE.facts()))
+    again = Quality.from_facts(facts)
+
+    assert again is not None
+    assert np.array_equal(again.shares, CURVE.shares)
+    assert np.array_equal(again.psnr, CURVE.psnr)
+    assert np.array_equal(again.absorbed, CURVE.absorbed)
+    for wrong in (None, {}, {"shares": [0.5]}, facts | {"psnr": [1.0]}, facts | {"psnr": ["x"]},
+                  {name: [] for name in facts}, 3):  # fmt: skip
+        assert Quality.from_facts(wrong) is None
+
+
+def test_a_psnr_removes_what_the_curve_says():
+    """At 40 dB half of ten."""
+    scores = Scores(np.arange(10, dtype=np.float32), np.zeros(10, np.int32), 1, 0, quality=CURVE)
+
+    assert select(scores, Budget(psnr=40.0)).tolist() == [False] * 5 + [True] * 5
+
+
+def test_scores_without_an_estimate_cannot_keep_a_psnr():
+    """The message says what to do."""
+    scores = Scores(np.arange(9, dtype=np.float32), np.zeros(9, np.int32), 1, 0)
+
+    with pytest.raises(RefineError, match="score again with a PSNR as budget"):
+        select(scores, Budget(psnr=40.0))
+
+
+@pytest.mark.parametrize("method", ["closed-form", "occlusion", "auto"])
+@pytest.mark.parametrize("goal", [20.0, 35.0])
+def test_every_method_reaches_a_psnr(method, goal):
+    """To half a dB by its own estimate, with one splat more it would be above."""
+    result = prune(cloud(), ring(), Budget(psnr=goal), Settings(method))
+
+    assert result.report["estimated_psnr"] == pytest.approx(goal, abs=0.6)
+    assert result.report["budget"] == {"psnr": goal}
+    assert not result.keep.all()
+
+
+def test_published_scores_reach_it_too():
+    """They see every splat from every view, yet the estimate is that of the pictures."""
+    settings = Settings(closed_form=ClosedForm.published("distance"))
+
+    result = prune(cloud(), ring(), Budget(psnr=30.0), settings)
+
+    assert result.report["estimated_psnr"] == pytest.approx(30.0, abs=0.6)
+
+
+@pytest.mark.parametrize("goal", [25.0, 40.0])
+def test_absorbing_reaches_a_psnr_with_fewer(goal):
+    """By its own estimate, to `pipeline.CLOSE` or as near as three tries come."""
+    splats, views = cloud(1500), ring()
+    plain = prune(splats, views, Budget(psnr=goal), Settings("occlusion"))
+    merged = prune(splats, views, Budget(psnr=goal), absorb=True)
+
+    assert merged.report["estimated_psnr"] == pytest.approx(goal, abs=1.5)
+    assert merged.report["estimated_psnr_absorbed"] == merged.report["estimated_psnr"]
+    assert merged.keep.sum() < plain.keep.sum()
+
+
+def test_protected_splats_stay_and_the_psnr_is_kept_all_the_same():
+    """With the lowest half protected, others must go, and fewer of them."""
+    splats, views = cloud(), ring()
+    scores = score(splats, views, Settings("occlusion"))
+    protected = scores.values <= np.median(scores.values)
+
+    result = prune(splats, views, Budget(psnr=30.0), Settings("occlusion"), protected=protected)
+
+    assert result.keep[protected].all()
+    assert result.report["estimated_psnr"] == pytest.approx(30.0, abs=1.0)
+
+
+def test_the_report_has_the_estimate_and_the_curve():
+    """Plain numbers: of the result, of absorbing instead, and of all shares."""
+    done = prune(cloud(), ring(), Budget(ratio=0.5), Settings("occlusion")).report
+
+    at = done["quality"]["shares"].index(0.5)
+    assert done["estimated_psnr"] == pytest.approx(done["quality"]["psnr"][at], abs=0.01)
+    assert done["estimated_psnr_absorbed"] > done["estimated_psnr"]
+    json.dumps(done, allow_nan=False)
+
+
+def test_the_closed_form_says_that_it_made_no_estimate():
+    """It would take longer than scoring does."""
+    done = prune(cloud(), ring(), Budget(ratio=0.5)).report
+
+    assert done["estimated_psnr"] is None
+    assert done["quality"] is None
+    assert "only if a PSNR is the budget" in done["estimated_psnr_note"]
+    assert done["notes"] == []
+
+
+def test_merged_splats_are_judged_against_the_original():
+    """Those that stay as they are change nothing; with other harmonics they do."""
+    splats, views = cloud(), ring()
+    found = sight_lines.sights(splats, views)
+    other = replace(splats, sh_rest=splats.sh_rest + 0.5)
+
+    assert found.against(splats, views) == PSNR_CAP
+    assert found.against(other, views) < 40.0
+
+
+def test_estimating_can_be_cancelled():
+    """Wherever it is."""
+    splats, views = cloud(), ring()
+    found = sight_lines.sights(splats, views)
+    values = np.arange(300, dtype=np.float32)
+
+    def stop(_fraction, _what):
+        return False
+
+    with pytest.raises(Cancelled):
+        sight_lines.sights(splats, views, progress=stop)
+    with pytest.raises(Cancelled):
+        found.curve(values, progress=stop)
+    with pytest.raises(Cancelled):
+        found.against(splats, views, progress=stop)
+
+
+@pytest.mark.filterwarnings("error")
+def test_extreme_splats_make_no_warning():
+    """Opaque, invisible, vast, tiny, far, behind, brighter than white."""
+    splats = cloud()
+    logs = splats.log_scales.copy()
+    logs[:20], logs[20:40] = 30.0, -60.0
+    logits = splats.opacity_logits.copy()
+    logits[40:60], logits[60:80] = np.inf, -5.54  # an opacity just above 1 / 255
+    dc = splats.sh_dc.copy()
+    dc[80:100] = 1e6
+    means = splats.means.copy()
+    means[100:120] *= 1e5
+    strange = replace(splats, log_scales=logs, opacity_logits=logits, sh_dc=dc, means=means)
+    assert np.any(np.abs(opacity(logits) - CUT) < 1e-4)
+
+    found = score(strange, ring(), quality=True).quality
+
+    assert found is not None
+    assert np.isfinite(found.psnr).all()
