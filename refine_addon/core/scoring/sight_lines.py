@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 LINES = 1 << 14
 """How many lines of sight all views together have."""
 
-MOST_MET = 1 << 23
+MOST_MET = 1 << 24
 """About how many splats all lines together may meet; there are fewer lines in dense scenes."""
 
 LEAST_LINES = 16
