@@ -48,6 +48,12 @@ MUTANTS = {
     "scoring/adaptive.py": [
         ("math.log(geometry)", "math.log(1 + geometry)", "wrong logarithm"),
     ],
+    "scoring/sight_lines.py": [
+        ("front = through - self.dark", "front = through", "a splat hides itself"),
+        (" - 5.0 / math.log(10.0) * relative", "", "chance not mended"),
+        ("np.where(back < on, before, after)", "after", "only those behind take over"),
+        ('order[np.argsort(protected[order], kind="stable")]', "order", "protection forgotten"),
+    ],
     "selection.py": [
         ("ties[: count", "ties[-count :][: count", "ties from the end"),
         ("count - 1)[count - 1]", "count)[count]", "off by one"),
