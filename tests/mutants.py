@@ -48,6 +48,12 @@ MUTANTS = {
     "scoring/adaptive.py": [
         ("math.log(geometry)", "math.log(1 + geometry)", "wrong logarithm"),
     ],
+    "scoring/sight_lines.py": [
+        ("front = through - self.dark", "front = through", "a splat hides itself"),
+        (" - 5.0 / math.log(10.0) * relative", "", "chance not mended"),
+        ("np.where(back < on, before, after)", "after", "only those behind take over"),
+        ('order[np.argsort(protected[order], kind="stable")]', "order", "protection forgotten"),
+    ],
     "selection.py": [
         ("ties[: count", "ties[-count :][: count", "ties from the end"),
         ("count - 1)[count - 1]", "count)[count]", "off by one"),
@@ -103,6 +109,8 @@ MUTANTS = {
     "cameras/colmap.py": [("if left:", "if left < 0:", "what is not announced skipped")],
     "scoring/occlusion.py": [
         ("return 0.25 + 0.5 * gone", "return 0.25", "what has gone forgotten"),
+        ("        self.turn += count\n", "", "the same views in every round"),
+        ("block.error[:] *= error", "pass", "errors before what hid them went"),
         (
             "LEAST ** (number / (rounds - 1))",
             "LEAST ** ((number - 1) / (rounds - 1))",
@@ -122,8 +130,8 @@ MUTANTS = {
     ],
     "scoring/measuring.py": [
         (
-            "self.views[piece.start :: blocks]",
-            "self.views[::blocks]",
+            "range(chosen[piece.start], len(self.views), self.count)",
+            "range(0, len(self.views), self.count)",
             "the same views in every block",
         ),
         (
@@ -134,6 +142,7 @@ MUTANTS = {
         ("footprints.index[footprints.inside]", "footprints.index", "seen beside the image"),
     ],
     "scoring/froxels.py": [
+        ("max(FEW_CELLS, len(", "min(MAX_CELLS, 9**9 + len(", "cells of 4 px whatever they cost"),
         ("    np.log(covered, out=covered)\n", "", "thickness of a thin point"),
         (
             "np.minimum(alphas, np.float32(ALPHA_MAX)).take(points.owners)",
@@ -213,11 +222,12 @@ MUTANTS = {
         ("known and away <=", "known or away <=", "farther than float32 holds"),
     ],
     "scoring/coverage.py": [
+        ("(logs / math.log(10.0), DOUBTS)", "(logs, DOUBTS) * 0", "any floor that gains a hair"),
         ("/ (1.0 + seen)", "/ 1.0", "seen forgotten in floor"),
         ("max(pair) for pair", "pair[0] for pair", "no floor where views agree"),
         (
-            'np.argsort(scores, kind="stable")]',
-            'np.argsort(-scores, kind="stable")]',
+            "(scores[:, None] <= last)",
+            "(scores[:, None] >= last)",
             "best go first",
         ),
         ("return [1.0] * len(SHARES)", "return [0.0] * len(SHARES)", "trust in what nobody judges"),
@@ -309,7 +319,7 @@ MUTANTS = {
             "the less seen survives",
         ),
         ("        touched[into] = True\n", "", "costs not renewed"),
-        ("self.patience * merging.costs", "merging.costs", "patience ignored"),
+        ("self.cost[mine] = self.patience * cost", "self.cost[mine] = cost", "patience ignored"),
         ("count < connected / 2", "count < 0", "never connected anew"),
         ("self.alive & ~np.isnan(self.field.error)", "self.alive", "a round that does nothing"),
     ],
@@ -350,6 +360,11 @@ MUTANTS = {
         ),
     ],
     "pipeline.py": [
+        (
+            "found.error + (1.0 - share) * expected.error",
+            "found.error",
+            "what the other views see forgotten",
+        ),
         ("math.floor(FIRST * total)", "0", "merged from the first"),
         ("else protected[rest]", "else None", "protection forgotten"),
         (

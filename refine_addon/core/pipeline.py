@@ -77,7 +77,7 @@ def score(
     settings : Settings
     quality : bool
         Whether the scores get an estimate of the pictures' quality even if that takes longer than
-        scoring by the closed form; all other methods always give one.
+        scoring by the closed form; scores by occlusion always have one.
     progress : callable, optional
         ``progress(fraction, what)``; returning ``False`` cancels.
     threads : int, optional
@@ -93,8 +93,8 @@ def score(
     Cancelled
         If `progress` answers ``False``.
     """
-    quality = quality or settings.estimates
-    whole, progress = progress, part(progress, 0.0, 0.9 if quality else 1.0)
+    whole, estimates = progress, quality or settings.estimates
+    progress = part(progress, 0.0, 0.9 if estimates else 1.0)
     # Numbers that underflow to 0 are negligible in all sums.
     with np.errstate(under="ignore"):
         used = views.spread(settings.views)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 PSNR_CAP = 100.0
 """What equal pictures count as, dB, and the most that any estimate says."""
 
-SHARES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
+SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 """Shares of the splats removed at which the estimate is made; between them it is interpolated."""
 
 TAKEN_OVER = (0.3, 0.5, 0.7, 0.9)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from types import SimpleNamespace
 
 import bpy
@@ -169,3 +170,16 @@ def test_the_quality_of_the_pictures_is_a_budget(draw, addon, room, room_cameras
     stored = addon.mesh.scores.stored_scores(addon.mesh.layout.check(room))
     assert stored.quality is not None
     assert any(text.startswith("Stay: ") for text in draw())
+
+
+def test_a_curve_of_more_splats_than_are_left_is_not_used(addon, room, room_cameras):  # noqa: ARG001
+    """Where some were deleted by hand since, a share of the rest is another."""
+    bpy.context.scene.refine.budget = "psnr"
+    bpy.ops.refine.score()
+    scores = addon.mesh.scores
+    noted = json.loads(room.data[scores.RECORD])
+    room.data[scores.RECORD] = json.dumps(noted | {"splats": noted["splats"] + 5})
+
+    stored = scores.stored_scores(addon.mesh.layout.check(room))
+
+    assert stored.quality is None

@@ -245,7 +245,7 @@ def work(addon, monkeypatch):
     """Return a function that has an operator's work wait until it is cancelled, or fail."""
 
     def work(name, how):
-        def instead(*_arguments, progress):
+        def instead(*_arguments, progress, **_options):
             while how == "wait" and progress(0.5, "waiting") is not False:
                 time.sleep(0.01)
             raise addon.core.Cancelled if how == "wait" else addon.core.RefineError("failed")

@@ -635,6 +635,19 @@ def test_each_share_has_the_weight_that_is_right_up_to_there():
     assert found[0] < 0.002 < min(found[1:3])
 
 
+def test_a_floor_that_gains_nothing_has_no_weight_while_little_goes():
+    """Scores and floors agree, so any weight loses the same: 0 is stood for by 10^-5.5.
+
+    From half removed on it weighs what it must at least.
+    """
+    right = np.random.default_rng(9).random(200)
+
+    found = coverage.floor_weights([(right, right, right[None])])
+
+    assert max(found[:2]) < 1e-5
+    assert found[2:] == list(coverage.LEAST_FLOOR_WEIGHTS)[2:]
+
+
 def test_splats_go_by_the_weight_of_the_floor_that_holds_up_to_each_stop():
     """Two by scores alone, none by a weight whose stop is no further, then by a large floor."""
     scores, floors = np.array([5.0, 1, 2, 3, 4]), np.array([1.0, 9, 9, 4, 3])

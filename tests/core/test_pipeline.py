@@ -23,6 +23,7 @@ from refine_addon.core import (
     Splats,
     View,
     ViewSet,
+    pipeline,
     prune,
     prune_file,
     read_cameras,
@@ -35,6 +36,7 @@ from refine_addon.core.scene import principal_axes
 from refine_addon.core.scoring import froxels, projection
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
 from refine_addon.core.scoring.closed_form import LUMA
+from refine_addon.core.scoring.measuring import Measured
 from refine_addon.core.selection import rank
 from refine_addon.core.task import Task
 from tests.strategies import plain_header, ply_of, splat_names
@@ -549,3 +551,36 @@ def test_the_first_tenth_goes_as_occlusion_says_and_nothing_absorbs_it(ratio):
         "merged": 0,
         "deleted": len(splats) - np.count_nonzero(deleted.keep),
     }
+
+
+def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, views, monkeypatch):
+    """What was expected counts by the share of the views that were not measured.
+
+    In place of the second measuring 1 for every splat, from a quarter of the views: 1 + .75 times
+    what was expected. All views are measured once, before.
+    """
+    asked, seen = [], []
+
+    def quarter(splats, _views, _settings, turn, parts, **_):
+        asked.append((turn, parts))
+        ones = np.ones(len(splats))
+        return Measured(ones, 2.0 * ones, np.zeros(len(splats), np.int32)), 0.25
+
+    def listening(splats, used, measure, count, original=pipeline.absorbing.absorb, **changes):
+        def tell(now, expected, progress):
+            sums = measure(now, expected, progress)
+            if expected is not None:
+                seen.append((sums, expected))
+            return sums
+
+        return original(splats, used, tell, count, **changes)
+
+    monkeypatch.setattr(pipeline.occlusion, "measure_part", quarter)
+    monkeypatch.setattr(pipeline.absorbing, "absorb", listening)
+    prune(read_ply(small).splats(), views, Budget(ratio=0.7), absorb=True)
+
+    assert asked == [(turn, 2) for turn in range(len(asked))]
+    assert len(seen) == len(asked) > 0
+    for sums, expected in seen:
+        np.testing.assert_allclose(sums.contribution, 1.0 + 0.75 * expected.contribution)
+        np.testing.assert_allclose(sums.error, 2.0 + 0.75 * expected.error)

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 LINES = 1 << 14
 """How many lines of sight all views together have."""
 
-MOST_MET = 1 << 23
+MOST_MET = 1 << 24
 """About how many splats all lines together may meet; there are fewer lines in dense scenes."""
 
 LEAST_LINES = 16
@@ -118,48 +118,54 @@ class Lines:
     dark: NDArray[np.float32]
     met: NDArray[np.int64]
 
-    def keeping(self, chosen: NDArray[np.bool_]) -> Lines:
-        """Return the lines with only some of what they meet, chosen by (h,) bool."""
-        return Lines(
-            self.columns,
-            self.rows,
-            self.line[chosen],
-            self.owner[chosen],
-            self.alpha[chosen],
-            self.dark[chosen],
-            self.met,
-        )
-
-    def colors(self, colors: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the colour that each line sees, (P, 3), 0..1.
+    def keeping(self, keep: NDArray[np.bool_]) -> Lines:
+        """Return the lines with only some of what they meet.
 
         Parameters
         ----------
-        colors : (u, 3) float64
+        keep : (u,) bool
+            Which of `met` are there.
+        """
+        there = np.flatnonzero(keep.take(self.owner))
+        return replace(
+            self,
+            line=self.line.take(there),
+            owner=self.owner.take(there),
+            alpha=self.alpha.take(there),
+            dark=self.dark.take(there),
+        )
+
+    def colors(self, colors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the colour that each line sees, (3, P), 0..1.
+
+        Parameters
+        ----------
+        colors : (3, u) float64
             Of the splats that are met.
         """
-        through = np.cumsum(self.dark, dtype=np.float64)
-        front = through - self.dark  # logarithm of the transmittance in front
-        first = np.flatnonzero(np.diff(self.line, prepend=-1))  # of each line that meets something
-        front -= np.repeat(front[first], np.diff(np.append(first, len(front))))
-        seen = np.flatnonzero(front > _DARK)
-        line = self.line[seen]
-        weight = self.alpha[seen] * np.exp(front[seen])  # (s,)
-        own = colors.take(self.owner[seen], axis=0)  # (s, 3)
         count = len(self.columns) * len(self.rows)
-        channels = [np.bincount(line, weight * channel, count) for channel in own.T]
-        return np.stack(channels, axis=1).clip(0.0, 1.0)
+        through = np.cumsum(self.dark, dtype=np.float64)
+        last = np.flatnonzero(self.line[1:] != self.line[:-1])  # of each line but the last
+        before = np.zeros(count)  # the sum over all lines before each
+        before[self.line[last + 1]] = through[last]
+        front = through - self.dark  # logarithm of the transmittance in front
+        front -= before.take(self.line)
+        seen = np.flatnonzero(front > _DARK)
+        line, owner = self.line.take(seen), self.owner.take(seen)
+        weight = self.alpha.take(seen) * np.exp(front.take(seen).astype(np.float32))  # (s,)
+        channels = [np.bincount(line, weight * channel.take(owner), count) for channel in colors]
+        return np.stack(channels).clip(0.0, 1.0)
 
     def taken_over(
         self, colors: NDArray[np.float64], keep: NDArray[np.bool_]
     ) -> NDArray[np.float64]:
-        """Return the colour that each line sees if survivors take over what goes, (P, 3), 0..1.
+        """Return the colour that each line sees if survivors take over what goes, (3, P), 0..1.
 
         What goes is as opaque as it was, in the colour of the nearest splat on the line that stays.
 
         Parameters
         ----------
-        colors : (u, 3) float64
+        colors : (3, u) float64
             Of the splats that are met.
         keep : (u,) bool
             Which of them stay.
@@ -176,8 +182,8 @@ class Lines:
         near = np.where(back < on, before, after)
         alone = np.minimum(back, on) == len(here)  # nothing on this line stays
         owner = self.owner.take(np.where(alone, here, near))
-        changed = replace(self, owner=np.where(alone, len(colors), owner))
-        return changed.colors(np.concatenate([colors, np.zeros((1, 3))]))
+        changed = replace(self, owner=np.where(alone, colors.shape[1], owner))
+        return changed.colors(np.concatenate([colors, np.zeros((3, 1))], axis=1))
 
     @property
     def meeting(self) -> int:
@@ -365,7 +371,7 @@ class SightLines:
             own = place.take(lines.met)  # (u,)
             for count in counts:
                 # What is removed stays removed: the lists grow shorter.
-                lines = lines.keeping(own.take(lines.owner) >= count)
+                lines = lines.keeping(own >= count)
                 values.append(psnr_of(lines.colors(colors), whole, view))
             return np.array(values)
 
@@ -390,7 +396,7 @@ class SightLines:
             whole, own, gains = lines.colors(colors), place.take(lines.met), []
             for count in counts:
                 keep = own >= count  # (u,)
-                left = lines.keeping(keep.take(lines.owner)).colors(colors)
+                left = lines.keeping(keep).colors(colors)
                 taken = lines.taken_over(colors, keep)
                 gains.append(psnr_of(taken, whole, view) - psnr_of(left, whole, view))
             return np.array(gains)
@@ -434,7 +440,7 @@ class SightLines:
 
 
 def _colors(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float64]:
-    """Return the colours in which a view sees some splats, (n, 3), at least 0.
+    """Return the colours in which a view sees some splats, (3, n), at least 0.
 
     Parameters
     ----------
@@ -450,7 +456,7 @@ def _colors(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.f
     colors = 0.5 + values[:, :1] * splats.sh_dc[rows].astype(np.float64)
     if splats.sh_degree:
         colors += np.einsum("nk,nkc->nc", values[:, 1:], splats.sh_rest[rows].astype(np.float64))
-    return np.asarray(colors.clip(0.0, projection.BRIGHTEST))
+    return np.ascontiguousarray(colors.T.clip(0.0, projection.BRIGHTEST))
 
 
 def psnr_of(seen: NDArray[np.float64], whole: NDArray[np.float64], view: View) -> float:
@@ -460,7 +466,7 @@ def psnr_of(seen: NDArray[np.float64], whole: NDArray[np.float64], view: View) -
     relative error, to second order, which is put right. How much the lines differ by chance, and
     not from one part of the picture to the other, is told by neighbours.
     """
-    errors = np.mean((seen - whole) ** 2, axis=1)
+    errors = np.mean((seen - whole) ** 2, axis=0)
     mean, count = float(np.mean(errors)), len(errors)
     if mean <= 10.0 ** (-PSNR_CAP / 10.0):
         return PSNR_CAP
