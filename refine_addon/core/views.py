@@ -258,6 +258,23 @@ class ViewSet:
         """
         return sorted(range(len(self)), key=lambda index: self.views[index].name)
 
+    def by_distance(self) -> list[tuple[View, float]]:
+        """Return the views of positive weight and their weights, in an order given by the scene.
+
+        They are sorted by distance from their middle, then from the view farthest from it, equal
+        ones by name. So their order depends neither on the frame nor on that of the set.
+        """
+        centers = self.centers - self.middle()[0]
+        order = np.array(self.by_name())
+        for _ in range(2):
+            distance = np.einsum("ij,ij->i", centers, centers)
+            largest = float(distance.max()) or 1.0
+            # Rounded, so that distances that differ by rounding only keep their order.
+            order = order[np.argsort(np.round(distance[order] / largest, 9), kind="stable")]
+            centers = centers - centers[order[-1]]
+        weights = self.weights
+        return [(self.views[k], float(weights[k])) for k in order.tolist() if weights[k] > 0]
+
 
 def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
     """Return the weighted median of values, (V,); the smaller one if two are in the middle."""

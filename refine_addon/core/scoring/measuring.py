@@ -119,14 +119,14 @@ class Measuring:
     Attributes
     ----------
     views : list of (View, float)
-        Views and their weights, see `by_distance`.
+        Views and their weights, see `ViewSet.by_distance`.
     """
 
     def __init__(
         self, scene: Scene, views: ViewSet, sampling: Sampling, threads: int | None
     ) -> None:
         self.scene, self.sampling, self.threads = scene, sampling, threads
-        self.views = by_distance(views)
+        self.views = views.by_distance()
 
     @property
     def count(self) -> int:
@@ -217,20 +217,3 @@ def measure_view(
         total.contribution[footprints.index] += weight * (mass * visible)
         total.error[footprints.index] += weight * (mass_squared * errors)
     return footprints
-
-
-def by_distance(views: ViewSet) -> list[tuple[View, float]]:
-    """Return the views of positive weight and their weights, in an order given by the scene.
-
-    They are sorted by distance from their middle, then from the view farthest from it, equal ones
-    by name. So which block a view belongs to depends neither on the frame nor on the order.
-    """
-    centers = views.centers - views.middle()[0]
-    order = np.array(views.by_name())
-    for _ in range(2):
-        distance = np.einsum("ij,ij->i", centers, centers)
-        largest = float(distance.max()) or 1.0
-        # Rounded, so that distances that differ by rounding only keep their order.
-        order = order[np.argsort(np.round(distance[order] / largest, 9), kind="stable")]
-        centers = centers - centers[order[-1]]
-    return [(views[int(k)], float(views.weights[k])) for k in order if views.weights[k] > 0]

@@ -25,7 +25,7 @@ from ..errors import RefineError
 from ..scores import Scores, shares_gone
 from ..work import Progress, part, report, silent
 from . import closed_form, coverage, projection
-from .measuring import Measured, Measuring, Sampling, by_distance
+from .measuring import Measured, Measuring, Sampling
 from .sight_lines import SightLines
 
 if TYPE_CHECKING:
@@ -168,8 +168,9 @@ def _scored(
     if not good.any():
         msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
         raise RefineError(msg)
-    sights = SightLines(by_distance(views), gaussians, splats)
-    run = _Run(gaussians, Measuring(scene, views, settings, threads), settings.rounds, sights)
+    measuring = Measuring(scene, views, settings, threads)
+    sights = SightLines(measuring.views, gaussians, splats)
+    run = _Run(gaussians, measuring, settings.rounds, sights)
     prior = closed_form.score(
         splats, views, PRIOR, progress=part(progress, 0.05, 0.1), threads=threads
     )

@@ -26,7 +26,6 @@ from ..rendering import ALPHA_CUT, ALPHA_MAX
 from ..spherical_harmonics import basis
 from ..work import Progress, checkpoint, for_chunks, part, silent
 from . import projection
-from .measuring import by_distance
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -78,7 +77,7 @@ def sights(
     gaussians, scene, _ = projection.prepare(
         splats, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
-    found = SightLines(by_distance(views), gaussians, splats)
+    found = SightLines(views.by_distance(), gaussians, splats)
 
     def work(piece: slice) -> None:
         with np.errstate(under="ignore"):
