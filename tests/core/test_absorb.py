@@ -780,7 +780,7 @@ def test_extreme_splats_raise_no_warning_and_stay_drawable():
         )
 
     with np.errstate(all="raise"):
-        for seen in (wild, lambda left, _: ViewSums(np.ones(len(left)), np.ones(len(left)))):
+        for seen in (wild, lambda left, *_: ViewSums(np.ones(len(left)), np.ones(len(left)))):
             result = absorb(splats, around(), seen, 150)
 
             changed = result.splats.take(result.changed)

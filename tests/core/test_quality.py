@@ -79,6 +79,7 @@ def half(count: int) -> np.ndarray:
     return np.random.default_rng(5).random(count) < 0.5
 
 
+@pytest.mark.slow
 def test_lines_through_all_pixels_tell_the_psnr_of_the_picture():
     """Five views of 80 x 60 have 24,000 pixels; with as many lines nothing is left to chance."""
     splats, views, keep = cloud(), ring(), half(300)
@@ -90,6 +91,7 @@ def test_lines_through_all_pixels_tell_the_psnr_of_the_picture():
     assert found.psnr(keep) == pytest.approx(psnr(splats, keep, views), abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_third_of_the_pixels_tell_it_nearly(monkeypatch):
     """8,192 of 24,000 pixels, of an error that is smooth over many pixels: within a quarter dB."""
     splats, views, keep = cloud(), ring(), half(300)
@@ -369,6 +371,7 @@ def test_published_scores_reach_it_too():
     assert result.report["estimated_psnr"] == pytest.approx(30.0, abs=0.6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("goal", [25.0, 40.0])
 def test_absorbing_reaches_a_psnr_with_fewer(goal):
     """By its own estimate, to `pipeline.CLOSE` or as near as three tries come."""
@@ -381,6 +384,7 @@ def test_absorbing_reaches_a_psnr_with_fewer(goal):
     assert merged.keep.sum() < plain.keep.sum()
 
 
+@pytest.mark.slow
 def test_protected_splats_stay_and_the_psnr_is_kept_all_the_same():
     """With the lowest half protected, others must go, and fewer of them."""
     splats, views = cloud(), ring()
