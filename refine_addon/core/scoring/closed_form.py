@@ -458,11 +458,16 @@ class _Scene:
     def compare(self, threads: int | None) -> None:
         """Divide each score by a power of the mean score around it."""
         cells = self.cells
-        sums = np.bincount(cells, self.values)
+        # Sums, means and logarithms in turn, in place.
+        powers = np.bincount(cells, self.values).astype(np.float64, copy=False)
         count = np.bincount(cells, self.good)
-        overall = sums.sum() / count.sum()
-        means = np.maximum(sums / np.maximum(count, 1) / overall, np.finfo(np.float32).tiny)
-        powers = -0.5 * np.log(means)
+        overall = powers.sum() / count.sum()
+        powers /= np.maximum(count, 1, out=count)
+        powers /= overall
+        np.maximum(powers, np.finfo(np.float32).tiny, out=powers)
+        np.log(powers, out=powers)
+        powers *= -0.5
+        del count
 
         def divide(piece: slice) -> None:
             values = self.values[piece].astype(np.float64)
