@@ -463,3 +463,20 @@ def test_extreme_splats_make_no_warning():
 
     assert found is not None
     assert np.isfinite(found.psnr).all()
+
+
+def test_images_of_millions_of_pixels_a_side_are_looked_at_as_small_ones(monkeypatch):
+    """Which lines lie in a footprint is told by a table or by searching, with one result."""
+    splats, views = cloud(), ring()
+    found = sight_lines.sights(splats, views).lines
+
+    monkeypatch.setattr(sight_lines, "_LARGE", 0)
+    again = sight_lines.sights(splats, views).lines
+
+    for one, other in zip(found, again, strict=True):
+        np.testing.assert_array_equal(one.line, other.line)
+        np.testing.assert_array_equal(one.owner, other.owner)
+    lens = {"fx": 1e7, "fy": 1e7, "cx": 4e6, "cy": 3e6, "width": 8_000_000, "height": 6_000_000}
+    wide = sight_lines.sights(splats, ViewSet((replace(views[0], **lens),)))
+    assert wide.psnr(np.ones(len(splats), bool)) == PSNR_CAP
+    assert wide.psnr(half(len(splats))) < PSNR_CAP

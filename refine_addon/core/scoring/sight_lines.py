@@ -53,6 +53,7 @@ JUDGES = 24
 """At most about so many views judge what takes more time than splats that are deleted."""
 
 _BLOCK = 1 << 17  # pairs of footprint and pixel at a time, which limits temporary memory
+_LARGE = 1 << 14  # pixels; for images no larger, a table says how many lines lie before each
 _DARK = -9.3  # logarithm of the transmittance below which nothing is seen, 1e-4
 
 
@@ -554,13 +555,17 @@ def _held(
     """
     center = footprints.centers[axis] - np.float32(0.5)
     half = np.sqrt(reach * (footprints.major[axis] ** 2 + footprints.minor[axis] ** 2))
-    size = int(places[-1]) + 1
-    before = np.searchsorted(places, np.arange(size + 1))  # (size + 1,), how many lie before each
-    first, end = (
-        before.take(np.ceil(edge).clip(0.0, size).astype(np.int64))
-        for edge in (center - half, center + half)
-    )
+    first, end = (_before(places, np.ceil(edge)) for edge in (center - half, center + half))
     return first, end - first
+
+
+def _before(places: NDArray[np.int64], edges: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return how many of some ascending pixels lie before each edge, (n,)."""
+    size = int(places[-1]) + 1
+    if size > _LARGE:
+        return np.asarray(np.searchsorted(places.astype(np.float64), edges.astype(np.float64)))
+    table = np.searchsorted(places, np.arange(size + 1))  # four times as fast as searching each
+    return np.asarray(table.take(edges.clip(0.0, size).astype(np.int64)))
 
 
 def _squared(
