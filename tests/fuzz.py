@@ -34,9 +34,8 @@ from refine_addon.command.info import describe  # noqa: E402 - from this checkou
 from refine_addon.core import Occlusion, RefineError, Settings, read_cameras, read_ply, score  # noqa: E402
 from refine_addon.core.formats.ply import splats_from_columns  # noqa: E402
 
-MEMORY = 60_000_000
-"""Bytes that any of these small inputs may cost: 30 MB that `for_chunks` touches once, 13 MB for
-the lines of sight of a single view, and what NumPy and JSON need of their own."""
+MEMORY = 40_000_000
+"""Bytes that any of these small inputs may cost; NumPy and JSON need some of their own."""
 
 SECONDS = 5.0
 """An input that takes longer is a crash too; of the processor, which others may be using."""

@@ -89,6 +89,26 @@ def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
     return np.stack([value for band in bands for value in band], axis=-1)
 
 
+def colors(
+    directions: NDArray[Any], sh_dc: NDArray[Any], sh_rest: NDArray[Any]
+) -> NDArray[np.float64]:
+    """Return the colour of each splat as viewed along a direction, (N, 3), not clipped.
+
+    Parameters
+    ----------
+    directions : (N, 3) floating
+        See `basis`.
+    sh_dc : (N, 3) floating
+    sh_rest : (N, K, 3) floating
+        Coefficients above the constant, K = (degree + 1)^2 - 1.
+    """
+    values = basis(directions, math.isqrt(sh_rest.shape[1] + 1) - 1)  # (N, K + 1)
+    found = 0.5 + values[:, :1] * np.asarray(sh_dc, np.float64)
+    if sh_rest.shape[1]:
+        found += np.einsum("nk,nkc->nc", values[:, 1:], np.asarray(sh_rest, np.float64))
+    return np.asarray(found)
+
+
 def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return coefficients whose colour along ``rotation @ d`` is the old colour along d.
 

@@ -17,22 +17,9 @@ pytest.importorskip("skimage")
 from benchmarks.baselines import rap
 from benchmarks.tables import evaluate
 from refine_addon.core.errors import RefineError
-from refine_addon.core.splats import Splats
+from tests.benchmarks.test_merging import scene_of
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
-
-
-def cloud(count: int = 400) -> Splats:
-    """Return splats spread over a cube, of degree 1."""
-    rng = np.random.default_rng(0)
-    return Splats(
-        rng.random((count, 3)).astype(np.float32),
-        rng.normal(-4, 0.5, (count, 3)).astype(np.float32),
-        rng.normal(size=(count, 4)).astype(np.float32),
-        rng.normal(size=count).astype(np.float32),
-        rng.normal(size=(count, 3)).astype(np.float32),
-        rng.normal(size=(count, 3, 3)).astype(np.float32),
-    )
 
 
 class Pickled:
@@ -91,7 +78,7 @@ def pointing(feature: int) -> list[np.ndarray]:
 
 def test_the_network_is_read_and_evaluated(tmp_path: Path) -> None:
     """Weights that pick one feature out give it back, scaled and shifted."""
-    splats = cloud()
+    splats = scene_of()
 
     for feature in (0, 14):
         weights = write_weights(tmp_path / "net.pth", pointing(feature))
@@ -105,7 +92,7 @@ def test_features_are_in_their_order_and_within_0_and_1() -> None:
     Columns 0 and 1 distance, 2 and 3 colour spread, 4 to 6 and 7 to 9 scales from short to long,
     10 and 11 volume, 12 and 13 opacity, 14 colour. All of splat 0's are at the 99th percentile.
     """
-    splats = cloud()
+    splats = scene_of()
     changes = {}
     for name, value in (
         ("means", [3.0, 3.0, 3.0]),
@@ -130,7 +117,7 @@ def test_features_are_in_their_order_and_within_0_and_1() -> None:
 
 def test_local_features_compare_with_neighbours_and_global_ones_with_all() -> None:
     """A small splat among tiny ones stands out there, though most splats elsewhere are larger."""
-    splats = cloud()
+    splats = scene_of()
     means, logs = splats.means.copy(), np.full((400, 3), -2.0, np.float32)
     means[:150] += 9.0
     logs[:150] = -6.0
@@ -145,7 +132,7 @@ def test_local_features_compare_with_neighbours_and_global_ones_with_all() -> No
 
 def test_splats_in_one_place_and_alike_have_finite_features() -> None:
     """Distances of 0 have no logarithm, and values that do not vary no standard deviation."""
-    same = cloud(200).take(np.zeros(200, np.int64))
+    same = scene_of(200).take(np.zeros(200, np.int64))
 
     assert np.isfinite(rap.features(same)).all()
 

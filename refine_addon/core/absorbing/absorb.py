@@ -40,10 +40,10 @@ what is hidden; None before the first stage.
 STAGE = 0.6
 """A stage leaves at least this share of its splats."""
 
-_CHUNK = 1 << 14
-
 PATIENCE = 2.0
 """Factor on the cost of merging if half of the splats go; see `patience`."""
+
+_CHUNK = 1 << 14
 
 
 @dataclass(frozen=True, eq=False)

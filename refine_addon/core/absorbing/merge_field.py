@@ -9,7 +9,7 @@ import numpy as np
 
 from .. import frustum, spherical_harmonics
 from ..rendering import LOW_PASS, NEAR_RELATIVE
-from ..splats import SH_C0, opacity, rotation_matrices
+from ..splats import opacity, rotation_matrices
 from ..work import Progress, for_chunks, part, silent
 
 if TYPE_CHECKING:
@@ -262,10 +262,9 @@ def field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
         logs = np.asarray(chunk.log_scales, np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
         axes = rotation_matrices(chunk.quaternions) * np.exp(logs)[:, None, :]  # (n, 3, 3)
         covariances[piece] = (axes @ np.swapaxes(axes, 1, 2))[:, upper[0], upper[1]]
-        color[piece] = 0.5 + SH_C0 * np.asarray(chunk.sh_dc, np.float64)
-        if chunk.sh_degree:
-            basis = spherical_harmonics.basis(looked.direction[piece], chunk.sh_degree)[:, 1:]
-            color[piece] += np.einsum("nk,nkc->nc", basis, chunk.sh_rest)
+        color[piece] = spherical_harmonics.colors(
+            looked.direction[piece], chunk.sh_dc, chunk.sh_rest
+        )
 
     ahead = part(progress, 0.5, 1.0)
     for_chunks(fill, count, _CHUNK, progress=ahead, what="absorbing", threads=threads)

@@ -139,6 +139,13 @@ class Measuring:
         mine = (weight for k in which for weight in weights[k :: self.count])
         return math.fsum(mine) / math.fsum(weights)
 
+    def measure(
+        self, gaussians: Gaussians, which: Sequence[int], progress: Progress
+    ) -> list[Measured]:
+        """Return the sums over some blocks of views; see `blocks`."""
+        none = np.empty(0, np.int64)
+        return [block for block, _ in self.blocks(gaussians, none, progress, which=which)]
+
     def blocks(
         self,
         gaussians: Gaussians,

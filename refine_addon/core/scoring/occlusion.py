@@ -189,7 +189,7 @@ def _scored(
         undrawable=int(np.count_nonzero(~good)),
         facts={"floor": run.floor_weights},
         method="occlusion",
-        sights=run.sights,
+        sights=sights,
     )
     return scores, run
 
@@ -261,8 +261,7 @@ def measure_part(  # noqa: PLR0913 - as `measure`, and which part
     blocks = measuring.count
     parts = min(parts, blocks)
     which = range(turn % parts, blocks, parts)
-    none, ahead = np.empty(0, np.int64), part(progress, 0.1, 1.0)
-    found = [block for block, _ in measuring.blocks(gaussians, none, ahead, which=which)]
+    found = measuring.measure(gaussians, which, part(progress, 0.1, 1.0))
     return Measured.sum(found).for_all(gaussians.index, len(splats)), measuring.share(which)
 
 
@@ -316,12 +315,11 @@ class _Run:
             end = 1.0 if number == self.rounds - 1 else done + (1.0 - done) * FIRST_COST
             ahead, done = part(progress, done, end), end
             if number == 0:
-                self._measure_first(prior, ahead)
-                seen[left.index] = self.measured.seen
+                measured = self._measure_first(prior, ahead)
+                seen[left.index] = measured.seen
             else:
-                self._measure_again(left, ahead)
+                measured = self._measure_again(left, ahead)
             report(ahead, 1.0, "scoring")
-            measured = Measured.sum(self.blocks)
             go = max(len(left) - stay, 0)
             order = self._order(measured, prior[left.index], removal, go)
             removal.add(left.index[order[:go]])
@@ -330,11 +328,11 @@ class _Run:
             self.blocks = [block.take(rows) for block in self.blocks]
         return removal.values, seen
 
-    def _measure_again(self, left: Gaussians, progress: Progress) -> None:
+    def _measure_again(self, left: Gaussians, progress: Progress) -> Measured:
         """Measure the splats left in some blocks of views, which take turns.
 
-        The sums of the other blocks are from an earlier round, when more was hidden. They are
-        raised by what the sums of these blocks have grown by on average.
+        The sums of the other blocks are from an earlier round, when more was hidden. Those of each
+        splat are raised by what its sums over these blocks have grown by, see `_growth`.
 
         Parameters
         ----------
@@ -347,8 +345,7 @@ class _Run:
         count = min(2 * pairs, blocks)
         which = [(self.turn + step) % blocks for step in range(count)]
         self.turn += count
-        none = np.empty(0, np.int64)
-        found = [block for block, _ in self.measuring.blocks(left, none, progress, which=which)]
+        found = self.measuring.measure(left, which, progress)
         before, now = (Measured.sum(some) for some in ([self.blocks[k] for k in which], found))
         every = Measured.sum(self.blocks)
         contribution = _growth(now.contribution, before.contribution, every.contribution)
@@ -358,6 +355,7 @@ class _Run:
             block.error[:] *= error
         for k, block in zip(which, found, strict=True):
             self.blocks[k] = block
+        return Measured.sum(self.blocks)
 
     def _order(
         self, measured: Measured, prior: NDArray[np.float32], removal: _Removal, go: int
@@ -384,7 +382,7 @@ class _Run:
         scores = combined(measured, share)
         return coverage.order(scores, floors, prior, self.floor_weights, stops)
 
-    def _measure_first(self, prior: NDArray[np.float32], progress: Progress) -> None:
+    def _measure_first(self, prior: NDArray[np.float32], progress: Progress) -> Measured:
         """Measure all Gaussians, and choose the weights of the floor by leaving views out."""
         sample = coverage.sample(self.gaussians)  # (m,)
         blocks = self.measuring.blocks(self.gaussians, sample, progress, sights=self.sights)
@@ -405,6 +403,7 @@ class _Run:
                 yield combined(others, 0.0), floors, errors
 
         self.floor_weights = coverage.floor_weights(folds())
+        return measured
 
 
 class _Removal:

@@ -1,4 +1,4 @@
-"""The PSNR that views will have, from a few thousand lines of sight instead of whole pictures.
+"""The PSNR that views will have, from thousands of lines of sight instead of whole pictures.
 
 Scoring projects every splat into every view. Of a few hundred pixels of each view, spread evenly,
 it is noted which splats their lines of sight meet, front to back, and with which alpha. The colour
@@ -21,9 +21,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .. import spherical_harmonics
 from ..quality import PSNR_CAP, SHARES, TAKEN_OVER, Quality, absorbed_from
 from ..rendering import ALPHA_CUT, ALPHA_MAX
-from ..spherical_harmonics import basis
 from ..work import Progress, checkpoint, for_chunks, part, silent
 from . import projection
 
@@ -170,8 +170,22 @@ class Lines:
         keep : (u,) bool
             Which of them stay.
         """
+        heirs = self._heirs(keep, nobody=colors.shape[1])
+        black = np.zeros((3, 1))  # of nobody
+        return replace(self, owner=heirs).colors(np.append(colors, black, axis=1))
+
+    def _heirs(self, keep: NDArray[np.bool_], nobody: int) -> NDArray[np.int32]:
+        """Return which of `met` takes over each thing that is met, (h,): the nearest that stays.
+
+        Parameters
+        ----------
+        keep : (u,) bool
+            Which of `met` stay.
+        nobody : int
+            Stands where nothing on the line stays.
+        """
         stays, here = keep.take(self.owner), np.arange(len(self.owner))
-        first = np.flatnonzero(np.diff(self.line, prepend=-1))
+        first = self._first()
         counts = np.diff(np.append(first, len(here)))
         low = np.repeat(first, counts)  # (h,), the first on the same line
         high = low + np.repeat(counts, counts)  # and the one behind the last
@@ -180,15 +194,19 @@ class Lines:
         back = np.where(before >= low, here - before, len(here))  # steps to the nearest in front
         on = np.where(after < high, after - here, len(here))
         near = np.where(back < on, before, after)
-        alone = np.minimum(back, on) == len(here)  # nothing on this line stays
-        owner = self.owner.take(np.where(alone, here, near))
-        changed = replace(self, owner=np.where(alone, colors.shape[1], owner))
-        return changed.colors(np.concatenate([colors, np.zeros((3, 1))], axis=1))
+        none = np.minimum(back, on) == len(here)  # nothing on this line stays
+        heirs = self.owner.take(np.where(none, here, near))
+        heirs[none] = nobody
+        return heirs
 
     @property
     def meeting(self) -> int:
         """How many of the lines meet a splat."""
-        return int(np.count_nonzero(np.diff(self.line, prepend=-1)))
+        return len(self._first())
+
+    def _first(self) -> NDArray[np.int64]:
+        """Return where each line that meets something begins."""
+        return np.flatnonzero(np.diff(self.line, prepend=-1))
 
 
 class SightLines:
@@ -452,11 +470,8 @@ def _colors(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.f
     """
     away = splats.means[rows].astype(np.float64) - view.center
     away /= np.maximum(np.linalg.norm(away, axis=1), np.finfo(np.float64).tiny)[:, None]
-    values = basis(away, splats.sh_degree)  # (n, K + 1)
-    colors = 0.5 + values[:, :1] * splats.sh_dc[rows].astype(np.float64)
-    if splats.sh_degree:
-        colors += np.einsum("nk,nkc->nc", values[:, 1:], splats.sh_rest[rows].astype(np.float64))
-    return np.ascontiguousarray(colors.T.clip(0.0, projection.BRIGHTEST))
+    found = spherical_harmonics.colors(away, splats.sh_dc[rows], splats.sh_rest[rows])
+    return np.ascontiguousarray(found.T.clip(0.0, projection.BRIGHTEST))
 
 
 def psnr_of(seen: NDArray[np.float64], whole: NDArray[np.float64], view: View) -> float:
