@@ -112,7 +112,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         prune += [options.ratio, "--cameras", ROOM / "cameras.json", "--report", report]
         commands = {
             "start": [sys.executable, "-m", "refine_addon", "--version"],
-            "prune": [*prune, *(["--method", "occlusion", "--absorb"] if options.absorb else [])],
+            "prune": [*prune, *(["--absorb"] if options.absorb else ["--method", "closed-form"])],
         }
         if not options.absorb:
             commands["copy"] = ["cp", source, output]

@@ -30,6 +30,7 @@ def large(folder: Path) -> None:
     source, output = folder / "in.ply", folder / "out.ply"
     make_input(source, LARGE)
     command = [sys.executable, "-m", "refine_addon", "prune", source, "-o", output]
+    command += ["--method", "closed-form"]
     took, busy, peak = run([*command, "--cameras", ROOM / "cameras.json"])
     size = source.stat().st_size / 1e9
     print(f"{LARGE:,} splats, {size:.2f} GB: {took:.1f} s ({busy:.1f} of the processor), ", end="")
@@ -43,7 +44,8 @@ def batch(folder: Path) -> None:
     inputs = [folder / f"{index:04}.ply" for index in range(FILES)]
     for path in inputs:
         shutil.copyfile(source, path)
-    common = ["--cameras", str(ROOM / "cameras.json"), "--overwrite", "--quiet"]
+    common = ["--method", "closed-form", "--cameras", str(ROOM / "cameras.json")]
+    common += ["--overwrite", "--quiet"]
     used = []
     start = time.perf_counter()
     for part in (inputs[:100], inputs):  # the first hundred fill what stays
@@ -77,6 +79,7 @@ def cameras(folder: Path) -> None:
         many.append(camera)
     path.write_text(json.dumps(many))
     command = [sys.executable, "-m", "refine_addon", "prune", source, "--dry-run", "--views", "0"]
+    command += ["--method", "closed-form"]
     took, busy, peak = run([*command, "--cameras", path])
     print(
         f"1,000,000 splats by {CAMERAS} cameras: {took:.1f} s ({busy:.1f} of the processor), ",

@@ -75,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for count in counts:
         splats = repeated(replace(room, sh_rest=room.sh_rest[:, :0]), count)
         for label, reading in (("default", ClosedForm()), ("paper", ClosedForm.published("z"))):
-            settings = Settings(closed_form=reading)
+            settings = Settings("closed-form", closed_form=reading)
             seconds = median_seconds(lambda s=splats, t=settings: score(s, views, t), runs)
             each = seconds / count / 64 * 1e9
             print(f"  {label:8} {count:>11,} splats  {seconds:7.3f} s  {each:6.2f} ns")
@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     splats = repeated(replace(room, sh_rest=room.sh_rest[:, :0]), 1_000_000)
     for number in (8, 16, 32, 64, 128, 256):
         many = views.take(np.arange(number) % 64)
-        settings = Settings(views=0)
+        settings = Settings("closed-form", views=0)
         seconds = median_seconds(lambda v=many, t=settings: score(splats, v, t), runs)
         print(f"  {number:4} views  {seconds:7.3f} s")
 

@@ -130,11 +130,13 @@ class Counts:
 def measure(splats: Splats, views: ViewSet) -> Counts:
     """Count every method of the core, and the hits of rendering."""
     settings = {
-        "refine-z": Settings(views=0, closed_form=ClosedForm.published("z")),
-        "refine-distance": Settings(views=0, closed_form=ClosedForm.published("distance")),
+        "refine-z": Settings("closed-form", views=0, closed_form=ClosedForm.published("z")),
+        "refine-distance": Settings(
+            "closed-form", views=0, closed_form=ClosedForm.published("distance")
+        ),
     }
     for name in get_args(get_type_hints(Settings)["method"]):
-        if name != "auto":  # runs the others, as often as its probes ask for
+        if name != "auto":  # occlusion by fewer views, which the scene decides
             settings[name] = Settings(views=0, method=name)
     if len(splats) > MOST_SPLATS:
         drawn = np.random.default_rng(0).choice(len(splats), MOST_SPLATS, replace=False)

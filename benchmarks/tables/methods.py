@@ -167,7 +167,7 @@ def _published() -> list[Method]:
             f"refine-{depth}",
             LITERATURE,
             f"REFINE's closed form, {text} (`--published --depth {depth}`)",
-            Settings(views=0, closed_form=ClosedForm.published(depth)),
+            Settings("closed-form", views=0, closed_form=ClosedForm.published(depth)),
         )
         for depth, text in readings.items()
     ]
@@ -176,7 +176,7 @@ def _published() -> list[Method]:
 CORE_ABOUT = {
     "closed-form": "closed form with frustum test, free of units: the default",
     "occlusion": "froxels: transmittance and contrast without rendering, in rounds",
-    "auto": "the cheapest model that agrees with the full one",
+    "auto": "occlusion with no more views than the pictures need",
 }
 
 

@@ -48,7 +48,7 @@ _PARTS = {
     "equal weights": {"equal_weights": True},
 }
 ABLATION = {
-    f"{reading}: {part}": Settings(views=0, closed_form=make(**changes))
+    f"{reading}: {part}": Settings("closed-form", views=0, closed_form=make(**changes))
     for reading, make in _READINGS.items()
     for part, changes in _PARTS.items()
 }

@@ -31,14 +31,14 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     if given.command == "info":
         return
     try:
-        options.settings(given)
+        settings = options.settings(given)
         if given.command == "prune":
-            frustum = not given.published
-            options.budget(given).refuse_meaningless(given.method, frustum=frustum)
+            budget = options.budget(given)
+            budget.refuse_meaningless(settings.method, frustum=settings.frustum)
     except RefineError as error:
         parser.error(str(error))
-    if given.method == "occlusion" and (given.published or given.depth != "z"):
-        parser.error("--published and --depth are settings of the closed form")
+    if settings.method != "closed-form" and (given.published or given.depth != "z"):
+        parser.error("--published and --depth are settings of --method closed-form")
     if given.command == "prune":
         _check_prune(parser, given)
     if given.cameras is None and not (given.scene and open_blend()):

@@ -107,15 +107,16 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=METHODS,
         default=METHODS[0],
-        help="default: closed-form; occlusion knows what hides what, and takes longer; auto takes "
-        "the cheapest that agrees with it",
+        help="default: auto, which knows what hides what, with no more views and rounds than "
+        "--tolerance asks for; occlusion uses all of them; closed-form takes nothing as hidden: "
+        "far faster, and worse",
     )
     parser.add_argument(
         "--tolerance",
         type=float,
         default=Settings.tolerance,
-        metavar="T",
-        help="with --method auto: share of the kept splats that may differ from the full model's "
+        metavar="DB",
+        help="with --method auto: by how much the PSNR may be lower than by occlusion, in dB "
         f"(default {Settings.tolerance})",
     )
     parser.add_argument(
@@ -123,13 +124,14 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
         choices=["z", "distance"],
         default="z",
         help="what the closed form takes as distance: along the view's axis (z), or to the view "
-        "itself (default z)",
+        "itself (default z); only with --method closed-form",
     )
     parser.add_argument(
         "--published",
         action="store_true",
         help="the formula as published, without frustum test and with constants in scene units: "
-        "the paper's with --depth z, its authors' code with --depth distance",
+        "the paper's with --depth z, its authors' code with --depth distance; only with --method "
+        "closed-form",
     )
     parser.add_argument(
         "--views",

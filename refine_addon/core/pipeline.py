@@ -103,10 +103,10 @@ def score(
                 splats, used, settings.occlusion, progress=progress, threads=threads
             )
         elif settings.method == "auto":
-            models = (settings.closed_form, settings.occlusion)
             scores = auto.score(
-                splats, used, settings.tolerance, models, progress=progress, threads=threads
-            )
+                splats, used, settings.tolerance, settings.occlusion,
+                progress=progress, threads=threads,
+            )  # fmt: skip
         else:
             scores = closed_form.score(
                 splats, used, settings.closed_form, progress=progress, threads=threads
@@ -263,9 +263,8 @@ def decide(
     if absorbed:
         facts["absorbed"] = absorbed.facts()
         facts["notes"].append(absorbed.note())
-        if known and task.settings.method != "occlusion":
-            name = task.settings.method
-            facts["notes"].append(f"absorbing measures by occlusion: {name} was not used")
+        if known and task.settings.method == "closed-form":
+            facts["notes"].append("absorbing measures by occlusion: closed-form was not used")
     return Result(keep, scores, facts, absorbed)
 
 

@@ -102,10 +102,10 @@ class Budget:
         method, frustum
             See `Scores`.
         """
-        if method == "auto" and self.needs_scores:
+        if method == "auto" and self.threshold is not None:
             msg = (
-                f"method auto may score by any model, and {self.kind} means something else to "
-                "each: choose closed-form or occlusion, or another budget"
+                "a threshold means something else to each method: choose closed-form or occlusion "
+                "instead of auto, or another budget"
             )
             raise RefineError(msg)
         if self.min_seen is not None and not frustum:

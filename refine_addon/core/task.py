@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
     from .splats import Splats
     from .views import ViewSet
 
-METHODS = ("closed-form", "occlusion", "auto")
+METHODS = ("auto", "occlusion", "closed-form")
+"""The first is the default."""
 
 
 @dataclass(frozen=True)
@@ -28,23 +30,24 @@ class Settings:
 
     Attributes
     ----------
-    method : {"closed-form", "occlusion", "auto"}
-        Scoring method: "closed-form" ignores occlusion, "occlusion" takes it into account, "auto"
-        uses the cheapest model that keeps nearly the same splats as "occlusion".
+    method : {"auto", "occlusion", "closed-form"}
+        Scoring method: "occlusion" takes into account what hides what; "auto" does so with no more
+        views and rounds than the pictures need; "closed-form" takes nothing as hidden, and is the
+        fastest.
     views : int
         Use at most this many views, spread evenly; 0 uses all.
     closed_form : ClosedForm
     occlusion : Occlusion
         Settings of these methods.
     tolerance : float
-        For "auto": the share of the kept set that may differ from that of "occlusion".
+        For "auto": by how much the PSNR of the pictures may be lower than by "occlusion", dB.
     """
 
-    method: Literal["closed-form", "occlusion", "auto"] = "closed-form"
+    method: Literal["auto", "occlusion", "closed-form"] = "auto"
     views: int = 64
     closed_form: ClosedForm = field(default_factory=ClosedForm)
     occlusion: Occlusion = field(default_factory=Occlusion)
-    tolerance: float = 0.01
+    tolerance: float = 0.5
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -57,8 +60,8 @@ class Settings:
         if self.method not in METHODS:
             msg = f"method is {self.method!r}, expected one of {', '.join(METHODS)}"
             raise RefineError(msg)
-        if not 0.0 <= self.tolerance <= 1.0:
-            msg = f"tolerance is {self.tolerance}, expected a share, 0 to 1"
+        if not 0.0 <= self.tolerance < math.inf:
+            msg = f"tolerance is {self.tolerance}, expected a number of dB, 0 or more"
             raise RefineError(msg)
         if self.views < 0:
             msg = f"views is {self.views}, expected 0 (all) or more"

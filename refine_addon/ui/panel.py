@@ -113,7 +113,7 @@ class REFINE_PT_advanced(_InSidebar, bpy.types.Panel):
         layout.use_property_decorate = False
         settings = context.scene.refine
         layout.prop(settings, "views")
-        if settings.method == "occlusion":
+        if settings.method != "closed-form":
             return  # the others are settings of the closed form
         layout.prop(settings, "depth")
         layout.prop(settings, "published")

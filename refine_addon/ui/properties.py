@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 METHODS = (
-    ("closed-form", "Closed Form", "REFINE's closed form: fast; takes nothing as hidden"),
-    ("occlusion", "Occlusion", "Knows what hides what: better, and takes longer"),
-    ("auto", "Auto", "The cheapest that keeps nearly the same splats as Occlusion"),
+    ("auto", "Auto", "Occlusion with no more views and rounds than the pictures need"),
+    ("occlusion", "Occlusion", "Knows what hides what; uses all views and rounds"),
+    ("closed-form", "Closed Form", "Takes nothing as hidden: far faster, and worse"),
 )
 """Methods of scoring, by the names that core gives them."""
 
@@ -110,10 +110,10 @@ class RefineSettings(bpy.types.PropertyGroup):
     )
     tolerance: FloatProperty(
         name="Tolerance",
-        description="Share of the kept splats that may differ from those of Occlusion",
-        default=0.01,
+        description="By how much the PSNR of the pictures may be lower than by Occlusion, in dB",
+        default=Settings.tolerance,
         min=0.0,
-        max=1.0,
+        max=20.0,
     )
     source: EnumProperty(name="Cameras", description="Which cameras decide", items=SOURCES)
     collection: PointerProperty(

@@ -20,7 +20,7 @@ def _bytes(path):
 def test_import_score_apply_export_writes_the_file_that_core_writes(addon, room_cameras, tmp_path):
     """The panel's path from file to file, against `prune_file` with the camera file: 50 % off."""
     settings = bpy.context.scene.refine
-    settings.ratio = 0.5
+    settings.method, settings.ratio = "auto", 0.5
     bpy.ops.refine.import_ply(filepath=str(ROOM / "point_cloud.ply"))
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
@@ -78,6 +78,7 @@ def test_every_budget_keeps_the_rows_that_core_keeps(addon, room, room_cameras, 
         file.splats(),
         core.read_cameras(ROOM / "cameras.json"),
         core.Budget(**{kind: value}),
+        core.Settings("closed-form"),
         row_bytes=file.row_bytes,
         fixed_bytes=file.fixed_bytes,
     ).keep
@@ -253,9 +254,8 @@ def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(
 
 @pytest.mark.parametrize(
     "case",
-    [({"method": "auto"}, "threshold", "method auto may score by any model"),
-     ({"method": "auto"}, "min_seen", "method auto may score by any model"),
-     ({"frustum": False}, "min_seen", "min_seen would remove none")],
+    [({"method": "auto"}, "threshold", "a threshold means something else"),
+     ({"method": "closed-form", "frustum": False}, "min_seen", "min_seen would remove none")],
 )  # fmt: skip
 @pytest.mark.parametrize("absorb", [False, True])
 def test_a_budget_that_means_nothing_to_the_scores_is_refused(
@@ -497,6 +497,7 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
         addon.splat_object.gather(addon.mesh.layout.check(room)),
         views,
         addon.core.Budget(ratio=0.5),
+        addon.core.Settings("closed-form"),
     ).keep
     if how == "hide_set":
         room.hide_set(True)

@@ -136,7 +136,7 @@ def test_while_scoring_a_bar_takes_the_place_of_the_button(draw, room):  # noqa:
     ("method", "expected"),
     [("closed-form", {"views", "depth", "published", "frustum"}),
      ("occlusion", {"views"}),
-     ("auto", {"views", "depth", "published", "frustum", "tolerance"})],
+     ("auto", {"views", "tolerance"})],
 )  # fmt: skip
 def test_only_settings_that_the_method_looks_at_are_drawn(draw, method, expected):
     """Occlusion has none in the panel but the number of views."""

@@ -55,7 +55,7 @@ def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):  # n
         "room",
         addon.cameras.sets.visible_views(bpy.context.scene),
         addon.core.Budget(keep=1000),
-        addon.core.Settings(),
+        addon.core.Settings("closed-form"),
         output=tmp_path / "out.ply",
         dry_run=True,
     )
@@ -182,7 +182,11 @@ def test_normals_turn_with_the_transform(addon, core, make_splats, tmp_path):
 def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):  # noqa: ARG001
     """Someone deleted a vertex while the scoring ran."""
     views = addon.cameras.sets.visible_views(bpy.context.scene)
-    scores = addon.core.score(addon.splat_object.gather(addon.mesh.layout.check(room)), views)
+    scores = addon.core.score(
+        addon.splat_object.gather(addon.mesh.layout.check(room)),
+        views,
+        addon.core.Settings("closed-form"),
+    )
     keep = np.ones(39755, np.bool_)
     keep[7] = False
     addon.mesh.edit.delete_vertices(room, ~keep)

@@ -36,25 +36,26 @@ def quality(scene, evaluator, ratio, settings, **options) -> float:
 
 
 @pytest.mark.parametrize(("ratio", "least"), [(0.3, 42.1), (0.5, 32.0), (0.7, 23.7)])
-def test_the_default_is_no_worse_than_the_authors_reading(scene, evaluator, ratio, least):
+def test_the_closed_form_is_no_worse_than_the_authors_reading(scene, evaluator, ratio, least):
     """The authors' reading, measured by a prototype: 42.1 / 32.0 / 23.7 dB."""
-    assert quality(scene, evaluator, ratio, Settings()) >= least
+    assert quality(scene, evaluator, ratio, Settings("closed-form")) >= least
 
 
-def test_the_default_beats_the_published_readings(scene, evaluator):
+def test_the_closed_form_beats_the_published_readings(scene, evaluator):
     """Both, at half removed."""
-    default = quality(scene, evaluator, 0.5, Settings())
+    default = quality(scene, evaluator, 0.5, Settings("closed-form"))
 
     for depth in ("z", "distance"):
-        published = Settings(closed_form=ClosedForm.published(depth))
+        published = Settings("closed-form", closed_form=ClosedForm.published(depth))
         assert default > quality(scene, evaluator, 0.5, published)
 
 
-def test_occlusion_beats_rendering_methods_at_every_ratio(scene, evaluator):
+@pytest.mark.parametrize("method", ["occlusion", "auto"])
+def test_occlusion_beats_rendering_methods_at_every_ratio(scene, evaluator, method):
     """LightGaussian, rendered: 46.1 / 34.4 / 25.6 / 16.8 dB; required: 47.5 / 36.5 / 27.5 / 18."""
     from refine_addon.core import score, select  # noqa: PLC0415
 
-    scores = score(scene.splats, scene.train, Settings("occlusion"))
+    scores = score(scene.splats, scene.train, Settings(method))
     for ratio, least in ((0.3, 47.5), (0.5, 36.5), (0.7, 27.5), (0.9, 18.0)):
         left = scene.splats.take(select(scores, Budget(ratio=ratio)))
         assert evaluator.evaluate(left).renders.mean["psnr"] >= least, ratio

@@ -58,6 +58,7 @@ def folder(tmp_path, monkeypatch):
 
 
 PRUNE = ["prune", "in.ply", "--cameras", "cameras.json"]
+CLOSED = ["--method", "closed-form"]
 SCORE = ["score", "in.ply", "--cameras", "cameras.json"]
 
 
@@ -81,26 +82,31 @@ def contents(folder: Path) -> dict[Path, bytes]:
         (["--ratio", "0.29"], Budget(ratio=0.29), Settings()),
         (["--keep", "7"], Budget(keep=7), Settings()),
         (["--max-mb", ".004"], Budget(max_mb=0.004), Settings()),
-        (["--threshold", "0.8"], Budget(threshold=0.8), Settings()),
+        (
+            ["--method", "closed-form", "--threshold", "0.8"],
+            Budget(threshold=0.8),
+            Settings("closed-form"),
+        ),
         (["--min-seen", "70"], Budget(min_seen=70), Settings()),
         (["--psnr", "30"], Budget(psnr=30), Settings()),
         (["--views", "2"], Budget(ratio=0.5), Settings(views=2)),
         (["--views", "0"], Budget(ratio=0.5), Settings(views=0)),
-        (["--method", "closed-form"], Budget(ratio=0.5), Settings()),
+        (["--method", "closed-form"], Budget(ratio=0.5), Settings("closed-form")),
+        (["--method", "occlusion"], Budget(ratio=0.5), Settings("occlusion")),
         (
-            ["--depth", "distance"],
+            [*CLOSED, "--depth", "distance"],
             Budget(ratio=0.5),
-            Settings(closed_form=ClosedForm("distance")),
+            Settings("closed-form", closed_form=ClosedForm("distance")),
         ),
         (
-            ["--published"],
+            [*CLOSED, "--published"],
             Budget(ratio=0.5),
-            Settings(closed_form=ClosedForm.published("z")),
+            Settings("closed-form", closed_form=ClosedForm.published("z")),
         ),
         (
-            ["--published", "--depth", "distance"],
+            [*CLOSED, "--published", "--depth", "distance"],
             Budget(ratio=0.5),
-            Settings(closed_form=ClosedForm.published("distance")),
+            Settings("closed-form", closed_form=ClosedForm.published("distance")),
         ),
     ],
 )
@@ -125,6 +131,7 @@ def test_every_budget_and_setting_keeps_the_rows_that_the_interface_keeps(
     assert {"out.ply"} == names(folder)
 
 
+@pytest.mark.slow
 def test_the_room_is_pruned_to_the_same_file_from_python_and_from_the_command(folder):
     """39,755 splats by the 64 most spread of 72 views, file to file."""
     source, cameras = ROOM / "point_cloud.ply", ROOM / "cameras.json"
@@ -306,7 +313,8 @@ def numbers(value: object) -> list[float]:
 
 def test_the_report_of_a_prune_is_complete_and_plain(folder):
     """Counts, settings, weights, timings, versions, notes, sizes; valid JSON without NaN."""
-    assert command.main([*PRUNE, "-o", "out.ply", "--keep", "9", "--report", "report.json"]) == 0
+    arguments = [*PRUNE, *CLOSED, "-o", "out.ply", "--keep", "9", "--report", "report.json"]
+    assert command.main(arguments) == 0
 
     def refuse(name):
         pytest.fail(f"{name} is no JSON")
@@ -346,7 +354,7 @@ def test_the_report_of_scores_is_plain_too(folder):
 @pytest.mark.usefixtures("folder")
 def test_the_summary_says_what_went_and_where_it_is(capsys):
     """One line a file: counts, megabytes, views, seconds, the output; nothing on stderr."""
-    assert command.main([*PRUNE, "-o", "out.ply", "--keep", "9"]) == 0
+    assert command.main([*PRUNE, *CLOSED, "-o", "out.ply", "--keep", "9"]) == 0
 
     said = capsys.readouterr()
     pattern = (
@@ -375,7 +383,7 @@ def test_the_summary_says_how_close_the_pictures_stay(capsys):
 
 def test_a_psnr_is_kept_by_every_method(folder):
     """By the estimate in the report, to the next of 60 splats; the closed form makes one too."""
-    for options in ([], ["--method", "occlusion"]):
+    for options in ([], CLOSED, ["--method", "occlusion"]):
         arguments = [*PRUNE, "-o", "out.ply", "--overwrite", "--report", "r.json", *options]
         assert command.main([*arguments, "--psnr", "30"]) == 0
 
@@ -450,8 +458,8 @@ USAGE = {
     "equal pictures": [*PRUNE, "-o", "out.ply", "--psnr", "100"],
     "no pictures": [*PRUNE, "-o", "out.ply", "--psnr", "0"],
     "seen by too many": [*PRUNE, "-o", "out.ply", "--min-seen", "101"],
-    "a score of any method": [*PRUNE, "-o", "out.ply", "--method", "auto", "--threshold", "1"],
-    "a count of all views": [*PRUNE, "-o", "out.ply", "--published", "--min-seen", "5"],
+    "a score of any method": [*PRUNE, "-o", "out.ply", "--threshold", "1"],
+    "a count of all views": [*PRUNE, "-o", "out.ply", *CLOSED, "--published", "--min-seen", "5"],
     "views below 0": [*PRUNE, "-o", "out.ply", "--views", "-1"],
     "unknown method": [*PRUNE, "-o", "out.ply", "--method", "guess"],
     "unknown depth": [*PRUNE, "-o", "out.ply", "--depth", "y"],
@@ -524,7 +532,7 @@ FAILS = {
     ),
     "cameras that see nothing": (
         ["prune", "in.ply", "--cameras", "away.json", "-o", "out.ply"],
-        "in.ply: no camera sees the splats: none of 60 lies in the frustum of any of 1 views",
+        "in.ply: no camera sees the splats: none of 60 reaches into the image of any of 1 views",
     ),
     "an output that exists": ([*PRUNE, "-o", "mesh.ply"], "mesh.ply: exists already; choose"),
     "an output that is a folder": ([*PRUNE, "-o", "folder", "--overwrite"], "folder: is a folder"),
@@ -577,7 +585,7 @@ FAILS = {
         "in.ply: max_mb is 1e-06",
     ),
     "too high a threshold": (
-        [*PRUNE, "-o", "out.ply", "--threshold", "1e30"],
+        [*PRUNE, *CLOSED, "-o", "out.ply", "--threshold", "1e30"],
         "in.ply: threshold would remove all 60 splats; nothing was removed",
     ),
     "scores over a file": ([*SCORE, "-o", "mesh.ply"], "mesh.ply: exists already; choose another"),
@@ -725,10 +733,11 @@ def test_an_output_never_replaces_what_is_no_splat_file(folder, capsys):
     assert (folder / "cameras.json").read_bytes() == before
 
 
-def test_settings_of_the_closed_form_are_refused_with_occlusion(folder, capsys):  # noqa: ARG001
-    """They would change nothing."""
-    assert command.main([*PRUNE, "-o", "out.ply", "--method", "occlusion", "--published"]) == 2
-    assert "settings of the closed form" in capsys.readouterr().err
+@pytest.mark.parametrize("method", [[], ["--method", "occlusion"]])
+def test_settings_of_the_closed_form_are_refused_elsewhere(folder, capsys, method):  # noqa: ARG001
+    """They would change nothing; auto is the default."""
+    assert command.main([*PRUNE, "-o", "out.ply", *method, "--published"]) == 2
+    assert "settings of --method closed-form" in capsys.readouterr().err
 
 
 def test_info_of_a_signalling_not_a_number_does_not_warn(folder, capsys):  # noqa: ARG001

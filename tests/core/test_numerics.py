@@ -39,15 +39,15 @@ EXTREME = [*FINITE, math.inf, -math.inf, math.nan]
 DOUBLES = [1e-320, -1e-310, 1e-200, 1e-100, 1e100, -1e200, 1e308]
 COARSE = Occlusion(cell=8.0, density=1.0, rounds=2)
 METHODS = {
-    "closed form": Settings(),
+    "closed form": Settings("closed-form"),
     "occlusion": Settings("occlusion", occlusion=COARSE),
-    "auto": Settings("auto", occlusion=COARSE, tolerance=0.1),
+    "auto": Settings(occlusion=COARSE),
 }
 READINGS = {
-    "distance": Settings(closed_form=ClosedForm("distance")),
-    "paper": Settings(closed_form=ClosedForm.published("z")),
-    "authors": Settings(closed_form=ClosedForm.published("distance")),
-    "ablated": Settings(closed_form=ClosedForm(projection=False, visibility=False)),
+    "distance": Settings("closed-form", closed_form=ClosedForm("distance")),
+    "paper": Settings("closed-form", closed_form=ClosedForm.published("z")),
+    "authors": Settings("closed-form", closed_form=ClosedForm.published("distance")),
+    "ablated": Settings("closed-form", closed_form=ClosedForm(projection=False, visibility=False)),
 }
 by_method = pytest.mark.parametrize("settings", METHODS.values(), ids=METHODS)
 by_method_and_reading = pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def view(center=(0.0, 0.0, 0.0), **changes) -> View:
     return View(np.eye(3), np.array(center, float), **values | changes)
 
 
-def scored(splats, views=None, settings=Settings()):  # noqa: B008 - frozen
+def scored(splats, views=None, settings=Settings("closed-form")):  # noqa: B008 - frozen
     """Score in this thread: NumPy's flags are raised in it alone."""
     views = views or ViewSet((view(), view([0.1, 0, 0])))
     return score(splats, views, settings, threads=1)
@@ -286,7 +286,7 @@ def test_ten_thousand_views_are_one_mean():
     splats = cloud()
     many = ViewSet((view(),) * 10_000)
 
-    values = scored(splats, many, Settings(views=0)).values
+    values = scored(splats, many, Settings("closed-form", views=0)).values
 
     np.testing.assert_allclose(values, scored(splats, ViewSet((view(),))).values, rtol=1e-6)
 
@@ -670,7 +670,7 @@ def test_scores_equal_fifty_digits_over_the_range(spread, steep, reading):
     )
     views = square_of_views()
     expected = np.array([float(v) for v in reference(splats, views, paper=reading == "paper")])
-    default = Settings(closed_form=ClosedForm(local=False))
+    default = Settings("closed-form", closed_form=ClosedForm(local=False))
     settings = READINGS["paper"] if reading == "paper" else default
 
     values = scored(splats, views, settings).values

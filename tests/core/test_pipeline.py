@@ -43,6 +43,7 @@ from tests.strategies import plain_header, ply_of, splat_names
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 PLY = ROOM / "point_cloud.ply"
+FAST = Settings("closed-form")
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +69,7 @@ def test_a_ratio_removes_exactly_its_floor(file, views, ratio):
     """floor(ratio * 39755), of the decimal as written."""
     expected = {0.0: 0, 0.1: 3975, 0.29: 11528, 0.5: 19877, 0.9: 35779, 0.9999: 39751}[ratio]
 
-    result = prune(file.splats(), views, Budget(ratio=ratio))
+    result = prune(file.splats(), views, Budget(ratio=ratio), FAST)
 
     assert np.count_nonzero(~result.keep) == expected
     assert result.report["splats"]["removed"] == expected
@@ -76,7 +77,9 @@ def test_a_ratio_removes_exactly_its_floor(file, views, ratio):
 
 def test_what_survives_half_survives_a_third(file, views):
     """Budgets are nested, since all select from one ranking."""
-    masks = [prune(file.splats(), views, Budget(ratio=r)).keep for r in (0.1, 0.3, 0.5, 0.7, 0.9)]
+    masks = [
+        prune(file.splats(), views, Budget(ratio=r), FAST).keep for r in (0.1, 0.3, 0.5, 0.7, 0.9)
+    ]
 
     for more, less in itertools.pairwise(masks):
         assert not (less & ~more).any()
@@ -84,7 +87,7 @@ def test_what_survives_half_survives_a_third(file, views):
 
 def test_the_ranking_says_what_a_budget_removes(file, views):
     """The k lowest ranks go: rank is the place in the order of removal."""
-    result = prune(file.splats(), views, Budget(keep=1000))
+    result = prune(file.splats(), views, Budget(keep=1000), FAST)
 
     order = np.argsort(rank(result.scores.values), kind="stable")
 
@@ -93,18 +96,20 @@ def test_the_ranking_says_what_a_budget_removes(file, views):
 
 def test_protected_splats_stay_and_others_go_in_their_place(file, views):
     """The thousand lowest are protected, so the next thousand go."""
-    lowest = np.argsort(prune(file.splats(), views, Budget(keep=1)).scores.values, kind="stable")
+    scores = prune(file.splats(), views, Budget(keep=1), FAST).scores
+    lowest = np.argsort(scores.values, kind="stable")
     protected = np.zeros(len(file), np.bool_)
     protected[lowest[:1000]] = True
 
-    keep = prune(file.splats(), views, Budget(keep=len(file) - 1000), protected=protected).keep
+    budget = Budget(keep=len(file) - 1000)
+    keep = prune(file.splats(), views, budget, FAST, protected=protected).keep
 
     assert sorted(np.flatnonzero(~keep)) == sorted(lowest[1000:2000])
 
 
 def test_a_size_in_megabytes_is_kept_to_the_row(views, tmp_path):
     """The file fits in 2 MB, and one row of 248 bytes more would not."""
-    result = prune_file(PLY, tmp_path / "out.ply", views, Budget(max_mb=2.0))
+    result = prune_file(PLY, tmp_path / "out.ply", views, Budget(max_mb=2.0), FAST)
 
     size = (tmp_path / "out.ply").stat().st_size
 
@@ -114,7 +119,7 @@ def test_a_size_in_megabytes_is_kept_to_the_row(views, tmp_path):
 
 def test_the_pruned_file_holds_the_kept_rows_and_the_report_is_json(file, views, tmp_path):
     """Rows bit for bit, in order; every number of the report is finite."""
-    result = prune_file(PLY, tmp_path / "out.ply", views, Budget(ratio=0.5))
+    result = prune_file(PLY, tmp_path / "out.ply", views, Budget(ratio=0.5), FAST)
 
     assert read_ply(tmp_path / "out.ply").rows.tobytes() == file.rows[result.keep].tobytes()
     assert json.loads(json.dumps(result.report, allow_nan=False))["splats"]["before"] == 39755
@@ -133,8 +138,10 @@ def test_faces_that_count_splats_are_noted_once_splats_go(small, views, tmp_path
     path = tmp_path / "in.ply"
     path.write_bytes(header.replace(b"end_header", faces + b"end_header") + body + face)
 
-    fewer = prune_file(path, tmp_path / "out.ply", views, Budget(ratio=0.5)).report["notes"]
-    same = prune_file(path, None, views, Budget(ratio=0.0)).report["notes"]
+    fewer, same = (
+        prune_file(path, output, views, Budget(ratio=ratio), FAST).report["notes"]
+        for output, ratio in ((tmp_path / "out.ply", 0.5), (None, 0.0))
+    )
 
     expected = (
         "element 'face' beside the splats is kept as it is; its indices may point past the end"
@@ -145,7 +152,7 @@ def test_faces_that_count_splats_are_noted_once_splats_go(small, views, tmp_path
 
 def test_no_output_writes_nothing(views, tmp_path):
     """A dry run decides and reports."""
-    result = prune_file(PLY, None, views, Budget(ratio=0.5))
+    result = prune_file(PLY, None, views, Budget(ratio=0.5), FAST)
 
     assert result.report["files"]["output"] is None
     assert list(tmp_path.iterdir()) == []
@@ -153,7 +160,7 @@ def test_no_output_writes_nothing(views, tmp_path):
 
 def test_fewer_views_are_used_when_asked_for(file, views):
     """Eight of the 63, spread out."""
-    report = prune(file.splats(), views, Budget(ratio=0.5), Settings(views=8)).report
+    report = prune(file.splats(), views, Budget(ratio=0.5), replace(FAST, views=8)).report
 
     assert report["views"] == {"given": 63, "used": 8}
 
@@ -246,12 +253,12 @@ def test_closed_form_of_floats_keeps_the_splats_that_doubles_keep(file, views):
     """At every tenth: against the same numbers as doubles, and against the formula in doubles."""
     splats = file.splats()
     for form in (ClosedForm(), ClosedForm("distance"), ClosedForm.published("z")):
-        settings = Settings(closed_form=form)
+        settings = Settings("closed-form", closed_form=form)
         scores = score(splats, views, settings)
 
         assert agreement(scores, score(wide(splats), views, settings)) == [1.0] * 9
 
-    assert agreement(score(splats, views), in_doubles(splats, views)) == [1.0] * 9
+    assert agreement(score(splats, views, FAST), in_doubles(splats, views)) == [1.0] * 9
 
 
 class Doubles:
@@ -446,32 +453,31 @@ def test_a_text_file_is_cut_to_its_limit_by_no_more_than_one_row(uneven, front, 
 def test_a_budget_that_only_scores_can_tell_says_how_many_survivors_absorb(small, views):
     """The threshold is the median score: half survive, by whatever costs least."""
     splats = read_ply(small).splats()
-    median = float(np.median(prune(splats, views, Budget(ratio=0.0)).scores.values))
+    median = float(np.median(prune(splats, views, Budget(ratio=0.0), FAST).scores.values))
 
-    result = prune(splats, views, Budget(threshold=median), absorb=True)
+    result = prune(splats, views, Budget(threshold=median), FAST, absorb=True)
 
     assert np.count_nonzero(result.keep) == pytest.approx(len(splats) / 2, abs=1)
 
 
 def test_without_the_frustum_test_no_number_of_views_is_counted(small, views):
     """Every view would count as seeing every splat."""
-    published = Settings(closed_form=ClosedForm.published("z"))
+    published = Settings("closed-form", closed_form=ClosedForm.published("z"))
 
     with pytest.raises(RefineError, match="min_seen would remove none"):
         prune(read_ply(small).splats(), views, Budget(min_seen=3), published)
 
 
-@pytest.mark.parametrize("budget", [Budget(threshold=0.5), Budget(min_seen=3)])
-def test_what_autos_scores_cannot_mean_is_refused_before_the_work(small, views, budget):
+def test_what_autos_scores_cannot_mean_is_refused_before_the_work(small, views):
     """Nothing is scored first: the first report of progress would fail the test."""
 
     def never(_fraction, what):
         raise AssertionError(what)
 
     for absorb in (False, True):
-        with pytest.raises(RefineError, match="method auto may score by any model"):
+        with pytest.raises(RefineError, match="a threshold means something else"):
             prune(
-                read_ply(small).splats(), views, budget, Settings("auto"),
+                read_ply(small).splats(), views, Budget(threshold=0.5), Settings("auto"),
                 absorb=absorb, progress=never,
             )  # fmt: skip
 
@@ -482,7 +488,7 @@ def test_scores_that_are_there_already_decide_as_new_ones_would(small, views, ab
     """The panel scores once and applies later: the same splats, and the same report of them."""
     splats, budget = read_ply(small).splats(), Budget(threshold=0.5)
     at_once = prune(splats, views, budget, absorb=absorb)
-    scores = score(splats, views)
+    scores = score(splats, views, Settings())
     scene = {"splats": splats, "views": views} if absorb else {}
 
     later = decide(Task(budget, scores=scores, absorb=absorb, **scene))

@@ -28,6 +28,7 @@ from refine_addon.core.splats import opacity
 from tests.core.test_invariance import MOTIONS, moved
 from tests.core.test_occlusion import cloud, look_along_z, ring, splats_of
 
+FAST = Settings("closed-form")
 CURVE = Quality(*np.array([[0.2, 0.5, 0.8], [50.0, 40.0, 30.0], [52.0, 47.0, 38.0]]))
 CUT = 1.0 / 255.0
 
@@ -248,7 +249,7 @@ def test_the_estimate_depends_on_nothing_but_the_scene(method):
 
 def test_the_estimate_does_not_change_the_scores():
     """The closed form ranks the same whether or not an estimate is asked for."""
-    with_curve, without = (score(cloud(), ring(), quality=asked) for asked in (True, False))
+    with_curve, without = (score(cloud(), ring(), FAST, quality=asked) for asked in (True, False))
 
     assert np.array_equal(with_curve.values, without.values)
     assert with_curve.quality is not None
@@ -364,7 +365,7 @@ def test_every_method_reaches_a_psnr(method, goal):
 
 def test_published_scores_reach_it_too():
     """They see every splat from every view, yet the estimate is that of the pictures."""
-    settings = Settings(closed_form=ClosedForm.published("distance"))
+    settings = Settings("closed-form", closed_form=ClosedForm.published("distance"))
 
     result = prune(cloud(), ring(), Budget(psnr=30.0), settings)
 
@@ -409,7 +410,7 @@ def test_the_report_has_the_estimate_and_the_curve():
 
 def test_the_closed_form_says_that_it_made_no_estimate():
     """It would take longer than scoring does."""
-    done = prune(cloud(), ring(), Budget(ratio=0.5)).report
+    done = prune(cloud(), ring(), Budget(ratio=0.5), FAST).report
 
     assert done["estimated_psnr"] is None
     assert done["quality"] is None

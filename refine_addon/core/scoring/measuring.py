@@ -116,27 +116,46 @@ class Measured:
 class Measuring:
     """The views of one scoring, ready to measure Gaussians.
 
+    Parameters
+    ----------
+    scene : Scene
+    views : ViewSet
+    sampling : Sampling
+    threads : int, optional
+    members : list of list of int, optional
+        By default each block has every eighth view.
+
     Attributes
     ----------
     views : list of (View, float)
         Views and their weights, see `ViewSet.by_distance`.
+    members : list of list of int
+        The numbers of the views of each block.
     """
 
     def __init__(
-        self, scene: Scene, views: ViewSet, sampling: Sampling, threads: int | None
+        self,
+        scene: Scene,
+        views: ViewSet,
+        sampling: Sampling,
+        threads: int | None,
+        members: list[list[int]] | None = None,
     ) -> None:
         self.scene, self.sampling, self.threads = scene, sampling, threads
         self.views = views.by_distance()
+        total = len(self.views)
+        count = min(BLOCKS, total)
+        self.members = members or [list(range(k, total, count)) for k in range(count)]
 
     @property
     def count(self) -> int:
         """Number of blocks."""
-        return min(BLOCKS, len(self.views))
+        return len(self.members)
 
     def share(self, which: Sequence[int]) -> float:
         """Return the share of the weights of all views that some blocks have."""
         weights = [weight for _, weight in self.views]
-        mine = (weight for k in which for weight in weights[k :: self.count])
+        mine = (weights[number] for k in which for number in self.members[k])
         return math.fsum(mine) / math.fsum(weights)
 
     def measure(
@@ -177,7 +196,7 @@ class Measuring:
         def block(piece: slice) -> tuple[Measured, NDArray[np.float64]]:
             total = Measured.zero(len(gaussians))
             errors = []
-            for number in range(chosen[piece.start], len(self.views), self.count):
+            for number in self.members[chosen[piece.start]]:
                 view, weight = self.views[number]
                 before = total.error[sample]  # (m,)
                 footprints = measure_view(gaussians, self.scene, view, weight, self.sampling, total)

@@ -29,7 +29,7 @@ from .measuring import Measured, Measuring, Sampling
 from .sight_lines import SightLines
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -49,6 +49,9 @@ COMMON = 0.1
 
 FIRST_COST = 0.5
 """Share of the time that is still ahead that a round takes, for the display of progress."""
+
+FIRST_END = 0.55
+"""Where the first of several rounds ends, as a share of all the time, for the same."""
 
 PRIOR = closed_form.ClosedForm("distance", frustum=False, local=False)
 """Model of the floor. It has no frustum test, since splats that no view shows also need a floor."""
@@ -121,7 +124,10 @@ def score(
     bytes for each point of a view, per thread. A view has at most about 4 million points
     (`froxels.MAX_POINTS`); only a view that shows more than 3 million splats has more.
     """
-    return _scored(splats, views, settings, progress, threads)[0]
+    run = Run(splats, views, settings, progress=part(progress, 0.0, 0.1), threads=threads)
+    end = FIRST_END if settings.rounds > 1 else 1.0
+    run.measure(range(run.measuring.count), part(progress, 0.1, end))
+    return run.rank(part(progress, end, 1.0))
 
 
 def score_once(
@@ -148,50 +154,12 @@ def score_once(
     RefineError, Cancelled
         See `score`.
     """
-    scores, run = _scored(splats, views, replace(settings, rounds=1), progress, threads)
-    return scores, run.measured.for_all(run.gaussians.index, len(splats))
-
-
-def _scored(
-    splats: Splats,
-    views: ViewSet,
-    settings: Occlusion,
-    progress: Progress,
-    threads: int | None,
-) -> tuple[Scores, _Run]:
-    if not len(splats):
-        msg = "there are no splats to score"
-        raise RefineError(msg)
-    gaussians, scene, good = projection.prepare(
-        splats, views, progress=part(progress, 0.0, 0.05), threads=threads
-    )
-    if not good.any():
-        msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
-        raise RefineError(msg)
-    measuring = Measuring(scene, views, settings, threads)
-    sights = SightLines(measuring.views, gaussians, splats)
-    run = _Run(gaussians, measuring, settings.rounds, sights)
-    prior = closed_form.score(
-        splats, views, PRIOR, progress=part(progress, 0.05, 0.1), threads=threads
-    )
-    values, seen = run.rank(prior.values, part(progress, 0.1, 1.0))
-    if not run.measured.contribution.any():
-        msg = (
-            f"no camera sees the splats: none of {len(splats)} reaches into the image of any of "
-            f"{len(views)} views; check that cameras and splats share their frame and unit"
-        )
-        raise RefineError(msg)
-    values[~good] = 0.0
-    scores = Scores(
-        values=values,
-        seen=seen,
-        views_used=len(views),
-        undrawable=int(np.count_nonzero(~good)),
-        facts={"floor": run.floor_weights},
-        method="occlusion",
-        sights=sights,
-    )
-    return scores, run
+    run = Run(
+        splats, views, replace(settings, rounds=1),
+        progress=part(progress, 0.0, 0.1), threads=threads,
+    )  # fmt: skip
+    measured = run.measure(range(run.measuring.count), part(progress, 0.1, 1.0))
+    return run.rank(silent), measured.for_all(run.gaussians.index, len(splats))
 
 
 def measure(
@@ -265,71 +233,153 @@ def measure_part(  # noqa: PLR0913 - as `measure`, and which part
     return Measured.sum(found).for_all(gaussians.index, len(splats)), measuring.share(which)
 
 
-class _Run:
-    """One scoring: rounds of measuring and removing.
+class Run:
+    """One scoring: the views measure all splats, then rounds of removing and measuring again.
+
+    Parameters
+    ----------
+    splats, views, settings, progress, threads
+        See `score`.
+    members : list of list of int, optional
+        See `Measuring`.
 
     Attributes
     ----------
     gaussians : Gaussians
         The splats that can contribute to a picture, before any is removed.
-    measured : Measured
-        Of these Gaussians, in the first round.
-    blocks : list of Measured
-        Of the splats left, over each block of views, as measured last.
-    turn : int
-        How many blocks were measured after the first round.
-    floor_weights : list of float
-        The weight of the floor up to each of `coverage.SHARES`; chosen in the first round.
+    measuring : Measuring
     sights : SightLines
-        Note what the views' lines of sight meet, in the first round.
+        Note what the lines of sight of the views meet that measure all splats.
+    prior : (N,) float32
+        Orders the splats that are not among the Gaussians, and is the floor of all others.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `score`.
     """
 
     def __init__(
-        self, gaussians: Gaussians, measuring: Measuring, rounds: int, sights: SightLines
+        self,
+        splats: Splats,
+        views: ViewSet,
+        settings: Occlusion,
+        *,
+        members: list[list[int]] | None = None,
+        progress: Progress = silent,
+        threads: int | None = None,
     ) -> None:
-        self.gaussians, self.measuring, self.rounds = gaussians, measuring, rounds
-        self.measured = Measured.zero(len(gaussians))
-        self.blocks: list[Measured] = []
-        self.turn = 0
-        self.floor_weights = [0.0] * len(coverage.SHARES)
-        self.sights = sights
+        if not len(splats):
+            msg = "there are no splats to score"
+            raise RefineError(msg)
+        self.gaussians, scene, good = projection.prepare(
+            splats, views, progress=part(progress, 0.0, 0.5), threads=threads
+        )
+        self.undrawable = ~good  # (N,) bool
+        if not good.any():
+            msg = (
+                f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
+            )
+            raise RefineError(msg)
+        self.measuring = Measuring(scene, views, settings, threads, members)
+        self.sights = SightLines(self.measuring.views, self.gaussians, splats)
+        self.rounds = settings.rounds
+        self.prior = closed_form.score(
+            splats, views, PRIOR, progress=part(progress, 0.5, 1.0), threads=threads
+        ).values
+        self._sample = coverage.sample(self.gaussians)  # (m,)
+        self._blocks: dict[int, tuple[Measured, NDArray[np.float64]]] = {}
+        self._turn = 0  # how many blocks were measured again
 
-    def rank(
-        self, prior: NDArray[np.float32], progress: Progress
-    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Return the values and `seen` of all N splats.
+    def measure(self, which: Sequence[int], progress: Progress = silent) -> Measured:
+        """Measure all splats in some more blocks of views; return the sums over all so far, (M,).
 
-        Parameters
-        ----------
-        prior : (N,) float32
-            Orders the splats that are not among the Gaussians, and is the floor of all others.
-        progress : callable
+        Raises
+        ------
+        Cancelled
+            If `progress` answers ``False``.
         """
-        count, left = len(prior), self.gaussians
-        removal = _Removal(count)
-        undrawn = np.setdiff1d(np.arange(count), left.index)
-        removal.add(undrawn[np.argsort(prior[undrawn], kind="stable")])
-        seen, done = np.zeros(count, np.int32), 0.0
-        for number, stay in enumerate(_survivors(count, self.rounds)):
-            # The first round costs about as much as all others.
+        found = self.measuring.blocks(
+            self.gaussians, self._sample, progress, which=which, sights=self.sights
+        )
+        self._blocks |= dict(zip(which, found, strict=True))
+        return self.measured()
+
+    def measured(self, which: Sequence[int] | None = None) -> Measured:
+        """Return the sums over some of the blocks that were measured, by default all, (M,)."""
+        chosen = sorted(self._blocks if which is None else which)
+        return Measured.sum([self._blocks[k][0] for k in chosen])
+
+    def once(self, which: Sequence[int], progress: Progress = silent) -> NDArray[np.float32]:
+        """Return the values of all N splats, in one round, by some of the blocks measured.
+
+        Raises
+        ------
+        Cancelled
+            If `progress` answers ``False``.
+        """
+        removal, measured = self._removal(), self.measured(which)
+        weights = self._floor_weights(measured, which, progress)
+        order = self._order(self.gaussians, measured, weights, removal, len(self.gaussians))
+        removal.add(self.gaussians.index[order])
+        return removal.values
+
+    def rank(self, progress: Progress) -> Scores:
+        """Return the scores, by the blocks measured; can be called once.
+
+        Raises
+        ------
+        RefineError, Cancelled
+            See `score`.
+        """
+        measured, removal = self.measured(), self._removal()
+        if not measured.contribution.any():
+            msg = (
+                f"no camera sees the splats: none of {len(self.prior)} reaches into the image of "
+                f"any of {len(self.measuring.views)} views; check that cameras and splats share "
+                "their frame and unit"
+            )
+            raise RefineError(msg)
+        seen = np.zeros(len(self.prior), np.int32)
+        seen[self.gaussians.index] = measured.seen
+        weights = self._floor_weights(measured, list(self._blocks), part(progress, 0.0, 0.0))
+        used = sum(len(self.measuring.members[k]) for k in self._blocks)
+        blocks = {k: self._blocks.pop(k)[0] for k in sorted(self._blocks)}
+        left, done = self.gaussians, 0.0
+        for number, stay in enumerate(_survivors(len(self.prior), self.rounds)):
             end = 1.0 if number == self.rounds - 1 else done + (1.0 - done) * FIRST_COST
             ahead, done = part(progress, done, end), end
-            if number == 0:
-                measured = self._measure_first(prior, ahead)
-                seen[left.index] = measured.seen
-            else:
-                measured = self._measure_again(left, ahead)
+            if number:
+                measured = self._measure_again(left, blocks, ahead)
             report(ahead, 1.0, "scoring")
             go = max(len(left) - stay, 0)
-            order = self._order(measured, prior[left.index], removal, go)
+            order = self._order(left, measured, weights, removal, go)
             removal.add(left.index[order[:go]])
             rows = np.sort(order[go:])
             left = left.take(rows)
-            self.blocks = [block.take(rows) for block in self.blocks]
-        return removal.values, seen
+            blocks = {k: block.take(rows) for k, block in blocks.items()}
+        removal.values[self.undrawable] = 0.0
+        return Scores(
+            values=removal.values,
+            seen=seen,
+            views_used=used,
+            undrawable=int(np.count_nonzero(self.undrawable)),
+            facts={"floor": weights},
+            method="occlusion",
+            sights=self.sights,
+        )
 
-    def _measure_again(self, left: Gaussians, progress: Progress) -> Measured:
-        """Measure the splats left in some blocks of views, which take turns.
+    def _removal(self) -> _Removal:
+        """Return an order of removal that begins with what is not among the Gaussians."""
+        removal = _Removal(len(self.prior))
+        undrawn = np.setdiff1d(np.arange(len(self.prior)), self.gaussians.index)
+        removal.add(undrawn[np.argsort(self.prior[undrawn], kind="stable")])
+        return removal
+
+    def _measure_again(
+        self, left: Gaussians, blocks: dict[int, Measured], progress: Progress
+    ) -> Measured:
+        """Measure the splats left in some blocks of views, which take turns; return all sums.
 
         The sums of the other blocks are from an earlier round, when more was hidden. Those of each
         splat are raised by what its sums over these blocks have grown by, see `_growth`.
@@ -337,62 +387,77 @@ class _Run:
         Parameters
         ----------
         left : Gaussians
+        blocks : dict of int to Measured
+            The sums of the splats left over each block of views, as measured last; changed.
         progress : callable
         """
-        blocks = len(self.blocks)
+        numbers = list(blocks)
         # An even number, since an odd one leaves one of two cores idle.
-        pairs = max(round(ROUND_COST * len(self.gaussians) / max(len(left), 1) * blocks / 2), 1)
-        count = min(2 * pairs, blocks)
-        which = [(self.turn + step) % blocks for step in range(count)]
-        self.turn += count
+        share = ROUND_COST * len(self.gaussians) / max(len(left), 1)
+        pairs = max(round(share * len(numbers) / 2), 1)
+        count = min(2 * pairs, len(numbers))
+        which = [numbers[(self._turn + step) % len(numbers)] for step in range(count)]
+        self._turn += count
         found = self.measuring.measure(left, which, progress)
-        before, now = (Measured.sum(some) for some in ([self.blocks[k] for k in which], found))
-        every = Measured.sum(self.blocks)
+        before, now = (Measured.sum(some) for some in ([blocks[k] for k in which], found))
+        every = Measured.sum(list(blocks.values()))
         contribution = _growth(now.contribution, before.contribution, every.contribution)
         error = _growth(now.error, before.error, every.error)
-        for block in self.blocks:
+        for block in blocks.values():
             block.contribution[:] *= contribution
             block.error[:] *= error
-        for k, block in zip(which, found, strict=True):
-            self.blocks[k] = block
-        return Measured.sum(self.blocks)
+        blocks |= dict(zip(which, found, strict=True))
+        return Measured.sum(list(blocks.values()))
 
     def _order(
-        self, measured: Measured, prior: NDArray[np.float32], removal: _Removal, go: int
+        self,
+        left: Gaussians,
+        measured: Measured,
+        weights: Sequence[float],
+        removal: _Removal,
+        go: int,
     ) -> NDArray[np.int64]:
         """Return the rows of the n splats left, in the order of removal.
 
         Parameters
         ----------
+        left : Gaussians
         measured : Measured
             Of the splats left.
-        prior : (n,) float32
-            Of the splats left.
+        weights : sequence of float
+            Of the floor, up to each of `coverage.SHARES`.
         removal : _Removal
             What was removed before.
         go : int
             How many are removed in this round; the order of the others is not exact.
         """
-        count, gone = len(removal.values), removal.gone
+        prior, count, gone = self.prior[left.index], len(removal.values), removal.gone
         share = gone / count
         floors = coverage.floor(prior.astype(np.float64), measured.seen, 1.0 + _exponent(share))
         # How many of these splats have been removed when each of the shares is reached.
         stops = np.clip(np.rint(np.multiply(coverage.SHARES, count)) - gone, 0, go).astype(int)
         stops[-1] = go
-        scores = combined(measured, share)
-        return coverage.order(scores, floors, prior, self.floor_weights, stops)
+        return coverage.order(combined(measured, share), floors, prior, weights, stops)
 
-    def _measure_first(self, prior: NDArray[np.float32], progress: Progress) -> Measured:
-        """Measure all Gaussians, and choose the weights of the floor by leaving views out."""
-        sample = coverage.sample(self.gaussians)  # (m,)
-        blocks = self.measuring.blocks(self.gaussians, sample, progress, sights=self.sights)
-        self.blocks = [block for block, _ in blocks]
-        measured = self.measured = Measured.sum(self.blocks)
-        worth = prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)
+    def _floor_weights(
+        self, measured: Measured, which: Sequence[int], progress: Progress
+    ) -> list[float]:
+        """Choose the weights of the floor by leaving out each of some blocks of views.
+
+        Parameters
+        ----------
+        measured : Measured
+            Sums over these blocks, (M,).
+        which : sequence of int
+        progress : callable
+        """
+        sample = self._sample
+        worth = self.prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)
 
         def folds() -> Iterator[tuple[NDArray[np.float64], ...]]:
-            for block, errors in blocks if len(blocks) > 1 else ():
-                report(progress, 1.0, "scoring")
+            for number in sorted(which) if len(which) > 1 else ():
+                report(progress, 0.0, "scoring")
+                block, errors = self._blocks[number]
                 others = Measured(
                     # Rounding can leave a negative difference.
                     np.maximum(measured.contribution[sample] - block.contribution[sample], 0.0),
@@ -402,8 +467,7 @@ class _Run:
                 floors = coverage.floor(worth, others.seen, 1.0 + _exponent(0.0))
                 yield combined(others, 0.0), floors, errors
 
-        self.floor_weights = coverage.floor_weights(folds())
-        return measured
+        return coverage.floor_weights(folds())
 
 
 class _Removal:

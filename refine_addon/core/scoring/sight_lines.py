@@ -28,11 +28,12 @@ from ..work import Progress, checkpoint, for_chunks, part, silent
 from . import projection
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from typing import Any
 
     from numpy.typing import NDArray
 
+    from ..scene import Scene
     from ..splats import Splats
     from ..views import View, ViewSet
     from .projection import Footprints, Gaussians
@@ -79,16 +80,8 @@ def sights(
         splats, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
     found = SightLines(views.by_distance(), gaussians, splats)
-
-    def work(piece: slice) -> None:
-        with np.errstate(under="ignore"):
-            footprints = projection.project(gaussians, scene, found.views[piece.start][0])
-            found.look(piece.start, gaussians, footprints)
-
-    for_chunks(
-        work, len(found.views), 1,
-        progress=part(progress, 0.2, 1.0), what="looking", threads=threads,
-    )  # fmt: skip
+    ahead = part(progress, 0.2, 1.0)
+    found.look_from(range(len(found.views)), gaussians, scene, ahead, threads)
     return found
 
 
@@ -257,6 +250,24 @@ class SightLines:
         columns, rows = self.pixels(number, count)
         self.lines[number] = meet(gaussians, footprints, columns, rows)
 
+    def look_from(
+        self,
+        numbers: Sequence[int],
+        gaussians: Gaussians,
+        scene: Scene,
+        progress: Progress,
+        threads: int | None,
+    ) -> None:
+        """Project all Gaussians into some views, and note what their lines meet."""
+
+        def work(piece: slice) -> None:
+            number = numbers[piece.start]
+            with np.errstate(under="ignore"):
+                footprints = projection.project(gaussians, scene, self.views[number][0])
+                self.look(number, gaussians, footprints)
+
+        for_chunks(work, len(numbers), 1, progress=progress, what="looking", threads=threads)
+
     def pixels(self, number: int, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the columns and rows of a view in which about `count` lines lie, spread evenly."""
         view, count = self.views[number][0], max(count, LEAST_LINES)
@@ -276,7 +287,8 @@ class SightLines:
         keep : (N,) bool
         threads : int, optional
         """
-        found = self._removing(keep[self.index].astype(np.int64), [1], silent, threads)
+        place = keep[self.index].astype(np.int64)
+        found = self._removing(place, [1], self._seen(), silent, threads)
         return None if found is None else float(found[0])
 
     def curve(
@@ -303,18 +315,13 @@ class SightLines:
         Cancelled
             If `progress` answers ``False``.
         """
-        order = np.argsort(values, kind="stable")
-        if protected is not None:
-            order = order[np.argsort(protected[order], kind="stable")]
-        place = np.empty(len(order), np.int64)
-        place[order] = np.arange(len(order))
+        place = _places(values, protected)[self.index]
         counts = [math.floor(share * len(values)) for share in SHARES]
-        ahead = part(progress, 0.0, 0.5)
-        found = self._removing(place[self.index], counts, ahead, threads)
+        found = self._removing(place, counts, self._seen(), part(progress, 0.0, 0.5), threads)
         if found is None:
             return None
         gains = self._taking_over(
-            place[self.index],
+            place,
             [math.floor(share * len(values)) for share in TAKEN_OVER],
             part(progress, 0.5, 1.0),
             threads,
@@ -322,6 +329,32 @@ class SightLines:
         assert gains is not None  # noqa: S101 - the same lines tell it
         found = np.minimum.accumulate(found)
         return Quality(np.array(SHARES), found, absorbed_from(found, gains))
+
+    def judged(
+        self,
+        values: NDArray[np.float32],
+        shares: Sequence[float],
+        views: Sequence[int],
+        *,
+        threads: int | None = None,
+    ) -> NDArray[np.float64] | None:
+        """Return the PSNR that some views tell, (L,), dB; None if their lines see too little.
+
+        Parameters
+        ----------
+        values : (N,) float32
+            The lowest are removed first.
+        shares : sequence of float
+            L shares of the splats that are removed, ascending.
+        views : sequence of int
+            The numbers of the views.
+        threads : int, optional
+        """
+        if self._meeting(views) < ENOUGH:
+            return None
+        seen = sorted(set(views) & set(self._seen()))
+        counts = [math.floor(share * len(values)) for share in shares]
+        return self._removing(_places(values)[self.index], counts, seen, silent, threads)
 
     def against(
         self,
@@ -366,6 +399,7 @@ class SightLines:
         self,
         place: NDArray[np.int64],
         counts: Sequence[int],
+        views: Sequence[int],
         progress: Progress,
         threads: int | None,
     ) -> NDArray[np.float64] | None:
@@ -377,6 +411,8 @@ class SightLines:
             Of each of the Gaussians in the order of removal.
         counts : sequence of int
             Ascending: Gaussians whose place is lower are removed.
+        views : sequence of int
+            The numbers of the views that tell it.
         progress : callable
         threads : int, optional
         """
@@ -393,7 +429,7 @@ class SightLines:
                 values.append(psnr_of(lines.colors(colors), whole, view))
             return np.array(values)
 
-        return self._mean(compare, self._seen(), progress, threads)
+        return self._mean(compare, views, progress, threads)
 
     def _taking_over(
         self,
@@ -430,6 +466,10 @@ class SightLines:
         """Return the numbers of the views whose lines meet a splat."""
         return [k for k, lines in enumerate(self.lines) if lines is not None and len(lines.line)]
 
+    def _meeting(self, views: Iterable[int]) -> int:
+        """Return how many lines of some views meet a splat."""
+        return sum(lines.meeting for lines in map(self.lines.__getitem__, views) if lines)
+
     def _mean(
         self,
         compare: Callable[[int, Lines], NDArray[np.float64]],
@@ -441,7 +481,7 @@ class SightLines:
 
         None if too few lines of all views meet a splat.
         """
-        if sum(lines.meeting for lines in self.lines if lines is not None) < ENOUGH:
+        if self._meeting(range(len(self.lines))) < ENOUGH:
             return None
 
         def work(piece: slice) -> NDArray[np.float64]:
@@ -455,6 +495,18 @@ class SightLines:
         )
         weights = np.array([self.views[number][1] for number in views])
         return np.asarray(weights @ np.array(values) / weights.sum())
+
+
+def _places(
+    values: NDArray[np.float32], protected: NDArray[np.bool_] | None = None
+) -> NDArray[np.int64]:
+    """Return the place of each of N splats in the order of removal, (N,); see `curve`."""
+    order = np.argsort(values, kind="stable")
+    if protected is not None:
+        order = order[np.argsort(protected[order], kind="stable")]
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    return place
 
 
 def _colors(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float64]:
