@@ -37,9 +37,9 @@ bench: $(BENCH)       ## speed and memory, with medians
 	$(PY) -m benchmarks.speed.file_to_file --absorb --splats 1900000 --runs 1
 	$(PY) -m benchmarks.speed.in_blender
 
-bench-trade: $(BENCH) ## quality over time: docs/trade.md; SCENES="folder ..." measures others
+bench-trade: $(BENCH) ## quality over time: docs/trade.md; SCENES="folder ..." measures others, RAP=FILE RAP too
 	-$(PY) -m benchmarks.baselines.splat_transform
-	$(PY) -m benchmarks.tables.trade $(SCENES)
+	$(PY) -m benchmarks.tables.trade $(SCENES) $(if $(RAP),--rap $(RAP))
 
 fuzz: $(DEV)          ## hostile files, for SECONDS
 	$(PY) -m tests.fuzz --seconds $(or $(SECONDS),300)

@@ -15,7 +15,7 @@ import numpy as np
 
 from refine_addon.core.splats import rotation_matrices
 
-from ..renderer.compositing import bins_of
+from ..renderer.compositing import add_up, bins_of
 from ..renderer.footprints import (
     Camera,
     Footprints,
@@ -99,7 +99,7 @@ def fisher(
         size = (camera.width, camera.height)
         _tiles(dealt(bins), bins, footprints, (size, np.array(background)), moments)
         merged = np.zeros((len(footprints.index), _MOMENTS))
-        _merge(bins.entries, moments, merged)
+        add_up(bins.entries, moments, merged)
         _add(scene, axes, camera, (footprints.index, merged), total)
     return total
 
@@ -139,15 +139,6 @@ def _collect(values: NDArray[np.float64], row: NDArray[np.float64]) -> None:
             row[column] += values[WEIGHT] * contrast[channel] * w[i]
             column += 1
     row[column] += values[WEIGHT] * values[WEIGHT]
-
-
-@numba.njit(cache=True)
-def _merge(
-    entries: NDArray[np.int32], moments: NDArray[np.float64], merged: NDArray[np.float64]
-) -> None:
-    """Add up the tiles' moments for every footprint, in order, so that threads do not matter."""
-    for k in range(len(entries)):
-        merged[entries[k]] += moments[k]
 
 
 @numba.njit(cache=True, parallel=True)

@@ -14,6 +14,7 @@ import numpy as np
 
 from refine_addon.core.splats import opacity as activated_opacity
 
+from ..renderer.rasterizer import accumulate_statistics
 from . import fisher
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ Baseline = Callable[["Splats", "ViewSet", "Statistics | None"], "NDArray[np.floa
 
 VOLUME_POWER = 0.1
 """Exponent of the normalised volume in LightGaussian and MesonGS."""
+ROUNDS = 8
+"""Of removing by the removal error, with new renders in between."""
 
 
 def random(
@@ -79,6 +82,33 @@ def removal_error(
     """Score by the exact squared error that removing this one splat adds to the pictures."""
     del splats, views
     return _required(statistics).removal_error
+
+
+def removed_in_rounds(
+    splats: Splats, views: ViewSet, keep_count: int, rounds: int = ROUNDS
+) -> NDArray[np.int64]:
+    """Remove splats by `removal_error` in rounds of equal size, rendered anew before each.
+
+    POTR prunes so: what one removal costs depends on what else has gone.
+
+    Parameters
+    ----------
+    splats, views
+    keep_count : int
+        How many stay.
+    rounds : int
+
+    Returns
+    -------
+    (keep_count,) int64
+        Which splats stay, ascending; of equal errors the first.
+    """
+    left = np.arange(len(splats))
+    for number in range(1, rounds + 1):
+        errors = accumulate_statistics(splats.take(left), views).removal_error
+        count = len(splats) - (len(splats) - keep_count) * number // rounds
+        left = np.sort(left[np.argsort(-errors, kind="stable")[:count]])
+    return left
 
 
 def pup_3dgs(splats: Splats, views: ViewSet, statistics: Statistics | None) -> NDArray[np.float64]:

@@ -11,6 +11,7 @@ Nothing of it is part of this project; where it is missing, the benchmark says s
 from __future__ import annotations
 
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -35,13 +36,14 @@ class Run:
 
     Attributes
     ----------
-    seconds : float
-        Of the whole process, its start included.
+    seconds, busy : float
+        Of the whole process, its start included, and of the processor, all cores together.
     peak_bytes : int or None
         Largest resident memory; None where the system does not tell.
     """
 
     seconds: float
+    busy: float
     peak_bytes: int | None
 
 
@@ -97,16 +99,18 @@ def decimate(source: Path, target: Path, flag: str, keep_count: int) -> Run:
     """
     arguments = command(source, target, flag, keep_count)
     with tempfile.TemporaryFile() as said:
+        before = processor_seconds(resource.RUSAGE_CHILDREN)
         start = time.perf_counter()
         process = subprocess.Popen(arguments, stdout=said, stderr=said)
         code, peak = _wait(process)
         seconds = time.perf_counter() - start
+        busy = processor_seconds(resource.RUSAGE_CHILDREN) - before
         said.seek(0)
         text = said.read().decode(errors="replace").strip()
     if code != 0 or not target.is_file():
         msg = f"splat-transform ended with {code}: {text}"
         raise RefineError(msg)
-    return Run(seconds, peak)
+    return Run(seconds, busy, peak)
 
 
 def _wait(process: subprocess.Popen[bytes]) -> tuple[int, int | None]:
@@ -129,6 +133,12 @@ def memory(what: str, process: int | str = "self") -> int | None:
     except OSError:
         return None
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(what)), None)
+
+
+def processor_seconds(whose: int) -> float:
+    """Return the seconds of all cores so far, of `resource.RUSAGE_SELF` or ``RUSAGE_CHILDREN``."""
+    usage = resource.getrusage(whose)
+    return usage.ru_utime + usage.ru_stime
 
 
 def install() -> int:

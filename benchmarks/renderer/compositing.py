@@ -322,3 +322,12 @@ def merge(
         for column in range(SUMS):
             sums[splat, column] += entry_sums[k, column]
         sums[splat, WEIGHT_MAX] = largest
+
+
+@numba.njit(cache=True)
+def add_up(
+    entries: NDArray[np.int32], found: NDArray[np.float64], sums: NDArray[np.float64]
+) -> None:
+    """Add the rows that the tiles `found`, to those of the footprints, in order; as `merge`."""
+    for k in range(len(entries)):
+        sums[entries[k]] += found[k]

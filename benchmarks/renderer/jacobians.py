@@ -225,3 +225,30 @@ def color_gradient(
             for j in range(len(harmonics)):
                 value += basis[j] * harmonics[j, channel]
             out[channel, b] = value.imag / step if value.real > 0.0 else 0.0
+
+
+@numba.njit(cache=True)
+def turn_gradient(
+    mean: NDArray[np.float64],
+    axes: NDArray[np.float64],
+    camera: Camera,
+    out: NDArray[np.float64],
+) -> None:
+    """Differentiate xx, xy, yy by a small turn of the splat about the axes of the world.
+
+    Parameters
+    ----------
+    mean, axes, camera
+        As in `shape_gradient`.
+    out : (3, 3) float64
+        Filled; columns: the turn's x, y, z, radians.
+
+    Notes
+    -----
+    A turn w moves every axis a by w x a, so ``p' dS q = w . (Sq x p + Sp x q)``.
+    """
+    p, q, _, _ = image_rows(mean, camera)
+    sp, sq = axes @ (p @ axes), axes @ (q @ axes)
+    out[0] = 2.0 * np.cross(sp, p)
+    out[1] = np.cross(sq, p) + np.cross(sp, q)
+    out[2] = 2.0 * np.cross(sq, q)

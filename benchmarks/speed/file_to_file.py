@@ -67,9 +67,15 @@ def make_input(path: Path, count: int) -> None:
 
 
 def run(command: Sequence[str | Path]) -> tuple[float, float, float]:
-    """Run a command from the checkout; return its seconds, the processor's, and peak megabytes."""
+    """Run a command from the checkout; return its seconds, the processor's, and peak megabytes.
+
+    Raises
+    ------
+    subprocess.CalledProcessError
+        If it fails.
+    """
     peak = 0.0
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    before = splat_transform.processor_seconds(resource.RUSAGE_CHILDREN)
     start = time.perf_counter()
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
         status = Path(f"/proc/{process.pid}/status")
@@ -78,9 +84,8 @@ def run(command: Sequence[str | Path]) -> tuple[float, float, float]:
             time.sleep(0.002)
         seconds = time.perf_counter() - start
     if process.returncode:
-        sys.exit(process.returncode)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    busy = after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime
+        raise subprocess.CalledProcessError(process.returncode, list(map(str, command)))
+    busy = splat_transform.processor_seconds(resource.RUSAGE_CHILDREN) - before
     return seconds, busy, peak
 
 

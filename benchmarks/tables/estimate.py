@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,34 +22,118 @@ from refine_addon.core.errors import RefineError
 from refine_addon.core.pipeline import Settings, prune
 from refine_addon.core.selection import Budget
 
-from .evaluate import Evaluator, Scene, read_scene
+from .evaluate import Evaluator, read_scene
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
-    from refine_addon.core.task import Result
+    from refine_addon.core.splats import Splats
+    from refine_addon.core.views import ViewSet
 
+DELETE, ABSORB = "delete", "absorb"
 HEADING = (
     f"{'scene':12}{'':10}{'budget':>12}{'removed':>9}{'estimate':>10}{'truth':>8}{'off by':>8}"
     f"{'expected':>10}{'seconds':>9}"
 )
 
 
+@dataclass(frozen=True)
+class Estimated:
+    """An estimate and the truth.
+
+    Attributes
+    ----------
+    way : {"delete", "absorb"}
+    budget : Budget
+    removed : float
+        Share of the splats.
+    estimate, truth : float
+        PSNR, dB; the truth is the mean over all views that score.
+    expected : float or None
+        What a result without absorbing says of absorbing, dB.
+    seconds : float
+        Of the prune.
+    """
+
+    way: str
+    budget: Budget
+    removed: float
+    estimate: float
+    truth: float
+    expected: float | None
+    seconds: float
+
+    @property
+    def off(self) -> float:
+        """By how much the estimate exceeds the truth, dB."""
+        return self.estimate - self.truth
+
+
+def measure(
+    splats: Splats,
+    views: ViewSet,
+    budgets: Sequence[Budget],
+    ways: Sequence[str] = (DELETE, ABSORB),
+) -> Iterator[Estimated]:
+    """Yield estimate and truth of every way and budget, by `views`, all of which score.
+
+    Raises
+    ------
+    RefineError
+        If there is no estimate, since the views see too little.
+    """
+    evaluator = Evaluator(splats, views, metrics=("psnr",))
+    settings = Settings("occlusion", views=0)
+    for way in ways:
+        for budget in budgets:
+            start = time.perf_counter()
+            result = prune(splats, views, budget, settings, absorb=way == ABSORB)
+            seconds = time.perf_counter() - start
+            left = result.absorbed.splats if result.absorbed else splats.take(result.keep)
+            estimate = result.report["estimated_psnr"]
+            if estimate is None:
+                raise RefineError(result.report["estimated_psnr_note"])
+            yield Estimated(
+                way,
+                budget,
+                1.0 - float(result.keep.mean()),
+                estimate,
+                float(evaluator.evaluate(left).renders.mean["psnr"]),
+                result.report["estimated_psnr_absorbed"] if way == DELETE else None,
+                seconds,
+            )
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print a line for each scene, way and budget; return the exit code."""
     options = _parse(arguments)
+    budgets = [Budget(ratio=ratio) for ratio in options.ratios]
+    budgets += [Budget(psnr=psnr) for psnr in options.psnr]
+    ways = [options.only] if options.only else [DELETE, ABSORB]
     print(HEADING)
     errors: list[float] = []
     for folder in options.scenes:
         try:
             scene = read_scene(folder)
+            views = scene.train.spread(options.views)
+            for row in measure(scene.splats, views, budgets, ways):
+                errors.append(abs(row.off))
+                print(_line(folder.name, row), flush=True)
         except RefineError as error:
             sys.stderr.write(f"{error}\n")
             return 1
-        errors += _measure(folder.name, scene, options)
-    absolute = [abs(error) for error in errors]
-    print(f"mean error {sum(absolute) / len(absolute):.2f} dB, largest {max(absolute):.2f} dB")
+    print(f"mean error {sum(errors) / len(errors):.2f} dB, largest {max(errors):.2f} dB")
     return 0
+
+
+def _line(name: str, row: Estimated) -> str:
+    kind = "psnr" if row.budget.psnr is not None else "ratio"
+    goal = f"{kind} {getattr(row.budget, kind):g}"
+    expected = "" if row.expected is None else f"{row.expected:.1f}"
+    return (
+        f"{name:12}{row.way:10}{goal:>12}{row.removed:9.1%}{row.estimate:10.2f}{row.truth:8.2f}"
+        f"{row.off:+8.2f}{expected:>10}{row.seconds:9.1f}"
+    )
 
 
 def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -60,43 +145,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--ratios", type=float, nargs="*", default=[0.3, 0.5, 0.7, 0.9])
     parser.add_argument("--psnr", type=float, nargs="*", default=[40.0])
     parser.add_argument("--views", type=int, default=64, help="that score, at most")
-    parser.add_argument("--only", choices=["delete", "absorb"], help="one of the two ways")
+    parser.add_argument("--only", choices=[DELETE, ABSORB], help="one of the two ways")
     return parser.parse_args(arguments)
-
-
-def _measure(name: str, scene: Scene, options: argparse.Namespace) -> list[float]:
-    """Print the lines of a scene; return by how much the estimates are off, dB."""
-    evaluator = Evaluator(scene.splats, scene.train.spread(options.views), metrics=("psnr",))
-    budgets = [Budget(ratio=ratio) for ratio in options.ratios]
-    budgets += [Budget(psnr=psnr) for psnr in options.psnr]
-    settings = Settings("occlusion", options.views)
-    errors = []
-    for absorb in [False, True]:
-        way = "absorb" if absorb else "delete"
-        if options.only not in (None, way):
-            continue
-        for budget in budgets:
-            start = time.perf_counter()
-            result = prune(scene.splats, scene.train, budget, settings, absorb=absorb)
-            seconds = time.perf_counter() - start
-            errors.append(_line(f"{name:12}{way:10}", scene, evaluator, result, seconds))
-    return errors
-
-
-def _line(start: str, scene: Scene, evaluator: Evaluator, result: Result, seconds: float) -> float:
-    """Print a line; return by how much its estimate is off, dB."""
-    left = result.absorbed.splats if result.absorbed else scene.splats.take(result.keep)
-    truth = float(evaluator.evaluate(left).renders.mean["psnr"])
-    said = result.report
-    ((kind, value),) = said["budget"].items()
-    estimate = said["estimated_psnr"]
-    expected = "" if result.absorbed else f"{said['estimated_psnr_absorbed']:.1f}"
-    print(
-        f"{start}{f'{kind} {value:g}':>12}{1.0 - result.keep.mean():9.1%}{estimate:10.2f}"
-        f"{truth:8.2f}{estimate - truth:+8.2f}{expected:>10}{seconds:9.1f}",
-        flush=True,
-    )
-    return float(estimate - truth)
 
 
 if __name__ == "__main__":

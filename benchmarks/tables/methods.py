@@ -22,7 +22,7 @@ from refine_addon.core.selection import Budget
 from refine_addon.core.splats import Splats
 
 from ..baselines import merging, rap, splat_transform
-from ..baselines.rendered import BASELINES, RENDERED
+from ..baselines.rendered import BASELINES, RENDERED, ROUNDS, removed_in_rounds
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -108,7 +108,17 @@ def _baselines() -> list[Method]:
 
         about = ABOUT.get(name, name)
         methods.append(Method(name, LITERATURE, about, score=score, rendered=name in RENDERED))
+        if name == "removal-error":
+            about = f"the same in {ROUNDS} rounds, rendered anew before each, as POTR"
+            methods.append(
+                Method("removal-error-iterated", LITERATURE, about, reduce=_removed_in_rounds)
+            )
     return methods
+
+
+def _removed_in_rounds(task: Task, keep_count: int, ratio: float) -> Splats:
+    del ratio
+    return task.splats.take(removed_in_rounds(task.splats, task.views, keep_count))
 
 
 def rap_network(weights: Path) -> Method:

@@ -6,9 +6,13 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from .estimate import Estimated
+    from .finetune import Tuned
     from .flops import Counts
     from .hessian import Energies
     from .methods import Method
+    from .million import Million
+    from .sizes import Timed
     from .variants import Line
 
 
@@ -18,14 +22,15 @@ class Cost:
 
     Attributes
     ----------
-    seconds : float
-        Median of the runs.
+    seconds, busy : float
+        Medians of the runs: by the clock, and of the processor, all cores together.
     runs : int
     peak_bytes : int or None
         Beyond what was held before; of a program of its own, all it had. None: not to be had here.
     """
 
     seconds: float
+    busy: float
     runs: int
     peak_bytes: int | None
 
@@ -33,7 +38,8 @@ class Cost:
         """Return the cost of doing both, one after the other."""
         peaks = [peak for peak in (self.peak_bytes, other.peak_bytes) if peak is not None]
         runs = min(self.runs, other.runs)
-        return Cost(self.seconds + other.seconds, runs, max(peaks, default=None))
+        seconds, busy = self.seconds + other.seconds, self.busy + other.busy
+        return Cost(seconds, busy, runs, max(peaks, default=None))
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +64,17 @@ class Row:
 
 @dataclass(eq=False)
 class Measured:
-    """All that was measured of one scene."""
+    """All that was measured of one scene; from `sizes` on, each part under its own name."""
 
     name: str
     facts: dict[str, str]
     rows: list[Row] = field(default_factory=list)
     unpruned: dict[tuple[str, str], dict[str, float]] = field(default_factory=dict)
+    sizes: list[Timed] = field(default_factory=list)
+    estimate: list[Estimated] = field(default_factory=list)
+    iterations: int = 0
+    finetune: list[Tuned] = field(default_factory=list)
+    million: Million | None = None
     cheaper: list[Line] = field(default_factory=list)
     ablation: list[Line] = field(default_factory=list)
     flops: Counts | None = None

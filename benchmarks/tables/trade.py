@@ -6,16 +6,21 @@ SCENE_DIR is any folder that `evaluate` reads: ``point_cloud.ply``, ``cameras.js
 ``split.json`` and ``images``. Without one, the committed room is measured.
 
 All methods get the same splats in memory and the same scoring views: those that are not held out,
-at most ``--views``, spread evenly. Time is that of scoring and pruning, the median of ``--runs``
-runs (fewer where one takes long), after one on a single view that does not count and compiles what
-is compiled. Memory is what the process had at its peak beyond what it had before.
+at most ``--views``, spread evenly. Time is that of scoring and pruning, by the clock and of the
+processor, the median of ``--runs`` runs (fewer where one takes long), after one on a single view
+that does not count and compiles what is compiled. Memory is what the process had at its peak beyond
+what it had before.
+
+Of several scenes, training on the photos and the million splats are measured for the first only.
 """
 
 from __future__ import annotations
 
 import argparse
 import gc
+import resource
 import statistics
+import subprocess
 import sys
 import time
 from contextlib import contextmanager
@@ -27,12 +32,23 @@ from refine_addon.core.selection import Budget, select
 
 from ..baselines import splat_transform
 from ..renderer import rasterizer
-from . import evaluate, flops, hessian, methods, trade_report, variants
+from . import (
+    estimate,
+    evaluate,
+    finetune,
+    flops,
+    hessian,
+    methods,
+    million,
+    sizes,
+    trade_report,
+    variants,
+)
 from .methods import Method, Task
 from .results import Cost, Measured, Row
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
 
     from refine_addon.core.scores import Scores
     from refine_addon.core.splats import Splats
@@ -44,7 +60,19 @@ ROOT = Path(__file__).resolve().parents[2]
 ROOM = ROOT / "tests/data/room_small"
 PATIENCE = 40.0
 """Seconds after which nothing is run once more for the median."""
-PARTS = ("methods", "cheaper", "ablation", "flops", "hessian")
+FAILURES = (
+    RefineError,
+    subprocess.SubprocessError,
+    ArithmeticError,
+    LookupError,
+    TypeError,
+    ValueError,
+)
+ONCE = ("finetune", "million")
+"""Parts that take long and are measured for the first scene only."""
+PARTS = ("methods", "sizes", "estimate", *ONCE, "cheaper", "ablation", "flops", "hessian")
+HALF = 0.5
+"""Share removed where methods are timed only."""
 
 
 class Judge:
@@ -54,8 +82,11 @@ class Judge:
         self, scene: evaluate.Scene, scoring: ViewSet, options: argparse.Namespace
     ) -> None:
         judged = {"held-out": scene.test, "scoring": scoring.spread(options.judged)}
+        # FLIP takes longer than all the rest, and the scoring views are not what counts.
+        plain = [metric for metric in options.metrics if metric != "flip"]
+        metrics = {"held-out": options.metrics, "scoring": plain or options.metrics}
         self.evaluators = {
-            name: evaluate.Evaluator(scene.splats, views, scene.pictures, metrics=options.metrics)
+            name: evaluate.Evaluator(scene.splats, views, scene.pictures, metrics=metrics[name])
             for name, views in judged.items()
         }
 
@@ -72,18 +103,20 @@ class Judge:
 
 def measured(work: Callable[[], Any], runs: int) -> tuple[Any, Cost]:
     """Do `work` up to `runs` times; return its last result and what it took."""
-    seconds, peak, result = [], None, None
+    seconds, busy, peak, result = [], [], None, None
     while len(seconds) < runs and (not seconds or sum(seconds) < PATIENCE):
         result = None
         gc.collect()
-        before = _start_peak()
+        before, worked = _start_peak(), splat_transform.processor_seconds(resource.RUSAGE_SELF)
         start = time.perf_counter()
         result = work()
         seconds.append(time.perf_counter() - start)
+        busy.append(splat_transform.processor_seconds(resource.RUSAGE_SELF) - worked)
         after = splat_transform.memory("VmHWM")
         if before is not None and after is not None:
             peak = max(peak or 0, after - before)
-    return result, Cost(statistics.median(seconds), len(seconds), peak)
+    cost = Cost(statistics.median(seconds), statistics.median(busy), len(seconds), peak)
+    return result, cost
 
 
 def _start_peak() -> int | None:
@@ -101,7 +134,7 @@ def measure_method(
 ) -> list[Row]:  # fmt: skip
     """Measure one method at all ratios."""
     rows = []
-    scores, scoring = None, Cost(0.0, runs, None)
+    scores, scoring = None, Cost(0.0, 0.0, runs, None)
     if method.score is not None:
         score = method.score
         scores, scoring = measured(lambda: score(task, rendering[0]), runs)
@@ -134,35 +167,69 @@ def _reduced(
         return measured(lambda: reduce(task, keep_count, ratio), runs)
     found = [method.run(task, keep_count) for _ in range(runs)] if method.run else []
     seconds = statistics.median(run.seconds for _, run in found)
-    return found[-1][0], Cost(seconds, runs, found[-1][1].peak_bytes)
+    busy = statistics.median(run.busy for _, run in found)
+    return found[-1][0], Cost(seconds, busy, runs, found[-1][1].peak_bytes)
 
 
-def measure(folder: Path, options: argparse.Namespace) -> Measured:
-    """Measure everything of one scene."""
+def leave(method: Method, task: Task, ratio: float) -> Splats:
+    """Return what a method that needs no rendered statistics leaves at one ratio."""
+    if method.score is not None:
+        return task.splats.take(select(method.score(task, None), Budget(ratio=ratio)))
+    count = len(task.splats) - (Budget(ratio=ratio).removals(len(task.splats)) or 0)
+    return _reduced(method, task, (ratio, count), None, 1)[0]
+
+
+def measure(folder: Path, options: argparse.Namespace, parts: Collection[str]) -> Measured:
+    """Measure the `parts` of one scene."""
     scene = evaluate.read_scene(folder)
     splats = methods.in_memory(scene.splats)
     scoring = scene.train.spread(options.views)
     task = Task(splats, scoring, folder / "point_cloud.ply")
-    found = Measured(folder.resolve().name, trade_report.facts(scene, scoring, options.judged))
+    about = trade_report.facts(scene, scoring, options.judged)
+    found = Measured(folder.resolve().name, about, iterations=options.iterations)
     judge = Judge(scene, scoring, options)
-    held_out = judge.evaluators["held-out"]
-    if "methods" in options.parts:
+    if "methods" in parts:
         found.unpruned = judge(splats)
         _measure_methods(task, judge, found, options)
     # An hour's measurements are not lost because one of them fails; it is said, and is an error.
-    if "cheaper" in options.parts:
-        with _noted("cheaper", found.failed):
-            found.cheaper = variants.measure(variants.CHEAPER, task, held_out, options.ratios)
-    if "ablation" in options.parts:
-        with _noted("ablation", found.failed):
-            found.ablation = variants.measure(variants.ABLATION, task, held_out, options.ratios)
-    if "flops" in options.parts:
-        with _noted("flops", found.failed):
-            found.flops = flops.measure(splats, scoring)
-    if "hessian" in options.parts:
-        with _noted("hessian", found.failed):
-            found.hessian = hessian.measure(splats, scoring)
+    for name, part in _parts(task, scene, judge.evaluators["held-out"], options).items():
+        if name in parts:
+            with _noted(name, found.failed):
+                setattr(found, name, part())
     return found
+
+
+def _parts(
+    task: Task, scene: evaluate.Scene, held_out: evaluate.Evaluator, options: argparse.Namespace
+) -> dict[str, Callable[[], Any]]:
+    """Return how each part but the methods is measured, under its name in `Measured`."""
+    splats, scoring, ratios = task.splats, task.views, options.ratios
+    offered = {method.name: method for method in methods.everything()}
+    ours = [method for method in offered.values() if method.group == methods.OURS]
+    budgets = [Budget(ratio=ratio) for ratio in ratios]
+
+    def timed(method: Method, task: Task) -> Cost:
+        return measured(lambda: leave(method, task, HALF), options.runs)[1]
+
+    def left(name: str, ratio: float) -> Splats:
+        return leave(offered[name], task, ratio)
+
+    def tuned() -> list[finetune.Tuned]:
+        if not scene.pictures:
+            return []
+        training = (scoring, scene.pictures)
+        return finetune.measure(left, finetune.METHODS, training, held_out, options.iterations)
+
+    return {
+        "sizes": lambda: sizes.measure(ours, task, timed),
+        "estimate": lambda: list(estimate.measure(splats, scoring, budgets)),
+        "finetune": tuned,
+        "million": lambda: million.measure(splats, scoring, scene.test, options.million),
+        "cheaper": lambda: variants.measure(variants.CHEAPER, task, held_out, ratios),
+        "ablation": lambda: variants.measure(variants.ABLATION, task, held_out, ratios),
+        "flops": lambda: flops.measure(splats, scoring),
+        "hessian": lambda: hessian.measure(splats, scoring),
+    }
 
 
 @contextmanager
@@ -170,7 +237,7 @@ def _noted(what: str, failed: list[str]) -> Iterator[None]:
     """Note what fails and go on."""
     try:
         yield
-    except (RefineError, ArithmeticError, LookupError, TypeError, ValueError) as error:
+    except FAILURES as error:
         failed.append(f"{what}: {type(error).__name__}: {error}")
         print(f"  {failed[-1]}", file=sys.stderr, flush=True)
 
@@ -186,7 +253,7 @@ def _measure_methods(
         method for method in offered if options.methods is None or method.name in options.methods
     ]
     _warm_up(task, chosen)
-    rendering: tuple[Statistics | None, Cost] = (None, Cost(0.0, options.runs, None))
+    rendering: tuple[Statistics | None, Cost] = (None, Cost(0.0, 0.0, options.runs, None))
     if any(method.rendered for method in chosen):
         rendering = measured(
             lambda: rasterizer.accumulate_statistics(task.splats, task.views), options.runs
@@ -219,7 +286,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for folder in options.scenes:
         print(folder, flush=True)
         try:
-            scenes.append(measure(folder, options))
+            parts = set(options.parts) - set(ONCE if scenes else ())
+            scenes.append(measure(folder, options, parts))
         except (RefineError, ValueError) as error:
             print(f"{folder}: {error}", file=sys.stderr)
             return 1
@@ -240,7 +308,10 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
                         default=list(evaluate.METRICS))  # fmt: skip
     parser.add_argument("--runs", type=int, default=3, help="of which the median counts")
     parser.add_argument("--views", type=int, default=64, help="that decide, at most; 0: all")
-    parser.add_argument("--judged", type=int, default=16, help="of them that judge, at most")
+    parser.add_argument("--judged", type=int, default=8, help="of them that judge, at most")
+    parser.add_argument("--iterations", type=int, default=finetune.ITERATIONS, help="of training")
+    parser.add_argument("--million", type=int, default=million.COUNT, metavar="N",
+                        help="into how many splats the scene is split")  # fmt: skip
     parser.add_argument("--output", type=Path, default=ROOT / "docs/trade.md")
     options = parser.parse_args(arguments)
     options.scenes = options.scenes or [ROOM]

@@ -1,4 +1,4 @@
-"""Writes what `trade` measured: docs/trade.md, and a plot of quality over time for each scene."""
+"""Writes what `trade` measured: docs/trade.md, with the plots of `trade_plot`."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numba
-import numpy as np
 
 from ..baselines import splat_transform
-from . import flops
 from .evaluate import HELD_OUT
-from .methods import EXTERNAL, LITERATURE, OURS
+from .methods import OURS
+from .trade_plot import draw
+from .trade_sections import sections, table
 
 if TYPE_CHECKING:
     import argparse
@@ -35,12 +35,11 @@ HOW = """\
 - All methods get the same splats in memory and the same scoring views. The held-out views never
   decide: those that `split.json` names as test views, else every {every}th.
 - Seconds are those of scoring and pruning, at 50 % or the ratio next to it, the median of at most
-  {runs} runs, reading and writing left out; splat-transform is another program and its seconds
-  are file to file. Rendered baselines share one pass of compiled rendering; each of them is
-  charged its whole time.
+  {runs} runs, reading and writing left out, with pictures of the size of the files;
+  splat-transform is another program and its seconds are file to file. Those of the processor count
+  all cores and tell what a busy machine hides. Rendered baselines share one pass of compiled
+  rendering; each of them is charged its whole time.
 - MB is the most memory in use beyond the scene itself; of splat-transform, all of it."""
-COLORS = {OURS: "#d1495b", LITERATURE: "#30638e", EXTERNAL: "#6a994e"}
-MARKERS = {OURS: "o", LITERATURE: "s", EXTERNAL: "^"}
 
 
 def facts(scene: Scene, scoring: ViewSet, judged: int) -> dict[str, str]:
@@ -112,9 +111,7 @@ def write(output: Path, scenes: Sequence[Measured], options: argparse.Namespace)
             draw(plot, scene)
             lines += ["", f"![Quality over time, {scene.name}]({plot.name})"]
             lines += ["", *_main_table(scene), *_miscounts(scene), "", *_detail_tables(scene)]
-        lines += _cheaper_table(scene, options.ratios)
-        lines += _ablation_table(scene, options.ratios) + _flops_table(scene)
-        lines += _hessian_table(scene)
+        lines += sections(scene, options.ratios)
         lines += ["", *(f"- Failed: {what}" for what in scene.failed)] if scene.failed else []
     if any(scene.rows for scene in scenes):
         lines += ["", "## The methods", "", *_methods(scenes)]
@@ -123,11 +120,6 @@ def write(output: Path, scenes: Sequence[Measured], options: argparse.Namespace)
 
 def _list(items: dict[str, str]) -> list[str]:
     return [f"- {name}: {value}" for name, value in items.items()]
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    lines = [f"| {' | '.join(heads)} |", "|---" + "|---:" * (len(heads) - 1) + "|"]
-    return lines + [f"| {' | '.join(row)} |" for row in rows]
 
 
 def by_method(rows: Iterable[Row]) -> dict[str, list[Row]]:
@@ -156,12 +148,14 @@ def _main_table(scene: Measured) -> list[str]:
         ]
         middle = min(rows, key=lambda row: abs(row.ratio - 0.5))
         peak = middle.cost.peak_bytes
-        cells += [f"{middle.cost.seconds:.2f}", "" if peak is None else f"{peak / MEGABYTE:,.0f}"]
+        cells += [f"{middle.cost.seconds:.2f}", f"{middle.cost.busy:.2f}"]
+        cells.append("" if peak is None else f"{peak / MEGABYTE:,.0f}")
         label = f"**{name}**" if rows[0].method.group == OURS else name
         body.append([label, *cells])
-    heads = ["PSNR, held-out views", *(f"{row.ratio:.0%}" for row in first), "seconds", "MB"]
+    heads = ["PSNR, held-out views", *(f"{row.ratio:.0%}" for row in first)]
+    heads += ["seconds", "of the processor", "MB"]
     title = "Removed, against renders of the unpruned splats (bold: ours, and each best):"
-    return [title, "", *_table(heads, body)]
+    return [title, "", *table(heads, body)]
 
 
 def _miscounts(scene: Measured) -> list[str]:
@@ -191,7 +185,7 @@ def _detail_tables(scene: Measured) -> list[str]:
         ]
         heads = [" / ".join(map(str.upper, metrics)), *(f"{row.ratio:.0%}" for row in first)]
         lines += [f"### {scene.name}: {key[0]} views against {names[key[1]]}", ""]
-        lines += [*_table(heads, body), ""]
+        lines += [*table(heads, body), ""]
     return lines[:-1]
 
 
@@ -199,119 +193,6 @@ def _cell(quality: dict[str, float]) -> str:
     return " / ".join(f"{value:.{DIGITS[name]}f}" for name, value in quality.items())
 
 
-def _cheaper_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
-    if not scene.cheaper:
-        return []
-    body = [
-        [line.name, *(f"{value:.1f}" for value in line.psnr), f"{line.seconds:.2f}"]
-        for line in scene.cheaper
-    ]
-    return ["", f"### {scene.name}: speed for accuracy within occlusion", "",
-            ("PSNR on held-out views against renders of the unpruned splats. Views are `--views`; "
-            "cells, density and rounds are settings of the core (`Occlusion`)."), "",
-            *_table(["occlusion", *(f"{r:.0%}" for r in ratios), "seconds"], body)]  # fmt: skip
-
-
-def _ablation_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
-    if not scene.ablation:
-        return []
-    body = [[line.name, *(f"{value:.1f}" for value in line.psnr)] for line in scene.ablation]
-    return ["", f"### {scene.name}: the closed form without its parts", "",
-            ("PSNR on held-out views against renders of the unpruned splats. Visibility is alpha, "
-            "projection 1 / (d^2 + eta), equal weights lambda = 1/3."), "",
-            *_table(["closed form", *(f"{ratio:.0%}" for ratio in ratios)], body)]  # fmt: skip
-
-
-def _flops_table(scene: Measured) -> list[str]:
-    counts = scene.flops
-    if counts is None:
-        return []
-    rows = [[term, *map(str, numbers)] for term, numbers in flops.ANALYTIC.items()]
-    total = np.sum(list(flops.ANALYTIC.values()), axis=0)
-    rows.append(["sum, by hand", *map(str, total)])
-    everything = counts.splats * counts.views / 1e9
-    body = [
-        [one.method, f"{one.per_splat:.0f}", f"{one.per_splat_view:.1f}",
-         f"{one.per_splat_view * everything + one.per_splat * counts.splats / 1e9:.2f}"]
-        for one in counts.methods
-    ]  # fmt: skip
-    rendered = flops.PER_HIT * counts.hits_per_splat_view
-    body.append(["rendered statistics, at least", "", f"{rendered:.0f}",
-                 f"{rendered * everything:.2f}"])  # fmt: skip
-    failed = [f"- {name} could not be counted: {why}" for name, why in counts.failed.items()]
-    return ["", f"### {scene.name}: floating-point operations", "",
-            "The closed form, a splat and a view, by hand (a test counts them):", "",
-            *_table(["operations", *flops.READINGS], rows), "",
-            ("Counted by running the code with arrays that count (`tables/flops.py`); the last "
-            f"column is for all {counts.splats:,} splats and {counts.views} views. Rendering pays "
-            f"for pixels: a splat is drawn in {counts.hits_per_splat_view:.1f} pixels of a view on "
-            f"average, {flops.PER_HIT} operations each, projection and pixels missed left out."),
-            "", *_table(["method", "a splat", "a splat and view", "all, 1e9"], body),
-            *(["", *failed] if failed else [])]  # fmt: skip
-
-
-def _hessian_table(scene: Measured) -> list[str]:
-    found = scene.hessian
-    if found is None:
-        return []
-    body = [
-        ["splats (14 parameters each)", found.primitives, found.primitives_unitless],
-        ["attributes of a splat (geometry, opacity, colour)", found.attributes,
-         found.attributes_unitless],
-        ["removals of single splats", found.removals, found.removals],
-    ]  # fmt: skip
-    rows = [[str(name), f"{raw:.3f}", f"{free:.3f}"] for name, raw, free in body]
-    rows[-1][-1] = ""
-    return ["", f"### {scene.name}: how independent splats and attributes are", "",
-            ("Diagonal energy ratio of the Gauss-Newton Hessian of the pictures, 1 is independent; "
-            f"the mean over {found.groups} random splats with their {found.neighbours} nearest "
-            f"neighbours, {found.views} views, exact Jacobians (`tables/hessian.py`). Unitless:"
-            " every parameter in the unit that makes its own diagonal entry 1."), "",
-            *_table(["diagonal blocks", "as it is", "unitless"], rows)]  # fmt: skip
-
-
 def _methods(scenes: Sequence[Measured]) -> list[str]:
     about = {row.method.name: row.method.about for scene in scenes for row in scene.rows}
     return [f"- {name}: {text}" for name, text in about.items()]
-
-
-def draw(file: Path, scene: Measured) -> None:
-    """Draw quality over time, one frame for each ratio."""
-    import matplotlib as mpl  # noqa: PLC0415 - slow, and only needed here
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt  # noqa: PLC0415
-
-    ratios = sorted({row.ratio for row in scene.rows})
-    figure, frames = plt.subplots(
-        1, len(ratios), figsize=(4.6 * len(ratios), 5.2), squeeze=False, layout="constrained"
-    )
-    for frame, ratio in zip(frames[0], ratios, strict=True):
-        rows = [row for row in scene.rows if row.ratio == ratio]
-        for row in rows:
-            x, y = max(row.cost.seconds, 1e-3), row.quality["held-out", "renders"]["psnr"]
-            group = row.method.group
-            frame.scatter(x, y, color=COLORS[group], marker=MARKERS[group], s=28, zorder=3)
-        _labels(frame, rows)
-        frame.set(xscale="log", xlabel="seconds", title=f"{ratio:.0%} removed")
-        frame.grid(alpha=0.3)
-        frame.margins(x=0.25)
-    frames[0][0].set_ylabel("PSNR on held-out views, dB")
-    figure.suptitle(f"{scene.name}: quality over time (circles: ours)")
-    # Without the date and version that would change the file at every run.
-    figure.savefig(file, dpi=100, metadata={"Software": None})
-    plt.close(figure)
-
-
-def _labels(frame: object, rows: Sequence[Row]) -> None:
-    """Name the points; names that would lie on one another move apart vertically."""
-    psnr = [row.quality["held-out", "renders"]["psnr"] for row in rows]
-    gap = (max(psnr) - min(psnr)) / 40 or 1.0
-    last = -np.inf
-    for value, row in sorted(zip(psnr, rows, strict=True), key=lambda pair: pair[0]):
-        last = max(value, last + gap)
-        frame.annotate(  # type: ignore[attr-defined]
-            row.method.name, (max(row.cost.seconds, 1e-3), value),
-            xytext=(max(row.cost.seconds, 1e-3) * 1.12, last), fontsize=7, va="center",
-            color=COLORS[row.method.group],
-        )  # fmt: skip

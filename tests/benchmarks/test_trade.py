@@ -111,6 +111,38 @@ def test_the_report_says_what_was_measured(small: Path, tmp_path: Path) -> None:
     assert len(rows) == 3
 
 
+def test_the_report_has_sizes_estimates_and_a_larger_scene(small: Path, tmp_path: Path) -> None:
+    """Every method of ours at three sizes and as a command; two ways; no photos, no training."""
+    output = tmp_path / "trade.md"
+    parts = "--parts sizes estimate finetune million --million 3500 --iterations 2"
+
+    code = trade.main([str(small), *parts.split(), "--ratios", "0.5", "--runs", "1",
+                       "--output", str(output)])  # fmt: skip
+
+    lines = output.read_text().splitlines()
+    assert code == 0
+    assert "corner: 3,500 splats" in "\n".join(lines)
+    assert any("60 x 40 | 480 x 320 | 1920 x 1280 |" in line for line in lines)
+    for name in (*METHODS, "occlusion+absorb"):
+        assert sum(line.startswith(f"| {name} |") for line in lines) == 2, name
+    for way in ("delete", "absorb"):
+        assert sum(line.startswith(f"| {way} |") for line in lines) == 1, way
+    assert not any("after training" in line for line in lines)
+
+
+def test_training_and_the_larger_scene_are_measured_for_the_first_scene_only(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They take minutes each."""
+    asked = []
+    empty = trade.Measured("", {})
+    monkeypatch.setattr(trade, "measure", lambda *given: asked.append(given[2]) or empty)
+
+    trade.main([str(small), str(small), "--output", str(tmp_path / "trade.md")])
+
+    assert asked == [set(trade.PARTS), set(trade.PARTS) - {"finetune", "million"}]
+
+
 def test_what_fails_is_said_and_the_rest_is_kept(
     small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -185,6 +217,6 @@ def test_memory_is_what_was_added_at_the_peak() -> None:
 
 def test_costs_one_after_the_other_add_up() -> None:
     """Seconds add, memory is the larger, and the fewer runs count."""
-    first, second = trade.Cost(1.0, 3, 100), trade.Cost(2.0, 1, None)
+    first, second = trade.Cost(1.0, 1.5, 3, 100), trade.Cost(2.0, 3.0, 1, None)
 
-    assert first.plus(second) == trade.Cost(3.0, 1, 100)
+    assert first.plus(second) == trade.Cost(3.0, 4.5, 1, 100)

@@ -1,0 +1,225 @@
+"""A million splats: seconds and memory of whole commands, file to file, and what is left.
+
+The splats are those of a scene, split until there are `COUNT`: the largest first, each in two along
+its longest axis, so that the two together look like the one. Half of them goes. Every command is a
+process of its own and is given the file; ours also the cameras that score, with pictures 480 pixels
+wide.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from refine_addon.core.formats.ply import read_ply
+from refine_addon.core.formats.ply_columns import columns_from_splats
+from refine_addon.core.splats import SH_C0, Splats, drawable, opacity, rotation_matrices
+from refine_addon.core.task import METHODS
+
+from ..baselines import splat_transform
+from ..speed.file_to_file import run
+from .evaluate import Evaluator
+from .sizes import scaled
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from refine_addon.core.views import ViewSet
+
+COUNT = 1_000_000
+RATIO = 0.5
+WIDTH = 480
+JUDGED = 4
+"""Held-out views that judge: a million splats take seconds to draw."""
+ASIDE = 0.75
+"""Where the two of a split splat lie, standard deviations to either side along its longest axis."""
+SHADE = 0.02
+"""Standard deviation of what one of the two is brighter and the other darker."""
+
+
+@dataclass(frozen=True)
+class Command:
+    """One command.
+
+    Attributes
+    ----------
+    name : str
+    seconds, busy : float
+        From start to end, and of the processor, all cores together.
+    megabytes : float
+        Most memory of its own.
+    kept : int
+    psnr : float
+        Against renders of the million, mean of the views that judge, dB.
+    """
+
+    name: str
+    seconds: float
+    busy: float
+    megabytes: float
+    kept: int
+    psnr: float
+
+
+@dataclass(frozen=True)
+class Million:
+    """What was measured of a million splats.
+
+    Attributes
+    ----------
+    source, splats : int
+        How many there were and how many were made of them.
+    likeness : float
+        PSNR of the renders of these against renders of those, dB.
+    judged : int
+        How many held-out views judge.
+    commands : list of Command
+    """
+
+    source: int
+    splats: int
+    likeness: float
+    judged: int
+    commands: list[Command]
+
+
+def split(splats: Splats, count: int) -> Splats:
+    """Return `count` splats that look like `splats`, of which there are fewer.
+
+    A splat of variance s^2 along its longest axis becomes two, `ASIDE` s to either side with
+    variance ``(1 - ASIDE^2) s^2``: together they have its mean and its covariance. Each gets half
+    of its optical thickness times area, ``1 - (1 - opacity)^(1 / (2 sqrt(1 - ASIDE^2)))``.
+
+    Raises
+    ------
+    ValueError
+        If there are more than `count`, or none can be drawn.
+    """
+    now = splats.take(drawable(splats))
+    if not 0 < len(now) <= count:
+        msg = f"cannot make {count} splats of {len(now)} that can be drawn"
+        raise ValueError(msg)
+    random = np.random.default_rng(0)
+    while len(now) < count:
+        areas = np.sum(np.sort(now.log_scales, axis=1)[:, 1:], axis=1)
+        order = np.argsort(-areas, kind="stable")
+        chosen, rest = np.split(order, [min(count - len(now), len(now))])
+        one, other = _halves(now.take(chosen), random)
+        now = _joined([now.take(rest), one, other])
+    return now
+
+
+def _halves(splats: Splats, random: np.random.Generator) -> tuple[Splats, Splats]:
+    """Split every splat in two."""
+    rows, longest = np.arange(len(splats)), np.argmax(splats.log_scales, axis=1)
+    axis = rotation_matrices(splats.quaternions)[rows, :, longest]
+    aside = ASIDE * np.exp(splats.log_scales[rows, longest])[:, None] * axis
+    shrunk = np.sqrt(1.0 - ASIDE**2)
+    scales = np.array(splats.log_scales)
+    scales[rows, longest] += np.log(shrunk)
+    # Of opacities next to 1 the logarithm needs a bound; 1 - 1e-6 is drawn as .99 anyway.
+    thickness = -np.log1p(-np.minimum(opacity(splats.opacity_logits), 1.0 - 1e-6))
+    logits = _logit(-np.expm1(-thickness / (2.0 * shrunk)))
+    shade = random.normal(scale=SHADE / SH_C0, size=(len(splats), 1)).astype(np.float32)
+    pair = [
+        replace(
+            splats,
+            means=(splats.means + sign * aside).astype(np.float32),
+            log_scales=scales.astype(np.float32),
+            opacity_logits=logits.astype(np.float32),
+            sh_dc=splats.sh_dc + sign * shade,
+        )
+        for sign in (np.float32(1.0), np.float32(-1.0))
+    ]
+    return pair[0], pair[1]
+
+
+def _logit(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    inside = np.maximum(values, 1e-30)
+    return np.asarray(np.log(inside) - np.log1p(-inside))
+
+
+def _joined(parts: Sequence[Splats]) -> Splats:
+    names = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
+    return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def write_ply(path: Path, splats: Splats) -> None:
+    """Write splats as a 3DGS PLY of float32."""
+    columns = columns_from_splats(splats)
+    rows = np.empty(len(splats), [(name, "<f4") for name in columns])
+    for name, values in columns.items():
+        rows[name] = values
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(path)
+
+
+def write_cameras(path: Path, views: ViewSet) -> None:
+    """Write cameras as the reference implementation does; principal points are the middles."""
+    cameras = [
+        {
+            "id": number,
+            "img_name": view.name,
+            "width": view.width,
+            "height": view.height,
+            "position": view.center.tolist(),
+            "rotation": view.rotation.T.tolist(),
+            "fx": view.fx,
+            "fy": view.fy,
+        }
+        for number, view in enumerate(views)
+    ]
+    path.write_text(json.dumps(cameras), encoding="utf-8")
+
+
+def commands(folder: Path, left: int) -> Mapping[str, Sequence[str | Path]]:
+    """Return all commands by name, from ``in.ply`` in a folder to ``out.ply`` there."""
+    source, output = folder / "in.ply", folder / "out.ply"
+    ours: list[str | Path] = [sys.executable, "-m", "refine_addon", "prune", source, "-o", output]
+    ours += ["--keep", str(left), "--cameras", folder / "cameras.json", "--views", "0"]
+    found: dict[str, Any] = {name: [*ours, "--method", name] for name in METHODS}
+    found["occlusion+absorb"] = [*ours, "--method", "occlusion", "--absorb"]
+    if splat_transform.find() is not None:
+        for flag in splat_transform.FLAGS:
+            name = f"splat-transform{flag.removeprefix('--decimate')}"
+            found[name] = splat_transform.command(source, output, flag, left)
+    return found
+
+
+def measure(splats: Splats, views: ViewSet, test: ViewSet, count: int = COUNT) -> Million:
+    """Split the splats of a scene and run every command on them.
+
+    Parameters
+    ----------
+    splats : Splats
+    views : ViewSet
+        Those that score.
+    test : ViewSet
+        Those that judge, `JUDGED` of them.
+    count : int
+    """
+    many = split(splats, count)
+    judges = scaled(test.spread(JUDGED), WIDTH)
+    likeness = Evaluator(splats, judges, metrics=("psnr",)).evaluate(many).renders.mean["psnr"]
+    evaluator = Evaluator(many, judges, metrics=("psnr",))
+    rows = []
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        write_ply(folder / "in.ply", many)
+        write_cameras(folder / "cameras.json", scaled(views, WIDTH))
+        for name, command in commands(folder, len(many) - int(RATIO * len(many))).items():
+            seconds, busy, peak = run(command)
+            left = read_ply(folder / "out.ply").splats()
+            psnr = evaluator.evaluate(left).renders.mean["psnr"]
+            rows.append(Command(name, seconds, busy, peak, len(left), psnr))
+            (folder / "out.ply").unlink()
+            print(f"  {rows[-1]}", flush=True)
+    return Million(len(splats), len(many), likeness, len(judges), rows)
