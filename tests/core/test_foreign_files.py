@@ -17,6 +17,7 @@ POINTER = (
     b"oid sha256:4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393\nsize 12345\n"
 )
 SPZ = struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(20)
+READ = "'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
 CONVERT = "convert it to a plain 3DGS PLY first (SuperSplat and splat-transform do)"
 
 
@@ -32,8 +33,8 @@ def zipped(*names: str) -> bytes:
 FOREIGN = {
     "a pointer": ("in.ply", POINTER, "a Git LFS pointer, not the file itself: 'git lfs pull'"),
     "a pointer to splats": ("in.splat", POINTER, "a Git LFS pointer, not the file itself"),
-    "splat": ("in.splat", bytes(64), f"a .splat file: {CONVERT}"),
-    "splat in capitals": ("IN.SPLAT", bytes(64), f"a .splat file: {CONVERT}"),
+    "splat": ("in.splat", bytes(64), f"a .splat file: {READ}"),
+    "splat in capitals": ("IN.SPLAT", bytes(64), f"a .splat file: {READ}"),
     "splat that starts like gzip": ("in.splat", b"\x1f\x8b" + bytes(62), "a .splat file"),
     "ksplat": ("in.ksplat", bytes(4096), f"a .ksplat file: {CONVERT}"),
     "spz": ("in.spz", gzip.compress(SPZ), f"an SPZ file: {CONVERT}"),
