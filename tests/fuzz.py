@@ -122,7 +122,7 @@ def ply_seeds() -> list[Files]:
     return [{"in.ply": seed} for seed in seeds]
 
 
-def format_seeds(form: Any) -> list[Files]:  # noqa: ANN401 - a `Format`
+def format_seeds(form: Any) -> list[Files]:
     """Return files of a format other than plain PLY, written by ours."""
     seeds = []
     for degree in (0, 1):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RefineError
+from ..scene import spatial_order
 from .ply import Origin, SplatFile
 from .ply_columns import empty_rows
 from .ply_header import new_header
@@ -121,3 +122,48 @@ def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
     if needed > available:
         msg = f"{path}: truncated: {what} need {needed} bytes, the file has {available}"
         raise RefineError(msg)
+
+
+def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Return the three smaller components of unit quaternions, which tell the largest.
+
+    Parameters
+    ----------
+    q : (N, 4) float64
+        Length 1.
+
+    Returns
+    -------
+    largest : (N,) intp
+        Which component is left out: the first of the largest.
+    others : (N, 3) float64
+        The others in their order, with the sign that makes the largest positive.
+    """
+    largest = np.abs(q).argmax(axis=1)
+    others = np.take_along_axis(q, _OTHERS[largest], axis=1)
+    negative = np.take_along_axis(q, largest[:, None], axis=1) < 0.0
+    return largest, np.where(negative, -others, others)
+
+
+def join_largest(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the quaternions of `split_largest`, (N, 4)."""
+    left = np.maximum(1.0 - np.einsum("ij,ij->i", others, others), 0.0)
+    q = np.empty((len(others), 4))
+    np.put_along_axis(q, _OTHERS[largest], others, axis=1)
+    np.put_along_axis(q, largest[:, None], np.sqrt(left)[:, None], axis=1)
+    return q
+
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""Left-out component -> the other three."""
+
+
+def near_ones_together(means: NDArray[Any]) -> NDArray[np.int64]:
+    """Return an order of finite positions (N, 3) in which near ones are near, (N,)."""
+    some = np.asarray(means[:: max(len(means) // 10_000, 1)], np.float64)
+    middle = np.median(some, axis=0)
+    size = float(np.median(np.abs(some - middle))) or 1.0
+    with np.errstate(over="ignore", under="ignore"):
+        place = (np.asarray(means, np.float64) - middle) / size
+        # Farther than that all are in one direction; their squares must stay finite.
+        return spatial_order(np.clip(place, -1e100, 1e100))

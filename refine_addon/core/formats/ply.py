@@ -285,7 +285,10 @@ def _check_properties(header: Header, vertex: int) -> None:
         for prop in header.elements[vertex].properties
     }
     if "packed_position" in kinds:
-        msg = f"{header.path}: a compressed splat PLY; expand it to the plain 3DGS layout first"
+        msg = (
+            f"{header.path}: a compressed splat PLY, which 'refine convert IN OUT.ply' makes a "
+            "plain one of"
+        )
         raise RefineError(msg)
     missing = [name for name in REQUIRED if name not in kinds]
     if missing:
