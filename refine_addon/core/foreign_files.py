@@ -72,8 +72,8 @@ def foreign_kind(path: Path, head: bytes) -> str:
     suffix = path.suffix.lower()
     if suffix in _UNSIGNED:
         return f"a {suffix} file: {_UNSIGNED[suffix]}"
-    if head.startswith(_SPZ) or _unpacked(head).startswith(_SPZ):
-        return f"an SPZ file: {_CONVERT}"
+    if head.startswith(_SPZ) or unpacked_beginning(head).startswith(_SPZ):
+        return f"an SPZ file: {_READ}"
     if head.startswith(_GZIP):
         return "compressed with gzip: unpack it first"
     if head.startswith(_ZIP) and (suffix == ".sog" or _lists_sog(path)):
@@ -95,7 +95,7 @@ def _lists_sog(path: Path) -> bool:
     )
 
 
-def _unpacked(head: bytes) -> bytes:
+def unpacked_beginning(head: bytes) -> bytes:
     """Return the first bytes of a gzip file's content; none if it is not a gzip file."""
     try:
         return zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, len(_SPZ))

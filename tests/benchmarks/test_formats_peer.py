@@ -27,6 +27,7 @@ COUNT = 700
 BOUNDS = {
     # suffix: (mean, log scale, opacity, colour, entry of the rotation matrix, harmonics)
     ".splat": (0.0, 1e-5, 0.004, 0.004, 0.1, np.inf),
+    ".spz": (0.0005, 0.032, 0.002, 0.004, 0.006, 0.071),
     ".compressed.ply": (0.006, 0.006, 0.002, 0.004, 0.006, 0.04),
 }
 """Suffix -> largest differences of activated values: what docs/conventions.md says of each format;
@@ -52,6 +53,13 @@ def room(folder: Path, degree: int) -> Path:
         columns[name] = (grid[:, axis] * 0.5 + columns[name] * 0.1).astype(np.float32)
         columns[f"scale_{axis}"] -= 4.0
     columns["opacity"] *= 8.0
+    # It does not normalise rotations for a .splat; SPZ holds harmonics between -1 and 1.
+    length = np.sqrt(sum(columns[f"rot_{index}"] ** 2 for index in range(4)))
+    for name, values in columns.items():
+        if name.startswith("rot_"):
+            columns[name] = values / length
+        elif name.startswith("f_rest_"):
+            columns[name] = (values * 0.5).clip(-0.9, 0.9)
     (folder / "in.ply").write_bytes(ply_of(columns))
     return folder / "in.ply"
 
@@ -102,3 +110,17 @@ def test_we_read_what_it_writes(tmp_path, suffix, degree):
     ours = read_splats(made).splats()
 
     compare(ours, read_splats(source).splats().up_to_degree(ours.sh_degree), BOUNDS[suffix])
+
+
+@pytest.mark.parametrize("version", ["3", "4"])
+def test_we_read_both_versions_of_spz_that_it_writes(tmp_path, version):
+    """By gzip and by zstd: the same splats."""
+    source, made = room(tmp_path, 2), tmp_path / "a.spz"
+    if version == "4":
+        pytest.importorskip("zstandard")
+    transformed(source, made, "--spz-version", version)
+
+    file = read_splats(made)
+
+    assert file.format == f"SPZ version {version}"
+    compare(file.splats(), read_splats(source).splats(), BOUNDS[".spz"])

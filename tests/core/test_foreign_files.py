@@ -37,9 +37,9 @@ FOREIGN = {
     "splat in capitals": ("IN.SPLAT", bytes(64), f"a .splat file: {READ}"),
     "splat that starts like gzip": ("in.splat", b"\x1f\x8b" + bytes(62), "a .splat file"),
     "ksplat": ("in.ksplat", bytes(4096), f"a .ksplat file: {CONVERT}"),
-    "spz": ("in.spz", gzip.compress(SPZ), f"an SPZ file: {CONVERT}"),
-    "spz, whatever its name": ("in.ply", gzip.compress(SPZ), f"an SPZ file: {CONVERT}"),
-    "spz without compression around it": ("in.spz", SPZ, f"an SPZ file: {CONVERT}"),
+    "spz": ("in.spz", gzip.compress(SPZ), f"an SPZ file: {READ}"),
+    "spz, whatever its name": ("in.ply", gzip.compress(SPZ), f"an SPZ file: {READ}"),
+    "spz without compression around it": ("in.spz", SPZ, f"an SPZ file: {READ}"),
     "sog": ("in.sog", zipped("means_l.webp", "meta.json"), f"a SOG file: {CONVERT}"),
     "sog by its content": ("in.ply", zipped("meta.json", "sh0.webp"), f"a SOG file: {CONVERT}"),
     "sog, longer than what is looked into": (

@@ -100,6 +100,16 @@ BOUNDS = {
         "rotation": 8 * 0.5 * 2**0.5 / 1023,
         "harmonics": 1 / 64 + 1e-6,
     },
+    # Half of 1/4096; of 1/16; of f_dc's 1/38.25, which is .282 / 38.25 of colour; of sqrt(.5) / 511
+    # for a rotation's component; of 16/128 and then of 1/128.
+    ".spz": {
+        "mean": 0.5 / 4096 + 1e-6,
+        "log scale": 0.5 / 16 + 1e-6,
+        "opacity": 0.5 / 255 + 1e-6,
+        "color": 0.5 * 0.2821 / 38.25 + 1e-6,
+        "rotation": 8 * 0.5 * 2**0.5 / 1023,
+        "harmonics": 0.5 / 8 + 0.5 / 128 + 1e-6,
+    },
 }
 """Suffix -> largest differences that docs/conventions.md allows in the test scene."""
 
