@@ -100,6 +100,15 @@ BOUNDS = {
         "rotation": 8 * 0.5 * 2**0.5 / 1023,
         "harmonics": 1 / 64 + 1e-6,
     },
+    # float32 of what is activated: 6e-8 of the value. An opacity p has the logit log(p / (1 - p)).
+    ".glb": {
+        "mean": 0.0,
+        "log scale": 1e-6,
+        "opacity": 1e-7,
+        "color": 1e-7,
+        "rotation": 1e-6,
+        "harmonics": 0.0,
+    },
     # Half of 1/4096; of 1/16; of f_dc's 1/38.25, which is .282 / 38.25 of colour; of sqrt(.5) / 511
     # for a rotation's component; of 16/128 and then of 1/128.
     ".spz": {
