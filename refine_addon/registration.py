@@ -6,6 +6,7 @@ import bpy
 from bpy.props import FloatProperty, PointerProperty
 
 from . import command
+from .core.formats.registry import SUFFIXES
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
 from .ui.operators import (
     REFINE_OT_apply,
@@ -44,6 +45,8 @@ CLASSES = (
     REFINE_PT_export,
 )
 
+_SPLATS = f"Gaussian Splats ({', '.join(SUFFIXES)})"
+
 _commands: list[object] = []
 """Handle of the command, which Blender wants back."""
 
@@ -75,9 +78,9 @@ def _run_command(arguments: list[str]) -> int:
 
 
 def _draw_import(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
-    menu.layout.operator("refine.import_ply", text="Gaussian Splats (.ply)")
+    menu.layout.operator("refine.import_ply", text=_SPLATS)
     menu.layout.operator("refine.import_cameras", text="Splat Cameras (.json, COLMAP)")
 
 
 def _draw_export(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
-    menu.layout.operator("refine.export_ply", text="Gaussian Splats (.ply)")
+    menu.layout.operator("refine.export_ply", text=_SPLATS)

@@ -17,7 +17,7 @@ import numpy as np
 from . import selection
 from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
-from .formats.registry import Packed, as_written, read_splats
+from .formats.registry import Packed, as_written, read_splats, refuse_unknown_size
 from .report import Clock, Files, complete_report, make_report
 from .scoring import auto, closed_form, occlusion, sight_lines
 from .selection import Budget
@@ -529,7 +529,7 @@ def prune_file(  # noqa: PLR0913 - as `prune`
     made = as_written(file, target)
     row_bytes: RowBytes = made.row_bytes
     if budget.max_mb is not None and isinstance(made, Packed):
-        made.refuse_unknown_size()
+        refuse_unknown_size(made.form)
     if absorb and budget.removals(len(file), row_bytes, made.fixed_bytes) != 0:
         row_bytes = made.changed_row_bytes  # how long each becomes is not known before
     task = Task(

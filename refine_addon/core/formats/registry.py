@@ -35,7 +35,7 @@ FORMATS: tuple[Format, ...] = (
 )
 """Every format but plain PLY, in the order in which an input is tried."""
 
-SUFFIXES = tuple(sorted({".ply", *(form.suffix for form in FORMATS)}))
+SUFFIXES = (".ply", *(form.suffix for form in FORMATS))
 """Endings of the files that are read and written."""
 
 NOT_WRITTEN = (".ksplat", ".gltf", ".lcc")
@@ -107,6 +107,17 @@ def format_named(path: Path) -> Format | None:
     return form
 
 
+def refuse_unknown_size(form: Format) -> None:
+    """Raise `RefineError` if the size of a file does not follow from the number of its splats."""
+    if form.sizes(0, 0) is None:
+        fixed = ", ".join(other.suffix for other in FORMATS if other.sizes(0, 0))
+        msg = (
+            f"a size cannot be kept to in {form.suffix}, which is compressed as a whole: choose "
+            f"another budget, or write .ply, {fixed}"
+        )
+        raise RefineError(msg)
+
+
 def as_written(file: SplatFile, path: Path | None) -> SplatFile | Packed:
     """Return what writes a file's splats to `path`, by the suffix of `path`.
 
@@ -158,16 +169,6 @@ class Packed:
         """Bytes of everything but the splats, at most."""
         sizes = self._sizes(len(self.file))
         return sizes.fixed if sizes else 0
-
-    def refuse_unknown_size(self) -> None:
-        """Raise `RefineError` if a file's size does not follow from the number of splats."""
-        if self._sizes(0) is None:
-            fixed = ", ".join(form.suffix for form in FORMATS if form.sizes(0, 0))
-            msg = (
-                f"a size cannot be kept to in {self.form.suffix}, which is compressed as a whole: "
-                f"choose another budget, or write .ply, {fixed}"
-            )
-            raise RefineError(msg)
 
     def size(
         self,
