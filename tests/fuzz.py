@@ -24,8 +24,10 @@ import time
 import traceback
 import tracemalloc
 import warnings
+import zipfile
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +48,7 @@ from refine_addon.core import (  # noqa: E402
     score,
 )
 from refine_addon.core.formats.ply_columns import empty_rows, splats_from_columns  # noqa: E402
-from refine_addon.core.formats.registry import FORMATS  # noqa: E402
+from refine_addon.core.formats.registry import FORMATS, SUFFIXES  # noqa: E402
 
 MEMORY = 40_000_000
 """Bytes that any of these small inputs may cost; NumPy and JSON need some of their own."""
@@ -359,6 +361,26 @@ def use_splats(folder: Path) -> None:
             raise
 
 
+def sog_seeds() -> list[Files]:
+    """Return what is in SOG files, so that what is broken is not the archive alone."""
+    archives = [seed["in.sog"] for seed in format_seeds(FORMATS[SUFFIXES.index(".sog") - 1])]
+    seeds = []
+    for data in archives:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            seeds.append({name: archive.read(name) for name in archive.namelist()})
+    return seeds
+
+
+def use_sog(folder: Path) -> None:
+    """Put the files into an archive and use that."""
+    files = list(folder.iterdir())
+    with zipfile.ZipFile(folder / "in.sog", "w") as archive:
+        for path in files:
+            archive.write(path, path.name)
+            path.unlink()
+    use_splats(folder)
+
+
 def use_cameras(folder: Path) -> None:
     """Read cameras, and score a few splats by them, by either method."""
     files = sorted(path for path in folder.iterdir() if path.name != "dataparser_transforms.json")
@@ -381,7 +403,12 @@ def use_cameras(folder: Path) -> None:
 Target = tuple[Callable[[], list[Files]], Callable[[Path], None]]
 TARGETS: dict[str, Target] = {
     "ply": (ply_seeds, use_ply),
-    **{form.name: (partial(format_seeds, form), use_splats) for form in FORMATS},
+    **{
+        form.name: (partial(format_seeds, form), use_splats)
+        for form in FORMATS
+        if form.name != "SOG"
+    },
+    **({"SOG": (sog_seeds, use_sog)} if find_spec("PIL") else {}),
     "cameras.json": (inria_seeds, use_cameras),
     "transforms.json": (transforms_seeds, use_cameras),
     "colmap text": (colmap_text_seeds, use_cameras),

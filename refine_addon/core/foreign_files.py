@@ -77,7 +77,7 @@ def foreign_kind(path: Path, head: bytes) -> str:
     if head.startswith(_GZIP):
         return "compressed with gzip: unpack it first"
     if head.startswith(_ZIP) and (suffix == ".sog" or _lists_sog(path)):
-        return f"a SOG file: {_CONVERT}"
+        return f"a SOG file: {_READ}"
     if head.startswith(_ZIP):
         return "a ZIP archive: unpack it first"
     return ""

@@ -91,3 +91,24 @@ def test_an_object_is_pruned_to_a_size_in_another_format(addon, small, tmp_path)
     assert report["files"]["output_bytes"] == 3200
     with pytest.raises(core.RefineError, match=r"a size cannot be kept to in \.spz"):
         prune(name, views, core.Budget(max_mb=1.0), core.Settings(), output=tmp_path / "a.spz")
+
+
+def test_the_images_of_blender_are_those_of_pillow(addon):
+    """What one writes the other reads, to the bit: any bytes, where alpha is not 0."""
+    random = np.random.default_rng(0)
+    pixels = random.integers(0, 256, (12, 20, 4), np.uint8)
+    pixels[..., 3] |= 1
+    pillow, blender = addon.core.formats.images._Pillow(), addon.webp.BlenderImages()
+    before = len(bpy.data.images)
+
+    for writer in (pillow, blender):
+        data = writer.encode(pixels)
+        for reader in (pillow, blender):
+            assert reader.size(data) == (20, 12)
+            assert np.array_equal(reader.decode(data), pixels)
+
+    assert len(bpy.data.images) == before
+    for reader in (pillow, blender):
+        for broken in (b"", b"RIFF1234WEBPVP8L", data[:40]):
+            with pytest.raises(ValueError, match=r"."):
+                reader.decode(broken)

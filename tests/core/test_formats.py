@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,12 +21,16 @@ from refine_addon.core import (
     read_ply,
     read_splats,
 )
-from refine_addon.core.formats.registry import FORMATS, SUFFIXES
+from refine_addon.core.formats import registry
+from refine_addon.core.formats.registry import SUFFIXES
 from refine_addon.core.splats import base_color, opacity, opacity_logits, rotation_matrices
 from tests.strategies import ply_of, splat_names
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+FORMATS = [form for form in registry.FORMATS if form.suffix != ".sog" or find_spec("PIL")]
+"""All but plain PLY; SOG where Pillow is installed."""
 
 SUFFIX = [form.suffix for form in FORMATS]
 FIXED = [form.suffix for form in FORMATS if form.sizes(1, 0)]
@@ -99,6 +104,16 @@ BOUNDS = {
         "color": 0.5 * 1.2 / 255 + 1e-6,
         "rotation": 8 * 0.5 * 2**0.5 / 1023,
         "harmonics": 1 / 64 + 1e-6,
+    },
+    # Half of 1/65535 of 2 log(1 + 4), times 1 + 4; half of 1/127 of the range of all log scales or
+    # colours; of 2/255/sqrt(2). Each splat of 512 palettes' groups is near its mean.
+    ".sog": {
+        "mean": 0.5 * 3.3 / 65535 * 5.0,
+        "log scale": 0.5 * 4.0 / 127,
+        "opacity": 0.5 / 255 + 1e-6,
+        "color": 0.5 * 1.2 / 127,
+        "rotation": 8 * 0.5 * 2**0.5 / 255,
+        "harmonics": 1.0,
     },
     # float32 of what is activated: 6e-8 of the value. An opacity p has the logit log(p / (1 - p)).
     ".glb": {

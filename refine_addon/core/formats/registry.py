@@ -14,7 +14,7 @@ from ..errors import RefineError
 from ..foreign_files import refuse_pointer
 from ..splats import drawable
 from ..whole_file import expanded, whole_file
-from . import compressed_ply, dot_splat, glb, spz
+from . import compressed_ply, dot_splat, glb, sog, spz
 from .ply import SplatFile, read_ply
 from .ply_columns import REQUIRED, splats_from_columns
 
@@ -31,6 +31,7 @@ FORMATS: tuple[Format, ...] = (
     compressed_ply.FORMAT,
     spz.FORMAT,
     glb.FORMAT,
+    sog.FORMAT,
     dot_splat.FORMAT,  # known by its name alone, if it is none of the others
 )
 """Every format but plain PLY, in the order in which an input is tried."""
