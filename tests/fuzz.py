@@ -416,6 +416,10 @@ TARGETS: dict[str, Target] = {
 }
 
 
+if not find_spec("PIL"):
+    del TARGETS["SOG"]
+
+
 class Crash(Exception):  # noqa: N818 - what fuzzers call it
     """Something other than a result or an error for the user, and the files that led to it."""
 

@@ -2,7 +2,7 @@
 
 In short::
 
-    file = read_ply("scene.ply")
+    file = read_splats("scene.ply")
     result = prune(file.splats(), read_cameras("cameras.json"), Budget(ratio=0.5))
     file.write("pruned.ply", result.keep)
 """
