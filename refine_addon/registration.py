@@ -6,6 +6,8 @@ import bpy
 from bpy.props import FloatProperty, PointerProperty
 
 from . import command
+from .core.formats import images
+from .core.formats.registry import SUFFIXES
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
 from .ui.operators import (
     REFINE_OT_apply,
@@ -24,6 +26,7 @@ from .ui.panel import (
     REFINE_PT_splats,
 )
 from .ui.properties import RefineSettings
+from .webp import BlenderImages
 
 CLASSES = (
     RefineSettings,
@@ -44,6 +47,8 @@ CLASSES = (
     REFINE_PT_export,
 )
 
+_SPLATS = f"Gaussian Splats ({', '.join(SUFFIXES)})"
+
 _commands: list[object] = []
 """Handle of the command, which Blender wants back."""
 
@@ -56,12 +61,14 @@ def register() -> None:
     bpy.types.WindowManager.refine_progress = FloatProperty(default=-1.0, options={"SKIP_SAVE"})
     bpy.types.TOPBAR_MT_file_import.append(_draw_import)
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
+    images.use(BlenderImages())
     _commands.append(bpy.utils.register_cli_command("refine", _run_command))
 
 
 def unregister() -> None:
     """Undo `register`, in reverse."""
     bpy.utils.unregister_cli_command(_commands.pop())
+    images.use(None)
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)
     bpy.types.TOPBAR_MT_file_import.remove(_draw_import)
     del bpy.types.WindowManager.refine_progress
@@ -75,9 +82,9 @@ def _run_command(arguments: list[str]) -> int:
 
 
 def _draw_import(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
-    menu.layout.operator("refine.import_ply", text="Gaussian Splats (.ply)")
+    menu.layout.operator("refine.import_ply", text=_SPLATS)
     menu.layout.operator("refine.import_cameras", text="Splat Cameras (.json, COLMAP)")
 
 
 def _draw_export(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
-    menu.layout.operator("refine.export_ply", text="Gaussian Splats (.ply)")
+    menu.layout.operator("refine.export_ply", text=_SPLATS)

@@ -18,6 +18,7 @@ from .core import pipeline
 from .core.affine import is_uniform, transformed
 from .core.errors import RefineError
 from .core.formats.ply import columns_from_splats
+from .core.formats.registry import as_written, format_named, refuse_unknown_size
 from .core.report import Clock, Files, complete_report
 from .core.survivors import survivor_columns
 from .core.task import DEFAULTS, Result, Settings, Task
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
 
     from .core.absorbing.absorb import Absorbed
     from .core.formats.ply import SplatFile
+    from .core.formats.registry import Packed
     from .core.selection import Budget
     from .core.splats import Splats
     from .core.views import ViewSet
@@ -223,13 +225,14 @@ def export_object(
     columns: dict[str, NDArray[Any]] | None = None,
     apply_transform: bool = False,
     overwrite: bool = False,
-) -> SplatFile:
-    """Write an object as a 3DGS PLY, in the layout of the file it was imported from.
+) -> SplatFile | Packed:
+    """Write an object to a file: as PLY, in the layout of the file it was imported from.
 
     Parameters
     ----------
     checked : SplatObject
     path : path-like
+        Its suffix names the format.
     keep : (N,) bool, optional
         Which splats to write; all by default.
     columns : mapping of str to (N,), optional
@@ -241,7 +244,7 @@ def export_object(
 
     Returns
     -------
-    SplatFile
+    SplatFile or Packed
         What was written, all rows.
 
     Raises
@@ -255,8 +258,9 @@ def export_object(
     file = mesh_attributes.file_from_object(
         checked, _world_columns(checked) if apply_transform else columns
     )
-    file.write(target, keep, overwrite=overwrite)
-    return file
+    made = as_written(file, target)
+    made.write(target, keep, overwrite=overwrite)
+    return made
 
 
 def prune_object(  # noqa: PLR0913 - the command's options
@@ -281,7 +285,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     views, budget, settings, absorb, progress
         See `refine_addon.core.pipeline.prune`.
     output : Path, optional
-        The PLY file to make.
+        The file to make, in the format that its suffix names.
     save : bool
         Whether to delete the splats from the object and save the .blend.
     dry_run : bool
@@ -308,7 +312,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
         refuse_existing(target, overwrite=overwrite)
     if save and not dry_run:
         _check_savable(checked.obj)
-    row_bytes, fixed_bytes = mesh_attributes.file_size(checked)
+    row_bytes, fixed_bytes = _file_size(checked, budget, output)
     estimates = settings.estimates or budget.psnr is not None
     task = Task(
         budget=budget,
@@ -333,9 +337,22 @@ def prune_object(  # noqa: PLR0913 - the command's options
     clock.lap("write_s")
     result.report["notes"] += modifier_notes(checked.obj)
     source, made = f"{bpy.data.filepath}#{name}", None if target is None else str(target)
-    files = Files(source, made, sizes.bytes_before, sizes.bytes_after)
+    after = sizes.bytes_after if target is None else target.stat().st_size
+    files = Files(source, made, sizes.bytes_before, after)
     complete_report(result.report, clock, files)
     return result.report
+
+
+def _file_size(checked: SplatObject, budget: Budget, output: Path | None) -> tuple[float, int]:
+    """Return the bytes that a splat takes in the output, and those of all else in it."""
+    form = None if output is None else format_named(output)
+    if form is None:
+        return mesh_attributes.file_size(checked)
+    if budget.max_mb is not None:
+        refuse_unknown_size(form)
+    degree = min(mesh_layout.sh_degree(checked.mesh), form.degree)
+    sizes = form.sizes(len(checked), degree)
+    return (sizes.row, sizes.fixed) if sizes else (0.0, 0)
 
 
 def _plan(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:

@@ -12,6 +12,8 @@ code is 1.
 from __future__ import annotations
 
 import argparse
+import gzip
+import io
 import json
 import random
 import re
@@ -22,8 +24,12 @@ import time
 import traceback
 import tracemalloc
 import warnings
+import zipfile
 from collections.abc import Callable
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,8 +37,18 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
 from refine_addon.command.info import describe  # noqa: E402 - from this checkout, installed or not
-from refine_addon.core import Occlusion, RefineError, Settings, read_cameras, read_ply, score  # noqa: E402
-from refine_addon.core.formats.ply import splats_from_columns  # noqa: E402
+from refine_addon.core import (  # noqa: E402
+    Occlusion,
+    RefineError,
+    Settings,
+    as_written,
+    read_cameras,
+    read_ply,
+    read_splats,
+    score,
+)
+from refine_addon.core.formats.ply_columns import empty_rows, splats_from_columns  # noqa: E402
+from refine_addon.core.formats.registry import FORMATS, SUFFIXES  # noqa: E402
 
 MEMORY = 40_000_000
 """Bytes that any of these small inputs may cost; NumPy and JSON need some of their own."""
@@ -107,6 +123,22 @@ def ply_seeds() -> list[Files]:
     seeds[-1] += b"3 0 1 2\n"
     seeds.append((text + "end_header\n" + lines).replace("\n", "\r").encode().rstrip())
     return [{"in.ply": seed} for seed in seeds]
+
+
+def format_seeds(form: Any) -> list[Files]:
+    """Return files of a format other than plain PLY, written by ours."""
+    seeds = []
+    for degree in (0, 1):
+        rows, splats = empty_rows(5, degree)
+        for values in (splats.means, splats.log_scales, splats.quaternions, splats.sh_dc):
+            values[:] = np.random.default_rng(degree).normal(size=values.shape)
+        splats.opacity_logits[:], splats.sh_rest[:] = np.linspace(-4.0, 4.0, 5), 0.1
+        stream = io.BytesIO()
+        form.write(stream, splats_from_columns(rows).up_to_degree(form.degree))
+        seeds.append({f"in{form.suffix}": stream.getvalue()})
+    if form.name == "SPZ":  # in the open, so that what is broken reaches what is inside
+        seeds += [{"in.spz": gzip.decompress(seed["in.spz"])} for seed in seeds]
+    return seeds
 
 
 def inria_seeds() -> list[Files]:
@@ -316,6 +348,39 @@ def use_ply(folder: Path) -> None:
         raise AssertionError(msg)
 
 
+def use_splats(folder: Path) -> None:
+    """Read and describe a file of another format, and write it in that format and as a PLY."""
+    path = next(folder.iterdir())
+    file = read_splats(path)
+    describe(file)
+    file.write(folder / "out.ply")
+    try:
+        as_written(file, path).write(path, overwrite=True)
+    except RefineError as error:
+        if not re.search("can be drawn: nothing|coordinates up to", str(error)):
+            raise
+
+
+def sog_seeds() -> list[Files]:
+    """Return what is in SOG files, so that what is broken is not the archive alone."""
+    archives = [seed["in.sog"] for seed in format_seeds(FORMATS[SUFFIXES.index(".sog") - 1])]
+    seeds = []
+    for data in archives:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            seeds.append({name: archive.read(name) for name in archive.namelist()})
+    return seeds
+
+
+def use_sog(folder: Path) -> None:
+    """Put the files into an archive and use that."""
+    files = list(folder.iterdir())
+    with zipfile.ZipFile(folder / "in.sog", "w") as archive:
+        for path in files:
+            archive.write(path, path.name)
+            path.unlink()
+    use_splats(folder)
+
+
 def use_cameras(folder: Path) -> None:
     """Read cameras, and score a few splats by them, by either method."""
     files = sorted(path for path in folder.iterdir() if path.name != "dataparser_transforms.json")
@@ -338,11 +403,21 @@ def use_cameras(folder: Path) -> None:
 Target = tuple[Callable[[], list[Files]], Callable[[Path], None]]
 TARGETS: dict[str, Target] = {
     "ply": (ply_seeds, use_ply),
+    **{
+        form.name: (partial(format_seeds, form), use_splats)
+        for form in FORMATS
+        if form.name != "SOG"
+    },
+    **({"SOG": (sog_seeds, use_sog)} if find_spec("PIL") else {}),
     "cameras.json": (inria_seeds, use_cameras),
     "transforms.json": (transforms_seeds, use_cameras),
     "colmap text": (colmap_text_seeds, use_cameras),
     "colmap binary": (colmap_binary_seeds, use_cameras),
 }
+
+
+if not find_spec("PIL"):
+    del TARGETS["SOG"]
 
 
 class Crash(Exception):  # noqa: N818 - what fuzzers call it

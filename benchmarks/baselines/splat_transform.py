@@ -1,7 +1,8 @@
 """PlayCanvas splat-transform as an external process: decimation by merging pairs.
 
-It is an npm package that needs Node 22, itself an npm package. `install` puts both under
-``build/splat-transform``, where `find` looks before the search path::
+It is an npm package that needs Node 22, itself an npm package. `install` puts both, and Khronos'
+validator for glTF files, under ``build/splat-transform``, where `find` looks before the search
+path::
 
     python -m benchmarks.baselines.splat_transform
 
@@ -22,7 +23,7 @@ from pathlib import Path
 
 from refine_addon.core.errors import RefineError
 
-PACKAGES = ("@playcanvas/splat-transform@3.7.0", "node@22")
+PACKAGES = ("@playcanvas/splat-transform@3.7.0", "node@22", "gltf-validator@2.0.0-dev.3.10")
 FOLDER = Path(__file__).resolve().parents[2] / "build/splat-transform"
 MISSING = (
     "splat-transform is not installed: python -m benchmarks.baselines.splat_transform (needs npm)"

@@ -7,6 +7,7 @@ import stat
 from typing import TYPE_CHECKING
 
 from ..core import RefineError
+from ..core.formats.registry import format_named
 from . import options
 from .report import is_report
 
@@ -28,7 +29,7 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     _check_report(parser, given)
     for path in _outputs(given):
         _check_output(parser, path)
-    if given.command == "info":
+    if given.command in ("info", "convert"):
         return
     try:
         settings = options.settings(given)
@@ -41,6 +42,8 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
         parser.error("--published and --depth are settings of --method closed-form")
     if given.command == "prune":
         _check_prune(parser, given)
+    elif format_named(given.output):
+        parser.error(f"-o {given.output}: only a .ply holds scores")
     if given.cameras is None and not (given.scene and open_blend()):
         parser.error("no cameras: give --cameras, or open a .blend that has some")
 
@@ -78,8 +81,11 @@ def _check_report(parser: argparse.ArgumentParser, given: argparse.Namespace) ->
 
 def _check_output(parser: argparse.ArgumentParser, path: Path) -> None:
     """Refuse an output that would replace something other than splats, cameras above all."""
-    if path.suffix.lower() == ".ply":
-        return
+    try:
+        if format_named(path) or path.suffix.lower() == ".ply":
+            return
+    except RefineError as error:
+        parser.error(str(error))
     beginning = _beginning(path)
     if beginning is not None and not beginning.startswith(b"ply"):
         parser.error(f"{path} exists and is no PLY: write to another name")

@@ -29,8 +29,10 @@ def describe(file: SplatFile) -> dict[str, Any]:
         low = np.minimum(low, means.min(axis=0, initial=np.inf))
         high = np.maximum(high, means.max(axis=0, initial=-np.inf))
     names, lengths = file.rows.dtype.names or (), file.row_bytes
-    if isinstance(lengths, int):
-        average: float = lengths
+    if file.origin is not None:
+        average: float = round(file.stored_bytes / max(len(file), 1), 1)
+    elif isinstance(lengths, int):
+        average = lengths
     else:
         average = round(int(lengths.sum()) / max(len(lengths), 1), 1)
     known = ("x", "y", "z", "nx", "ny", "nz", "opacity")
@@ -38,7 +40,7 @@ def describe(file: SplatFile) -> dict[str, Any]:
     return {
         "splats": len(file),
         "sh_degree": whole.sh_degree,
-        "bytes": file.size(),
+        "bytes": file.stored_bytes,
         "bytes_per_splat": average,
         "format": file.format,
         "extent_low": low.tolist() if np.isfinite(low).all() else None,

@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..core import METHODS, Budget, ClosedForm, RefineError, Settings
+from ..core.formats.registry import SUFFIXES
 from ..core.whole_file import expanded
 from ..version import VERSION
 from .terminal import shown
 
 DEFAULT_RATIO = 0.5
+
+FORMATS = ", ".join(SUFFIXES)
 
 
 class _Parser(argparse.ArgumentParser):
@@ -22,7 +25,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of all three subcommands."""
+    """Return the parser of all subcommands."""
     parser = _Parser(
         prog="refine",
         description="Prune 3D Gaussian splats by how much the cameras would miss them.",
@@ -35,22 +38,29 @@ def make_parser() -> argparse.ArgumentParser:
     )
     _add_prune(commands)
     _add_score(commands)
-    info = commands.add_parser("info", help="say what is in 3DGS PLY files")
-    info.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help="3DGS PLY files")
+    _add_convert(commands)
+    info = commands.add_parser("info", help="say what is in files of splats")
+    info.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help="files of splats")
     _add_common(info)
     return parser
 
 
 def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     prune = commands.add_parser("prune", help="remove the splats the cameras would miss least")
-    prune.add_argument("inputs", nargs="*", type=_given, metavar="INPUT", help="3DGS PLY files")
+    prune.add_argument("inputs", nargs="*", type=_given, metavar="INPUT", help=f"files: {FORMATS}")
     prune.add_argument(
         "--object", type=_name, metavar="NAME", help="prune this splat object of the open .blend"
     )
     prune.add_argument(
         "--save", action="store_true", help="with --object: delete the splats there and save"
     )
-    prune.add_argument("-o", "--output", type=_path, metavar="OUT.ply", help="for a single input")
+    prune.add_argument(
+        "-o",
+        "--output",
+        type=_path,
+        metavar="OUT.ply",
+        help="for a single input; written in the format of its suffix",
+    )
     prune.add_argument(
         "--output-dir", type=_path, metavar="DIR", help="for many inputs; made if it is not there"
     )
@@ -88,12 +98,19 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
 
 def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     scoring = commands.add_parser("score", help="write the file with a float property refine_score")
-    scoring.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a 3DGS PLY file")
+    scoring.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a file of splats")
     scoring.add_argument(
         "-o", "--output", type=_path, metavar="OUT.ply", required=True, help="the file to make"
     )
     _add_scoring(scoring)
     _add_common(scoring)
+
+
+def _add_convert(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+    convert = commands.add_parser("convert", help="write a file of splats in another format")
+    convert.add_argument("inputs", nargs=1, type=_given, metavar="IN", help="known by its content")
+    convert.add_argument("output", type=_path, metavar="OUT", help=f"by its suffix: {FORMATS}")
+    _add_common(convert)
 
 
 def _add_scoring(parser: argparse.ArgumentParser) -> None:

@@ -7,11 +7,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core import RefineError, prune_file, read_cameras, read_ply, score
+import numpy as np
+
+from ..core import RefineError, as_written, prune_file, read_cameras, read_splats, score
 from ..core.errors import printable
 from ..core.quality import UNSEEN, in_words
 from ..core.report import scoring_notes
-from ..core.whole_file import refuse_existing
+from ..core.whole_file import refuse_existing, refuse_mapped
 from . import report
 from .info import describe
 from .options import budget, settings
@@ -36,7 +38,8 @@ def execute(options: argparse.Namespace) -> bool:
     if options.report is not None:
         report.check(options.report, overwrite=options.overwrite)
     run = _Run(options)
-    {"prune": _prune, "score": _score, "info": _info}[options.command](run)
+    works = {"prune": _prune, "score": _score, "convert": _convert, "info": _info}
+    works[options.command](run)
     run.finish()
     return not run.failed
 
@@ -106,12 +109,13 @@ def _prune_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
         output = options.output_dir / source.name
     result = prune_file(
         source,
-        None if options.dry_run else output,
+        output,
         views,
         budget(options),
         settings(options),
         absorb=options.absorb,
         overwrite=options.overwrite,
+        dry_run=options.dry_run,
         progress=run.terminal.progress(source.name),
     )
     run.terminal.clear()
@@ -143,11 +147,11 @@ def _prune_object(run: _Run, views: ViewSet) -> dict[str, Any]:
 def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
     splats, views, files = done["splats"], done["views"], done["files"]
     verb = "would keep" if run.options.dry_run else "kept"
-    before, after = (files[name] / 1e6 for name in ("input_bytes", "output_bytes"))
+    sizes = _megabytes(files["input_bytes"], files["output_bytes"])
     share = splats["removed"] / splats["before"]
     parts = [
         f"{verb} {splats['kept']:,} of {splats['before']:,} splats ({share:.1%} removed)",
-        f"{before:,.1f} -> {after:,.1f} MB",
+        sizes,
         f"by {views['used']} of {views['given']} views",
         f"{done['timings']['total_s']:.2f} s",
     ]
@@ -158,6 +162,12 @@ def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
         run.terminal.say(f"  quality: {quality}")
     for note in done["notes"]:
         run.terminal.say(f"  note: {note}")
+
+
+def _megabytes(before: int, after: int | None) -> str:
+    if after is None:  # only writing tells
+        return f"of {before / 1e6:,.1f} MB"
+    return f"{before / 1e6:,.1f} -> {after / 1e6:,.1f} MB"
 
 
 def _quality(done: dict[str, Any]) -> str:
@@ -182,7 +192,7 @@ def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     options = run.options
     output = options.output
     refuse_existing(output, overwrite=options.overwrite)
-    file = read_ply(source)
+    file = read_splats(source)
     scores = score(
         file.splats(), views, settings(options), progress=run.terminal.progress(source.name)
     )
@@ -204,13 +214,43 @@ def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     }
 
 
+def _convert(run: _Run) -> None:
+    source = run.options.inputs[0]
+    run.attempt(str(source), lambda: _convert_one(run, source))
+
+
+def _convert_one(run: _Run, source: Path) -> dict[str, Any]:
+    output, overwrite = run.options.output, run.options.overwrite
+    refuse_existing(output, overwrite=overwrite)
+    refuse_mapped(output, source)
+    file = read_splats(source)
+    made = as_written(file, output)
+    made.write(output, overwrite=overwrite)
+    size, notes = output.stat().st_size, made.notes(np.ones(len(file), np.bool_))
+    run.terminal.say(
+        f"{source}: {len(file):,} splats, {_megabytes(file.stored_bytes, size)} -> {output}"
+    )
+    for note in notes:
+        run.terminal.say(f"  note: {note}")
+    return {
+        "files": {
+            "input": str(source),
+            "output": str(output),
+            "input_bytes": file.stored_bytes,
+            "output_bytes": size,
+        },
+        "splats": {"before": len(file)},
+        "notes": notes,
+    }
+
+
 def _info(run: _Run) -> None:
     for source in run.options.inputs:
         run.attempt(str(source), lambda source=source: _info_one(run, source))
 
 
 def _info_one(run: _Run, source: Path) -> dict[str, Any]:
-    file = read_ply(source)
+    file = read_splats(source)
     facts = describe(file)
     run.terminal.say(f"{source}")
     for name, value in facts.items():

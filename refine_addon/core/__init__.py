@@ -2,7 +2,7 @@
 
 In short::
 
-    file = read_ply("scene.ply")
+    file = read_splats("scene.ply")
     result = prune(file.splats(), read_cameras("cameras.json"), Budget(ratio=0.5))
     file.write("pruned.ply", result.keep)
 """
@@ -10,6 +10,7 @@ In short::
 from .cameras.read import read_cameras
 from .errors import Cancelled, RefineError
 from .formats.ply import SplatFile, read_ply
+from .formats.registry import as_written, read_splats
 from .pipeline import prune, prune_file, score
 from .scores import Scores
 from .scoring.closed_form import ClosedForm
@@ -34,11 +35,13 @@ __all__ = [
     "Splats",
     "View",
     "ViewSet",
+    "as_written",
     "prune",
     "prune_file",
     "rank",
     "read_cameras",
     "read_ply",
+    "read_splats",
     "score",
     "select",
     "survivor_columns",

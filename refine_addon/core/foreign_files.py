@@ -1,4 +1,4 @@
-"""Files of known kinds that cannot be read here: they are refused with advice what to do."""
+"""Files of known kinds where another kind is expected: they are refused with advice what to do."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ if TYPE_CHECKING:
 
 _POINTER = b"version https://git-lfs.github.com/spec/"
 _GZIP, _ZIP, _SPZ = b"\x1f\x8b", b"PK\x03\x04", b"NGSP"
-_UNSIGNED = (".splat", ".ksplat")
-"""Formats that only the file's name tells, since the files have no signature."""
-
 _CONVERT = "convert it to a plain 3DGS PLY first (SuperSplat and splat-transform do)"
+_READ = "'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
+
+_UNSIGNED = {".splat": _READ, ".ksplat": _CONVERT}
+"""Formats that only the file's name tells, since the files have no signature, and what to do."""
 
 
 def refuse_pointer(path: Path, head: bytes) -> None:
@@ -70,13 +71,13 @@ def foreign_kind(path: Path, head: bytes) -> str:
     """
     suffix = path.suffix.lower()
     if suffix in _UNSIGNED:
-        return f"a {suffix} file: {_CONVERT}"
-    if head.startswith(_SPZ) or _unpacked(head).startswith(_SPZ):
-        return f"an SPZ file: {_CONVERT}"
+        return f"a {suffix} file: {_UNSIGNED[suffix]}"
+    if head.startswith(_SPZ) or unpacked_beginning(head).startswith(_SPZ):
+        return f"an SPZ file: {_READ}"
     if head.startswith(_GZIP):
         return "compressed with gzip: unpack it first"
     if head.startswith(_ZIP) and (suffix == ".sog" or _lists_sog(path)):
-        return f"a SOG file: {_CONVERT}"
+        return f"a SOG file: {_READ}"
     if head.startswith(_ZIP):
         return "a ZIP archive: unpack it first"
     return ""
@@ -94,7 +95,7 @@ def _lists_sog(path: Path) -> bool:
     )
 
 
-def _unpacked(head: bytes) -> bytes:
+def unpacked_beginning(head: bytes) -> bytes:
     """Return the first bytes of a gzip file's content; none if it is not a gzip file."""
     try:
         return zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, len(_SPZ))

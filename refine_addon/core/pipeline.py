@@ -17,7 +17,7 @@ import numpy as np
 from . import selection
 from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
-from .formats.ply import read_ply
+from .formats.registry import Packed, as_written, read_splats, refuse_unknown_size
 from .report import Clock, Files, complete_report, make_report
 from .scoring import auto, closed_form, occlusion, sight_lines
 from .selection import Budget
@@ -487,21 +487,25 @@ def prune_file(  # noqa: PLR0913 - as `prune`
     *,
     absorb: bool = False,
     overwrite: bool = False,
+    dry_run: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Result:
-    """Prune a 3DGS PLY file, and write the result to another file.
+    """Prune a file of splats, and write the result to another file.
 
     Parameters
     ----------
     source : path-like
-        The file to read.
+        The file to read, of any format (`read_splats`).
     output : path-like or None
-        The file to write; None decides without writing.
+        The file to write, in the format that its suffix names; None decides without writing, as for
+        a plain PLY.
     views, budget, settings, absorb, progress, threads
         See `prune`.
     overwrite : bool
         Whether `output` may replace a file.
+    dry_run : bool
+        Whether to decide as for `output`, and write nothing.
 
     Returns
     -------
@@ -511,17 +515,22 @@ def prune_file(  # noqa: PLR0913 - as `prune`
     Raises
     ------
     RefineError, Cancelled
-        See `prune`, `read_ply` and `SplatFile.write`; then nothing is written.
+        See `prune`, `read_splats` and `SplatFile.write`; also if a budget is a size, and the format
+        of `output` compresses the file as a whole. Then nothing is written.
     """
     clock = Clock()
     target = None if output is None else expanded(output)
-    if target is not None:
-        refuse_existing(target, overwrite=overwrite)
-        refuse_mapped(target, expanded(source))
-    file = read_ply(source)
-    row_bytes: RowBytes = file.row_bytes
-    if absorb and budget.removals(len(file), row_bytes, file.fixed_bytes) != 0:
-        row_bytes = file.changed_row_bytes  # how long each becomes is not known before
+    written = None if dry_run else target
+    if written is not None:
+        refuse_existing(written, overwrite=overwrite)
+        refuse_mapped(written, expanded(source))
+    file = read_splats(source)
+    made = as_written(file, target)
+    row_bytes: RowBytes = made.row_bytes
+    if budget.max_mb is not None and isinstance(made, Packed):
+        refuse_unknown_size(made.form)
+    if absorb and budget.removals(len(file), row_bytes, made.fixed_bytes) != 0:
+        row_bytes = made.changed_row_bytes  # how long each becomes is not known before
     task = Task(
         budget=budget,
         settings=settings,
@@ -529,17 +538,18 @@ def prune_file(  # noqa: PLR0913 - as `prune`
         views=views,
         absorb=absorb,
         row_bytes=row_bytes,
-        fixed_bytes=file.fixed_bytes,
+        fixed_bytes=made.fixed_bytes,
     )
     clock.lap("read_s")
     result = decide(task, clock=clock, progress=part(progress, 0.0, 0.8), threads=threads)
     report(progress, 0.8, "writing")
     columns = survivor_columns(file.rows, result.absorbed) if result.absorbed else {}
-    if target is not None:
-        file.write(target, result.keep, columns=columns, overwrite=overwrite)
+    sizes = (file.stored_bytes, made.size(result.keep, columns))
+    if written is not None:
+        made.write(written, result.keep, columns=columns, overwrite=overwrite)
+        sizes = (sizes[0], written.stat().st_size)
     clock.lap("write_s")
-    result.report["notes"] += file.notes(result.keep)
-    made = None if target is None else str(target)
-    sizes = (file.size(), file.size(result.keep, columns))
-    complete_report(result.report, clock, Files(str(file.path), made, *sizes))
+    result.report["notes"] += made.notes(result.keep)
+    names = (str(file.path), None if written is None else str(written))
+    complete_report(result.report, clock, Files(*names, *sizes))
     return result

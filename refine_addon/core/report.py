@@ -50,14 +50,15 @@ class Files:
         A file, or a .blend file and the object in it.
     output : str or None
         The file that was written, if any.
-    input_bytes, output_bytes : int
-        Sizes as PLY files.
+    input_bytes : int
+    output_bytes : int or None
+        Sizes; None for a file that is not written and whose size only writing tells.
     """
 
     input: str
     output: str | None
     input_bytes: int
-    output_bytes: int
+    output_bytes: int | None
 
 
 def scoring_notes(scores: Scores) -> list[str]:

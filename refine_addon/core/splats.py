@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,6 +54,10 @@ class Splats:
         """Highest spherical-harmonics band present, 0 to 4."""
         return math.isqrt(self.sh_rest.shape[1] + 1) - 1
 
+    def up_to_degree(self, degree: int) -> Splats:
+        """Return the splats without harmonics above a degree."""
+        return replace(self, sh_rest=self.sh_rest[:, : (degree + 1) ** 2 - 1])
+
     def take(self, index: NDArray[Any] | slice) -> Splats:
         """Return the splats at `index` (a mask, integers or a slice), in that order."""
         return Splats(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
@@ -75,6 +79,28 @@ def opacity(logits: NDArray[Any]) -> NDArray[np.float64]:
     # exp(-700) is 1e-304; the limit avoids underflow.
     decay = np.exp(-np.minimum(np.abs(logits), 700.0))
     return np.asarray(np.where(logits >= 0.0, 1.0, decay) / (1.0 + decay))
+
+
+OPACITY_MARGIN = 1e-6
+"""Opacities read from formats that round them are kept this far from 0 and 1, whose logits are
+infinite. The step of 8 bits is 4,000 times as large."""
+
+
+def opacity_logits(opacities: NDArray[Any], margin: float = OPACITY_MARGIN) -> NDArray[np.float64]:
+    """Logits of opacities: the inverse of `opacity`.
+
+    Parameters
+    ----------
+    opacities : (...) floating
+        Those outside of ``margin..1 - margin`` count as the nearer end; NaN stays NaN.
+    margin : float
+
+    Returns
+    -------
+    (...) float64
+    """
+    inside = np.clip(np.asarray(opacities, np.float64), margin, 1.0 - margin)
+    return np.asarray(np.log(inside) - np.log1p(-inside))
 
 
 def base_color(sh_dc: NDArray[Any]) -> NDArray[np.float64]:

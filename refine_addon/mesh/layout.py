@@ -11,6 +11,7 @@ import numpy as np
 
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED, REST_COUNTS
+from ..core.formats.ply_header import new_header
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -326,6 +327,4 @@ def vertex_header(header: bytes) -> bytes:
 
 def _new_header(columns: Sequence[Column], count: int) -> bytes:
     types = {"f4": "float", "i4": "int", "i1": "char"}
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
-    lines += [f"property {types[column.dtype[1:]]} {column.name}" for column in columns]
-    return ("\n".join([*lines, "end_header"]) + "\n").encode()
+    return new_header(((column.name, types[column.dtype[1:]]) for column in columns), count)

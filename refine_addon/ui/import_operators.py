@@ -15,10 +15,12 @@ from ..cameras.objects import UPRIGHT
 from ..cameras.sets import create_cameras
 from ..core.cameras.read import read_cameras
 from ..core.errors import RefineError
-from ..core.formats.ply import read_ply
+from ..core.formats.registry import SUFFIXES, read_splats
 from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
 from .on_thread import FAILURES, Answer, described, fail
+
+_NAMES = tuple(f"a{suffix}" for suffix in SUFFIXES)
 
 UPRIGHT_TEXT = (
     "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "
@@ -39,14 +41,16 @@ class _InObjectMode:
 
 
 class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
-    """Import 3DGS PLY files: a vertex a splat, a point attribute a property"""
+    """Import files of splats, of any format: a vertex a splat, a point attribute a property"""
 
     bl_idname = "refine.import_ply"
     bl_label = "Import Splats"
     bl_options = {"REGISTER", "UNDO"}
 
     filename_ext = ".ply"
-    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+    filter_glob: StringProperty(
+        default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"}
+    )
     files: CollectionProperty(
         type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"}
     )
@@ -86,7 +90,7 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
         return [Path(bpy.path.abspath(self.filepath))]
 
     def _import(self, context: bpy.types.Context, path: Path) -> bpy.types.Object:
-        file = read_ply(path)
+        file = read_splats(path)
         if not len(file):
             msg = f"{path}: holds no splats"
             raise RefineError(msg)
@@ -156,7 +160,7 @@ class REFINE_FH_ply(bpy.types.FileHandler):
     bl_idname = "REFINE_FH_ply"
     bl_label = "Gaussian Splats (REFINE)"
     bl_import_operator = "refine.import_ply"
-    bl_file_extensions = ".ply"
+    bl_file_extensions = ";".join(dict.fromkeys(Path(suffix).suffix for suffix in _NAMES))
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:

@@ -10,12 +10,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import bpy
+import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
 from .. import splat_object
 from ..cameras.sets import views_from_scene
 from ..core import pipeline
+from ..core.formats.registry import FORMATS, SUFFIXES, Packed
 from ..core.quality import in_words
 from ..core.report import scoring_notes
 from ..mesh import edit as mesh_edit
@@ -33,6 +35,15 @@ if TYPE_CHECKING:
     from ..mesh.layout import SplatObject
 
 
+_FORMATS = (
+    (".ply", ".ply", "In the layout that was imported"),
+    *((form.suffix, form.suffix, f"It {form.loss}") for form in FORMATS),
+)
+"""The formats of an export as Blender lists them, with tooltips."""
+
+_GLOB = ";".join(f"*{suffix}" for suffix in SUFFIXES)
+
+
 class _OnSplats:
     """An operator on the active object, which must hold splats."""
 
@@ -41,7 +52,7 @@ class _OnSplats:
         """Tell whether the operator can run, and if not, why."""
         obj = context.object
         if not mesh_layout.looks_like_splats(obj):
-            cls.poll_message_set("Select an object that holds splats: import a 3DGS PLY file")
+            cls.poll_message_set("Select an object that holds splats: import a file of splats")
             return False
         if obj.mode == "EDIT":
             cls.poll_message_set("Leave edit mode first")
@@ -252,14 +263,20 @@ class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
-    """Write the active object's splats to a 3DGS PLY file"""
+    """Write the active object's splats to a file, in the format that its suffix names"""
 
     bl_idname = "refine.export_ply"
     bl_label = "Export Splats"
     bl_options = {"REGISTER"}
 
     filename_ext = ".ply"
-    filter_glob: StringProperty(default="*.ply", options={"HIDDEN"})
+    filter_glob: StringProperty(default=_GLOB, options={"HIDDEN"})
+    suffix: EnumProperty(
+        name="Format",
+        description="Of the file that is picked here; what the suffix of a file name says holds",
+        items=_FORMATS,
+        options={"SKIP_SAVE"},
+    )
     apply_transform: BoolProperty(
         name="Apply Transform",
         description="Write the splats as they stand in the world: positions, rotations, scales "
@@ -278,6 +295,16 @@ class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
         self.overwrite = True
         return super().invoke(context, event)
 
+    def check(self, _context: bpy.types.Context) -> bool:
+        """Give the file name the suffix of the format that is chosen; return whether it changed."""
+        bare = self.filepath
+        for suffix in sorted(SUFFIXES, key=len, reverse=True):
+            if bare.lower().endswith(suffix):
+                bare = bare[: -len(suffix)]
+                break
+        before, self.filepath = self.filepath, bare + self.suffix
+        return before != self.filepath
+
     def execute(self, context: bpy.types.Context) -> Answer:
         """Write the file."""
         try:
@@ -289,5 +316,7 @@ class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
             )
         except FAILURES as error:
             return fail(self, error)
-        self.report({"INFO"}, f"Wrote {len(file):,} splats to {self.filepath}")
+        if isinstance(file, Packed):
+            self.report({"INFO"}, "; ".join(file.notes(np.ones(len(file.file), np.bool_))))
+        self.report({"INFO"}, f"Wrote the splats to {self.filepath}")
         return {"FINISHED"}

@@ -17,6 +17,7 @@ POINTER = (
     b"oid sha256:4d7a214614ab2935c943f9e0ff69d22eadbb8f32b1258daaa5e2ca24d17e2393\nsize 12345\n"
 )
 SPZ = struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(20)
+READ = "'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
 CONVERT = "convert it to a plain 3DGS PLY first (SuperSplat and splat-transform do)"
 
 
@@ -32,21 +33,21 @@ def zipped(*names: str) -> bytes:
 FOREIGN = {
     "a pointer": ("in.ply", POINTER, "a Git LFS pointer, not the file itself: 'git lfs pull'"),
     "a pointer to splats": ("in.splat", POINTER, "a Git LFS pointer, not the file itself"),
-    "splat": ("in.splat", bytes(64), f"a .splat file: {CONVERT}"),
-    "splat in capitals": ("IN.SPLAT", bytes(64), f"a .splat file: {CONVERT}"),
+    "splat": ("in.splat", bytes(64), f"a .splat file: {READ}"),
+    "splat in capitals": ("IN.SPLAT", bytes(64), f"a .splat file: {READ}"),
     "splat that starts like gzip": ("in.splat", b"\x1f\x8b" + bytes(62), "a .splat file"),
     "ksplat": ("in.ksplat", bytes(4096), f"a .ksplat file: {CONVERT}"),
-    "spz": ("in.spz", gzip.compress(SPZ), f"an SPZ file: {CONVERT}"),
-    "spz, whatever its name": ("in.ply", gzip.compress(SPZ), f"an SPZ file: {CONVERT}"),
-    "spz without compression around it": ("in.spz", SPZ, f"an SPZ file: {CONVERT}"),
-    "sog": ("in.sog", zipped("means_l.webp", "meta.json"), f"a SOG file: {CONVERT}"),
-    "sog by its content": ("in.ply", zipped("meta.json", "sh0.webp"), f"a SOG file: {CONVERT}"),
+    "spz": ("in.spz", gzip.compress(SPZ), f"an SPZ file: {READ}"),
+    "spz, whatever its name": ("in.ply", gzip.compress(SPZ), f"an SPZ file: {READ}"),
+    "spz without compression around it": ("in.spz", SPZ, f"an SPZ file: {READ}"),
+    "sog": ("in.sog", zipped("means_l.webp", "meta.json"), f"a SOG file: {READ}"),
+    "sog by its content": ("in.ply", zipped("meta.json", "sh0.webp"), f"a SOG file: {READ}"),
     "sog, longer than what is looked into": (
         "in.ply",
         zipped("a.txt", *(f"{'x' * 200}{i}.webp" for i in range(10_000)), "meta.json"),
-        f"a SOG file: {CONVERT}",
+        f"a SOG file: {READ}",
     ),
-    "sog in a folder": ("in.ply", zipped("a/meta.json", "a/b.webp"), f"a SOG file: {CONVERT}"),
+    "sog in a folder": ("in.ply", zipped("a/meta.json", "a/b.webp"), f"a SOG file: {READ}"),
     "zip with some meta.json": ("in.zip", zipped("meta.json", "in.ply"), "a ZIP archive: unpack"),
     "zip that says meta.json": ("in.zip", zipped("my-meta.json.webp"), "a ZIP archive: unpack"),
     "zip, cut": ("in.zip", zipped("meta.json", "a.webp")[:60], "a ZIP archive: unpack it first"),

@@ -462,7 +462,7 @@ REFUSED = {
         b"ply\nformat binary_little_endian 1.0\nelement chunk 1\nproperty float min_x\n"
         b"element vertex 1\nproperty uint packed_position\nproperty uint packed_rotation\n"
         b"end_header\n" + bytes(12),
-        "a compressed splat PLY; expand it to the plain 3DGS layout first",
+        "a compressed splat PLY, which 'refine convert IN OUT.ply' makes a plain one of",
     ),
     "no rotation": (
         declared((b"property float rot_3\n", b"")),

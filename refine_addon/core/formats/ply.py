@@ -44,9 +44,25 @@ INDEXING = ("edge", "face", "tristrips")
 _NAMES_SHOWN = 12
 
 
+@dataclass(frozen=True)
+class Origin:
+    """The file that rows come from, where it is no plain PLY.
+
+    Attributes
+    ----------
+    format : str
+        Name and version of its format.
+    size : int
+        Its bytes.
+    """
+
+    format: str
+    size: int
+
+
 @dataclass(frozen=True, eq=False)
 class SplatFile:
-    """A 3DGS PLY file, opened.
+    """A 3DGS PLY file, opened; or a file of another format, as the PLY that holds the same splats.
 
     Attributes
     ----------
@@ -62,6 +78,8 @@ class SplatFile:
         For ASCII files, the text of each vertex row with its line end.
     indexing : tuple of str
         Names of other elements whose rows hold indices of splats.
+    origin : Origin or None
+        Where the file is no plain PLY, what it is; `write` writes a plain PLY.
     """
 
     path: Path
@@ -71,6 +89,7 @@ class SplatFile:
     after: NDArray[np.uint8]
     lines: list[bytes] | None = None
     indexing: tuple[str, ...] = ()
+    origin: Origin | None = None
 
     def __len__(self) -> int:
         """Return the number of splats."""
@@ -99,8 +118,13 @@ class SplatFile:
 
     @property
     def format(self) -> str:
-        """Format as in the header, such as ``binary_little_endian 1.0``."""
-        return format_of(self.header)
+        """Format as in the header, such as ``binary_little_endian 1.0``, or of the `origin`."""
+        return format_of(self.header) if self.origin is None else self.origin.format
+
+    @property
+    def stored_bytes(self) -> int:
+        """Size of the file that was read, bytes."""
+        return self.size() if self.origin is None else self.origin.size
 
     def size(
         self,
@@ -261,7 +285,10 @@ def _check_properties(header: Header, vertex: int) -> None:
         for prop in header.elements[vertex].properties
     }
     if "packed_position" in kinds:
-        msg = f"{header.path}: a compressed splat PLY; expand it to the plain 3DGS layout first"
+        msg = (
+            f"{header.path}: a compressed splat PLY, which 'refine convert IN OUT.ply' makes a "
+            "plain one of"
+        )
         raise RefineError(msg)
     missing = [name for name in REQUIRED if name not in kinds]
     if missing:

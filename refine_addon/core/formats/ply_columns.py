@@ -56,6 +56,32 @@ def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> S
     )
 
 
+def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
+    """Return rows of float32 in the layout of a plain 3DGS PLY without normals, to be filled.
+
+    Parameters
+    ----------
+    count : int
+    degree : int
+        Of the harmonics, 0 to 4.
+
+    Returns
+    -------
+    rows : (count,) structured
+        Values are not set.
+    splats : Splats
+        Views of the rows; what is assigned to them is in the rows.
+    """
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    names = [*REQUIRED[:6], *(f"f_rest_{index}" for index in range(rest)), *REQUIRED[6:]]
+    table = np.empty((count, len(names)), "<f4")
+    ends = np.cumsum([3, 3, rest, 1, 3])
+    means, sh_dc, sh_rest, logits, scales, quaternions = np.split(table, ends, axis=1)
+    planes = sh_rest.reshape(count, 3, rest // 3)
+    splats = Splats(means, scales, quaternions, logits[:, 0], sh_dc, planes.transpose(0, 2, 1))
+    return table.view(np.dtype([(name, "<f4") for name in names]))[:, 0], splats
+
+
 def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
     """Return views of splats, (N,) each, by the names of properties in a 3DGS PLY.
 

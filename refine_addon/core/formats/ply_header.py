@@ -17,7 +17,7 @@ from ..errors import RefineError
 from ..foreign_files import refuse_foreign_splats
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
 
 HEADER_LIMIT = 1 << 20
@@ -89,6 +89,21 @@ def read_header(path: Path, stream: BinaryIO) -> Header:
         raise RefineError(msg) from error
     order = TEXT if data.text else data.byte_order
     return Header(path, raw, tuple(data.elements), tuple(counts), order)
+
+
+def new_header(properties: Iterable[tuple[str, str]], count: int) -> bytes:
+    """Return the header of a binary PLY of one element, ``vertex``.
+
+    Parameters
+    ----------
+    properties : iterable of (str, str)
+        Names and types (in PLY's words), in their order.
+    count : int
+        How many vertices.
+    """
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {kind} {name}" for name, kind in properties]
+    return "\n".join([*lines, "end_header", ""]).encode()
 
 
 def format_of(raw: bytes) -> str:

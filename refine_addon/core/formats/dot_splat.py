@@ -1,0 +1,102 @@
+"""``.splat`` files: 32 bytes a splat and nothing else, as antimatter15/splat introduced them.
+
+Mean and linear scale are float32, colour, opacity and rotation 8 bits each. The files have no
+signature, so that their name alone tells.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import RefineError
+from ..splats import SH_C0, base_color, opacity, opacity_logits
+from .format import Format, Sizes, codes, new_file, pieces, unit
+from .ply import Origin, SplatFile
+
+if TYPE_CHECKING:
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from numpy.typing import NDArray
+
+    from ..splats import Splats
+
+NAME = ".splat"
+
+_ROW = np.dtype(
+    [("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("rotation", "u1", 4)]
+)
+"""Of one splat: colour is red, green, blue and opacity, rotation is w x y z."""
+
+_NO_TURN = 128.0
+"""Code of 0 in a rotation, and the step from 0 to 1."""
+
+
+def matches(path: Path, head: bytes) -> bool:
+    """Return whether a file is taken for one: by its name, unless it is a PLY."""
+    return path.suffix.lower() == FORMAT.suffix and bool(head) and not head.startswith(b"ply")
+
+
+def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
+    """Read a ``.splat`` file.
+
+    Raises
+    ------
+    RefineError
+        If it ends within a splat.
+    """
+    size = _ROW.itemsize
+    count, beyond = divmod(len(data), size)
+    if beyond:
+        msg = (
+            f"{path}: truncated: splat {count} at byte {count * size} has {beyond} bytes, "
+            f"expected {size}"
+        )
+        raise RefineError(msg)
+    stored = data.view(_ROW)
+    file, splats = new_file(path, Origin(NAME, len(data)), count, 0)
+    # Scales that are 0 or no sizes at all become logarithms that are not finite, as in a PLY.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for piece in pieces(count):
+            rows = stored[piece]
+            splats.means[piece] = rows["mean"]
+            splats.log_scales[piece] = np.log(rows["scale"])
+            shares = rows["color"] / 255.0  # (n, 4)
+            splats.sh_dc[piece] = (shares[:, :3] - 0.5) / SH_C0
+            splats.opacity_logits[piece] = opacity_logits(shares[:, 3])
+            splats.quaternions[piece] = unit(rows["rotation"] / _NO_TURN - 1.0)
+    return file
+
+
+def write(stream: BinaryIO, splats: Splats) -> None:
+    """Write splats as a ``.splat`` file."""
+    for piece in pieces(len(splats)):
+        some = splats.take(piece)
+        rows = np.empty(len(some), _ROW)
+        rows["mean"] = some.means
+        with np.errstate(under="ignore"):
+            rows["scale"] = np.exp(np.asarray(some.log_scales, np.float64))
+            rows["color"][:, :3] = codes(base_color(some.sh_dc))
+            rows["color"][:, 3] = codes(opacity(some.opacity_logits))
+        turns = np.rint(unit(some.quaternions) * _NO_TURN + _NO_TURN)
+        rows["rotation"] = np.clip(turns, 0.0, 255.0)
+        stream.write(rows.data)
+
+
+def sizes(_count: int, _degree: int) -> Sizes:
+    """Return how large a file is."""
+    return Sizes(_ROW.itemsize, 0)
+
+
+FORMAT = Format(
+    name=NAME,
+    suffix=".splat",
+    degree=0,
+    loss="holds colour, opacity and rotation in 8 bits each",
+    matches=matches,
+    read=read,
+    write=write,
+    sizes=sizes,
+)

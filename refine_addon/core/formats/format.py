@@ -1,0 +1,169 @@
+"""What a splat format other than plain PLY is to the rest: how it is known, read and written."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import RefineError
+from ..scene import spatial_order
+from .ply import Origin, SplatFile
+from .ply_columns import empty_rows
+from .ply_header import new_header
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from numpy.typing import NDArray
+
+    from ..splats import Splats
+
+CHUNK = 1 << 15
+"""Splats that are converted at a time: 8 MB at degree 3."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How large a file of a format is, where that follows from the number of splats.
+
+    Attributes
+    ----------
+    row : float
+        Bytes of one splat.
+    fixed : int
+        Bytes of everything else, at most.
+    """
+
+    row: float
+    fixed: int
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of splat files.
+
+    Attributes
+    ----------
+    name : str
+        For messages.
+    suffix : str
+        Ending of its files, lower case, by which an output is known.
+    degree : int
+        Highest degree of harmonics that it holds.
+    loss : str
+        What it does to splats, as a sentence without its subject.
+    matches : callable
+        ``matches(path, head)``: whether a file with these first bytes is of this format.
+    read : callable
+        ``read(path, data)`` returns a `SplatFile`; `data` is the file, (M,) uint8.
+    write : callable
+        ``write(stream, splats)``; all of the splats can be drawn.
+    sizes : callable
+        ``sizes(count, degree)`` returns `Sizes`; None where a file is compressed as a whole.
+    """
+
+    name: str
+    suffix: str
+    degree: int
+    loss: str
+    matches: Callable[[Path, bytes], bool]
+    read: Callable[[Path, NDArray[np.uint8]], SplatFile]
+    write: Callable[[BinaryIO, Splats], None]
+    sizes: Callable[[int, int], Sizes | None]
+
+
+def new_file(path: Path, origin: Origin, count: int, degree: int) -> tuple[SplatFile, Splats]:
+    """Return a file of `count` splats whose values are still to be set.
+
+    Returns
+    -------
+    file : SplatFile
+        The plain PLY of the splats, in memory.
+    splats : Splats
+        Views of its rows, to be assigned to.
+    """
+    rows, splats = empty_rows(count, degree)
+    header = new_header(((name, "float") for name in rows.dtype.names or ()), count)
+    nothing = np.empty(0, np.uint8)
+    return SplatFile(path, rows, header, nothing, nothing, origin=origin), splats
+
+
+def pieces(count: int) -> Iterator[slice]:
+    """Yield the slices of ``range(count)`` that are converted at a time."""
+    for start in range(0, count, CHUNK):
+        yield slice(start, min(start + CHUNK, count))
+
+
+def codes(shares: NDArray[Any], largest: int = 255) -> NDArray[np.uint8]:
+    """Return shares of 0..1 as the nearest of ``0..largest``; those outside count as an end."""
+    return np.asarray(np.rint(np.clip(shares, 0.0, 1.0) * largest), np.uint8)
+
+
+def unit(quaternions: NDArray[Any]) -> NDArray[np.float64]:
+    """Return quaternions (N, 4) with length 1; zero and what is not finite is the identity."""
+    q = np.asarray(quaternions, np.float64)
+    largest = np.max(np.abs(q), axis=1, keepdims=True)
+    none = ~(np.isfinite(largest) & (largest > 0.0))
+    if none.any():
+        q = np.where(none, [1.0, 0.0, 0.0, 0.0], q)
+        largest = np.where(none, 1.0, largest)
+    with np.errstate(under="ignore"):  # components far smaller than the largest
+        q = q / largest
+        q /= np.sqrt(np.einsum("ij,ij->i", q, q))[:, None]
+    return np.asarray(q, np.float64)
+
+
+def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
+    """Raise `RefineError` if a file of `available` bytes is too short for what it announces."""
+    if needed > available:
+        msg = f"{path}: truncated: {what} need {needed} bytes, the file has {available}"
+        raise RefineError(msg)
+
+
+def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Return the three smaller components of unit quaternions, which tell the largest.
+
+    Parameters
+    ----------
+    q : (N, 4) float64
+        Length 1.
+
+    Returns
+    -------
+    largest : (N,) intp
+        Which component is left out: the first of the largest.
+    others : (N, 3) float64
+        The others in their order, with the sign that makes the largest positive.
+    """
+    largest = np.abs(q).argmax(axis=1)
+    others = np.take_along_axis(q, _OTHERS[largest], axis=1)
+    negative = np.take_along_axis(q, largest[:, None], axis=1) < 0.0
+    return largest, np.where(negative, -others, others)
+
+
+def join_largest(largest: NDArray[np.intp], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the quaternions of `split_largest`, (N, 4)."""
+    left = np.maximum(1.0 - np.einsum("ij,ij->i", others, others), 0.0)
+    q = np.empty((len(others), 4))
+    np.put_along_axis(q, _OTHERS[largest], others, axis=1)
+    np.put_along_axis(q, largest[:, None], np.sqrt(left)[:, None], axis=1)
+    return q
+
+
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+"""Left-out component -> the other three."""
+
+
+def near_ones_together(means: NDArray[Any]) -> NDArray[np.int64]:
+    """Return an order of finite positions (N, 3) in which near ones are near, (N,)."""
+    some = np.asarray(means[:: max(len(means) // 10_000, 1)], np.float64)
+    middle = np.median(some, axis=0)
+    size = float(np.median(np.abs(some - middle))) or 1.0
+    with np.errstate(over="ignore", under="ignore"):
+        place = (np.asarray(means, np.float64) - middle) / size
+        # Farther than that all are in one direction; their squares must stay finite.
+        return spatial_order(np.clip(place, -1e100, 1e100))

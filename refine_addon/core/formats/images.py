@@ -1,0 +1,96 @@
+"""Lossless WebP images in and out, by whoever can: Blender's own library, or Pillow.
+
+Core has no codec of its own. `use` names one, as the extension does in Blender; without, Pillow is
+imported when an image is read or written.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import warnings
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from ..errors import RefineError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+
+class Codec(Protocol):
+    """What reads and writes images."""
+
+    def size(self, data: bytes) -> tuple[int, int]:
+        """Return width and height of an image, without unpacking it; raise `ValueError`."""
+        ...
+
+    def decode(self, data: bytes) -> NDArray[np.uint8]:
+        """Return the pixels of an image, (height, width, 4), the top row first; see `size`."""
+        ...
+
+    def encode(self, pixels: NDArray[np.uint8]) -> bytes:
+        """Return a WebP image that holds these pixels, (height, width, 4), to the bit."""
+        ...
+
+
+class _Pillow:
+    """Pillow as a codec."""
+
+    def __init__(self) -> None:
+        self._image: Any = importlib.import_module("PIL.Image")
+
+    def size(self, data: bytes) -> tuple[int, int]:
+        """See `Codec`."""
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of large images, which are refused by their size
+                with self._image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+                    width, height = image.size
+        except (OSError, SyntaxError, self._image.DecompressionBombError) as error:
+            raise ValueError(str(error)) from error
+        return width, height
+
+    def decode(self, data: bytes) -> NDArray[np.uint8]:
+        """See `Codec`."""
+        try:
+            with self._image.open(io.BytesIO(data), formats=["WEBP"]) as image:
+                return np.array(image.convert("RGBA"))
+        except (OSError, SyntaxError, self._image.DecompressionBombError) as error:
+            raise ValueError(str(error)) from error
+
+    def encode(self, pixels: NDArray[np.uint8]) -> bytes:
+        """See `Codec`."""
+        stream = io.BytesIO()
+        # Without `exact`, the colours of pixels whose alpha is 0 would be lost.
+        image = self._image.fromarray(pixels, "RGBA")
+        image.save(stream, "WEBP", lossless=True, exact=True, quality=25, method=2)
+        return stream.getvalue()
+
+
+_named: list[Codec] = []
+
+
+def use(codec: Codec | None) -> None:
+    """Read and write images by `codec` from now on; None stands for Pillow."""
+    _named[:] = [] if codec is None else [codec]
+
+
+def codec_for(path: Path) -> Codec:
+    """Return what reads and writes images.
+
+    Raises
+    ------
+    RefineError
+        If there is nothing; `path` is the file that needs it.
+    """
+    if _named:
+        return _named[0]
+    try:
+        return _Pillow()
+    except ImportError as error:
+        msg = f"{path}: WebP images need a library: run this in Blender, or 'pip install pillow'"
+        raise RefineError(msg) from error

@@ -1,0 +1,261 @@
+"""All splat formats: an input is known by its content, an output by its suffix."""
+
+from __future__ import annotations
+
+import math
+import mmap
+import stat
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import RefineError
+from ..foreign_files import refuse_pointer
+from ..splats import drawable
+from ..whole_file import expanded, whole_file
+from . import compressed_ply, dot_splat, glb, sog, spz
+from .ply import SplatFile, read_ply
+from .ply_columns import REQUIRED, splats_from_columns
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from ..splats import Splats
+    from .format import Format, Sizes
+
+FORMATS: tuple[Format, ...] = (
+    compressed_ply.FORMAT,
+    spz.FORMAT,
+    glb.FORMAT,
+    sog.FORMAT,
+    dot_splat.FORMAT,  # known by its name alone, if it is none of the others
+)
+"""Every format but plain PLY, in the order in which an input is tried."""
+
+SUFFIXES = (".ply", *(form.suffix for form in FORMATS))
+"""Endings of the files that are read and written."""
+
+NOT_WRITTEN = (".ksplat", ".gltf", ".lcc")
+"""Endings of other splat formats: a PLY of such a name would mislead."""
+
+_HEAD = 1 << 16
+"""Bytes by which a format is known; the header of a compressed PLY has fewer."""
+
+
+def read_splats(path: Path | str) -> SplatFile:
+    """Open a file of splats of any format, known by its content.
+
+    Parameters
+    ----------
+    path : path-like
+        ``~`` is the home folder.
+
+    Returns
+    -------
+    SplatFile
+        A plain PLY is mapped as it is; a file of another format becomes the rows of the plain PLY
+        that holds the same splats, in memory, and `SplatFile.origin` says what it was.
+
+    Raises
+    ------
+    RefineError
+        If the file does not exist, is of no known format, or is damaged; the message names the
+        file, the place, what was found and what was expected.
+    """
+    path = expanded(path)
+    head = _beginning(path)
+    refuse_pointer(path, head)
+    form = next((form for form in FORMATS if form.matches(path, head)), None)
+    if form is None:
+        return read_ply(path)
+    try:
+        with path.open("rb") as stream:
+            whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    except (OSError, ValueError) as error:
+        msg = f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
+        raise RefineError(msg) from error
+    return form.read(path, np.frombuffer(whole, np.uint8))
+
+
+def _beginning(path: Path) -> bytes:
+    """Return the first bytes of a file; none where it cannot be read, which `read_ply` explains."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):
+            return b""
+        with path.open("rb") as stream:
+            return stream.read(_HEAD)
+    except (OSError, ValueError):
+        return b""
+
+
+def format_named(path: Path) -> Format | None:
+    """Return the format that an output of this name is written in; None for a plain PLY.
+
+    Raises
+    ------
+    RefineError
+        If the name is that of a format which is not written.
+    """
+    name = path.name.lower()
+    form = next((form for form in FORMATS if name.endswith(form.suffix)), None)
+    if form is None and name.endswith(NOT_WRITTEN):
+        msg = f"{path}: {path.suffix} is not written, expected one of {', '.join(SUFFIXES)}"
+        raise RefineError(msg)
+    return form
+
+
+def refuse_unknown_size(form: Format) -> None:
+    """Raise `RefineError` if the size of a file does not follow from the number of its splats."""
+    if form.sizes(0, 0) is None:
+        fixed = ", ".join(other.suffix for other in FORMATS if other.sizes(0, 0))
+        msg = (
+            f"a size cannot be kept to in {form.suffix}, which is compressed as a whole: choose "
+            f"another budget, or write .ply, {fixed}"
+        )
+        raise RefineError(msg)
+
+
+def as_written(file: SplatFile, path: Path | None) -> SplatFile | Packed:
+    """Return what writes a file's splats to `path`, by the suffix of `path`.
+
+    Parameters
+    ----------
+    file : SplatFile
+    path : Path or None
+        None stands for a plain PLY.
+
+    Returns
+    -------
+    SplatFile or Packed
+        `file` itself where a plain PLY is written.
+
+    Raises
+    ------
+    RefineError
+        See `format_named`.
+    """
+    form = None if path is None else format_named(path)
+    return file if form is None else Packed(file, form)
+
+
+@dataclass(frozen=True, eq=False)
+class Packed:
+    """The splats of a file as another format than plain PLY holds them.
+
+    It has what `SplatFile` has for writing.
+
+    Attributes
+    ----------
+    file : SplatFile
+    form : Format
+    """
+
+    file: SplatFile
+    form: Format
+
+    @property
+    def row_bytes(self) -> float:
+        """Bytes of one splat in the file; 0 where a file is compressed as a whole."""
+        sizes = self._sizes(len(self.file))
+        return sizes.row if sizes else 0.0
+
+    changed_row_bytes = row_bytes
+
+    @property
+    def fixed_bytes(self) -> int:
+        """Bytes of everything but the splats, at most."""
+        sizes = self._sizes(len(self.file))
+        return sizes.fixed if sizes else 0
+
+    def size(
+        self,
+        keep: NDArray[np.bool_] | None = None,
+        _columns: Mapping[str, NDArray[Any]] | None = None,
+    ) -> int | None:
+        """Return how many bytes `write` would write, at most; None where only writing tells.
+
+        Parameters
+        ----------
+        keep
+            See `write`.
+        """
+        count = len(self.file) if keep is None else int(np.count_nonzero(keep))
+        sizes = self._sizes(count)
+        return None if sizes is None else math.ceil(sizes.row * count) + sizes.fixed
+
+    def notes(self, keep: NDArray[np.bool_]) -> list[str]:
+        """Return what the user should know about a file of the kept rows, in sentences."""
+        notes = [f"{self.form.suffix} {self.form.loss} (docs/conventions.md, Formats)"]
+        degree = self.file.splats().sh_degree
+        if degree > self.form.degree:
+            notes.append(
+                f"{self.form.suffix} holds harmonics of degree {self.form.degree}, "
+                f"the file has degree {degree}: the others are left out"
+            )
+        names = self.file.rows.dtype.names or ()
+        known = ("nx", "ny", "nz", *REQUIRED)
+        extra = [n for n in names if n not in known and not n.startswith("f_rest_")]
+        if extra:
+            notes.append(f"{self.form.suffix} does not hold {', '.join(extra)}: left out")
+        lost = int(np.count_nonzero(keep & ~drawable(self.file.splats())))
+        if lost:
+            notes.append(
+                f"{lost} of the kept splats cannot be drawn and {self.form.suffix} cannot hold "
+                "them: left out"
+            )
+        return notes
+
+    def write(
+        self,
+        path: Path | str,
+        keep: NDArray[np.bool_] | None = None,
+        *,
+        columns: Mapping[str, NDArray[Any]] | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        """Write the kept splats; those that cannot be drawn are left out.
+
+        Parameters
+        ----------
+        path, keep, columns, overwrite
+            See `SplatFile.write`.
+
+        Raises
+        ------
+        RefineError
+            If the file cannot be written, or exists and may not be replaced; if no splat is left,
+            or a column is none that the format holds.
+        """
+        path = expanded(path)
+        splats = self._chosen(path, keep, columns or {})
+        with whole_file(path, overwrite=overwrite) as stream:
+            self.form.write(stream, splats)
+
+    def _chosen(
+        self, path: Path, keep: NDArray[np.bool_] | None, columns: Mapping[str, NDArray[Any]]
+    ) -> Splats:
+        """Return the splats that are written."""
+        rows = self.file.rows if keep is None else self.file.rows[keep]
+        if columns:
+            rows = rows.copy()
+            for name, values in columns.items():
+                if name not in (rows.dtype.names or ()):
+                    msg = f"{path}: {self.form.suffix} holds no property '{name}'; write to a .ply"
+                    raise RefineError(msg)
+                rows[name] = values if keep is None else values[keep]
+        splats = splats_from_columns(rows)
+        good = drawable(splats)
+        if not good.any():
+            msg = f"{path}: none of the {len(splats)} splats can be drawn: nothing to write"
+            raise RefineError(msg)
+        if not good.all():
+            splats = splats.take(good)
+        return splats.up_to_degree(self.form.degree)
+
+    def _sizes(self, count: int) -> Sizes | None:
+        degree = min(self.file.splats().sh_degree, self.form.degree)
+        return self.form.sizes(count, degree)

@@ -1,0 +1,332 @@
+"""SPZ files by Niantic: 16 to 20 bytes a splat and one for each harmonic, compressed as a whole.
+
+Versions 2 and 3 are one gzip stream. Version 4 is a header, a table and a zstd stream for each
+attribute; it is read where a module for zstd is there, which Blender brings. Version 3 is written.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+import math
+import struct
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import RefineError
+from ..foreign_files import unpacked_beginning
+from ..splats import opacity, opacity_logits
+from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest, unit
+from .ply import Origin, SplatFile
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from typing import BinaryIO
+
+    from numpy.typing import NDArray
+
+    from ..splats import Splats
+
+NAME = "SPZ"
+MAGIC = b"NGSP"
+
+_HEADER = struct.Struct("<4sIIBBBB")
+"""Magic, version, splats, degree, fractional bits, flags; then 0, or in version 4 how many streams
+there are."""
+
+_TABLE_AT = struct.Struct("<I12x")
+"""Behind the header in version 4: the byte at which the table of streams begins."""
+
+_STREAM = struct.Struct("<QQ")
+"""In that table: bytes of a stream, and of what is in it."""
+
+_VERSIONS = (2, 3, 4)
+_ONE_TURN, _ZSTD = 2, 4  # versions: rotations without the smallest three, streams by zstd
+_DEGREES = 5
+
+_COLOR_STEP = 0.15  # of f_dc: colours a bit outside of 0..1 have codes too
+_SCALE_STEPS, _LOWEST_SCALE = 16.0, -10.0
+_BUCKETS = (8, 16)
+"""Harmonics are rounded to multiples of these, in 1/128: of degree 1, and of all others."""
+
+_INFLATION = 1032
+"""gzip makes no stream this many times as small."""
+
+_PIECE = 1 << 20
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What the first bytes say."""
+
+    version: int
+    count: int
+    degree: int
+    fraction: int
+    streams: int
+
+    def blocks(self) -> dict[str, int]:
+        """Return the bytes of each attribute by its name, in their order."""
+        turn = 3 if self.version == _ONE_TURN else 4
+        rest = 3 * ((self.degree + 1) ** 2 - 1)
+        widths = {"mean": 9, "opacity": 1, "color": 3, "scale": 3, "rotation": turn, "rest": rest}
+        return {name: width * self.count for name, width in widths.items()}
+
+
+def matches(_path: Path, head: bytes) -> bool:
+    """Return whether a file is one: its signature stands in the open or in a gzip stream."""
+    return head.startswith(MAGIC) or unpacked_beginning(head).startswith(MAGIC)
+
+
+def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
+    """Read an SPZ file.
+
+    Raises
+    ------
+    RefineError
+        If it is truncated or damaged, of another version, or of version 4 and there is no module
+        for zstd.
+    """
+    packed = not data[: len(MAGIC)].tobytes().startswith(MAGIC)
+    if packed:
+        header, blocks = _unpacked(path, data)
+    else:
+        header = _parsed(path, data[: _HEADER.size].tobytes())
+        if header.version == _ZSTD:
+            blocks = _streams(path, data, header)
+        else:
+            blocks = _split(path, header, data[_HEADER.size :])
+    origin = Origin(f"{NAME} version {header.version}", len(data))
+    file, splats = new_file(path, origin, header.count, header.degree)
+    for piece in pieces(header.count):
+        some = {name: block[piece] for name, block in blocks.items()}
+        splats.means[piece] = _positions(some["mean"], header.fraction)
+        splats.opacity_logits[piece] = opacity_logits(some["opacity"][:, 0] / 255.0)
+        splats.sh_dc[piece] = (some["color"] / 255.0 - 0.5) / _COLOR_STEP
+        splats.log_scales[piece] = some["scale"] / _SCALE_STEPS + _LOWEST_SCALE
+        splats.quaternions[piece] = _rotations(some["rotation"])
+        rest = some["rest"].reshape(splats.sh_rest[piece].shape)
+        splats.sh_rest[piece] = (rest - np.float32(128.0)) / np.float32(128.0)
+    return file
+
+
+def _parsed(path: Path, head: bytes) -> _Header:
+    """Return what the first bytes say, or refuse them."""
+    refuse_short(path, _HEADER.size, len(head), "the first bytes of an SPZ file")
+    magic, version, count, degree, fraction, _, streams = _HEADER.unpack(head)
+    if magic != MAGIC or version not in _VERSIONS:
+        msg = f"{path}: SPZ version {version}, expected {', '.join(map(str, _VERSIONS))}"
+        raise RefineError(msg)
+    if degree >= _DEGREES:
+        msg = f"{path}: byte 12: harmonics of degree {degree}, expected 0 to {_DEGREES - 1}"
+        raise RefineError(msg)
+    if fraction > 23:  # noqa: PLR2004 - of 24 bits, one is the sign
+        msg = f"{path}: byte 13: {fraction} fractional bits, expected 0 to 23"
+        raise RefineError(msg)
+    return _Header(version, count, degree, fraction, streams)
+
+
+def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict[str, NDArray[np.uint8]]]:
+    """Return header and attributes of a gzip stream."""
+    engine = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    try:
+        header = _parsed(path, engine.decompress(data.data, _HEADER.size))
+        if header.version == _ZSTD:
+            msg = f"{path}: SPZ version 4 inside of gzip, expected its own header first"
+            raise RefineError(msg)
+        needed = sum(header.blocks().values())
+        refuse_short(path, needed, _INFLATION * len(data), f"{header.count} splats")
+        body = engine.decompress(engine.unconsumed_tail, needed) if needed else b""
+        if len(body) == needed:
+            # Extensions may follow; at the end of the stream its checksum is tested.
+            while not engine.eof and engine.decompress(engine.unconsumed_tail, _PIECE):
+                pass
+    except zlib.error as error:
+        msg = f"{path}: the gzip stream is damaged ({error})"
+        raise RefineError(msg) from error
+    blocks = _split(path, header, np.frombuffer(body, np.uint8))
+    if not engine.eof:
+        msg = f"{path}: truncated: the gzip stream has no end"
+        raise RefineError(msg)
+    return header, blocks
+
+
+def _split(path: Path, header: _Header, body: NDArray[np.uint8]) -> dict[str, NDArray[np.uint8]]:
+    """Return the attributes that follow each other in `body`, (count, bytes) each."""
+    lengths = header.blocks()
+    refuse_short(path, sum(lengths.values()), len(body), f"{header.count} splats (unpacked)")
+    blocks, at = {}, 0
+    for name, length in lengths.items():
+        blocks[name] = _table(body[at : at + length], header.count)
+        at += length
+    return blocks
+
+
+def _table(block: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
+    return block.reshape(count, len(block) // count if count else 0)
+
+
+def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> dict[str, NDArray[np.uint8]]:
+    """Return the attributes of version 4."""
+    first = _HEADER.size + _TABLE_AT.size
+    refuse_short(path, first, len(data), "the first bytes of an SPZ file of version 4")
+    (at,) = _TABLE_AT.unpack(data[_HEADER.size : first].tobytes())
+    lengths = {name: length for name, length in header.blocks().items() if length}
+    if header.streams < len(lengths):
+        msg = f"{path}: byte 15: {header.streams} streams, expected {len(lengths)}"
+        raise RefineError(msg)
+    start = at + header.streams * _STREAM.size
+    refuse_short(path, start, len(data), "the table of streams")
+    blocks = {name: np.empty((header.count, 0), np.uint8) for name in header.blocks()}
+    for name, length in lengths.items():
+        packed, announced = _STREAM.unpack(data[at : at + _STREAM.size].tobytes())
+        at += _STREAM.size
+        if announced != length:
+            msg = f"{path}: stream '{name}' announces {announced} bytes, expected {length}"
+            raise RefineError(msg)
+        refuse_short(path, start + packed, len(data), f"stream '{name}' and what is before it")
+        found = bytearray()
+        for piece in _zstd(path, name, data[start : start + packed].tobytes()):
+            found += piece
+            if len(found) > length:
+                break
+        if len(found) != length:
+            more = "more" if len(found) > length else str(len(found))
+            msg = f"{path}: stream '{name}' holds {more} bytes, expected {length}"
+            raise RefineError(msg)
+        blocks[name] = _table(np.frombuffer(bytes(found), np.uint8), header.count)
+        start += packed
+    return blocks
+
+
+def _zstd(path: Path, name: str, packed: bytes) -> Iterator[bytes]:
+    """Yield what is in a zstd stream, a piece at a time."""
+    try:
+        reader, failure = _zstd_reader(packed)
+    except ImportError as error:
+        msg = (
+            f"{path}: SPZ version 4 needs a module for zstd: run this in Blender, which brings "
+            "one, or 'pip install zstandard'; or write the file as version 3"
+        )
+        raise RefineError(msg) from error
+    try:
+        while piece := reader.read(_PIECE):
+            yield piece
+    except (failure, EOFError) as error:
+        msg = f"{path}: stream '{name}' is damaged ({error})"
+        raise RefineError(msg) from error
+
+
+def _zstd_reader(packed: bytes) -> tuple[Any, type[Exception]]:
+    """Return a file of what is in a zstd stream, and what it raises; `ImportError` without one."""
+    try:
+        module: Any = importlib.import_module("compression.zstd")  # Python 3.14 and later
+    except ImportError:
+        module = importlib.import_module("zstandard")
+        return module.ZstdDecompressor().stream_reader(packed), module.ZstdError
+    return module.ZstdFile(io.BytesIO(packed)), module.ZstdError
+
+
+def _positions(block: NDArray[np.uint8], fraction: int) -> NDArray[np.float64]:
+    """Return positions (n, 3) of 24-bit numbers, (n, 9) bytes."""
+    parts = block.reshape(-1, 3, 3).astype(np.int32)
+    whole = parts[..., 0] | (parts[..., 1] << 8) | (parts[..., 2] << 16)
+    # Shifting up and down again repeats the sign.
+    return np.asarray(((whole << 8) >> 8) * math.ldexp(1.0, -fraction))
+
+
+def _rotations(block: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return quaternions w x y z; in the file they are x y z w."""
+    if block.shape[1] == 3:  # noqa: PLR2004 - version 2: x, y and z; w is positive
+        others = block / 127.5 - 1.0
+        return join_largest(np.zeros(len(block), np.intp), others)
+    packed = np.ascontiguousarray(block).view("<u4")[:, 0]
+    others = np.empty((len(packed), 3))
+    for index, shift in enumerate((20, 10, 0)):
+        code = packed >> np.uint32(shift)
+        size = (code & np.uint32(511)) * (math.sqrt(0.5) / 511.0)
+        others[:, index] = np.where(code & np.uint32(512), -size, size)
+    return join_largest((packed >> np.uint32(30)).astype(np.intp), others)[:, _WXYZ]
+
+
+_XYZW, _WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]
+
+
+def write(stream: BinaryIO, splats: Splats) -> None:
+    """Write splats as an SPZ file of version 3.
+
+    Raises
+    ------
+    RefineError
+        If a coordinate is beyond 8388607, the largest that the format holds.
+    """
+    count, rest = len(splats), 3 * splats.sh_rest.shape[1]
+    fraction = _fraction(splats)
+    header = _Header(3, count, splats.sh_degree, fraction, 0)
+    blocks = {name: np.empty((count, n // count), np.uint8) for name, n in header.blocks().items()}
+    for piece in pieces(count):
+        some = splats.take(piece)
+        places = np.rint(np.ldexp(np.asarray(some.means, np.float64), fraction)).astype("<i4")
+        blocks["mean"][piece] = places.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9)
+        with np.errstate(under="ignore"):
+            blocks["opacity"][piece, 0] = codes(opacity(some.opacity_logits))
+        blocks["color"][piece] = codes(np.asarray(some.sh_dc, np.float64) * _COLOR_STEP + 0.5)
+        steps = (np.asarray(some.log_scales, np.float64) - _LOWEST_SCALE) * _SCALE_STEPS
+        blocks["scale"][piece] = np.rint(np.clip(steps, 0.0, 255.0))
+        turns = _packed_rotations(some.quaternions)
+        blocks["rotation"][piece] = turns.view(np.uint8).reshape(-1, 4)
+        if rest:
+            blocks["rest"][piece] = _harmonic_codes(some.sh_rest).reshape(-1, rest)
+    engine = zlib.compressobj(wbits=16 + zlib.MAX_WBITS)
+    stream.write(engine.compress(_HEADER.pack(MAGIC, 3, count, header.degree, fraction, 0, 0)))
+    stream.writelines(engine.compress(block.data) for block in blocks.values())
+    stream.write(engine.flush())
+
+
+def _fraction(splats: Splats) -> int:
+    """Return how many bits a position has behind the point.
+
+    12, as other writers have it, gives 4096 steps a unit. Scenes that are too large for it get
+    fewer, small ones as many as divide them into a quarter of a million steps.
+    """
+    farthest = float(np.abs(splats.means).max())
+    # One step beyond, since the largest may be rounded up.
+    _, bits = math.frexp(farthest * (1.0 + 1e-6))
+    if bits > 23:  # noqa: PLR2004 - of 24 bits, one is the sign
+        msg = f"a coordinate is {farthest:g}: {NAME} holds coordinates up to 8388607"
+        raise RefineError(msg)
+    return min(max(12, 18 - bits), 23 - bits, 23)
+
+
+def _packed_rotations(quaternions: NDArray[Any]) -> NDArray[np.uint32]:
+    largest, others = split_largest(unit(quaternions)[:, _XYZW])
+    packed = largest.astype("<u4")
+    for index in range(3):
+        size = np.rint(np.abs(others[:, index]) * (511.0 * math.sqrt(2.0))).astype(np.uint32)
+        sign = (others[:, index] < 0.0).astype(np.uint32) << np.uint32(9)
+        packed = (packed << np.uint32(10)) | sign | np.minimum(size, np.uint32(511))
+    return packed.astype("<u4")
+
+
+def _harmonic_codes(sh_rest: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return the codes of harmonics (n, K, 3): the middles of their buckets, 128 being 0."""
+    steps = np.rint(np.clip(sh_rest, -1.0, 1.0) * np.float32(128.0)).astype(np.int16) + 128
+    for bucket, band in zip(_BUCKETS, (slice(3), slice(3, None)), strict=True):
+        steps[:, band] = (steps[:, band] + bucket // 2) // bucket * bucket
+    return np.asarray(np.minimum(steps, 255), np.uint8)
+
+
+FORMAT = Format(
+    name=NAME,
+    suffix=".spz",
+    degree=_DEGREES - 1,
+    loss="holds positions in 24 bits, all else in 8 to 10, and harmonics in 4 to 5",
+    matches=matches,
+    read=read,
+    write=write,
+    sizes=lambda _count, _degree: None,
+)

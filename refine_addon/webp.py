@@ -1,0 +1,89 @@
+"""WebP images through Blender's own library, for formats of core that consist of them."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import bpy
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+_LOSSLESS = 100
+"""Quality at which Blender compresses WebP without loss."""
+
+
+class BlenderImages:
+    """A codec, see `refine_addon.core.formats.images.Codec`; for Blender's main thread."""
+
+    def size(self, data: bytes) -> tuple[int, int]:
+        """Return width and height, read from the first bytes of the file.
+
+        A WebP file is a RIFF container. Its first chunk is ``VP8X`` (24 bits each, less 1), or
+        ``VP8L`` (14 bits each, less 1, behind a byte), or ``VP8 `` (14 bits each, behind 6 bytes).
+        """
+        kind, start = data[12:16], data[20:30]
+        if data[:4] != b"RIFF" or data[8:12] != b"WEBP" or len(start) < 10:  # noqa: PLR2004
+            msg = "no WebP image"
+            raise ValueError(msg)
+        # Blender shows a black image where the data of one cannot be unpacked.
+        if int.from_bytes(data[4:8], "little") + 8 > len(data):
+            msg = "truncated"
+            raise ValueError(msg)
+        if kind == b"VP8X":
+            sides = [int.from_bytes(start[at : at + 3], "little") + 1 for at in (4, 7)]
+        elif kind == b"VP8L":
+            packed = int.from_bytes(start[1:5], "little")
+            sides = [(packed & 0x3FFF) + 1, (packed >> 14 & 0x3FFF) + 1]
+        else:
+            sides = [int.from_bytes(start[at : at + 2], "little") & 0x3FFF for at in (6, 8)]
+        return sides[0], sides[1]
+
+    def decode(self, data: bytes) -> NDArray[np.uint8]:
+        """Return the pixels, (height, width, 4), the top row first."""
+        with _file() as path:
+            path.write_bytes(data)
+            try:
+                image = bpy.data.images.load(str(path))
+            except RuntimeError as error:
+                raise ValueError(str(error).strip()) from error
+            try:
+                image.colorspace_settings.name = "Non-Color"
+                image.alpha_mode = "CHANNEL_PACKED"
+                width, height = image.size
+                if (width, height) != self.size(data):
+                    msg = "damaged"
+                    raise ValueError(msg)
+                values = np.empty(width * height * 4, np.float32)
+                image.pixels.foreach_get(values)
+            finally:
+                bpy.data.images.remove(image)
+        pixels = np.rint(values * 255.0).astype(np.uint8)
+        return pixels.reshape(height, width, 4)[::-1]  # Blender's first row is the lowest
+
+    def encode(self, pixels: NDArray[np.uint8]) -> bytes:
+        """Return a WebP image of pixels (height, width, 4); colours of alpha 0 may be lost."""
+        height, width = pixels.shape[:2]
+        image = bpy.data.images.new("refine", width, height, alpha=True, is_data=True)
+        try:
+            image.alpha_mode = "CHANNEL_PACKED"
+            image.pixels.foreach_set((pixels[::-1] / np.float32(255.0)).astype(np.float32).ravel())
+            image.file_format = "WEBP"
+            with _file() as path:
+                image.save(filepath=str(path), quality=_LOSSLESS)
+                return path.read_bytes()
+        finally:
+            bpy.data.images.remove(image)
+
+
+@contextmanager
+def _file() -> Iterator[Path]:
+    """Yield the path of a file for an image, in a folder that is removed."""
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder) / "image.webp"

@@ -1,0 +1,114 @@
+"""The panel imports and exports every format that core knows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+
+ROOM = Path(__file__).parents[1] / "data/room_small"
+
+
+@pytest.fixture
+def small(addon, tmp_path):
+    """Return the path of 500 splats of the room, with harmonics of degree 3."""
+    file = addon.core.read_ply(ROOM / "point_cloud.ply")
+    file.write(tmp_path / "small.ply", np.arange(len(file)) < 500)
+    return tmp_path / "small.ply"
+
+
+def suffixes(addon):
+    """Return the endings of all formats."""
+    return addon.core.formats.registry.SUFFIXES
+
+
+def test_every_format_is_exported_and_imported(addon, small, tmp_path):
+    """Blender writes what core writes of the same splats, and holds what core reads of it."""
+    bpy.ops.refine.import_ply(filepath=str(small))
+    source = bpy.context.object
+    core = addon.core
+    for suffix in suffixes(addon):
+        bpy.context.view_layer.objects.active = source
+        made, expected = tmp_path / f"panel{suffix}", tmp_path / f"core{suffix}"
+        bpy.ops.refine.export_ply(filepath=str(made))
+        core.as_written(core.read_ply(small), expected).write(expected)
+
+        bpy.ops.refine.import_ply(filepath=str(made))
+
+        read = core.read_splats(made)
+        layout = addon.mesh.layout.check(bpy.context.object)
+        stored = addon.mesh.attributes.stored_columns(layout)
+        assert made.read_bytes() == expected.read_bytes()
+        assert len(read) == len(layout) == 500
+        for name in read.rows.dtype.names:
+            assert np.array_equal(stored[name], read.rows[name]), name
+
+
+def test_the_file_name_follows_the_format_that_is_chosen(addon):
+    """The suffix of another format is replaced, also one with two dots; a name of its own is not.
+
+    `check` is what the file browser calls when an option changes.
+    """
+
+    class Browser:
+        check = addon.ui.operators.REFINE_OT_export_ply.check
+
+    browser = Browser()
+    browser.filepath, browser.suffix = "a.compressed.ply", ".spz"
+    changed = browser.check(None), browser.filepath, browser.check(None)
+    browser.suffix = ".compressed.ply"
+    browser.check(None)
+
+    assert changed == (True, "a.spz", False)
+    assert browser.filepath == "a.compressed.ply"
+
+
+def test_all_formats_can_be_dropped_and_picked(addon):
+    """The file handler and both file browsers know every ending."""
+    handler = addon.ui.import_operators.REFINE_FH_ply.bl_file_extensions.split(";")
+    globs = [
+        operator.get_rna_type().properties["filter_glob"].default.split(";")
+        for operator in (bpy.ops.refine.import_ply, bpy.ops.refine.export_ply)
+    ]
+
+    assert set(handler) == {Path(f"a{suffix}").suffix for suffix in suffixes(addon)}
+    assert globs == [[f"*{suffix}" for suffix in suffixes(addon)]] * 2
+
+
+def test_an_object_is_pruned_to_a_size_in_another_format(addon, small, tmp_path):
+    """3,200 bytes hold 100 splats of a .splat; the size of a .spz does not follow from them."""
+    bpy.ops.refine.import_ply(filepath=str(small))
+    core, views = addon.core, addon.core.read_cameras(ROOM / "cameras.json")
+    prune, name = addon.splat_object.prune_object, bpy.context.object.name
+
+    report = prune(
+        name, views, core.Budget(max_mb=0.0032), core.Settings(), output=tmp_path / "a.splat"
+    )
+
+    assert len(core.read_splats(tmp_path / "a.splat")) == report["splats"]["kept"] == 100
+    assert report["files"]["output_bytes"] == 3200
+    with pytest.raises(core.RefineError, match=r"a size cannot be kept to in \.spz"):
+        prune(name, views, core.Budget(max_mb=1.0), core.Settings(), output=tmp_path / "a.spz")
+
+
+def test_the_images_of_blender_are_those_of_pillow(addon):
+    """What one writes the other reads, to the bit: any bytes, where alpha is not 0."""
+    random = np.random.default_rng(0)
+    pixels = random.integers(0, 256, (12, 20, 4), np.uint8)
+    pixels[..., 3] |= 1
+    pillow, blender = addon.core.formats.images._Pillow(), addon.webp.BlenderImages()
+    before = len(bpy.data.images)
+
+    for writer in (pillow, blender):
+        data = writer.encode(pixels)
+        for reader in (pillow, blender):
+            assert reader.size(data) == (20, 12)
+            assert np.array_equal(reader.decode(data), pixels)
+
+    assert len(bpy.data.images) == before
+    for reader in (pillow, blender):
+        for broken in (b"", b"RIFF1234WEBPVP8L", data[:40]):
+            with pytest.raises(ValueError, match=r"."):
+                reader.decode(broken)

@@ -1,0 +1,362 @@
+"""Every format but plain PLY: what comes back lies within the bounds of docs/conventions.md."""
+
+from __future__ import annotations
+
+import re
+import struct
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from refine_addon.command import main
+from refine_addon.core import (
+    Budget,
+    RefineError,
+    Splats,
+    as_written,
+    prune_file,
+    read_cameras,
+    read_ply,
+    read_splats,
+)
+from refine_addon.core.formats import registry
+from refine_addon.core.formats.registry import SUFFIXES
+from refine_addon.core.splats import base_color, opacity, opacity_logits, rotation_matrices
+from tests.strategies import ply_of, splat_names
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+FORMATS = [form for form in registry.FORMATS if form.suffix != ".sog" or find_spec("PIL")]
+"""All but plain PLY; SOG where Pillow is installed."""
+
+SUFFIX = [form.suffix for form in FORMATS]
+FIXED = [form.suffix for form in FORMATS if form.sizes(1, 0)]
+COUNT = 600
+"""Splats of the test scene: two whole chunks of a compressed PLY and a part of one."""
+
+
+def scene(degree: int = 0, count: int = COUNT) -> dict[str, np.ndarray]:
+    """Return columns of splats in the order of x, each .01 from the next."""
+    random = np.random.default_rng(5)
+    columns = {
+        name: random.normal(0.0, 0.5, count).astype(np.float32) for name in splat_names(degree)
+    }
+    columns["x"] = (np.arange(count) * 0.01 - 2.0).astype(np.float32)
+    for name in ("scale_0", "scale_1", "scale_2"):
+        columns[name] -= 4.0
+    columns["opacity"] *= 4.0
+    for name in columns:
+        if name.startswith("f_rest_"):
+            columns[name] *= 0.3
+    return columns
+
+
+def written(folder: Path, suffix: str, columns: dict[str, np.ndarray]) -> Path:
+    """Write columns as a plain PLY and then in a format; return the path of that."""
+    (folder / "in.ply").write_bytes(ply_of(columns))
+    path = folder / f"made{suffix}"
+    file = read_splats(folder / "in.ply")
+    as_written(file, path).write(path, overwrite=True)
+    return path
+
+
+def in_order(splats: Splats) -> Splats:
+    """Return splats in the order of x, since some formats sort them."""
+    return splats.take(np.argsort(splats.means[:, 0], kind="stable"))
+
+
+def differences(one: Splats, other: Splats) -> dict[str, float]:
+    """Return the largest differences: absolute, of the activated values; log of the scale."""
+    rest = min(one.sh_rest.shape[1], other.sh_rest.shape[1])
+    turns = rotation_matrices(one.quaternions) - rotation_matrices(other.quaternions)
+    step = np.abs(one.sh_rest[:, :rest] - other.sh_rest[:, :rest])
+    return {
+        "mean": np.abs(one.means - other.means).max(),
+        "log scale": np.abs(one.log_scales - other.log_scales).max(),
+        "opacity": np.abs(opacity(one.opacity_logits) - opacity(other.opacity_logits)).max(),
+        "color": np.abs(base_color(one.sh_dc) - base_color(other.sh_dc)).max(),
+        "rotation": np.abs(turns).max(),
+        "harmonics": step.max(initial=0.0),
+    }
+
+
+BOUNDS = {
+    # Of a quaternion's component: half a step of 1/128, or a whole one at +1, which is code 255.
+    # A matrix's entries are sums of two products of two components, times 2: at most 4 times that
+    # for each of two components.
+    ".splat": {
+        "mean": 0.0,
+        "log scale": 1e-6,
+        "opacity": 0.5 / 255 + 1e-6,
+        "color": 0.5 / 255 + 1e-6,
+        "rotation": 8 / 128,
+    },
+    # Half a step of the range of a chunk, which is at most that of the scene: y and z and the log
+    # scales of 600 normal deviates times .5 lie within 4 (8 deviations). A component of a rotation
+    # is off by half a step of sqrt(2) / 1023, the largest by up to three times that.
+    ".compressed.ply": {
+        "mean": 0.5 * 6.0 / 1023 + 1e-6,
+        "log scale": 0.5 * 4.0 / 1023 + 1e-6,
+        "opacity": 0.5 / 255 + 1e-6,
+        "color": 0.5 * 1.2 / 255 + 1e-6,
+        "rotation": 8 * 0.5 * 2**0.5 / 1023,
+        "harmonics": 1 / 64 + 1e-6,
+    },
+    # Half of 1/65535 of 2 log(1 + 4), times 1 + 4; half of 1/127 of the range of all log scales or
+    # colours; of 2/255/sqrt(2). Each splat of 512 palettes' groups is near its mean.
+    ".sog": {
+        "mean": 0.5 * 3.3 / 65535 * 5.0,
+        "log scale": 0.5 * 4.0 / 127,
+        "opacity": 0.5 / 255 + 1e-6,
+        "color": 0.5 * 1.2 / 127,
+        "rotation": 8 * 0.5 * 2**0.5 / 255,
+        "harmonics": 1.0,
+    },
+    # float32 of what is activated: 6e-8 of the value. An opacity p has the logit log(p / (1 - p)).
+    ".glb": {
+        "mean": 0.0,
+        "log scale": 1e-6,
+        "opacity": 1e-7,
+        "color": 1e-7,
+        "rotation": 1e-6,
+        "harmonics": 0.0,
+    },
+    # Half of 1/4096; of 1/16; of f_dc's 1/38.25, which is .282 / 38.25 of colour; of sqrt(.5) / 511
+    # for a rotation's component; of 16/128 and then of 1/128.
+    ".spz": {
+        "mean": 0.5 / 4096 + 1e-6,
+        "log scale": 0.5 / 16 + 1e-6,
+        "opacity": 0.5 / 255 + 1e-6,
+        "color": 0.5 * 0.2821 / 38.25 + 1e-6,
+        "rotation": 8 * 0.5 * 2**0.5 / 1023,
+        "harmonics": 0.5 / 8 + 0.5 / 128 + 1e-6,
+    },
+}
+"""Suffix -> largest differences that docs/conventions.md allows in the test scene."""
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("suffix", SUFFIX)
+def test_what_comes_back_lies_within_the_bounds(tmp_path, suffix, degree):
+    """Written, read as what it is, compared splat by splat with activated values."""
+    columns = scene(degree)
+    path = written(tmp_path, suffix, columns)
+
+    file = read_splats(path)
+
+    found = differences(in_order(file.splats()), read_splats(tmp_path / "in.ply").splats())
+    form = FORMATS[SUFFIX.index(suffix)]
+    assert len(file) == COUNT
+    assert file.splats().sh_degree == min(degree, form.degree)
+    assert file.format.startswith(form.name)
+    assert file.stored_bytes == path.stat().st_size
+    for name, bound in BOUNDS[suffix].items():
+        assert found[name] <= bound, name
+
+
+@pytest.mark.parametrize("suffix", SUFFIX)
+def test_the_format_is_told_by_the_content(tmp_path, suffix):
+    """A file of any format is read under any name; only .splat has no signature but its name."""
+    path = written(tmp_path, suffix, scene())
+    other = path.rename(tmp_path / ("in.bin" if suffix != ".splat" else "IN.SPLAT"))
+
+    assert read_splats(other).format.startswith(FORMATS[SUFFIX.index(suffix)].name)
+
+
+@pytest.mark.parametrize("suffix", SUFFIX)
+def test_what_is_read_is_written_as_a_plain_ply(tmp_path, suffix):
+    """And read as one, with the same numbers to the bit."""
+    file = read_splats(written(tmp_path, suffix, scene(1)))
+    file.write(tmp_path / "plain.ply")
+
+    plain = read_ply(tmp_path / "plain.ply")
+
+    assert plain.rows.tobytes() == file.rows.tobytes()
+    assert plain.rows.dtype == file.rows.dtype
+
+
+@pytest.mark.parametrize("suffix", SUFFIX)
+def test_what_cannot_be_drawn_is_left_out_with_a_note(tmp_path, suffix):
+    """Of 600 splats, one has no number as mean and one opacity 0: 598 are written."""
+    columns = scene()
+    columns["y"][3], columns["opacity"][5] = np.nan, -np.inf
+    columns["scale_1"][7] = -np.inf  # flat, which can be drawn
+    columns["opacity"][9] = np.inf
+
+    file = read_splats(written(tmp_path, suffix, columns))
+
+    source = read_splats(tmp_path / "in.ply")
+    notes = as_written(source, tmp_path / f"a{suffix}").notes(np.ones(COUNT, np.bool_))
+    assert len(file) == COUNT - 2
+    assert any(note.startswith("2 of the kept splats cannot be drawn") for note in notes)
+
+
+@pytest.mark.parametrize("suffix", SUFFIX)
+def test_properties_that_a_format_does_not_hold_are_named(tmp_path, suffix):
+    """A property of no splat's is left out with a note; to write one is refused."""
+    (tmp_path / "in.ply").write_bytes(ply_of({**scene(), "mine": np.zeros(COUNT, np.float32)}))
+    packed = as_written(read_splats(tmp_path / "in.ply"), tmp_path / f"a{suffix}")
+
+    notes = packed.notes(np.ones(COUNT, np.bool_))
+
+    assert f"{suffix} does not hold mine: left out" in notes
+    with pytest.raises(RefineError, match=r"holds no property 'score'; write to a \.ply"):
+        packed.write(tmp_path / f"a{suffix}", columns={"score": np.zeros(COUNT, np.float32)})
+    assert not (tmp_path / f"a{suffix}").exists()
+
+
+@pytest.mark.parametrize("suffix", SUFFIX)
+def test_harmonics_of_a_higher_degree_are_left_out_with_a_note(tmp_path, suffix):
+    """No format but PLY and SPZ holds degree 4."""
+    (tmp_path / "in.ply").write_bytes(ply_of(scene(4, 3)))
+    file = read_splats(tmp_path / "in.ply")
+    degree = FORMATS[SUFFIX.index(suffix)].degree
+
+    notes = as_written(file, tmp_path / f"a{suffix}").notes(np.ones(3, np.bool_))
+    as_written(file, tmp_path / f"a{suffix}").write(tmp_path / f"a{suffix}")
+
+    assert read_splats(tmp_path / f"a{suffix}").splats().sh_degree == degree
+    assert any(f"degree {degree}, the file has degree 4" in note for note in notes) == (degree < 4)
+
+
+@pytest.mark.parametrize("suffix", SUFFIX)
+def test_a_file_cut_anywhere_is_refused(tmp_path, suffix):
+    """With a sentence that names it, or, of .splat between two splats, read as fewer splats."""
+    path = written(tmp_path, suffix, scene(1, 3))
+    whole = path.read_bytes()
+
+    for cut in range(1, len(whole)):
+        path.write_bytes(whole[:cut])
+        if suffix == ".splat" and cut % 32 == 0:
+            assert len(read_splats(path)) == cut // 32
+            continue
+        with pytest.raises(RefineError, match=re.escape(f"{path}: ")):
+            read_splats(path)
+
+
+@pytest.mark.parametrize("suffix", FIXED)
+def test_a_size_is_kept_to(tmp_path, suffix, cameras):
+    """Room for half a splat more than 300 and for all else: 300 stay, and the file fits."""
+    (tmp_path / "in.ply").write_bytes(ply_of(scene(1)))
+    form = FORMATS[SUFFIX.index(suffix)]
+    sizes = form.sizes(COUNT, min(1, form.degree))
+    limit = (sizes.fixed + 300.5 * sizes.row) / 1e6
+    path = tmp_path / f"out{suffix}"
+
+    report = prune_file(tmp_path / "in.ply", path, cameras, Budget(max_mb=limit)).report
+
+    assert report["splats"]["kept"] == len(read_splats(path)) == 300
+    assert 300 * sizes.row <= path.stat().st_size <= limit * 1e6
+    assert report["files"]["output_bytes"] == path.stat().st_size
+
+
+@pytest.mark.parametrize("suffix", sorted(set(SUFFIX) - set(FIXED)))
+def test_a_size_is_refused_where_only_writing_tells_it(tmp_path, suffix, cameras):
+    """A file that is compressed as a whole has no size a splat."""
+    (tmp_path / "in.ply").write_bytes(ply_of(scene()))
+
+    with pytest.raises(RefineError, match=f"a size cannot be kept to in {suffix}, which is compr"):
+        prune_file(tmp_path / "in.ply", tmp_path / f"out{suffix}", cameras, Budget(max_mb=0.01))
+    assert not (tmp_path / f"out{suffix}").exists()
+
+
+@pytest.mark.parametrize("suffix", SUFFIX)
+def test_survivors_that_absorbed_are_written_as_they_became(tmp_path, suffix, cameras):
+    """The same prune to a PLY and to the format: the same splats within the bounds."""
+    (tmp_path / "in.ply").write_bytes(ply_of(scene()))
+    for name in (f"out{suffix}", "out.ply"):
+        prune_file(tmp_path / "in.ply", tmp_path / name, cameras, Budget(keep=300), absorb=True)
+
+    kept = read_splats(tmp_path / f"out{suffix}").splats()
+    plain = read_splats(tmp_path / "out.ply").splats()
+    apart = np.linalg.norm(kept.means[:, None] - plain.means, axis=2)
+    plain = plain.take(apart.argmin(axis=1))
+
+    assert len(kept) == len(plain) == 300
+    for name in ("opacity", "color"):
+        assert differences(kept, plain)[name] <= 2 * BOUNDS[suffix][name], name
+
+
+@pytest.fixture(scope="module")
+def cameras(tmp_path_factory):
+    """Return two views of the test scene."""
+    path = tmp_path_factory.mktemp("views") / "cameras.json"
+    path.write_text(CAMERAS)
+    return read_cameras(path)
+
+
+CAMERAS = (
+    '[{"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "fx": 300, "fy": 300, "width": 640, '
+    '"height": 480, "position": [0, 0, -6]}, {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], '
+    '"fx": 300, "fy": 300, "width": 640, "height": 480, "position": [1, 0, -6]}]'
+)
+
+
+def test_the_command_converts_by_the_suffix(tmp_path, capsys):
+    """PLY to .splat and back: what is said, the sizes, and nothing overwritten."""
+    (tmp_path / "in.ply").write_bytes(ply_of(scene()))
+    there, back = str(tmp_path / "a.splat"), str(tmp_path / "b.ply")
+
+    assert main(["convert", str(tmp_path / "in.ply"), there]) == 0
+    assert main(["convert", there, back]) == 0
+    assert main(["convert", there, back]) == 1
+
+    said = capsys.readouterr()
+    assert f"in.ply: 600 splats, 0.0 -> 0.0 MB -> {there}\n  note: .splat holds colour" in said.out
+    assert "exists already" in said.err
+    assert read_ply(back).rows.tobytes() == read_splats(there).rows.tobytes()
+
+
+def test_the_command_does_not_write_a_ply_under_a_misleading_name(tmp_path, capsys):
+    """A .ksplat would hold a PLY; scores have no place in another format than PLY."""
+    (tmp_path / "in.ply").write_bytes(ply_of(scene()))
+    (tmp_path / "cameras.json").write_text(CAMERAS)
+    source, cameras = str(tmp_path / "in.ply"), ["--cameras", str(tmp_path / "cameras.json")]
+
+    assert main(["convert", source, str(tmp_path / "a.ksplat")]) == 2
+    assert main(["score", source, *cameras, "-o", str(tmp_path / "a.splat")]) == 2
+
+    said = capsys.readouterr().err
+    assert f".ksplat is not written, expected one of {', '.join(SUFFIXES)}" in said
+    assert "only a .ply holds scores" in said
+
+
+def test_a_dry_run_counts_the_bytes_of_the_output(tmp_path, capsys):
+    """16,000 bytes hold 500 splats of a .splat, at 32 each; nothing is written."""
+    (tmp_path / "in.ply").write_bytes(ply_of(scene()))
+    (tmp_path / "cameras.json").write_text(CAMERAS)
+    order = ["prune", str(tmp_path / "in.ply"), "--cameras", str(tmp_path / "cameras.json")]
+
+    code = main([*order, "--max-mb", "0.016", "--dry-run", "-o", str(tmp_path / "a.splat")])
+
+    assert code == 0
+    assert "would keep 500 of 600 splats" in capsys.readouterr().out
+    assert not (tmp_path / "a.splat").exists()
+
+
+def test_logits_of_opacities_are_clamped():
+    """The inverse of the logistic function; 0 and 1 count as 1e-6 and 1 - 1e-6."""
+    logits = opacity_logits(np.array([0.0, 0.25, 0.5, 1.0]))
+
+    ends = np.log(1e-6 / (1.0 - 1e-6))
+    np.testing.assert_allclose(logits, [ends, -np.log(3.0), 0.0, -ends], atol=1e-9)
+
+
+def test_a_splat_file_written_by_hand(tmp_path):
+    """Mean and scale as floats; red 255 is 1, which is f_dc = .5 / .282095; 128 is no turn.
+
+    The rotation (128, 192, 128, 128) is (0, .5, 0, 0): half a turn about x once it has length 1.
+    """
+    row = struct.pack("<6f", 1.0, -2.0, 3.0, 0.5, 1.0, 2.0)
+    (tmp_path / "a.splat").write_bytes(row + bytes([255, 0, 51, 204, 128, 192, 128, 128]))
+
+    splats = read_splats(tmp_path / "a.splat").splats()
+
+    assert splats.means.tolist() == [[1.0, -2.0, 3.0]]
+    np.testing.assert_allclose(splats.log_scales, np.log([[0.5, 1.0, 2.0]]), rtol=1e-6)
+    np.testing.assert_allclose(splats.sh_dc * 0.28209479, [[0.5, -0.5, -0.3]], atol=1e-6)
+    np.testing.assert_allclose(splats.opacity_logits, [np.log(4.0)], rtol=1e-6)
+    assert splats.quaternions.tolist() == [[0.0, 1.0, 0.0, 0.0]]

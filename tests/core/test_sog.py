@@ -1,0 +1,211 @@
+"""SOG: what is in the archive, and archives that lie."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import json
+import re
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+
+from refine_addon.core import RefineError, as_written, read_splats
+from refine_addon.core.formats import images
+from refine_addon.core.formats.sog import _grouped
+from tests.strategies import plain_ply
+
+pytest.importorskip("PIL", reason="needs Pillow, which a .sog does outside of Blender")
+
+
+@pytest.fixture
+def sog(tmp_path):
+    """Return the path of a file of 40 splats of degree 1."""
+    (tmp_path / "in.ply").write_bytes(plain_ply(40, 1))
+    as_written(read_splats(tmp_path / "in.ply"), tmp_path / "a.sog").write(tmp_path / "a.sog")
+    return tmp_path / "a.sog"
+
+
+def content(path):
+    """Return the files in an archive by their names; meta.json parsed."""
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    return {**files, "meta.json": json.loads(files["meta.json"])}
+
+
+def pack(path, files, folder=""):
+    """Write an archive of files."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in files.items():
+            archive.writestr(folder + name, json.dumps(data) if name == "meta.json" else data)
+
+
+def picture(width, height, value=(0, 0, 0, 255)):
+    """Return a WebP image of one colour."""
+    return images._Pillow().encode(np.full((height, width, 4), value, np.uint8))
+
+
+def test_values_by_hand(sog):
+    """One splat. 16 bits of 255 + 256 * 127 = 32767 of 65535 between 0 and 2, logarithmic.
+
+    exp(.99998) - 1 = 1.71825. Components 0 of a rotation are 127.5, so that 128 is .5 / 127.5 /
+    sqrt(2); the alpha 253 leaves out x. Places 2 of tables that count by tenths are .2.
+    """
+    files = content(sog)
+    tenths = [0.1 * index for index in range(256)]
+    files["meta.json"] = {
+        "version": 2,
+        "count": 1,
+        "means": {"mins": [0, 0, 0], "maxs": [2, 2, -2], "files": ["l", "u"]},
+        "scales": {"codebook": tenths, "files": ["s"]},
+        "quats": {"files": ["q"]},
+        "sh0": {"codebook": tenths, "files": ["c"]},
+    }
+    files |= {
+        "l": picture(1, 1, (255, 0, 255, 255)),
+        "u": picture(1, 1, (127, 0, 127, 255)),
+        "s": picture(1, 1, (2, 0, 1, 255)),
+        "q": picture(1, 1, (128, 128, 128, 253)),
+        "c": picture(1, 1, (2, 3, 4, 51)),
+        "b.webp": b"",
+    }
+    pack(sog, files, "folder/")
+
+    splats = read_splats(sog).splats()
+
+    step = np.expm1(2 * 32767 / 65535)
+    np.testing.assert_allclose(splats.means, [[step, 0.0, -step]], rtol=1e-6)
+    np.testing.assert_allclose(splats.log_scales, [[0.2, 0.0, 0.1]], rtol=1e-6)
+    small = 0.5 / 127.5 / np.sqrt(2.0)
+    expected = [[small, np.sqrt(1 - 3 * small**2), small, small]]
+    np.testing.assert_allclose(splats.quaternions, expected, rtol=1e-6)
+    np.testing.assert_allclose(splats.sh_dc, [[0.2, 0.3, 0.4]], rtol=1e-6)
+    np.testing.assert_allclose(splats.opacity_logits, [-np.log(4.0)], rtol=1e-6)
+
+
+def test_groups_are_halves_of_halves():
+    """Four clumps of two: 8 rows become 4 groups at least, and no group spans two clumps."""
+    random = np.random.default_rng(0)
+    clumps = np.array([[0, 0, 0], [9, 0, 0], [9, 5, 0], [0, 5, 0]]).repeat(2, axis=0)
+
+    labels = _grouped(clumps + random.normal(0.0, 0.1, clumps.shape))
+
+    assert len(set(labels)) == labels.max() + 1 >= 4
+    for one in range(8):
+        for other in range(8):
+            assert labels[one] != labels[other] or one // 2 == other // 2
+
+
+def _meta(*path_and_value):
+    *path, key, value = path_and_value
+
+    def change(files):
+        held = files["meta.json"]
+        for step in path:
+            held = held[step]
+        held[key] = value
+
+    return change
+
+
+def _file(name, data):
+    def change(files):
+        files[name] = data
+
+    return change
+
+
+FAULTS = {
+    "version 1": (_meta("version", 1), "meta.json: version 1, expected 2"),
+    "no version": (_meta("version", None), "meta.json: version none, expected 2"),
+    "many": (_meta("count", 10**9), "meta.json: count: 1000000000, expected 1 to "),
+    "none": (_meta("count", 0), "meta.json: count: 0, expected 1 to "),
+    "half": (_meta("count", 1.5), "meta.json: count: none, expected 1 to "),
+    "a few too many": (_meta("count", 100), "image 'means_l.webp': "),
+    "no means": (_meta("means", []), "meta.json: means: is not there, expected an object"),
+    "two limits": (_meta("means", "mins", [0, 0]), "meta.json: means.mins: expected 3 numbers"),
+    "a huge limit": (_meta("means", "maxs", [10**400] * 3), "meta.json: means.maxs: a number too"),
+    "a short table": (_meta("sh0", "codebook", [0.0]), "meta.json: sh0.codebook: expected 256 nu"),
+    "no file": (_meta("scales", "files", []), "meta.json: scales.files: expected at least 1 nam"),
+    "another file": (_meta("scales", "files", ["x"]), "'x' in the archive cannot be read ("),
+    "no image": (_file("sh0.webp", b"RIFF"), "image 'sh0.webp': cannot be read ("),
+    "another image": (_file("sh0.webp", b"\x89PNG\r\n\x1a\n"), "image 'sh0.webp': cannot be read"),
+    "a small image": (_file("quats.webp", picture(4, 4)), "image 'quats.webp': 4 x 4 pixels, expe"),
+    "a huge image": (
+        _file("quats.webp", picture(9000, 900)),
+        "image 'quats.webp': 9000 x 900 pixels, expected 40",
+    ),
+    "an image of another size": (_file("quats.webp", picture(8, 8)), None),
+    "an unknown rotation": (
+        _file("quats.webp", picture(8, 8, (0, 0, 0, 9))),
+        "rotation of splat 0: alpha 9, expected 252 to 255",
+    ),
+    "bands": (_meta("shN", "bands", 4), "meta.json: shN.bands: expected 1, 2 or 3"),
+    "entries": (_meta("shN", "count", 70_000), "meta.json: shN.count: expected 1 to 65536"),
+    "a narrow palette": (
+        _file("shN_centroids.webp", picture(64, 8)),
+        "image 'shN_centroids.webp': 64 pixels wide, expected 192",
+    ),
+    "labels": (
+        _file("shN_labels.webp", picture(8, 8, (255, 1, 0, 255))),
+        "splat 0: entry 511 of ",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_what_is_wrong_is_named_with_its_place(sog, name):
+    """With memory that the file accounts for: a WebP of one colour may be as large as it likes."""
+    change, expected = FAULTS[name]
+    files = content(sog)
+    change(files)
+    pack(sog, files)
+    if expected is None:  # no fault: 64 pixels hold 40 splats
+        assert len(read_splats(sog)) == 40
+        return
+    tracemalloc.start()
+
+    with pytest.raises(RefineError, match=re.escape(f"{sog}: {expected}")):
+        read_splats(sog)
+
+    assert tracemalloc.get_traced_memory()[1] < 5_000_000
+    tracemalloc.stop()
+
+
+def test_a_bomb_in_the_archive_is_refused(sog):
+    """100 MB of zeros in 100 KB, as an image."""
+    files = content(sog)
+    with zipfile.ZipFile(sog, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, data in files.items():
+            data = json.dumps(data) if name == "meta.json" else data  # noqa: PLW2901
+            archive.writestr(name, bytes(100_000_000) if name == "sh0.webp" else data)
+
+    with pytest.raises(RefineError, match=r"'sh0.webp' in the archive has more than \d{6} bytes"):
+        read_splats(sog)
+
+
+def test_what_is_missing_is_said(sog, monkeypatch):
+    """Without Pillow, neither read nor written."""
+
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    source = read_splats(sog.with_name("in.ply"))
+
+    with pytest.raises(RefineError, match=r"a\.sog: WebP images need a library: run this in Blen"):
+        read_splats(sog)
+    with pytest.raises(RefineError, match="WebP images need a library: run this in Blender, or 'p"):
+        as_written(source, sog.with_name("b.sog")).write(sog.with_name("b.sog"))
+    assert not sog.with_name("b.sog").exists()
+
+
+def test_the_same_splats_make_the_same_file(sog):
+    """No time of day is in it."""
+    source = read_splats(sog.with_name("in.ply"))
+    as_written(source, sog).write(sog.with_name("b.sog"))
+
+    assert sog.read_bytes() == sog.with_name("b.sog").read_bytes()
+    assert io.BytesIO(sog.read_bytes()).read(4) == b"PK\x03\x04"
