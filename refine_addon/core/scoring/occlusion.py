@@ -342,7 +342,7 @@ class _Run:
         blocks = len(self.blocks)
         # An even number, since an odd one leaves one of two cores idle.
         pairs = max(round(ROUND_COST * len(self.gaussians) / max(len(left), 1) * blocks / 2), 1)
-        count = min(2 * pairs, blocks)
+        count = min(2 * pairs, max(blocks // 2, 2), blocks)
         which = [(self.turn + step) % blocks for step in range(count)]
         self.turn += count
         found = self.measuring.measure(left, which, progress)
