@@ -167,11 +167,7 @@ MUTANTS = {
         ),
         ("number *= math.ceil(size[0])", "number *= math.ceil(size[0]) + 1", "rows too long"),
         ("total *= points.inside / np", "total *= 1.0 / np", "outside counts"),
-        (
-            "    touching |= vast.take(rows)\n",
-            "",
-            "a splat wider than the image is dropped where its centre lies beside it",
-        ),
+        ("frame.axes[:, vast] = 0.0", "frame.axes[:, vast] += 0.0", "a sky beside is lost"),
         ("(high >= 0.0) & (low < size)\n", "(low >= 0.0) & (low < size)\n", "left edge lost"),
         ("            shares[again] = 0.0\n", "", "points merged twice"),
         (

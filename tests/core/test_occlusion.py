@@ -972,3 +972,18 @@ def test_points_lie_where_their_lattices_put_them_in_and_across_the_image():
     cells = sorted({cell for _, cell in expected})
     totals = [sum(s for (_, c), s in expected.items() if c == cell) for cell in cells]
     np.testing.assert_allclose(of_cells, totals, rtol=1e-4)
+
+
+@pytest.mark.parametrize("x", [0.0, 8.0, -16.0])
+def test_a_splat_wider_than_the_image_counts_all_of_it_wherever_its_centre_is(x):
+    """Sigma 500 px on 80 x 60: against the sum of its alpha over the pixels, up to 800 px off."""
+    view, splats = look_along_z(), splats_of([[x, 0, 2]], scales=10.0)
+    center, covariance = plain_footprint(splats, view)
+    row, column = np.mgrid[:60, :80] + 0.5
+    away = np.stack([column.ravel(), row.ravel()]) - center[:, None]
+    squared = np.sum(away * np.linalg.solve(covariance, away), axis=0)
+
+    found = measured(splats, view)
+
+    # The mass leaves out the edge below 1/255, a share of 1/127 of it.
+    assert found.contribution[0] == pytest.approx(0.5 * np.exp(-squared / 2).sum(), rel=0.01)

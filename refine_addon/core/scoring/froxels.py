@@ -237,8 +237,8 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
     kinds = _kinds(footprints, view, density / side)  # (n,)
     frame = _framed(footprints, view, side)
     vast = kinds == len(lattices()) - 1  # (n,), the few footprints much larger than the image
-    frame.axes[:, vast] = 0.0
-    rows, patches, whole = _patches(frame, kinds, vast)  # (q,) each
+    frame.axes[:, vast] = 0.0  # in the image; `_flat` replaces their points
+    rows, patches, whole = _patches(frame, kinds)  # (q,) each
     sizes = _table().sizes.take(patches)  # (q,)
     owners = np.repeat(rows.astype(np.int32), sizes)  # (p,)
     cells, shares, sums = _laid(frame, rows, patches, whole)  # (p,), (p,), (2, q)
@@ -334,7 +334,7 @@ def _framed(footprints: Footprints, view: View, side: float) -> _Frame:
 
 
 def _patches(
-    frame: _Frame, kinds: NDArray[np.uint8], vast: NDArray[np.bool_]
+    frame: _Frame, kinds: NDArray[np.uint8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
     """Return the patches that may reach into the image, footprint by footprint.
 
@@ -343,8 +343,6 @@ def _patches(
     frame : _Frame
     kinds : (n,) uint8
         Which lattice each footprint gets.
-    vast : (n,) bool
-        Which footprints' points lie over the image wherever their centre is.
 
     Returns
     -------
@@ -369,7 +367,6 @@ def _patches(
         low, high = where - reach, where + reach
         touching &= (high >= 0.0) & (low < size)
         whole &= (low >= 0.0) & (high < size)
-    touching |= vast.take(rows)
     some = np.flatnonzero(touching)
     return rows.take(some), patches.take(some), whole.take(some)
 
