@@ -15,7 +15,8 @@ from __future__ import annotations
 import functools
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from ..rendering import ALPHA_CUT, ALPHA_MAX
 from ..work import checkpoint
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
     from typing import Any
 
     from numpy.typing import NDArray
@@ -65,7 +66,9 @@ Line = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
 _EXTENT, _WIDE_EXTENT, _WIDE = 2.4, 3.0, 8  # standard deviations; the wide one from 8 points on
 _GROWTH = 2.0**0.25  # factor by which the side of a cell grows in a step
 _OUTSIDE = MAX_CELLS  # the cell number of points outside the image
-_BLOCK = 1 << 16  # points processed at a time, which limits temporary memory
+_PATCH = 6  # points along a side of a patch, at most
+_MARGIN = 1e-2  # cells; far more than what rounding moves a point by
+_BLOCK = 1 << 15  # points processed at a time, which limits temporary memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +78,16 @@ class Lattice:
     Attributes
     ----------
     points : (2, k) float32
-        In standard deviations along the major and the minor axis.
+        In standard deviations along the major and the minor axis; patch by patch.
     shares : (k,) float32
         Of the mass; their sum is 1.
+    patches : (P,) int64
+        Sizes of groups of neighbouring points. Those that miss the image are not laid out.
     """
 
     points: NDArray[np.float32]
     shares: NDArray[np.float32]
+    patches: NDArray[np.int64]
 
 
 @functools.cache
@@ -95,7 +101,8 @@ def lattices() -> tuple[Lattice, ...]:
     made = [_lattice(major, minor) for major in lines for minor in lines]
     line = (np.arange(FLAT) + 0.5) / FLAT * 2.0 - 1.0
     flat = np.stack([axis.ravel() for axis in np.meshgrid(line, line)]).astype(np.float32)
-    return (*made, Lattice(flat, np.full(FLAT**2, 1.0 / FLAT**2, np.float32)))
+    whole = np.array([FLAT**2])
+    return (*made, Lattice(flat, np.full(FLAT**2, 1.0 / FLAT**2, np.float32), whole))
 
 
 def _lattice(major: Line, minor: Line) -> Lattice:
@@ -109,7 +116,17 @@ def _lattice(major: Line, minor: Line) -> Lattice:
     points = np.stack([axis[keep] for axis in place])  # (2, k)
     variance = (points * points) @ shares
     points /= np.sqrt(np.where(variance > 0.0, variance, 1.0))[:, None]
-    return Lattice(points.astype(np.float32), shares.astype(np.float32))
+    parts = [-(-count // _PATCH) for count in product.shape]
+    row, column = (
+        np.arange(count) * number // count
+        for count, number in zip(product.shape, parts, strict=True)
+    )
+    patch = np.add.outer(row * parts[1], column)[keep]  # (k,)
+    order = np.argsort(patch, kind="stable")
+    sizes = np.bincount(patch)
+    return Lattice(
+        points[:, order].astype(np.float32), shares[order].astype(np.float32), sizes[sizes > 0]
+    )
 
 
 def _line(count: int) -> Line:
@@ -129,31 +146,35 @@ def _line(count: int) -> Line:
 class Points:
     """The m points inside the image, cell by cell, and front to back in each cell.
 
-    Points of one splat in one cell are merged into one, so that a splat does not hide itself.
+    Of several points of one splat in one cell the first has the shares of all, so that a splat does
+    not hide itself; the others have none.
 
     Attributes
     ----------
-    owners : (m,) int64
+    owners : (m,) int32
         Row of the `Footprints`.
     shares : (m,) float32
         Of the splat's mass.
     columns : (C,) int64
         How many points lie in each of the C cells that are not empty.
+    inside, squares : (n,) float64
+        Of each footprint: the sum of its shares, and of their squares.
     area : float
         Of a cell, px^2.
     """
 
-    owners: NDArray[np.int64]
+    owners: NDArray[np.int32]
     shares: NDArray[np.float32]
     columns: NDArray[np.int64]
+    inside: NDArray[np.float64]
+    squares: NDArray[np.float64]
     area: float
 
-    def pieces(self) -> Iterator[tuple[slice, Points]]:
-        """Yield about `_BLOCK` points at a time, in whole cells: a slice and its points."""
+    def pieces(self) -> Iterator[tuple[slice, slice]]:
+        """Yield about `_BLOCK` points at a time, in whole cells: slices of the cells and points."""
         for cells, place in _runs(self.columns):
             checkpoint()
-            columns = self.columns[cells]
-            yield place, Points(self.owners[place], self.shares[place], columns, self.area)
+            yield cells, place
 
 
 def _runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
@@ -214,20 +235,22 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
         Points per standard deviation that is as long as a cell.
     """
     kinds = _kinds(footprints, view, density / side)  # (n,)
-    sizes, *_ = _table()
-    counts = sizes[kinds]  # (n,), points of each footprint
-    cells = np.empty(int(counts.sum()), np.uint16)  # (p,), as all that follows
-    shares = np.empty(len(cells), np.float32)
-    for row, place in _runs(counts):
-        checkpoint()
-        cells[place], shares[place] = _laid(footprints, row, kinds[row], view, side)
-    # Replace the points of the few splats that are much larger than the image.
-    vast = np.flatnonzero(kinds == len(sizes) - 1)
-    if len(vast):
-        at = np.cumsum(counts)[vast][:, None] - np.arange(FLAT**2, 0, -1)
-        cells[at], shares[at] = _flat(footprints, vast, view, side)
-    owners = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
-    return _merged(cells, owners, shares, side * side)
+    frame = _framed(footprints, view, side)
+    vast = kinds == len(lattices()) - 1  # (n,), the few footprints much larger than the image
+    frame.axes[:, vast] = 0.0  # in the image; `_flat` replaces their points
+    rows, patches, whole = _patches(frame, kinds)  # (q,) each
+    sizes = _table().sizes.take(patches)  # (q,)
+    owners = np.repeat(rows.astype(np.int32), sizes)  # (p,)
+    cells, shares, sums = _laid(frame, rows, patches, whole)  # (p,), (p,), (2, q)
+    replaced = np.flatnonzero(vast.take(rows))
+    if len(replaced):
+        at = np.cumsum(sizes)[replaced][:, None] - np.arange(FLAT**2, 0, -1)
+        cells[at], shares[at] = _flat(footprints, rows[replaced], view, side)
+        sums[:, replaced] = shares[at].sum(axis=1), (shares[at] ** 2).sum(axis=1)
+    inside, squares = (  # (n,) each
+        np.asarray(np.bincount(rows, some, len(kinds)), np.float64) for some in sums
+    )
+    return _merged(cells, owners, shares, inside, squares, side * side)
 
 
 def _kinds(footprints: Footprints, view: View, scale: float) -> NDArray[np.uint8]:
@@ -242,60 +265,253 @@ def _kinds(footprints: Footprints, view: View, scale: float) -> NDArray[np.uint8
     return np.where(vast, np.uint8(len(COUNTS) ** 2), kinds)
 
 
+class _Table(NamedTuple):
+    """All L lattices in one table of P patches and K points.
+
+    Attributes
+    ----------
+    first, patches : (L,) int64
+        The first patch of each lattice, and how many it has.
+    start, sizes : (P,) int64
+        The first point of each patch, and how many it has.
+    middle, half : (2, P) float32
+        Of the box around each patch, standard deviations along the major and the minor axis.
+    points : (2, K) float32
+        Along the major and the minor axis, standard deviations.
+    shares : (K,) float32
+        Of the mass.
+    sums : (2, P) float32
+        Of the shares of each patch, and of their squares.
+    """
+
+    first: NDArray[np.int64]
+    patches: NDArray[np.int64]
+    start: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    middle: NDArray[np.float32]
+    half: NDArray[np.float32]
+    points: NDArray[np.float32]
+    shares: NDArray[np.float32]
+    sums: NDArray[np.float32]
+
+
 @functools.cache
-def _table() -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[Any], NDArray[Any]]:
-    """Return all L lattices in one table: sizes (L,), starts (L,), points (2, K), shares (K,)."""
-    sizes = np.array([len(lattice.shares) for lattice in lattices()])
-    points = np.concatenate([lattice.points for lattice in lattices()], axis=1)
+def _table() -> _Table:
+    """Return all lattices in one table."""
+    count = np.array([len(lattice.patches) for lattice in lattices()])
+    sizes = np.concatenate([lattice.patches for lattice in lattices()])
+    start = np.cumsum(sizes) - sizes
     shares = np.concatenate([lattice.shares for lattice in lattices()])
-    return sizes, np.cumsum(sizes) - sizes, points, shares
+    points = np.concatenate([lattice.points for lattice in lattices()], axis=1)
+    low, high = np.minimum.reduceat(points, start, 1), np.maximum.reduceat(points, start, 1)
+    sums = np.add.reduceat([shares, shares * shares], start, 1)
+    first = np.cumsum(count) - count
+    return _Table(
+        first, count, start, sizes, (low + high) / 2, (high - low) / 2, points, shares, sums
+    )
 
 
-def _laid(
-    footprints: Footprints, row: slice, kinds: NDArray[np.uint8], view: View, side: float
-) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
-    """Return cells and shares, (p,) each, of the points of r footprints, one after the other."""
-    sizes, starts, points, shares = _table()
-    counts = sizes[kinds]  # (r,)
-    first = np.cumsum(counts) - counts  # (r,), number of each footprint's first point
-    # (p,), row of the table for each point: start of its footprint's lattice plus a running number.
-    which = np.arange(int(counts.sum())) - np.repeat(first - starts[kinds], counts)
-    along, across = points[0].take(which), points[1].take(which)
-    place = []
-    for axis in range(2):
-        where = along * np.repeat(footprints.major[axis, row], counts)
-        where += across * np.repeat(footprints.minor[axis, row], counts)
-        where += np.repeat(footprints.centers[axis, row], counts)
-        place.append(where)
-    return _cells(place, view, side), shares.take(which)
+class _Frame(NamedTuple):
+    """Footprints in units of a cell.
+
+    Attributes
+    ----------
+    axes : (6, n) float32
+        Half axes, major then minor, and centre: each across and down.
+    size : tuple of float
+        Of the image, across and down.
+    """
+
+    axes: NDArray[np.float32]
+    size: tuple[float, float]
 
 
-def _cells(place: list[NDArray[np.float32]], view: View, side: float) -> NDArray[np.uint16]:
-    """Return the number of each point's cell, (p,), or `_OUTSIDE` for points beside the image.
+def _framed(footprints: Footprints, view: View, side: float) -> _Frame:
+    """Return footprints in units of a cell."""
+    axes = np.concatenate([footprints.major, footprints.minor, footprints.centers])
+    axes *= np.float32(1.0 / side)
+    return _Frame(axes, (view.width / side, view.height / side))
+
+
+def _patches(
+    frame: _Frame, kinds: NDArray[np.uint8]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the patches that may reach into the image, footprint by footprint.
 
     Parameters
     ----------
-    place : list of (p,) float32
-        Across and down, pixels.
-    view : View
-    side : float
-        Of a cell, pixels.
+    frame : _Frame
+    kinds : (n,) uint8
+        Which lattice each footprint gets.
+
+    Returns
+    -------
+    rows, patches : (q,) int64
+        Of the footprints, and of the table.
+    whole : (q,) bool
+        Which lie in the image with all of their points.
     """
-    inside = np.ones(place[0].shape, np.bool_)
-    number = np.zeros(place[0].shape, np.int32)
-    for where, size in zip(place[::-1], (view.height, view.width), strict=True):
-        inside &= where >= 0.0
-        inside &= where < size
-        # Clipped as floats, since far points do not fit an integer. Rounding of float32 can put
-        # the last pixel one cell too far, which the clipping corrects.
-        cell = where * np.float32(1.0 / side)
-        np.maximum(cell, np.float32(0.0), out=cell)
-        np.minimum(cell, np.float32(math.ceil(size / side) - 1), out=cell)
-        number *= math.ceil(view.width / side)
-        number += cell.astype(np.int32)
-    cells = number.astype(np.uint16)
-    cells[~inside] = _OUTSIDE
-    return cells
+    table = _table()
+    count = table.patches.take(kinds)  # (n,)
+    rows = np.repeat(np.arange(len(kinds)), count)  # (q,)
+    before = np.cumsum(count) - count - table.first.take(kinds)  # (n,)
+    patches = np.arange(len(rows)) - before.take(rows)  # (q,)
+    middle, half = table.middle.take(patches, axis=1), table.half.take(patches, axis=1)  # (2, q)
+    touching = np.ones(len(rows), np.bool_)
+    whole = np.ones(len(rows), np.bool_)
+    for axis, size in enumerate(frame.size):
+        checkpoint()
+        major, minor = frame.axes[axis].take(rows), frame.axes[2 + axis].take(rows)  # (q,) each
+        where = major * middle[0] + minor * middle[1] + frame.axes[4 + axis].take(rows)
+        reach = np.abs(major) * half[0] + np.abs(minor) * half[1] + np.float32(_MARGIN)
+        low, high = where - reach, where + reach
+        touching &= (high >= 0.0) & (low < size)
+        whole &= (low >= 0.0) & (high < size)
+    some = np.flatnonzero(touching)
+    return rows.take(some), patches.take(some), whole.take(some)
+
+
+def _laid(
+    frame: _Frame,
+    rows: NDArray[np.int64],
+    patches: NDArray[np.int64],
+    whole: NDArray[np.bool_],
+) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]:
+    """Return the points of q patches, one after the other.
+
+    Parameters
+    ----------
+    frame : _Frame
+    rows, patches, whole : (q,) array
+        See `_patches`.
+
+    Returns
+    -------
+    cells : (p,) uint16
+        `_OUTSIDE` for points beside the image.
+    shares : (p,) float32
+        Of the mass.
+    sums : (2, q) float32
+        Of the shares of each patch's points inside the image, and of their squares.
+    """
+    table = _table()
+    sizes = table.sizes.take(patches)  # (q,)
+    first = np.cumsum(sizes) - sizes  # (q,), number of each patch's first point
+    cells = np.empty(int(sizes.sum()), np.uint16)
+    shares, sums = np.empty(len(cells), np.float32), table.sums.take(patches, axis=1)
+    # Patches alike are laid out together, which needs no look-up for each point.
+    some = np.flatnonzero(whole)
+    some = some.take(np.argsort(patches.take(some).astype(np.uint16), kind="stable"))  # (s,)
+    axes, begin = frame.axes.take(rows.take(some), axis=1), first.take(some)
+    for patch, piece in _alike(patches.take(some)):
+        own = slice(int(table.start[patch]), int(table.start[patch] + table.sizes[patch]))
+        at = begin[piece] + np.arange(own.stop - own.start)[:, None]  # (points, patches)
+        cells[at] = _cells(_place(axes[:, piece], table.points[:, own, None]), frame.size)
+        shares[at] = table.shares[own, None]
+    edge = np.flatnonzero(~whole)
+    for piece, _ in _runs(sizes.take(edge)):
+        checkpoint()
+        some = edge[piece]
+        at, found, share, sums[:, some] = _cut(frame, rows[some], patches[some], first[some])
+        cells[at], shares[at] = found, share
+    return cells, shares, sums
+
+
+def _alike(patches: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
+    """Yield runs of equal numbers that have about `_BLOCK` points at most: number and slice.
+
+    Parameters
+    ----------
+    patches : (s,) int64
+        Ascending.
+    """
+    sizes = _table().sizes
+    stops = np.cumsum(np.bincount(patches, minlength=len(sizes))).tolist()
+    for patch, (start, stop) in enumerate(pairwise([0, *stops])):
+        step = max(_BLOCK // int(sizes[patch]), 1)
+        for begin in range(start, stop, step):
+            checkpoint()
+            yield patch, slice(begin, min(begin + step, stop))
+
+
+def _cut(
+    frame: _Frame,
+    rows: NDArray[np.int64],
+    patches: NDArray[np.int64],
+    first: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[Any], NDArray[np.float32], NDArray[np.float32]]:
+    """Return the points of q patches that lie across the edge of the image, one after the other.
+
+    Parameters
+    ----------
+    frame : _Frame
+    rows, patches : (q,) int64
+        See `_patches`.
+    first : (q,) int64
+        The number of each patch's first point.
+
+    Returns
+    -------
+    at : (p,) int64
+        Numbers of the points.
+    cells, shares : (p,) array
+        `_OUTSIDE` and 0 for points beside the image.
+    sums : (2, q) float32
+        Of the shares of each patch, and of their squares.
+    """
+    table = _table()
+    sizes = table.sizes.take(patches)  # (q,)
+    begin = np.cumsum(sizes) - sizes
+    step = np.arange(int(sizes.sum())) - np.repeat(begin, sizes)  # (p,), as all that follows
+    which = step + np.repeat(table.start.take(patches), sizes)
+    axes = np.repeat(frame.axes.take(rows, axis=1), sizes, axis=1)
+    place = _place(axes, table.points.take(which, axis=1))
+    there = np.ones(len(which), np.bool_)
+    for where, size in zip(place, frame.size, strict=True):
+        there &= (where >= 0.0) & (where < np.float32(size))
+    cells = np.where(there, _cells(place, frame.size), np.uint16(_OUTSIDE))
+    shares = np.where(there, table.shares.take(which), np.float32(0.0))
+    sums = np.add.reduceat([shares, shares * shares], begin, axis=1)
+    return step + np.repeat(first, sizes), cells, shares, sums
+
+
+def _place(
+    axes: NDArray[np.float32], points: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return where points of lattices lie, across and down, in cells.
+
+    Parameters
+    ----------
+    axes : (6, ...) float32
+        See `_Frame`.
+    points : (2, ...) float32
+        Of the lattice, along the major and the minor axis.
+    """
+    across = axes[0] * points[0]
+    across += axes[2] * points[1]
+    across += axes[4]
+    down = axes[1] * points[0]
+    down += axes[3] * points[1]
+    down += axes[5]
+    return across, down
+
+
+def _cells(
+    place: tuple[NDArray[np.float32], NDArray[np.float32]], size: tuple[float, float]
+) -> NDArray[np.uint16]:
+    """Return the number of each point's cell; it means nothing beside the image.
+
+    Parameters
+    ----------
+    place : tuple of float32 arrays
+        Across and down, in cells.
+    size : tuple of float
+        Of the image, in cells.
+    """
+    number = place[1].astype(np.int32)
+    number *= math.ceil(size[0])
+    number += place[0].astype(np.int32)
+    return number.astype(np.uint16)
 
 
 def _flat(
@@ -317,13 +533,16 @@ def _flat(
         squared += along * along
     mass = np.float32(2.0 * math.pi) * footprints.sigmas[0, row] * footprints.sigmas[1, row]
     share = np.float32(view.width * view.height / FLAT**2) / mass
-    return _cells([u, v], view, side), np.exp(squared / -2.0) * share[:, None]
+    cells = _cells((u / np.float32(side), v / np.float32(side)), (view.width / side, 0.0))
+    return cells, np.exp(squared / -2.0) * share[:, None]
 
 
 def _merged(
     cells: NDArray[np.uint16],
     owners: NDArray[np.int32],
     shares: NDArray[np.float32],
+    inside: NDArray[np.float64],
+    squares: NDArray[np.float64],
     area: float,
 ) -> Points:
     """Sort p points into cells, and merge those of one splat in one cell.
@@ -335,86 +554,124 @@ def _merged(
     owners : (p,) int32
         Ascending, that is, front to back.
     shares : (p,) float32
+    inside, squares : (n,) float64
+        See `Points`; `squares` before merging, and changed in place.
     area : float
     """
     filled = np.bincount(cells, minlength=_OUTSIDE)[:_OUTSIDE]
-    filled = filled[filled > 0]  # (C,), points of each cell before merging
+    columns = filled[filled > 0]  # (C,)
     # A stable sort keeps the points of a cell front to back; those `_OUTSIDE` come last.
-    order = np.argsort(cells, kind="stable")[: filled.sum()]
+    order = np.argsort(cells, kind="stable")[: columns.sum()]
     checkpoint()
-    if not len(order):
-        return Points(order, shares[:0], order, area)
-    owners = owners.take(order)
-    tops = np.cumsum(filled) - filled  # first point of each cell
-    new = np.empty(len(owners), np.bool_)  # whether a point is the first of its splat in its cell
-    np.not_equal(owners[1:], owners[:-1], out=new[1:])
-    new[tops] = True
-    starts = np.flatnonzero(new)
-    columns = np.add.reduceat(new, tops, dtype=np.int64)
-    return Points(
-        owners.take(starts).astype(np.int64),
-        np.add.reduceat(shares.take(order), starts),
-        columns,
-        area,
-    )
+    owners, shares = owners.take(order), shares.take(order)
+    if len(order):
+        new = np.empty(len(owners), np.bool_)  # whether a point is the first of its splat there
+        np.not_equal(owners[1:], owners[:-1], out=new[1:])
+        new[np.cumsum(columns) - columns] = True  # the first point of each cell
+        again = np.flatnonzero(~new)  # (a,)
+        starts = np.flatnonzero(new.take(again - 1))  # where another splat's points begin
+        if len(starts):
+            first = again.take(starts) - 1
+            more, own = shares.take(again), shares.take(first)
+            total = own + np.add.reduceat(more, starts)
+            apart = own * own + np.add.reduceat(more * more, starts)
+            squares += np.bincount(owners.take(first), total * total - apart, len(squares))
+            shares[again] = 0.0
+            shares[first] = total
+    return Points(owners, shares, columns, inside, squares, area)
 
 
-def thickness(
-    points: Points, alphas: NDArray[np.float32], mass: NDArray[np.float32]
+def traits(
+    footprints: Footprints,
+    alphas: NDArray[np.float32],
+    mass: NDArray[np.float32],
+    colors: NDArray[np.float32],
+    area: float,
 ) -> NDArray[np.float32]:
-    """Return the optical thickness of each point, (m,).
-
-    It is ``-log(1 - a)``. a is the share of the cell that the point covers: its mass over the
-    cell's area, at most the splat's opacity.
+    """Return what points take from their splats, in one table: one look-up is faster than six.
 
     Parameters
     ----------
-    points : Points
+    footprints : Footprints
     alphas, mass : (n,) float32
-        Of the footprints.
+    colors : (n, 3) float32
+    area : float
+        Of a cell, px^2.
+
+    Returns
+    -------
+    (n, 6) float32
+        Red, green, blue; the mass over the cell's area; the largest share of a cell that the splat
+        covers, which is its opacity; `evenness`.
     """
-    covered = points.shares * (mass / np.float32(points.area)).take(points.owners)
-    np.minimum(covered, np.minimum(alphas, np.float32(ALPHA_MAX)).take(points.owners), out=covered)
-    np.subtract(np.float32(1.0), covered, out=covered)
-    np.log(covered, out=covered)
-    return np.negative(covered, out=covered)
+    table = np.empty((len(alphas), 6), np.float32)
+    table[:, :3] = colors
+    table[:, 3] = mass / np.float32(area)
+    np.minimum(alphas, np.float32(ALPHA_MAX), out=table[:, 4])
+    table[:, 5] = evenness(footprints, area)
+    return table
 
 
-def paired(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[Any]:
-    """Return two real arrays as the real and imaginary parts of one complex array, (n,).
+def look(
+    shares: NDArray[np.float32], traits: NDArray[np.float32], columns: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the transmittance in front of points and their squared contrast, (m,) each.
 
-    Sums, and products with real numbers, work on both parts separately, so one running sum over the
-    pair is two running sums in the time of one.
+    Parameters
+    ----------
+    shares : (m,) float32
+        Of the splat's mass.
+    traits : (m, 6) float32
+        Of each point's splat, see `traits`.
+    columns : (C,) int64
+        Lengths of the columns of points.
     """
-    pair = np.empty(first.shape, np.result_type(first, np.complex64))
+    covered = shares * traits[:, 3]
+    np.minimum(covered, traits[:, 4], out=covered)
+    thick = thickness(covered)
+    front, even = in_front(thick, thick * traits[:, 5], columns)
+    return transmittance(front, even), squared_contrast(front, covered, traits[:, :3], columns)
+
+
+def thickness(covered: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the optical thickness of points, ``-log(1 - a)``, (m,).
+
+    Parameters
+    ----------
+    covered : (m,) float32
+        a, the share of its cell that each point covers: its mass over the cell's area, at most the
+        splat's opacity.
+    """
+    left = np.subtract(np.float32(1.0), covered)
+    np.log(left, out=left)
+    return np.asarray(np.negative(left, out=left))
+
+
+def _paired(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[Any]:
+    """Return two real arrays as the real and imaginary parts of one complex array, (m,).
+
+    A running sum over the pair is two running sums in the time of one.
+    """
+    pair = np.empty(first.shape, np.complex128)
     pair.real, pair.imag = first, second
     return pair
 
 
 def in_front(
-    points: Points, thick: NDArray[np.float32], even: NDArray[np.float32]
+    thick: NDArray[np.float32], even: NDArray[np.float32], columns: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the sums of two thicknesses, (m,) each, over the points in front in the same cell."""
-    sums = _before(paired(thick, even), points.columns)
+    values = _paired(thick, even)
+    sums = np.cumsum(values)
+    sums -= values
+    sums -= np.repeat(sums.take(np.cumsum(columns) - columns), columns)
     return sums.real.astype(np.float32), sums.imag.astype(np.float32)
 
 
-def _before(values: NDArray[Any], columns: NDArray[np.int64]) -> NDArray[Any]:
-    """Return for each of `values`, (m,), the sum of those before it in its column, in float64.
-
-    Parameters
-    ----------
-    values : (m,) floating or complex
-    columns : (C,) int64
-        Lengths of the columns, which follow each other.
-    """
-    starts = np.cumsum(columns) - columns
-    steps = np.empty(len(values), np.result_type(values, np.float64))
-    steps[1:] = values[:-1]
-    steps[starts] = 0.0
-    # Subtract the previous column's total, so that the running sum restarts at 0.
-    steps[starts[1:]] = -np.add.reduceat(steps, starts)[:-1]
-    return np.cumsum(steps)
+def _behind(values: NDArray[Any], columns: NDArray[np.int64]) -> NDArray[Any]:
+    """Return for each of `values`, (m,), the sum of those behind it in its column."""
+    sums = np.cumsum(values)
+    return np.asarray(np.repeat(sums.take(np.cumsum(columns) - 1), columns) - sums)
 
 
 def evenness(footprints: Footprints, area: float) -> NDArray[np.float32]:
@@ -448,10 +705,10 @@ def transmittance(front: NDArray[np.float32], even: NDArray[np.float32]) -> NDAr
 
 
 def squared_contrast(
-    points: Points,
     front: NDArray[np.float32],
-    thick: NDArray[np.float32],
-    colors: Sequence[NDArray[Any]],
+    covered: NDArray[np.float32],
+    colors: NDArray[np.float32],
+    columns: NDArray[np.int64],
 ) -> NDArray[np.float32]:
     """Return the squared contrast of each point, (m,).
 
@@ -462,57 +719,49 @@ def squared_contrast(
 
     Parameters
     ----------
-    points : Points
-    front, thick : (m,) float32
-        Optical thickness in front of each point, and its own.
-    colors : sequence of (n,) arrays
-        Channels of the footprints, or two of them `paired`.
+    front, covered : (m,) float32
+        Optical thickness in front of each point, and a.
+    colors : (m, 3) float32
+    columns : (C,) int64
+        Lengths of the columns of points.
     """
-    shown = np.exp(-np.minimum(front, np.float32(60.0)))  # T_k, then T_k a_k
-    left = shown * np.exp(-thick)  # T_{k+1}
-    shown -= left
+    shown = np.exp(-np.minimum(front, np.float32(60.0)))  # T_k
     # Limited, since a colour behind less transmittance than this cannot be seen anyway.
-    scale = np.float32(1.0) / np.maximum(left, np.float32(1e-4))
+    left = np.maximum(shown * (np.float32(1.0) - covered), np.float32(1e-4))  # T_{k+1}
+    shown *= covered  # T_k a_k
+    pair = _behind(_paired(shown * colors[:, 0], shown * colors[:, 1]), columns)
+    last = _behind((shown * colors[:, 2]).astype(np.float64), columns)
     squared = np.zeros_like(front)
-    for pair in colors:
-        color = pair.take(points.owners)  # (m,)
-        behind = _before((shown * color)[::-1], points.columns[::-1])[::-1].astype(pair.dtype)
-        behind *= scale
-        behind -= color
-        squared += np.square(behind.real)
-        if np.iscomplexobj(pair):
-            squared += np.square(behind.imag)
+    for channel, behind in enumerate((pair.real, pair.imag, last)):
+        contrast = behind.astype(np.float32)
+        contrast /= left
+        contrast -= colors[:, channel]
+        contrast *= contrast
+        squared += contrast
     return squared
 
 
 def mean_visible(
-    points: Points,
-    transmittance: NDArray[np.float32],
-    squared_contrast: NDArray[np.float32],
-    count: int,
+    points: Points, visible: NDArray[np.float64], errors: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the means over each footprint of T and of ``T^2 |c - B|^2``, both (count,).
+    """Return the means over each footprint of T and of ``T^2 |c - B|^2``, both (n,).
 
     The first is weighted by alpha, the second by alpha^2; both are 0 outside the image.
 
     Parameters
     ----------
     points : Points
-    transmittance, squared_contrast : (m,) float32
-        Of each point.
-    count : int
-        Number of footprints.
+    visible, errors : (m,) float64
+        Of each point: its share times T, and the square of that times ``|c - B|^2``.
     """
     checkpoint()
-    owners, shares = points.owners, points.shares
-    squares = shares * shares
-    visible = np.bincount(owners, shares * transmittance, count)
-    errors = np.bincount(owners, squares * transmittance * transmittance * squared_contrast, count)
+    count = len(points.inside)
+    owners = points.owners.astype(np.int64)
+    total = np.asarray(np.bincount(owners, errors, count), np.float64)
     # The factors alpha^2 do not sum to 1: divide by their sum, and multiply by the share of the
     # footprint that lies in the image.
-    inside = np.bincount(owners, shares, count)
-    errors = errors * inside / np.maximum(np.bincount(owners, squares, count), 1e-30)
-    return np.asarray(visible, np.float64), np.asarray(errors, np.float64)
+    total *= points.inside / np.maximum(points.squares, 1e-30)
+    return np.asarray(np.bincount(owners, visible, count), np.float64), total
 
 
 def masses(

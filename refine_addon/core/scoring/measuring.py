@@ -228,18 +228,18 @@ def measure_view(
         side = froxels.cell_size(footprints, view, sampling.cell, sampling.density)
         points = froxels.scatter(footprints, view, side, sampling.density)
         alphas = gaussians.alphas[footprints.index]  # (n,)
-        red, green, blue = gaussians.colors[footprints.index].T  # (n,) each
-        colors = (froxels.paired(red, green), blue.copy())
         mass, mass_squared = froxels.masses(footprints, alphas)  # (n,) each
-        evenness = froxels.evenness(footprints, points.area)  # (n,)
-        transmittance = np.empty(len(points.owners), np.float32)  # (m,)
-        squared_contrast = np.empty(len(points.owners), np.float32)  # (m,)
-        for place, piece in points.pieces():
-            thick = froxels.thickness(piece, alphas, mass)
-            front, even = froxels.in_front(piece, thick, thick * evenness.take(piece.owners))
-            transmittance[place] = froxels.transmittance(front, even)
-            squared_contrast[place] = froxels.squared_contrast(piece, front, thick, colors)
-        visible, errors = froxels.mean_visible(points, transmittance, squared_contrast, count)
+        colors = gaussians.colors[footprints.index]  # (n, 3)
+        traits = froxels.traits(footprints, alphas, mass, colors, points.area)  # (n, 6)
+        visible, errors = np.empty((2, len(points.owners)))  # (m,) each
+        for cells, place in points.pieces():
+            shares, mine = points.shares[place], traits.take(points.owners[place], axis=0)
+            seen, squared_contrast = froxels.look(shares, mine, points.columns[cells])
+            seen *= shares
+            visible[place] = seen
+            seen *= seen
+            errors[place] = seen * squared_contrast
+        visible, errors = froxels.mean_visible(points, visible, errors)
         total.contribution[footprints.index] += weight * (mass * visible)
         total.error[footprints.index] += weight * (mass_squared * errors)
     return footprints

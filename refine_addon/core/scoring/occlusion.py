@@ -16,6 +16,7 @@ all that a smaller one does.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -42,7 +43,7 @@ LEAST = 0.1
 
 ROUND_COST = 0.16
 """A round after the first measures about as many blocks of views as cost this share of the first;
-at least two."""
+at least two, at most about half of them."""
 
 COMMON = 0.1
 """Weight of what all splats have grown by, as a share of a splat's sum over all views."""
@@ -395,7 +396,8 @@ class Run:
         # An even number, since an odd one leaves one of two cores idle.
         share = ROUND_COST * len(self.gaussians) / max(len(left), 1)
         pairs = max(round(share * len(numbers) / 2), 1)
-        count = min(2 * pairs, len(numbers))
+        half = math.ceil(len(numbers) / 4)  # in pairs
+        count = min(2 * min(pairs, half), len(numbers))
         which = [numbers[(self._turn + step) % len(numbers)] for step in range(count)]
         self._turn += count
         found = self.measuring.measure(left, which, progress)
