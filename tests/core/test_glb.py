@@ -104,8 +104,8 @@ def test_values_are_activated_and_y_points_up(read):
 def test_what_nodes_do_is_applied(read):
     """A node turned a quarter about x, of twice the size and moved by (1, 0, 0), in a moved one.
 
-    (x, y, z) becomes 2 (x, -z, y) + (1, 0, 0) + (0, 0, 1), and that is turned half about z. The colour along
-    the direction that the turns make of d is that of the untouched file along d.
+    (x, y, z) becomes 2 (x, -z, y) + (1, 0, 0) + (0, 0, 1), and that is turned half about z.
+    The colour along the direction that the turns make of d is that of the untouched file along d.
     """
     content, binary = document()
     plain = read(content, binary)
