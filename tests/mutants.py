@@ -84,6 +84,65 @@ MUTANTS = {
             "median without weights",
         ),
     ],
+    "formats/compressed_ply.py": [
+        (
+            "low * (1.0 - share) + high * share",
+            "low * share + high * (1.0 - share)",
+            "reversed",
+        ),
+        (
+            "(np.arange(1, 255) + 0.5) / 256.0",
+            "np.arange(1, 255) / 256.0",
+            "codes at an end",
+        ),
+        ("len(chunks) < needed", "len(chunks) < needed - 1", "a chunk too few is read"),
+        ("np.minimum.reduceat(values", "np.maximum.reduceat(values", "no range"),
+    ],
+    "formats/dot_splat.py": [
+        ("np.exp(np.asarray(some.log_scales", "(np.asarray(some.log_scales", "log scales stored"),
+        ("    if beyond:", "    if beyond > 31:", "a cut splat is no fault"),
+    ],
+    "formats/format.py": [
+        ("np.where(negative, -others, others)", "others", "sign of the largest component"),
+        ("np.rint(np.clip(shares, 0.0, 1.0) * largest)", "shares * largest", "codes not rounded"),
+        ("    if needed > available:", "    if needed > available + 8:", "a few bytes too few"),
+    ],
+    "formats/glb.py": [
+        ("np.stack([-z, -y, x, w], axis=1)", "np.stack([w, x, y, z], axis=1)", "rotations stay"),
+        ("(-1.0) ** m for band", "(-1.0) ** band for band", "harmonics turned otherwise"),
+        ("if count > len(data):", "if count > 100 * len(data):", "one mesh in many nodes"),
+        ("above @ _matrix(document", "_matrix(document", "parents of nodes"),
+    ],
+    "formats/glb_document.py": [
+        ("end > length or", "", "a value beyond its view"),
+        ("step < size or", "", "values that overlap"),
+        ("kind, data[at : at + size]", "kind, data[at:]", "chunks up to the end of the file"),
+    ],
+    "formats/registry.py": [
+        ("        if not good.all():", "        if good.all():", "undrawable splats written"),
+        ("math.ceil(sizes.row * count) + sizes.fixed", "sizes.fixed", "a size without splats"),
+        (
+            "values if keep is None else values[keep]",
+            "values[: len(rows)]",
+            "columns moved",
+        ),
+    ],
+    "formats/sog.py": [
+        ("np.expm1(np.abs(places))", "np.abs(places)", "positions left logarithmic"),
+        ("pixels[:, 0] + 256 * pixels[:, 1]", "pixels[:, 0]", "labels of 8 bits"),
+        ("across * down > 4 * count + (1 << 16)", "across * down > 1 << 40", "images of any size"),
+        ("wider = spread > widest", "wider = spread < widest", "halved along the narrowest"),
+    ],
+    "formats/spz.py": [
+        ("(whole << 8) >> 8", "whole", "positions without sign"),
+        ("[:, _WXYZ]", "", "rotations x y z w"),
+        (
+            "            if len(found) > length:",
+            "            if len(found) > length + (1 << 40):",
+            "a stream without end",
+        ),
+        ("_INFLATION * len(data)", "1 << 62", "memory by a lying count"),
+    ],
     "formats/ply_columns.py": [
         (
             "sh_rest = planes.transpose(0, 2, 1)",
@@ -378,6 +437,12 @@ TESTS = {
     "invariance": ["scene.py"],
     "affine": ["spherical_harmonics.py"],
     "ply": ["formats/ply_columns.py", "formats/ply_write.py"],
+    "formats": [
+        "formats/dot_splat.py",
+        "formats/format.py",
+        "formats/registry.py",
+    ],
+    "glb": ["formats/glb_document.py"],
 }
 """Modules whose tests are not in the file of their own name; those run first."""
 

@@ -324,7 +324,7 @@ def test_the_command_does_not_write_a_ply_under_a_misleading_name(tmp_path, caps
     assert "only a .ply holds scores" in said
 
 
-def test_a_dry_run_counts_the_bytes_of_the_output(tmp_path, capsys):
+def test_a_dry_run_counts_the_bytes_of_the_output(tmp_path, capsys, cameras):
     """16,000 bytes hold 500 splats of a .splat, at 32 each; nothing is written."""
     (tmp_path / "in.ply").write_bytes(ply_of(scene()))
     (tmp_path / "cameras.json").write_text(CAMERAS)
@@ -335,6 +335,11 @@ def test_a_dry_run_counts_the_bytes_of_the_output(tmp_path, capsys):
     assert code == 0
     assert "would keep 500 of 600 splats" in capsys.readouterr().out
     assert not (tmp_path / "a.splat").exists()
+    for suffix, size in ((".splat", 500 * 32), (".spz", None)):
+        result = prune_file(
+            tmp_path / "in.ply", tmp_path / f"a{suffix}", cameras, Budget(keep=500), dry_run=True
+        )
+        assert result.report["files"]["output_bytes"] == size
 
 
 def test_logits_of_opacities_are_clamped():

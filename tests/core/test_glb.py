@@ -102,10 +102,10 @@ def test_values_are_activated_and_y_points_up(read):
 
 
 def test_what_nodes_do_is_applied(read):
-    """A node turned a quarter about x, of twice the size and moved by (1, 0, 0), in an empty one.
+    """A node turned a quarter about x, of twice the size and moved by (1, 0, 0), in a moved one.
 
-    (x, y, z) becomes 2 (x, -z, y) + (1, 0, 0), and that is turned half about z. The colour along
-    the direction that the turns make of d is that of the untouched file along d.
+    (x, y, z) becomes 2 (x, -z, y) + (1, 0, 0) + (0, 0, 1), and that is turned half about z.
+    The colour along the direction that the turns make of d is that of the untouched file along d.
     """
     content, binary = document()
     plain = read(content, binary)
@@ -116,11 +116,11 @@ def test_what_nodes_do_is_applied(read):
         "scale": [2, 2, 2],
         "translation": [1, 0, 0],
     }
-    content["nodes"] = [{"children": [1]}, child]
+    content["nodes"] = [{"children": [1], "translation": [0, 0, 1]}, child]
 
     splats = read(content, binary)
 
-    np.testing.assert_allclose(splats.means[0], [-3.0, 6.0, 4.0], atol=1e-5)
+    np.testing.assert_allclose(splats.means[0], [-3.0, 6.0, 5.0], atol=1e-5)
     np.testing.assert_allclose(splats.log_scales[0], plain.log_scales[0] + np.log(2.0), atol=1e-6)
     quarter = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     flip = np.diag([-1.0, -1, 1])

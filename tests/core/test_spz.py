@@ -141,9 +141,14 @@ def test_a_stream_that_holds_more_than_it_announces_is_refused(tmp_path):
     data[32 + 16 + 8 : 32 + 16 + 16] = struct.pack("<Q", 1)  # the table's word on it
     path = tmp_path / "a.spz"
     path.write_bytes(data)
+    del parts, data
+    tracemalloc.start()
 
     with pytest.raises(RefineError, match="stream 'opacity' holds more bytes, expected 1"):
         read_splats(path)
+
+    assert tracemalloc.get_traced_memory()[1] < 5_000_000
+    tracemalloc.stop()
 
 
 @pytest.mark.parametrize(
