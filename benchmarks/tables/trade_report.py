@@ -63,8 +63,17 @@ def machine() -> dict[str, str]:
         "date": dt.datetime.now(dt.UTC).strftime("%Y-%m-%d"),
         "processor": f"{_processor()}, {os.cpu_count()} cores, {numba.get_num_threads()} used",
         "system": f"{platform.system()}, Python {platform.python_version()}, {versions}",
+        "load": _load(),
         "splat-transform": splat_transform.version() or "not installed, so not measured",
     }
+
+
+def _load() -> str:
+    """Say how busy the machine was: with more than its cores can do, seconds are too long."""
+    if not hasattr(os, "getloadavg"):
+        return "unknown"
+    minutes = dict(zip((1, 5, 15), os.getloadavg(), strict=True))
+    return f"{minutes[15]:.1f} processes wanted to run, mean of the last 15 minutes"
 
 
 def _version(package: str) -> str:
