@@ -184,7 +184,7 @@ def _published() -> list[Method]:
 
 
 CORE_ABOUT = {
-    "closed-form": "closed form with frustum test, free of units: the default",
+    "closed-form": "closed form with frustum test, free of units: the instant answer",
     "occlusion": "froxels: transmittance and contrast without rendering, in rounds",
     "auto": "occlusion with no more views than the pictures need",
 }

@@ -62,7 +62,7 @@ def _estimate_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
     for row in scene.estimate:
         by_way[row.way].append(row)
     body = [
-        [way, *(f"{row.estimate:.1f} / {row.truth:.1f} ({row.off:+.1f})" for row in rows)]
+        [way, *(f"{row.estimate:.1f} / {row.truth:.1f} ({_signed(row.off)})" for row in rows)]
         for way, rows in by_way.items()
     ]
     errors = [abs(row.off) for row in scene.estimate]
@@ -72,6 +72,10 @@ def _estimate_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
             *table(["estimate / truth", *(f"{ratio:.0%}" for ratio in ratios)], body), "",
             (f"Mean error {sum(errors) / len(errors):.2f} dB, largest {max(errors):.2f} dB.")
             ]  # fmt: skip
+
+
+def _signed(value: float) -> str:
+    return f"{round(value, 1) + 0.0:+.1f}"  # no minus before a zero
 
 
 def _finetune_table(scene: Measured) -> list[str]:
