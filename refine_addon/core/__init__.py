@@ -8,6 +8,7 @@ In short::
 """
 
 from .cameras.read import read_cameras
+from .cleaning.clean import REASONS, Cleaned, Cleaning, clean
 from .errors import Cancelled, RefineError
 from .formats.ply import SplatFile, read_ply
 from .pipeline import prune, prune_file, score
@@ -22,8 +23,11 @@ from .views import View, ViewSet
 
 __all__ = [
     "METHODS",
+    "REASONS",
     "Budget",
     "Cancelled",
+    "Cleaned",
+    "Cleaning",
     "ClosedForm",
     "Occlusion",
     "RefineError",
@@ -34,6 +38,7 @@ __all__ = [
     "Splats",
     "View",
     "ViewSet",
+    "clean",
     "prune",
     "prune_file",
     "rank",
