@@ -31,13 +31,20 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     if given.command == "info":
         return
     try:
-        options.settings(given)
+        if given.command == "clean":
+            options.cleaning(given)
+        else:
+            options.settings(given)
         if given.command == "prune":
             frustum = not given.published
             options.budget(given).refuse_meaningless(given.method, frustum=frustum)
     except RefineError as error:
         parser.error(str(error))
-    if given.method == "occlusion" and (given.published or given.depth != "z"):
+    if (
+        given.command != "clean"
+        and given.method == "occlusion"
+        and (given.published or given.depth != "z")
+    ):
         parser.error("--published and --depth are settings of the closed form")
     if given.command == "prune":
         _check_prune(parser, given)
@@ -100,6 +107,8 @@ def _beginning(path: Path) -> bytes | None:
 
 
 def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    if given.clean and given.object:
+        parser.error("--clean goes with INPUT files, not with --object")
     if bool(given.inputs) == bool(given.object):
         parser.error("expected INPUT files or --object NAME, and not both")
     if given.object:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..core import METHODS, Budget, ClosedForm, RefineError, Settings
+from ..core import METHODS, REASONS, Budget, Cleaning, ClosedForm, RefineError, Settings
 from ..core.whole_file import expanded
 from ..version import VERSION
 from .terminal import shown
@@ -22,7 +22,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of all three subcommands."""
+    """Return the parser of all subcommands."""
     parser = _Parser(
         prog="refine",
         description="Prune 3D Gaussian splats by how much the cameras would miss them.",
@@ -35,6 +35,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     _add_prune(commands)
     _add_score(commands)
+    _add_clean(commands)
     info = commands.add_parser("info", help="say what is in 3DGS PLY files")
     info.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help="3DGS PLY files")
     _add_common(info)
@@ -82,8 +83,32 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "much is removed, and slower; they change; --method then only matters with --threshold and "
         "--min-seen",
     )
+    prune.add_argument(
+        "--clean",
+        action="store_true",
+        help="first remove floaters and outliers, as clean does; the budget counts the rest",
+    )
     prune.add_argument("--dry-run", action="store_true", help="decide and report, write nothing")
     _add_common(prune)
+
+
+def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+    cleaning = commands.add_parser("clean", help="remove what the cameras see to float in the air")
+    cleaning.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a 3DGS PLY file")
+    cleaning.add_argument(
+        "-o", "--output", type=_path, metavar="OUT.ply", help="without it, only say what would go"
+    )
+    _add_cameras(cleaning)
+    cleaning.add_argument(
+        "--reasons",
+        nargs="+",
+        choices=REASONS,
+        default=Cleaning.reasons,
+        metavar="REASON",
+        help=f"which to remove, of {', '.join(REASONS)} (default: {' '.join(Cleaning.reasons)})",
+    )
+    _add_views(cleaning)
+    _add_common(cleaning)
 
 
 def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
@@ -96,13 +121,27 @@ def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     _add_common(scoring)
 
 
-def _add_scoring(parser: argparse.ArgumentParser) -> None:
+def _add_cameras(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cameras",
         type=_given,
         metavar="FILE_OR_FOLDER",
         help="cameras.json, transforms.json or a COLMAP model; default: the open scene's cameras",
     )
+
+
+def _add_views(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--views",
+        type=int,
+        default=64,
+        metavar="N",
+        help="use at most N views, spread out evenly; 0 uses all (default 64)",
+    )
+
+
+def _add_scoring(parser: argparse.ArgumentParser) -> None:
+    _add_cameras(parser)
     parser.add_argument(
         "--method",
         choices=METHODS,
@@ -131,13 +170,7 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
         help="the formula as published, without frustum test and with constants in scene units: "
         "the paper's with --depth z, its authors' code with --depth distance",
     )
-    parser.add_argument(
-        "--views",
-        type=int,
-        default=64,
-        metavar="N",
-        help="use at most N views, spread out evenly; 0 uses all (default 64)",
-    )
+    _add_views(parser)
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
@@ -174,6 +207,11 @@ def settings(options: argparse.Namespace) -> Settings:
     """Return how to score, or raise `RefineError` where a value cannot be."""
     make = ClosedForm.published if options.published else ClosedForm
     return Settings(options.method, options.views, make(options.depth), tolerance=options.tolerance)
+
+
+def cleaning(options: argparse.Namespace) -> Cleaning:
+    """Return what to clean away, or raise `RefineError` where a value cannot be."""
+    return Cleaning(getattr(options, "reasons", Cleaning.reasons), options.views)
 
 
 def budget(options: argparse.Namespace) -> Budget:

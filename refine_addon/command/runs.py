@@ -7,14 +7,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core import RefineError, prune_file, read_cameras, read_ply, score
+from ..core import RefineError, clean, prune_file, read_cameras, read_ply, score
 from ..core.errors import printable
 from ..core.quality import UNSEEN, in_words
 from ..core.report import scoring_notes
 from ..core.whole_file import refuse_existing
 from . import report
 from .info import describe
-from .options import budget, settings
+from .options import budget, cleaning, settings
 from .terminal import Terminal, complain, described
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def execute(options: argparse.Namespace) -> bool:
     if options.report is not None:
         report.check(options.report, overwrite=options.overwrite)
     run = _Run(options)
-    {"prune": _prune, "score": _score, "info": _info}[options.command](run)
+    {"prune": _prune, "score": _score, "clean": _clean, "info": _info}[options.command](run)
     run.finish()
     return not run.failed
 
@@ -71,6 +71,7 @@ class _Run:
         if options.report is None:
             return
         writes = options.command != "info" and not getattr(options, "dry_run", False)
+        writes = writes and (options.command != "clean" or options.output is not None)
         report.write(
             options.report,
             self.entries,
@@ -111,6 +112,7 @@ def _prune_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
         budget(options),
         settings(options),
         absorb=options.absorb,
+        cleaning=cleaning(options) if options.clean else None,
         overwrite=options.overwrite,
         progress=run.terminal.progress(source.name),
     )
@@ -153,6 +155,8 @@ def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
     ]
     target = f" -> {files['output']}" if files["output"] else ""
     run.terminal.say(f"{label}: {', '.join(parts)}{target}")
+    if "cleaned" in done:
+        run.terminal.say(f"  cleaned: {done['cleaned']['words']}")
     quality = _quality(done)
     if quality:
         run.terminal.say(f"  quality: {quality}")
@@ -201,6 +205,33 @@ def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
         "settings": asdict(settings(options)),
         "weights": scores.facts,
         "notes": notes,
+    }
+
+
+def _clean(run: _Run) -> None:
+    views, source = _views(run.options), run.options.inputs[0]
+    run.attempt(str(source), lambda: _clean_one(run, source, views))
+
+
+def _clean_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
+    options = run.options
+    if options.output:
+        refuse_existing(options.output, overwrite=options.overwrite)
+    file = read_ply(source)
+    progress = run.terminal.progress(source.name)
+    found = clean(file.splats(), views, cleaning(options), progress=progress)
+    if options.output:
+        file.write(options.output, found.keep, overwrite=options.overwrite)
+    run.terminal.clear()
+    kept, made = int(found.keep.sum()), f" -> {options.output}" if options.output else ""
+    run.terminal.say(f"{source}: {found.in_words()}; {kept:,} of {len(file):,} splats stay{made}")
+    return {
+        "files": {"input": str(source), "output": str(options.output) if made else None},
+        "splats": {"before": len(file), "kept": kept, "removed": len(file) - kept},
+        "views": {"given": len(views)},
+        "settings": asdict(found.settings),
+        "cleaned": found.facts(),
+        "notes": file.notes(found.keep),
     }
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from . import selection
 from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
+from .cleaning.clean import clean
 from .formats.ply import read_ply
 from .report import Clock, Files, complete_report, make_report
 from .scoring import auto, closed_form, occlusion, sight_lines
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .absorbing.absorb import Absorbed
+    from .cleaning.clean import Cleaned, Cleaning
     from .scores import Scores
     from .scoring.measuring import Measured
     from .selection import RowBytes
@@ -487,6 +489,7 @@ def prune_file(  # noqa: PLR0913 - as `prune`
     settings: Settings = DEFAULTS,
     *,
     absorb: bool = False,
+    cleaning: Cleaning | None = None,
     overwrite: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
@@ -501,6 +504,8 @@ def prune_file(  # noqa: PLR0913 - as `prune`
         The file to write; None decides without writing.
     views, budget, settings, absorb, progress, threads
         See `prune`.
+    cleaning : Cleaning, optional
+        What to clean away first. The budget then counts what is left.
     overwrite : bool
         Whether `output` may replace a file.
 
@@ -523,17 +528,28 @@ def prune_file(  # noqa: PLR0913 - as `prune`
     row_bytes: RowBytes = file.row_bytes
     if absorb and budget.removals(len(file), row_bytes, file.fixed_bytes) != 0:
         row_bytes = file.changed_row_bytes  # how long each becomes is not known before
+    splats, cleaned = file.splats(), None
+    clock.lap("read_s")
+    if cleaning is not None:
+        ahead = part(progress, 0.0, 0.4)
+        cleaned = clean(splats, views, cleaning, progress=ahead, threads=threads)
+        splats = splats.take(cleaned.keep)
+        if isinstance(row_bytes, np.ndarray):
+            row_bytes = row_bytes[cleaned.keep]
+        clock.lap("clean_s")
     task = Task(
         budget=budget,
         settings=settings,
-        splats=file.splats(),
+        splats=splats,
         views=views,
         absorb=absorb,
         row_bytes=row_bytes,
         fixed_bytes=file.fixed_bytes,
     )
-    clock.lap("read_s")
-    result = decide(task, clock=clock, progress=part(progress, 0.0, 0.8), threads=threads)
+    ahead = part(progress, 0.0 if cleaned is None else 0.4, 0.8)
+    result = decide(task, clock=clock, progress=ahead, threads=threads)
+    if cleaned is not None:
+        result = _of_all(result, cleaned)
     report(progress, 0.8, "writing")
     columns = survivor_columns(file.rows, result.absorbed) if result.absorbed else {}
     if target is not None:
@@ -544,3 +560,19 @@ def prune_file(  # noqa: PLR0913 - as `prune`
     sizes = (file.size(), file.size(result.keep, columns))
     complete_report(result.report, clock, Files(str(file.path), made, *sizes))
     return result
+
+
+def _of_all(result: Result, cleaned: Cleaned) -> Result:
+    """Return a result for what cleaning left as one for all splats.
+
+    Its scores stay those of what cleaning left.
+    """
+    keep = cleaned.keep.copy()
+    keep[cleaned.keep] = result.keep
+    absorbed = result.absorbed
+    if absorbed is not None:
+        absorbed = replace(absorbed, keep=keep)
+    total, kept = len(keep), int(np.count_nonzero(keep))
+    result.report["splats"] |= {"before": total, "kept": kept, "removed": total - kept}
+    result.report["cleaned"] = cleaned.facts()
+    return replace(result, keep=keep, absorbed=absorbed)

@@ -12,7 +12,7 @@ Only the second step decides. A splat with nothing behind it, such as one of a s
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -137,6 +137,10 @@ class Cleaned:
     def counts(self) -> dict[str, int]:
         """Return how many splats go for each reason that is switched on."""
         return {name: int(np.count_nonzero(self.found[name])) for name in self.settings.reasons}
+
+    def facts(self) -> dict[str, Any]:
+        """Return what a report says of it."""
+        return {**self.counts(), "words": self.in_words()}
 
     def in_words(self) -> str:
         """Return what goes and why, such as "2,114 in front of surfaces in 3+ views, 301 isolated".
