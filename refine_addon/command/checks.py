@@ -32,20 +32,33 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     if given.command in ("info", "convert"):
         return
     try:
-        settings = options.settings(given)
-        if given.command == "prune":
-            budget = options.budget(given)
-            budget.refuse_meaningless(settings.method, frustum=settings.frustum)
+        _check_settings(parser, given)
     except RefineError as error:
         parser.error(str(error))
-    if settings.method != "closed-form" and (given.published or given.depth != "z"):
-        parser.error("--published and --depth are settings of --method closed-form")
     if given.command == "prune":
         _check_prune(parser, given)
-    elif format_named(given.output):
+    elif given.command == "score" and format_named(given.output):
         parser.error(f"-o {given.output}: only a .ply holds scores")
     if given.cameras is None and not (given.scene and open_blend()):
         parser.error("no cameras: give --cameras, or open a .blend that has some")
+
+
+def _check_settings(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Refuse values that cannot be, and settings of a method that is not used.
+
+    Raises
+    ------
+    RefineError
+        For a value.
+    """
+    if given.command == "clean":
+        options.cleaning(given)
+        return
+    settings = options.settings(given)
+    if given.command == "prune":
+        options.budget(given).refuse_meaningless(settings.method, frustum=settings.frustum)
+    if settings.method != "closed-form" and (given.published or given.depth != "z"):
+        parser.error("--published and --depth are settings of --method closed-form")
 
 
 def open_blend() -> str:
@@ -106,6 +119,8 @@ def _beginning(path: Path) -> bytes | None:
 
 
 def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    if given.clean and given.object:
+        parser.error("--clean goes with INPUT files, not with --object")
     if bool(given.inputs) == bool(given.object):
         parser.error("expected INPUT files or --object NAME, and not both")
     if given.object:

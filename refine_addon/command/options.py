@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..core import METHODS, Budget, ClosedForm, RefineError, Settings
+from ..core import METHODS, REASONS, Budget, Cleaning, ClosedForm, RefineError, Settings
 from ..core.formats.registry import SUFFIXES
 from ..core.whole_file import expanded
 from ..version import VERSION
@@ -38,6 +38,7 @@ def make_parser() -> argparse.ArgumentParser:
     )
     _add_prune(commands)
     _add_score(commands)
+    _add_clean(commands)
     _add_convert(commands)
     info = commands.add_parser("info", help="say what is in files of splats")
     info.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help="files of splats")
@@ -92,8 +93,32 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "much is removed, and slower; they change; --method then only matters with --threshold and "
         "--min-seen",
     )
+    prune.add_argument(
+        "--clean",
+        action="store_true",
+        help="first remove floaters and outliers, as clean does; the budget counts the rest",
+    )
     prune.add_argument("--dry-run", action="store_true", help="decide and report, write nothing")
     _add_common(prune)
+
+
+def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+    cleaning = commands.add_parser("clean", help="remove what the cameras see to float in the air")
+    cleaning.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a 3DGS PLY file")
+    cleaning.add_argument(
+        "-o", "--output", type=_path, metavar="OUT.ply", help="without it, only say what would go"
+    )
+    _add_cameras(cleaning)
+    cleaning.add_argument(
+        "--reasons",
+        nargs="+",
+        choices=REASONS,
+        default=Cleaning.reasons,
+        metavar="REASON",
+        help=f"which to remove, of {', '.join(REASONS)} (default: {' '.join(Cleaning.reasons)})",
+    )
+    _add_views(cleaning)
+    _add_common(cleaning)
 
 
 def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
@@ -113,13 +138,27 @@ def _add_convert(commands: Any) -> None:  # noqa: ANN401 - argparse does not nam
     _add_common(convert)
 
 
-def _add_scoring(parser: argparse.ArgumentParser) -> None:
+def _add_cameras(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cameras",
         type=_given,
         metavar="FILE_OR_FOLDER",
         help="cameras.json, transforms.json or a COLMAP model; default: the open scene's cameras",
     )
+
+
+def _add_views(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--views",
+        type=int,
+        default=64,
+        metavar="N",
+        help="use at most N views, spread out evenly; 0 uses all (default 64)",
+    )
+
+
+def _add_scoring(parser: argparse.ArgumentParser) -> None:
+    _add_cameras(parser)
     parser.add_argument(
         "--method",
         choices=METHODS,
@@ -150,13 +189,7 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
         "the paper's with --depth z, its authors' code with --depth distance; only with --method "
         "closed-form",
     )
-    parser.add_argument(
-        "--views",
-        type=int,
-        default=64,
-        metavar="N",
-        help="use at most N views, spread out evenly; 0 uses all (default 64)",
-    )
+    _add_views(parser)
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
@@ -193,6 +226,11 @@ def settings(options: argparse.Namespace) -> Settings:
     """Return how to score, or raise `RefineError` where a value cannot be."""
     make = ClosedForm.published if options.published else ClosedForm
     return Settings(options.method, options.views, make(options.depth), tolerance=options.tolerance)
+
+
+def cleaning(options: argparse.Namespace) -> Cleaning:
+    """Return what to clean away, or raise `RefineError` where a value cannot be."""
+    return Cleaning(getattr(options, "reasons", Cleaning.reasons), options.views)
 
 
 def budget(options: argparse.Namespace) -> Budget:

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core import RefineError, as_written, prune_file, read_cameras, read_splats, score
+from ..core import RefineError, as_written, clean, prune_file, read_cameras, read_splats, score
 from ..core.errors import printable
 from ..core.quality import UNSEEN, in_words
 from ..core.report import scoring_notes
 from ..core.whole_file import refuse_existing, refuse_mapped
 from . import report
 from .info import describe
-from .options import budget, settings
+from .options import budget, cleaning, settings
 from .terminal import Terminal, complain, described
 
 if TYPE_CHECKING:
@@ -38,7 +38,13 @@ def execute(options: argparse.Namespace) -> bool:
     if options.report is not None:
         report.check(options.report, overwrite=options.overwrite)
     run = _Run(options)
-    works = {"prune": _prune, "score": _score, "convert": _convert, "info": _info}
+    works = {
+        "prune": _prune,
+        "score": _score,
+        "clean": _clean,
+        "convert": _convert,
+        "info": _info,
+    }
     works[options.command](run)
     run.finish()
     return not run.failed
@@ -74,6 +80,7 @@ class _Run:
         if options.report is None:
             return
         writes = options.command != "info" and not getattr(options, "dry_run", False)
+        writes = writes and (options.command != "clean" or options.output is not None)
         report.write(
             options.report,
             self.entries,
@@ -114,6 +121,7 @@ def _prune_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
         budget(options),
         settings(options),
         absorb=options.absorb,
+        cleaning=cleaning(options) if options.clean else None,
         overwrite=options.overwrite,
         dry_run=options.dry_run,
         progress=run.terminal.progress(source.name),
@@ -157,6 +165,8 @@ def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
     ]
     target = f" -> {files['output']}" if files["output"] else ""
     run.terminal.say(f"{label}: {', '.join(parts)}{target}")
+    if "cleaned" in done:
+        run.terminal.say(f"  cleaned: {done['cleaned']['words']}")
     quality = _quality(done)
     if quality:
         run.terminal.say(f"  quality: {quality}")
@@ -241,6 +251,35 @@ def _convert_one(run: _Run, source: Path) -> dict[str, Any]:
         },
         "splats": {"before": len(file)},
         "notes": notes,
+    }
+
+
+def _clean(run: _Run) -> None:
+    views, source = _views(run.options), run.options.inputs[0]
+    run.attempt(str(source), lambda: _clean_one(run, source, views))
+
+
+def _clean_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
+    options = run.options
+    if options.output:
+        refuse_existing(options.output, overwrite=options.overwrite)
+        refuse_mapped(options.output, source)
+    file = read_splats(source)
+    progress = run.terminal.progress(source.name)
+    found = clean(file.splats(), views, cleaning(options), progress=progress)
+    made = as_written(file, options.output)
+    if options.output:
+        made.write(options.output, found.keep, overwrite=options.overwrite)
+    run.terminal.clear()
+    kept, to = int(found.keep.sum()), f" -> {options.output}" if options.output else ""
+    run.terminal.say(f"{source}: {found.in_words()}; {kept:,} of {len(file):,} splats stay{to}")
+    return {
+        "files": {"input": str(source), "output": str(options.output) if to else None},
+        "splats": {"before": len(file), "kept": kept, "removed": len(file) - kept},
+        "views": {"given": len(views)},
+        "settings": asdict(found.settings),
+        "cleaned": found.facts(),
+        "notes": made.notes(found.keep),
     }
 
 

@@ -8,6 +8,7 @@ In short::
 """
 
 from .cameras.read import read_cameras
+from .cleaning.clean import REASONS, Cleaned, Cleaning, clean
 from .errors import Cancelled, RefineError
 from .formats.ply import SplatFile, read_ply
 from .formats.registry import as_written, read_splats
@@ -23,8 +24,11 @@ from .views import View, ViewSet
 
 __all__ = [
     "METHODS",
+    "REASONS",
     "Budget",
     "Cancelled",
+    "Cleaned",
+    "Cleaning",
     "ClosedForm",
     "Occlusion",
     "RefineError",
@@ -36,6 +40,7 @@ __all__ = [
     "View",
     "ViewSet",
     "as_written",
+    "clean",
     "prune",
     "prune_file",
     "rank",

@@ -17,6 +17,7 @@ import numpy as np
 from . import selection
 from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
+from .cleaning.clean import clean
 from .formats.registry import Packed, as_written, read_splats, refuse_unknown_size
 from .report import Clock, Files, complete_report, make_report
 from .scoring import auto, closed_form, occlusion, sight_lines
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .absorbing.absorb import Absorbed
+    from .cleaning.clean import Cleaned, Cleaning
     from .scores import Scores
     from .scoring.measuring import Measured
     from .selection import RowBytes
@@ -486,6 +488,7 @@ def prune_file(  # noqa: PLR0913 - as `prune`
     settings: Settings = DEFAULTS,
     *,
     absorb: bool = False,
+    cleaning: Cleaning | None = None,
     overwrite: bool = False,
     dry_run: bool = False,
     progress: Progress = silent,
@@ -502,6 +505,8 @@ def prune_file(  # noqa: PLR0913 - as `prune`
         a plain PLY.
     views, budget, settings, absorb, progress, threads
         See `prune`.
+    cleaning : Cleaning, optional
+        What to clean away first. The budget then counts what is left.
     overwrite : bool
         Whether `output` may replace a file.
     dry_run : bool
@@ -531,17 +536,28 @@ def prune_file(  # noqa: PLR0913 - as `prune`
         refuse_unknown_size(made.form)
     if absorb and budget.removals(len(file), row_bytes, made.fixed_bytes) != 0:
         row_bytes = made.changed_row_bytes  # how long each becomes is not known before
+    splats, cleaned = file.splats(), None
+    clock.lap("read_s")
+    if cleaning is not None:
+        ahead = part(progress, 0.0, 0.4)
+        cleaned = clean(splats, views, cleaning, progress=ahead, threads=threads)
+        splats = splats.take(cleaned.keep)
+        if isinstance(row_bytes, np.ndarray):
+            row_bytes = row_bytes[cleaned.keep]
+        clock.lap("clean_s")
     task = Task(
         budget=budget,
         settings=settings,
-        splats=file.splats(),
+        splats=splats,
         views=views,
         absorb=absorb,
         row_bytes=row_bytes,
         fixed_bytes=made.fixed_bytes,
     )
-    clock.lap("read_s")
-    result = decide(task, clock=clock, progress=part(progress, 0.0, 0.8), threads=threads)
+    ahead = part(progress, 0.0 if cleaned is None else 0.4, 0.8)
+    result = decide(task, clock=clock, progress=ahead, threads=threads)
+    if cleaned is not None:
+        result = _of_all(result, cleaned)
     report(progress, 0.8, "writing")
     columns = survivor_columns(file.rows, result.absorbed) if result.absorbed else {}
     sizes = (file.stored_bytes, made.size(result.keep, columns))
@@ -553,3 +569,19 @@ def prune_file(  # noqa: PLR0913 - as `prune`
     names = (str(file.path), None if written is None else str(written))
     complete_report(result.report, clock, Files(*names, *sizes))
     return result
+
+
+def _of_all(result: Result, cleaned: Cleaned) -> Result:
+    """Return a result for what cleaning left as one for all splats.
+
+    Its scores stay those of what cleaning left.
+    """
+    keep = cleaned.keep.copy()
+    keep[cleaned.keep] = result.keep
+    absorbed = result.absorbed
+    if absorbed is not None:
+        absorbed = replace(absorbed, keep=keep)
+    total, kept = len(keep), int(np.count_nonzero(keep))
+    result.report["splats"] |= {"before": total, "kept": kept, "removed": total - kept}
+    result.report["cleaned"] = cleaned.facts()
+    return replace(result, keep=keep, absorbed=absorbed)

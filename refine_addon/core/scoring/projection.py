@@ -99,6 +99,12 @@ class Footprints:
     sigmas: NDArray[np.float32]
     inside: NDArray[np.bool_]
 
+    def take(self, rows: NDArray[np.int64]) -> Footprints:
+        """Return some footprints, in that order."""
+        return Footprints(
+            *(np.take(getattr(self, item.name), rows, axis=-1) for item in fields(self))
+        )
+
 
 def prepare(
     splats: Splats, views: ViewSet, *, progress: Progress = silent, threads: int | None = None
@@ -213,6 +219,14 @@ def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
     checkpoint()
     order = _by_depth(depth)
     return Footprints(index[order], *(np.take(values, order, axis=-1) for values in rest))
+
+
+def in_camera(
+    gaussians: Gaussians, scene: Scene, view: View
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return centres, (3, M), and covariances, (6, M), in camera coordinates, scene sizes."""
+    turned = _rotation6(view.rotation @ scene.axes.T) @ gaussians.covariances
+    return _local(gaussians.means, scene, view), turned
 
 
 def _nothing() -> Footprints:

@@ -241,11 +241,7 @@ class SightLines:
         footprints : Footprints
             Of these in this view.
         """
-        view = self.views[number][0]
-        size = float(view.width * view.height)
-        area = _reach(gaussians.alphas[footprints.index])  # (n,)
-        area *= np.float32(math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
-        met = float(np.minimum(area, np.float32(size)).sum(dtype=np.float64)) / size
+        met = crowding(gaussians, footprints, self.views[number][0])
         count = min(LINES, MOST_MET / max(met, 1.0)) / len(self.views)
         columns, rows = self.pixels(number, count)
         self.lines[number] = meet(gaussians, footprints, columns, rows)
@@ -547,6 +543,14 @@ def spread(size: int, count: int, start: float) -> NDArray[np.int64]:
     """Return `count` of `size` pixels, evenly spread and ascending; `start` shifts them, 0 to 1."""
     places = (np.arange(count) + start) * (size / count)
     return np.asarray(np.floor(places), np.int64)
+
+
+def crowding(gaussians: Gaussians, footprints: Footprints, view: View) -> float:
+    """Return about how many footprints a line of sight of a view meets, at most all of them."""
+    size = float(view.width * view.height)
+    area = _reach(gaussians.alphas[footprints.index])  # (n,), px^2
+    area *= np.float32(math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
+    return float(np.minimum(area, np.float32(size)).sum(dtype=np.float64)) / size
 
 
 def meet(

@@ -1,0 +1,1 @@
+"""Floaters and outliers: what the cameras tell of splats that belong to no surface."""

@@ -1,0 +1,196 @@
+"""Floaters and outliers: what cameras see past goes, what is a surface stays."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+from refine_addon.core import Cleaning, RefineError, Splats, View, ViewSet, clean
+from refine_addon.core.cleaning.clusters import connected
+
+SIDE = 24
+"""Splats along each side of the wall."""
+
+
+def made(means, scale, opacity, color):
+    """Return round splats of one kind."""
+    means = np.atleast_2d(np.asarray(means, np.float32))
+    count = len(means)
+    return Splats(
+        means,
+        np.full((count, 3), np.log(scale), np.float32),
+        np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        np.full(count, np.log(opacity / (1 - opacity)), np.float32),
+        np.full((count, 3), (color - 0.5) / 0.28209479, np.float32),
+        np.zeros((count, 0, 3), np.float32),
+    )
+
+
+def joined(*parts):
+    """Return all splats of some sets."""
+    names = [item.name for item in fields(Splats)]
+    return Splats(**{name: np.concatenate([getattr(s, name) for s in parts]) for name in names})
+
+
+def wall():
+    """Return a dense, opaque, white wall at z = 4: neighbours overlap at 1.5 sigmas."""
+    line = np.linspace(-3.0, 3.0, SIDE)
+    x, y = (axis.ravel() for axis in np.meshgrid(line, line))
+    return made(np.stack([x, y, np.full_like(x, 4.0)], axis=1), 0.17, 0.95, 0.9)
+
+
+def cameras(count=6):
+    """Return views that stand side by side and look at the wall."""
+    places = np.linspace(-1.0, 1.0, count)
+    views = [View(np.eye(3), np.array([x, 0.1 * x, 0]), 60, 60, 40, 30, 80, 60) for x in places]
+    return ViewSet(tuple(replace(view, name=str(k)) for k, view in enumerate(views)))
+
+
+FLOATER = made([[0.1, 0.0, 2.0]], 0.06, 0.8, 0.1)
+
+
+def test_what_views_see_past_goes_as_being_in_front():
+    """All six views see the dark splat at half the depth of the white wall; nothing is near it."""
+    splats = joined(wall(), FLOATER)
+
+    found = clean(splats, cameras())
+
+    assert np.flatnonzero(~found.keep).tolist() == [SIDE**2]
+    assert found.counts() == {"front": 1, "isolated": 0, "giant": 0, "needle": 0}
+    assert found.in_words() == "1 in front of surfaces in 3+ views"
+
+
+def test_a_wall_stays_whole():
+    """Each splat of the wall has others beside it, and nothing lies behind them."""
+    found = clean(wall(), cameras())
+
+    assert found.keep.all()
+    assert found.in_words() == "nothing to clean away"
+
+
+def test_a_clump_in_front_of_the_wall_is_isolated():
+    """Its 12 opaque splats support each other, but with all of them gone nothing does."""
+    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (12, 3))
+    splats = joined(wall(), made(places, 0.06, 0.95, 0.1))
+
+    found = clean(splats, cameras())
+
+    assert found.keep[: SIDE**2].all()
+    assert not found.keep[SIDE**2 :].any()
+    assert found.found["isolated"].sum() >= 6
+
+
+def test_a_clump_of_many_splats_is_a_thing():
+    """A cluster of 200 splats or more is no floater, wherever it is."""
+    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.1, (260, 3))
+    splats = joined(wall(), made(places, 0.06, 0.95, 0.1))
+
+    assert clean(splats, cameras()).keep.all()
+
+
+def test_a_veil_before_the_wall_is_giant():
+    """Its standard deviation reaches across 60 x 1.5 / 2 = 45 of 80 pixels."""
+    splats = joined(wall(), made([[0.0, 0.0, 2.0]], 1.5, 0.2, 0.1))
+
+    found = clean(splats, cameras())
+
+    assert found.counts() == {"front": 0, "isolated": 0, "giant": 1, "needle": 0}
+    assert found.keep[: SIDE**2].all()
+
+
+def test_a_dome_behind_all_stays():
+    """Vast splats behind the wall and around it are the last that the light meets."""
+    splats = joined(made([[0.0, 0.0, 9.0], [4.0, 0.0, 9.0]], 3.0, 0.9, 0.5), wall())
+
+    assert clean(splats, cameras()).keep.all()
+
+
+def test_what_changes_no_pixel_is_nearly_transparent_and_stays():
+    """Opacity .015 against white changes a pixel by at most 3 of 255."""
+    splats = joined(wall(), made([[0.1, 0.0, 2.0]], 0.06, 0.015, 0.1))
+
+    assert clean(splats, cameras()).keep.all()
+    asked = clean(splats, cameras(), Cleaning(("transparent",)))
+    assert np.flatnonzero(~asked.keep).tolist() == [SIDE**2]
+
+
+def test_switches_and_protection_spare():
+    """A reason that is off takes nothing, and a protected splat has no reason."""
+    splats = joined(wall(), FLOATER)
+    protected = np.arange(len(splats)) == SIDE**2
+
+    assert clean(splats, cameras(), Cleaning(("giant",))).keep.all()
+    spared = clean(splats, cameras(), protected=protected)
+    assert spared.keep.all()
+    assert not spared.found["front"].any()
+
+
+def test_one_view_is_enough_where_no_other_sees_it():
+    """A splat close to the one camera there is; the words say so."""
+    found = clean(joined(wall(), FLOATER), cameras(1))
+
+    assert found.in_words() == "1 in front of surfaces in all of the 1 or 2 views that see them"
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_neither_order_nor_unit_nor_frame_decides(unit):
+    """The scene reversed, turned by a quarter about x and in another unit loses the same splats."""
+    turn = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+    splats, views = joined(wall(), FLOATER), cameras()
+    other = replace(
+        splats.take(slice(None, None, -1)),
+        means=((splats.means[::-1] @ turn.T + 5.0) * unit).astype(np.float32),
+        log_scales=(splats.log_scales[::-1] + np.log(unit)).astype(np.float32),
+    )
+    poses = [
+        replace(view, rotation=view.rotation @ turn.T, center=(turn @ view.center + 5.0) * unit)
+        for view in views
+    ]
+
+    expected = clean(splats, views).keep
+
+    assert np.array_equal(clean(other, ViewSet(tuple(poses[::-1]))).keep[::-1], expected)
+
+
+def test_extreme_and_undrawable_splats_are_survived():
+    """No warning, which would be an error here; what no renderer draws is nobody's floater."""
+    odd = made(np.zeros((6, 3)), 0.1, 0.5, 0.5)
+    odd.means[:4] = [[np.nan, 0, 0], [3e38, 0, 0], [0, 0, 1e-30], [0, 0, 2]]
+    odd.log_scales[3:] = [[80, 80, 80], [-np.inf, -np.inf, -np.inf], [-90, 3, -90]]
+    odd.opacity_logits[2] = np.inf
+
+    found = clean(joined(wall(), odd), cameras())
+
+    assert found.keep[: SIDE**2].all()
+    assert found.keep[SIDE**2 : SIDE**2 + 2].all()
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_next_to_nothing_is_survived(count):
+    """No splats, or one alone, behind which nothing is: nothing to clean away."""
+    assert clean(FLOATER.take(slice(count)), cameras()).keep.all()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Cleaning(("fog",)), "reason is 'fog', expected some of front, isolated, giant"),
+        (lambda: Cleaning(()), "reason is none, expected"),
+        (lambda: Cleaning(views=-1), "views is -1, expected 0 (all) or more"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(make, message):
+    """The message names the value and what was expected."""
+    with pytest.raises(RefineError) as caught:
+        make()
+    assert str(caught.value).startswith(message)
+
+
+def test_connected_parts_have_one_number():
+    """A ring of 1,000 nodes in any order is one part, whatever the rounds it takes."""
+    random = np.random.default_rng(0)
+    ring = random.permutation(1000)
+
+    assert not connected(1000, ring, np.roll(ring, 1)).any()
