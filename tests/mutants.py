@@ -408,6 +408,22 @@ MUTANTS = {
         ("order[tied] = rows[np.lexsort((ties(rows), code[rows]))]", "pass", "ties by row"),
         ("+ views_squared", "", "views forgotten"),
     ],
+    "cleaning/sight.py": [
+        (
+            "depth = depth + slope[owner] * along",
+            "depth = depth + 0.0",
+            "no slope",
+        ),
+        ("lines.dark * present", "lines.dark + 0.0 * present", "suspects hide what lies behind"),
+    ],
+    "cleaning/clean.py": [
+        ("(seen.views > 0) & ", "", "who sees nothing sees past"),
+        ("found[name] &= ~protected", "pass", "protected ones go"),
+        ("sizes < max(SMALL", "sizes < min(SMALL", "clusters of any size"),
+    ],
+    "cleaning/clusters.py": [
+        ("labels = jumped", "break", "parts that are not joined"),
+    ],
     "absorbing/neighbours.py": [
         (
             "key[candidates == np.arange(piece.start, piece.stop)[:, None]] = _NOBODY",
@@ -434,6 +450,7 @@ TESTS = {
         "scoring/coverage.py",
     ],
     "absorb": ["absorbing/merge_field.py", "absorbing/merging.py", "absorbing/merge_graph.py"],
+    "cleaning": ["cleaning/sight.py", "cleaning/clean.py", "cleaning/clusters.py"],
     "invariance": ["scene.py"],
     "affine": ["spherical_harmonics.py"],
     "ply": ["formats/ply_columns.py", "formats/ply_write.py"],

@@ -48,8 +48,9 @@ REASONS = {
 DEFAULT_REASONS = ("front", "isolated", "giant", "needle")
 """All but the nearly transparent, which no picture shows."""
 
-LONE = 0.28
-"""A splat is suspect if others support less than this share of its light."""
+DOUBTED, LONE = 0.35, 0.25
+"""A splat is suspect if others support less than the first share of its light; below the second it
+stands alone, and may be found to be in front of surfaces."""
 
 SMALL, SMALL_SHARE = 200, 0.001
 """A cluster of fewer splats than this number, or than this share of all, is suspect."""
@@ -57,7 +58,7 @@ SMALL, SMALL_SHARE = 200, 0.001
 SOLID = 0.1
 """Splats of lower opacity do not hold clusters together."""
 
-HUGE, GIANT = 0.15, 0.25
+HUGE, GIANT = 0.15, 0.2
 """A giant is longer than this many scene sizes, and its standard deviation reaches across this
 share of a picture's longer side."""
 
@@ -65,7 +66,7 @@ SLENDER, LONG = 10.0, 0.05
 """A needle is this many times as long as wide, and its standard deviation reaches across this share
 of a picture's longer side."""
 
-SUPPORT, GIANT_SUPPORT = 0.1, 0.3
+SUPPORT, GIANT_SUPPORT = 0.1, 0.5
 """What less of the light stops near than this share has no surface. Giants cross surfaces."""
 
 VIEWS = 3
@@ -74,7 +75,7 @@ VIEWS = 3
 AGREE = 0.85
 """Share of the views that must see past it."""
 
-VISIBLE, GIANT_VISIBLE = 4 / 255, 1 / 255
+VISIBLE, GIANT_VISIBLE = 4 / 255, 0.5 / 255
 """By how much a splat must change a pixel, as its opacity times its contrast to what lies behind. A
 giant changes all pixels."""
 
@@ -240,9 +241,9 @@ class _Run:
         support, widest = self._support(part(progress, 0.0, 0.5))
         giant = (self.gaussians.largest >= HUGE) & (widest >= GIANT)
         needle = self.slender & (widest >= LONG) & ~giant
-        lone = support < LONE
+        doubted, lone = support < DOUBTED, support < LONE
         small = self._clusters(~lone & ~giant, part(progress, 0.5, 0.6))
-        self._judge(lone | giant | needle | small, part(progress, 0.6, 1.0))
+        self._judge(doubted | giant | needle | small, part(progress, 0.6, 1.0))
         effect = self._effect()
         floats = ~giant & self._floats(SUPPORT) & self._agreed()
         visible = floats & (effect >= VISIBLE)
@@ -251,7 +252,7 @@ class _Run:
             "isolated": visible & small & ~needle,
             "giant": giant & self._floats(GIANT_SUPPORT) & (effect >= GIANT_VISIBLE),
             "needle": visible & needle,
-            "transparent": floats & ~visible,
+            "transparent": floats & lone & ~visible,
         }
 
     def _support(self, progress: Progress) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

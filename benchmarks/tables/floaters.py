@@ -1,0 +1,177 @@
+"""Floaters put into a scene, and how many of them cleaning finds, at what cost.
+
+::
+
+    python -m benchmarks.tables.floaters SCENE_DIR ... --seed 7
+
+Of 2,000 floaters, 1,100 stand in front of a camera, each by itself; 800 form blobs of 5 to 59 in
+free space; 100 are huge veils. Size, opacity, colour and place vary. Free space is what lies in
+front of the depth at which half of a line of sight's light is gone. The train views place floaters
+and decide; the test views only judge, against renders of the unpolluted scene and real pictures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from refine_addon.core.cleaning.clean import clean
+from refine_addon.core.scoring import projection, sight_lines
+from refine_addon.core.splats import SH_C0, Splats
+
+from .evaluate import Evaluator, read_scene
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from refine_addon.core.views import View, ViewSet
+
+COUNTS = {"front": 1100, "blob": 800, "veil": 100}
+
+
+class Places:
+    """Random places in free space, as views see it.
+
+    Parameters
+    ----------
+    splats : Splats
+    views : ViewSet
+    """
+
+    def __init__(self, splats: Splats, views: ViewSet) -> None:
+        sights = sight_lines.sights(splats, views)
+        gaussians, scene, _ = projection.prepare(splats, views)
+        self.size = scene.size
+        self.found: list[tuple[View, NDArray[np.float64], NDArray[np.float64]]] = []
+        for (view, _), lines in zip(sights.views, sights.lines, strict=True):
+            if lines is None or not len(lines.line):
+                continue
+            local, _ = projection.in_camera(gaussians.take(lines.met), scene, view)
+            depth = local[2][lines.owner] * scene.size
+            dark = lines.dark.astype(np.float64)
+            first = np.flatnonzero(np.diff(lines.line, prepend=-1))
+            total = np.cumsum(dark)
+            before = np.repeat(total[first] - dark[first], np.diff(np.append(first, len(dark))))
+            half = np.flatnonzero(total - before < np.log(0.5))
+            line, place = np.unique(lines.line[half], return_index=True)
+            across = lines.columns[line % len(lines.columns)] + 0.5
+            down = lines.rows[line // len(lines.columns)] + 0.5
+            ray = [(across - view.cx) / view.fx, (down - view.cy) / view.fy, np.ones(len(line))]
+            if len(line):
+                self.found.append((view, np.stack(ray, axis=1), depth[half[place]]))
+
+    def draw(
+        self, random: np.random.Generator, count: int, low: float, high: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return places, (count, 3), at `low` to `high` of a surface's depth, and their depths."""
+        places, depths = np.empty((count, 3)), np.empty(count)
+        for k in range(count):
+            view, rays, surface = self.found[random.integers(len(self.found))]
+            line = random.integers(len(rays))
+            depths[k] = surface[line] * random.uniform(low, high)
+            places[k] = view.center + rays[line] * depths[k] @ view.rotation
+        return places, depths
+
+
+def floaters(splats: Splats, views: ViewSet, seed: int) -> tuple[Splats, NDArray[np.int64]]:
+    """Return floaters for a scene, and which of `COUNTS` each is, (n,)."""
+    random = np.random.default_rng(seed)
+    free = Places(splats, views)
+    rows: list[tuple[NDArray[np.float64], ...]] = [_front(random, free), *_blobs(random, free)]
+    rows.append(_veils(random, free))
+    means, scales, alphas, colors = (np.concatenate(part) for part in zip(*rows, strict=True))
+    count = len(means)
+    made = Splats(
+        means.astype(np.float32),
+        np.log(scales).astype(np.float32),
+        random.normal(size=(count, 4)).astype(np.float32),
+        np.log(alphas / (1.0 - alphas)).astype(np.float32),
+        ((colors - 0.5) / SH_C0).astype(np.float32),
+        random.normal(0.0, 0.05, (count, *splats.sh_rest.shape[1:])).astype(np.float32),
+    )
+    return made, np.repeat(np.arange(3), list(COUNTS.values()))
+
+
+def _log_uniform(
+    random: np.random.Generator, low: float, high: float, size: tuple[int, ...]
+) -> NDArray[np.float64]:
+    return np.asarray(np.exp(random.uniform(np.log(low), np.log(high), size)))
+
+
+def _front(random: np.random.Generator, free: Places) -> tuple[NDArray[np.float64], ...]:
+    count = COUNTS["front"]
+    means, depths = free.draw(random, count, 0.05, 0.6)
+    scales = (depths * _log_uniform(random, 0.004, 0.08, (count,)))[:, None]
+    scales = scales * _log_uniform(random, 0.2, 1.0, (count, 3))
+    return means, scales, random.uniform(0.05, 0.95, count), random.uniform(0.0, 1.0, (count, 3))
+
+
+def _blobs(random: np.random.Generator, free: Places) -> list[tuple[NDArray[np.float64], ...]]:
+    blobs, left = [], COUNTS["blob"]
+    while left:
+        count = min(int(random.integers(5, 60)), left)
+        left -= count
+        center, depth = free.draw(random, 1, 0.2, 0.8)
+        radius = depth * _log_uniform(random, 0.01, 0.06, (1,))
+        means = center + random.normal(size=(count, 3)) * radius / 2.0
+        scales = radius * _log_uniform(random, 0.1, 0.6, (count, 1))
+        scales = scales * _log_uniform(random, 0.3, 1.0, (count, 3))
+        alphas = random.uniform(0.2, 0.95) * random.uniform(0.5, 1.0, count)
+        colors = random.uniform(0.0, 1.0, 3) + random.normal(0.0, 0.1, (count, 3))
+        blobs.append((means, scales, alphas, colors.clip(0.0, 1.0)))
+    return blobs
+
+
+def _veils(random: np.random.Generator, free: Places) -> tuple[NDArray[np.float64], ...]:
+    count = COUNTS["veil"]
+    means, _ = free.draw(random, count, 0.1, 0.9)
+    scales = free.size * _log_uniform(random, 0.3, 2.0, (count, 1))
+    scales = scales * _log_uniform(random, 0.1, 1.0, (count, 3))
+    return means, scales, random.uniform(0.01, 0.1, count), random.uniform(0.0, 1.0, (count, 3))
+
+
+def joined(first: Splats, second: Splats) -> Splats:
+    """Return all splats of both."""
+    pairs = {f.name: (getattr(first, f.name), getattr(second, f.name)) for f in fields(Splats)}
+    return Splats(**{name: np.concatenate(pair) for name, pair in pairs.items()})
+
+
+def main() -> int:
+    """Print a line for each scene."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE_DIR")
+    parser.add_argument("--seed", type=int, default=7)
+    options = parser.parse_args()
+    print("scene: recall (front blob veil), true splats taken, seconds, PSNR: before dirty cleaned")
+    for folder in options.scenes:
+        scene = read_scene(folder)
+        made, kinds = floaters(scene.splats, scene.train, options.seed)
+        dirty, count = joined(scene.splats, made), len(scene.splats)
+        start = time.process_time()
+        found = clean(dirty, scene.train)
+        seconds = time.process_time() - start
+        gone = ~found.keep[count:]
+        recalls = " ".join(f"{gone[kinds == kind].mean():.1%}" for kind in range(3))
+        true = float(np.mean(~found.keep[:count]))
+        judge = Evaluator(scene.splats, scene.test, scene.pictures, metrics=("psnr",))
+        cells = []
+        for splats in (scene.splats, dirty, dirty.take(found.keep)):
+            quality = judge.evaluate(splats)
+            pictures = quality.pictures.mean["psnr"] if quality.pictures else float("nan")
+            cells.append(f"{quality.renders.mean['psnr']:.2f} ({pictures:.2f})")
+        print(
+            f"{folder.name}: {gone.mean():.1%} ({recalls}), {true:.3%}, {seconds:.0f} s, "
+            f"{' '.join(cells)}; {found.in_words()}",
+            flush=True,
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
