@@ -58,7 +58,7 @@ SMALL, SMALL_SHARE = 200, 0.001
 SOLID = 0.1
 """Splats of lower opacity do not hold clusters together."""
 
-HUGE, GIANT = 0.15, 0.2
+HUGE, GIANT = 0.15, 0.25
 """A giant is longer than this many scene sizes, and its standard deviation reaches across this
 share of a picture's longer side."""
 
@@ -66,7 +66,7 @@ SLENDER, LONG = 10.0, 0.05
 """A needle is this many times as long as wide, and its standard deviation reaches across this share
 of a picture's longer side."""
 
-SUPPORT, GIANT_SUPPORT = 0.1, 0.5
+SUPPORT, GIANT_SUPPORT = 0.1, 0.3
 """What less of the light stops near than this share has no surface. Giants cross surfaces."""
 
 VIEWS = 3
@@ -75,7 +75,7 @@ VIEWS = 3
 AGREE = 0.85
 """Share of the views that must see past it."""
 
-VISIBLE, GIANT_VISIBLE = 4 / 255, 0.5 / 255
+VISIBLE, GIANT_VISIBLE = 4 / 255, 1 / 255
 """By how much a splat must change a pixel, as its opacity times its contrast to what lies behind. A
 giant changes all pixels."""
 
