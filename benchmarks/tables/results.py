@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from .cost import Cost
     from .estimate import Estimated
     from .finetune import Tuned
     from .flops import Counts
@@ -14,32 +15,6 @@ if TYPE_CHECKING:
     from .million import Million
     from .sizes import Timed
     from .variants import Line
-
-
-@dataclass(frozen=True)
-class Cost:
-    """What something took.
-
-    Attributes
-    ----------
-    seconds, busy : float
-        Medians of the runs: by the clock, and of the processor, all cores together.
-    runs : int
-    peak_bytes : int or None
-        Beyond what was held before; of a program of its own, all it had. None: not to be had here.
-    """
-
-    seconds: float
-    busy: float
-    runs: int
-    peak_bytes: int | None
-
-    def plus(self, other: Cost) -> Cost:
-        """Return the cost of doing both, one after the other."""
-        peaks = [peak for peak in (self.peak_bytes, other.peak_bytes) if peak is not None]
-        runs = min(self.runs, other.runs)
-        seconds, busy = self.seconds + other.seconds, self.busy + other.busy
-        return Cost(seconds, busy, runs, max(peaks, default=None))
 
 
 @dataclass(frozen=True, eq=False)

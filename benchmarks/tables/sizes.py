@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from refine_addon.core.views import ViewSet
 
+    from .cost import Cost
     from .methods import Method, Task
-    from .results import Cost
 
 WIDTHS = (480, 1920)
 """Widths measured beside that of the files, pixels."""

@@ -44,8 +44,9 @@ from . import (
     trade_report,
     variants,
 )
+from .cost import Cost
 from .methods import Method, Task
-from .results import Cost, Measured, Row
+from .results import Measured, Row
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence

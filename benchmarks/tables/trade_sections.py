@@ -12,7 +12,8 @@ from . import finetune, flops, million
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from .results import Cost, Measured
+    from .cost import Cost
+    from .results import Measured
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
