@@ -74,7 +74,9 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     )
     amount.add_argument("--keep", type=int, metavar="N", help="how many splats stay")
     amount.add_argument("--max-mb", type=float, metavar="M", help="size of the file, in 1e6 bytes")
-    amount.add_argument("--threshold", type=float, metavar="S", help="remove scores below S")
+    amount.add_argument(
+        "--threshold", type=float, metavar="S", help="remove scores below S; not with auto"
+    )
     amount.add_argument(
         "--min-seen", type=float, metavar="P", help="remove what fewer than P %% of the views see"
     )
@@ -104,7 +106,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
 
 def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     cleaning = commands.add_parser("clean", help="remove what the cameras see to float in the air")
-    cleaning.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a 3DGS PLY file")
+    cleaning.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a file of splats")
     cleaning.add_argument(
         "-o", "--output", type=_path, metavar="OUT.ply", help="without it, only say what would go"
     )
@@ -163,16 +165,15 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
         "--method",
         choices=METHODS,
         default=METHODS[0],
-        help="default: auto, which knows what hides what, with no more views and rounds than "
-        "--tolerance asks for; occlusion uses all of them; closed-form takes nothing as hidden: "
-        "far faster, and worse",
+        help="default: auto, which knows what hides what, by no more views than --tolerance asks "
+        "for; occlusion uses all of them; closed-form takes nothing as hidden: far faster, worse",
     )
     parser.add_argument(
         "--tolerance",
         type=float,
         default=Settings.tolerance,
         metavar="DB",
-        help="with --method auto: by how much the PSNR may be lower than by occlusion, in dB "
+        help="with --method auto: by how much the PSNR may be lower than by all views, in dB "
         f"(default {Settings.tolerance})",
     )
     parser.add_argument(

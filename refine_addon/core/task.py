@@ -32,15 +32,14 @@ class Settings:
     ----------
     method : {"auto", "occlusion", "closed-form"}
         Scoring method: "occlusion" takes into account what hides what; "auto" does so with no more
-        views and rounds than the pictures need; "closed-form" takes nothing as hidden, and is the
-        fastest.
+        views than the pictures need; "closed-form" takes nothing as hidden, and is the fastest.
     views : int
         Use at most this many views, spread evenly; 0 uses all.
     closed_form : ClosedForm
     occlusion : Occlusion
         Settings of these methods.
     tolerance : float
-        For "auto": by how much the PSNR of the pictures may be lower than by "occlusion", dB.
+        For "auto": by how much the PSNR of the pictures may be lower than by all views, dB.
     """
 
     method: Literal["auto", "occlusion", "closed-form"] = "auto"

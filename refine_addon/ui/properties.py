@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 METHODS = (
-    ("auto", "Auto", "Occlusion with no more views and rounds than the pictures need"),
-    ("occlusion", "Occlusion", "Knows what hides what; uses all views and rounds"),
+    ("auto", "Auto", "Occlusion with no more views than the pictures need"),
+    ("occlusion", "Occlusion", "Knows what hides what; uses all views"),
     ("closed-form", "Closed Form", "Takes nothing as hidden: far faster, and worse"),
 )
 """Methods of scoring, by the names that core gives them."""
