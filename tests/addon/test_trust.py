@@ -72,6 +72,7 @@ def test_a_shot_of_five_thousand_frames_is_a_view_set(addon, room):
     scene.frame_start, scene.frame_end = 1, 5000
     settings = scene.refine
     settings.source, settings.frame_step = "FRAMES", 1
+    settings.method = "closed-form"
 
     bpy.ops.refine.score()
 

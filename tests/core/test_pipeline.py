@@ -487,11 +487,11 @@ def test_what_autos_scores_cannot_mean_is_refused_before_the_work(small, views):
 def test_scores_that_are_there_already_decide_as_new_ones_would(small, views, absorb):
     """The panel scores once and applies later: the same splats, and the same report of them."""
     splats, budget = read_ply(small).splats(), Budget(threshold=0.5)
-    at_once = prune(splats, views, budget, absorb=absorb)
-    scores = score(splats, views, Settings())
+    at_once = prune(splats, views, budget, FAST, absorb=absorb)
+    scores = score(splats, views, FAST)
     scene = {"splats": splats, "views": views} if absorb else {}
 
-    later = decide(Task(budget, scores=scores, absorb=absorb, **scene))
+    later = decide(Task(budget, FAST, scores=scores, absorb=absorb, **scene))
 
     np.testing.assert_array_equal(at_once.keep, later.keep)
     for report in (at_once.report, later.report):
