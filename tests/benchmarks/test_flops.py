@@ -74,7 +74,7 @@ def test_the_table_is_what_the_closed_form_does(reading: str, settings: ClosedFo
         )
     )
     expected = sum(term[READINGS.index(reading)] for term in ANALYTIC.values())
-    options = Settings(views=0, closed_form=settings)
+    options = Settings("closed-form", views=0, closed_form=settings)
 
     few = flops.count(splats, views.take(range(16)), options)
     many = flops.count(splats, views, options)
