@@ -419,7 +419,7 @@ MUTANTS = {
     "cleaning/clean.py": [
         ("(seen.views > 0) & ", "", "who sees nothing sees past"),
         ("found[name] &= ~protected", "pass", "protected ones go"),
-        ("sizes < max(SMALL", "sizes < min(SMALL", "clusters of any size"),
+        ("sizes < SMALL", "sizes > SMALL", "clusters of any size"),
     ],
     "cleaning/clusters.py": [
         ("labels = jumped", "break", "parts that are not joined"),

@@ -43,7 +43,7 @@ _FORMATS = (
 """The formats of an export as Blender lists them, with tooltips."""
 
 
-class _OnSplats:
+class OnSplats:
     """An operator on the active object, which must hold splats."""
 
     @classmethod
@@ -59,7 +59,7 @@ class _OnSplats:
         return True
 
 
-class _OnScored(_OnSplats):
+class _OnScored(OnSplats):
     """An operator on the active object, which must be scored."""
 
     @classmethod
@@ -73,7 +73,7 @@ class _OnScored(_OnSplats):
         return True
 
 
-def _views(context: bpy.types.Context) -> ViewSet:
+def chosen_views(context: bpy.types.Context) -> ViewSet:
     """Return the views of the cameras that the panel names."""
     settings = context.scene.refine
     return views_from_scene(
@@ -96,7 +96,7 @@ class _Scoring:
     origin: dict[str, Any]
 
 
-class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
+class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     """Score each splat by how much the cameras would miss it (Esc cancels)"""
 
     bl_idname = "refine.score"
@@ -106,7 +106,7 @@ class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Scoring:
         """Gather splats, views and settings."""
-        settings, views = context.scene.refine.to_settings(), _views(context)
+        settings, views = context.scene.refine.to_settings(), chosen_views(context)
         mesh_edit.check_writable(checked.obj)
         quality = settings.estimates or context.scene.refine.budget == "psnr"
         splats = splat_object.gather(checked, whole=None if quality else False)
@@ -173,7 +173,7 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
             settings.to_budget(),
             settings.protect,
             settings=settings.to_settings(),
-            views=_views(context) if settings.absorb else None,
+            views=chosen_views(context) if settings.absorb else None,
         )
 
     @staticmethod
@@ -209,7 +209,7 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
+class REFINE_OT_preview(OnSplats, bpy.types.Operator):
     """Show the splats as points, without changing them"""
 
     bl_idname = "refine.preview"
@@ -261,7 +261,7 @@ class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
+class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
     """Write the active object's splats to a file, in the format that its suffix names"""
 
     bl_idname = "refine.export_ply"

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..cameras.sets import chosen_cameras
+from ..mesh import floaters
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from . import plans, preview, staleness
+from .properties import FLOATERS
 
 if TYPE_CHECKING:
     from .properties import RefineSettings
@@ -63,6 +65,33 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
         elif settings.source != "ACTIVE":
             cameras = chosen_cameras(context, settings.source, settings.collection)
             layout.label(text=f"{len(cameras)} cameras", icon="CAMERA_DATA")
+
+
+class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
+    """What the cameras see through."""
+
+    bl_label = "Floaters"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the reasons, how many splats each takes, and the buttons."""
+        layout = self.layout
+        settings = context.scene.refine
+        progress = context.window_manager.refine_progress
+        if progress >= 0.0:
+            layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
+            return
+        layout.operator("refine.find_floaters", icon="VIEWZOOM")
+        obj = context.object
+        found = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        column = layout.column(align=True)
+        for name, text, _ in FLOATERS:
+            shown = text if found is None else f"{text}: {found[name]:,}"
+            column.prop_enum(settings, "reasons", name, text=shown)
+        if found is not None:
+            total = sum(found[name] for name in settings.reasons)
+            layout.label(text=f"Go: {total:,} of {len(obj.data.vertices):,}", icon="TRASH")
+            layout.operator("refine.delete_floaters", icon="TRASH")
 
 
 class REFINE_PT_score(_InSidebar, bpy.types.Panel):

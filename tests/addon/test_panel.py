@@ -35,6 +35,11 @@ class Layout:
         assert name in data.bl_rna.properties
         self.drawn.append(name)
 
+    def prop_enum(self, data, name, value, **_options):
+        """Note one value of a property; it must exist."""
+        assert value in data.bl_rna.properties[name].enum_items
+        self.drawn.append(name)
+
     def label(self, *, text="", **_options):
         """Note a text."""
         self.drawn.append(text)
