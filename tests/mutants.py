@@ -99,7 +99,7 @@ MUTANTS = {
         ("np.minimum.reduceat(values", "np.maximum.reduceat(values", "no range"),
     ],
     "formats/dot_splat.py": [
-        ("np.exp(np.asarray(some.log_scales", "(np.asarray(some.log_scales", "log scales stored"),
+        ("= scales(some.log_scales)", "= some.log_scales", "log scales stored"),
         ("    if beyond:", "    if beyond > 31:", "a cut splat is no fault"),
     ],
     "formats/format.py": [
