@@ -145,7 +145,7 @@ def single_logits(opacities: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def scales(log_scales: NDArray[Any]) -> NDArray[np.float64]:
-    """Standard deviations of stored log scales, (...) float64; beyond the range 0 or infinite."""
+    """Return the standard deviations of log scales, in float64; beyond its range 0 or infinite."""
     with np.errstate(over="ignore", under="ignore"):
         return np.asarray(np.exp(np.asarray(log_scales, np.float64)))
 

@@ -10,6 +10,7 @@ import bpy
 from ..cameras.sets import chosen_cameras
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.convert import other_form
 from . import plans, preview, staleness
 
 if TYPE_CHECKING:
@@ -35,12 +36,13 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         if not mesh_layout.looks_like_splats(obj):
             layout.label(text="Select an object that holds splats", icon="INFO")
             return
-        count = len(obj.data.vertices)
+        count = mesh_layout.splat_count(obj.data)
         layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
         layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
         size = mesh_layout.export_bytes(obj)
         if size is not None:
             layout.label(text=f"{size / 1e6:,.1f} MB")
+        layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
 
 
 class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):

@@ -457,7 +457,7 @@ def _painting(room):  # noqa: ARG001
 
 @pytest.mark.parametrize(
     ("prepare", "reason"),
-    [(_shared, "shares its mesh"), (_keyed, "shape keys"), (_painting, "weight paint mode")],
+    [(_shared, "shares its data"), (_keyed, "shape keys"), (_painting, "weight paint mode")],
 )
 def test_an_object_that_cannot_lose_vertices_is_refused(
     room,

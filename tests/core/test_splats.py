@@ -102,8 +102,10 @@ def test_what_is_0_stays_undrawable_and_what_is_not_drawable():
 
 
 def test_no_number_of_a_file_changes_by_a_millionth_on_the_way_through_float32():
-    """Logit -> opacity in float32 -> logit in float32 -> opacity: rounding to float32 is 6e-8, and
-    the logit is moved by less than half its step unless it is near 0, where that step is smaller.
+    """The activated value is rounded to float32, then what is stored: 6e-8 each at most.
+
+    Far from 0 the second rounding leads back: half a step of a logit of 32 is 2e-6, far more than
+    the 6e-8 by which the first one moved it.
     """
     values = single(np.random.default_rng(0).uniform(-80.0, 80.0, 100_000))
 
