@@ -263,8 +263,7 @@ class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_convert(_OnSplats, bpy.types.Operator):
-    """Turn a splat mesh into a point cloud of Blender's own splats, which Blender 5.3 draws, or \
-back; scores and transform stay"""
+    """Turn a splat mesh into a point cloud of Blender's own splats, or such a point cloud back"""
 
     bl_idname = "refine.convert"
     bl_label = "Convert Splats"
