@@ -95,8 +95,9 @@ def _point_cloud_of(checked: SplatObject) -> bpy.types.PointCloud:
     """Return a new point cloud with the attributes of Blender's own splats, to be filled."""
     cloud = _new_point_cloud(checked.mesh.name, len(checked))
     # Before Blender 5.3 there is but one type of point clouds.
-    if "type" in cloud.bl_rna.properties:
-        cloud.type = "GAUSSIAN_SPLAT"
+    kinds = cloud.bl_rna.properties.get("type")
+    if kinds and native.TYPE in kinds.enum_items:
+        cloud.type = native.TYPE
     types = bpy.types.Attribute.bl_rna.properties["data_type"].enum_items.keys()
     for place in native.places(rest_count(checked.mesh) // 3).values():
         if place.attribute not in cloud.attributes:

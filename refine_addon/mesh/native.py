@@ -21,12 +21,15 @@ if TYPE_CHECKING:
 
 BASE, SCALE, ROTATION, HARMONIC = "radiance:base", "scale", "rotation", "radiance:sh_"
 
+TYPE = "GAUSSIAN_SPLAT"
+"""Of point clouds that Blender draws as splats, since 5.3."""
+
 NAMES = f"{BASE}, {SCALE}, {ROTATION}"
 """For messages."""
 
 FOUR_FLOATS = ("FLOAT4", "FLOAT_COLOR")
-"""Types of `BASE`: that of 5.3, and what holds the same four numbers before 5.2, which has no
-``FLOAT4``."""
+"""Types of `BASE`: that of 5.3, and what holds the same four numbers in 5.0 and older, which have
+no ``FLOAT4``."""
 
 _MOST = 24
 """Harmonics of degree 4, beyond the constant."""
@@ -94,13 +97,20 @@ def places(count: int) -> dict[str, Place]:
     return found
 
 
-def refuse_lost_base(obj: bpy.types.Object) -> None:
-    """Raise `RefineError` for what is left of Blender's splats where their colours were lost."""
+def lost_base(obj: bpy.types.Object) -> bool:
+    """Tell whether an object is what an older Blender leaves of 5.3's splats: all but `BASE`."""
+    if obj.type != "POINTCLOUD":
+        return False
     attributes = obj.data.attributes
     rest = SCALE in attributes and ROTATION in attributes and "f_dc_0" not in attributes
-    if hasattr(obj.data, "points") and rest and BASE not in attributes:
+    return rest and BASE not in attributes
+
+
+def refuse_lost_base(obj: bpy.types.Object) -> None:
+    """Raise `RefineError` for what is left of Blender's splats where their colours were lost."""
+    if lost_base(obj):
         msg = (
             f"object '{obj.name}': has no attribute {BASE}, which holds colour and opacity: "
-            "Blender before 5.2 drops it where it opens a file of 5.3; use 5.2 or later"
+            "Blender 5.0 and older drop it where they open a file of 5.3; use 5.2 or later"
         )
         raise RefineError(msg)

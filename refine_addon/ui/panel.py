@@ -9,12 +9,16 @@ import bpy
 
 from ..cameras.sets import chosen_cameras
 from ..mesh import layout as mesh_layout
+from ..mesh import native
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
 from . import plans, preview, staleness
 
 if TYPE_CHECKING:
     from .properties import RefineSettings
+
+
+_NONE = "Select an object that holds splats"
 
 
 class _InSidebar:
@@ -34,7 +38,9 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         layout.operator("refine.import_ply", icon="IMPORT")
         obj = context.object
         if not mesh_layout.looks_like_splats(obj):
-            layout.label(text="Select an object that holds splats", icon="INFO")
+            lost = obj is not None and native.lost_base(obj)
+            text = "Colours were lost: open it in Blender 5.2" if lost else _NONE
+            layout.label(text=text, icon="ERROR" if lost else "INFO")
             return
         count = mesh_layout.splat_count(obj.data)
         layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")

@@ -449,7 +449,7 @@ def test_point_clouds_that_are_no_splats_are_refused_in_a_sentence(addon, core):
         store(odd, f"radiance:sh_{index}", "FLOAT_VECTOR", np.ones((3, 3), np.float32))
     wrong = {
         plain: r"no attribute f_dc_0.*or Blender's own radiance:base, scale, rotation on its",
-        left: "no attribute radiance:base, which holds colour and opacity: Blender before 5.2",
+        left: "no attribute radiance:base, which holds colour and opacity: Blender 5.0 and",
         odd: "has 4 attributes radiance:sh_.*, expected 0, 3, 8, 15 or 24 of them",
     }
     for obj, sentence in wrong.items():
