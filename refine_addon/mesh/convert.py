@@ -13,7 +13,7 @@ import bpy
 from ..core.errors import RefineError
 from . import attributes as mesh_attributes
 from . import heat_map, native
-from .edit import check_writable, group_weights
+from .edit import check_changeable, group_weights
 from .layout import KINDS, STORAGE, SplatObject, check, rest_count
 from .node_trees import add, chain, new_tree
 
@@ -51,11 +51,12 @@ def converted(checked: SplatObject) -> tuple[bpy.types.Object, list[str]]:
     Raises
     ------
     RefineError
-        If the object belongs to a library, or is a point cloud that holds the properties of a file
-        under their own names. Nothing is changed then.
+        See `edit.check_changeable`; also if the object is a point cloud that holds the properties
+        of a file under their own names, or has another attribute of a name that the new form
+        needs. Nothing is changed then.
     """
     old = checked.obj
-    check_writable(old)
+    check_changeable(old)
     if old.type == "POINTCLOUD" and not checked.layout.native:
         msg = f"object '{old.name}': is a point cloud without {native.NAMES}: nothing to convert"
         raise RefineError(msg)
@@ -150,8 +151,15 @@ def _fill(checked: SplatObject, obj: bpy.types.Object) -> None:
     old, data = checked.obj, obj.data
     columns = _moved(checked)
     held = {column.attribute for column in columns} | {heat_map.COLOR}  # that of a preview
+    needed = set(data.attributes.keys())
     for attribute in list(checked.mesh.attributes):
         if _copied(attribute) and attribute.name not in held and attribute.name[0] != ".":
+            if attribute.name in needed:
+                msg = (
+                    f"object '{old.name}': has an attribute '{attribute.name}', a name that the "
+                    f"splats of a {other_form(checked.mesh).lower()} need; rename it first"
+                )
+                raise RefineError(msg)
             values = mesh_attributes.read_attribute(checked.mesh, attribute.name)
             mesh_attributes.write_attribute(data, attribute.name, attribute.data_type, values)
     for group in old.vertex_groups:
@@ -180,7 +188,9 @@ def _take_place(old: bpy.types.Object, new: bpy.types.Object) -> None:
         _animate(old.animation_data, new.animation_data_create())
     name, data = old.name, old.data
     layer = bpy.context.view_layer
-    was = (layer.objects.active == old, old.select_get() if old.name in layer.objects else False)
+    there = old.name in layer.objects
+    active, selected = layer.objects.active == old, there and old.select_get()
+    hidden = there and old.hide_get()
     old.user_remap(new)
     bpy.data.objects.remove(old)
     if not data.users:
@@ -189,9 +199,10 @@ def _take_place(old: bpy.types.Object, new: bpy.types.Object) -> None:
         new.data.name = name_of_data
     new.name = name
     layer.update()
-    if new.name in layer.objects:
-        new.select_set(was[1])
-        if was[0]:
+    if there:
+        new.select_set(selected)
+        new.hide_set(hidden)
+        if active:
             layer.objects.active = new
 
 

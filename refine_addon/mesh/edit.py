@@ -35,23 +35,28 @@ def check_writable(obj: bpy.types.Object) -> None:
         raise RefineError(msg)
 
 
-def check_deletable(obj: bpy.types.Object) -> None:
-    """Raise `RefineError` if vertices cannot be deleted from an object."""
+def check_changeable(obj: bpy.types.Object) -> None:
+    """Raise `RefineError` if the splats of an object cannot be changed as a whole."""
     check_writable(obj)
-    mesh = obj.data
     label = f"object '{obj.name}'"
     if obj.mode != "OBJECT":
         msg = f"{label}: is in {obj.mode.replace('_', ' ').lower()} mode; go to object mode first"
         raise RefineError(msg)
-    users = mesh.users - mesh.use_fake_user
+    if getattr(obj.data, "shape_keys", None):  # point clouds have none
+        msg = f"{label}: has shape keys, which hold every vertex again; apply or delete them first"
+        raise RefineError(msg)
+
+
+def check_deletable(obj: bpy.types.Object) -> None:
+    """Raise `RefineError` if vertices cannot be deleted from an object."""
+    check_changeable(obj)
+    users = obj.data.users - obj.data.use_fake_user
     if users > 1:
         msg = (
-            f"{label}: shares its data '{mesh.name}' with {users - 1} other user(s), which would "
-            "lose the splats too; make it single-user first (Object > Relations)"
+            f"object '{obj.name}': shares its data '{obj.data.name}' with {users - 1} other "
+            "user(s), which would lose the splats too; make it single-user first (Object > "
+            "Relations)"
         )
-        raise RefineError(msg)
-    if getattr(mesh, "shape_keys", None):  # point clouds have none
-        msg = f"{label}: has shape keys, which hold every vertex again; apply or delete them first"
         raise RefineError(msg)
 
 

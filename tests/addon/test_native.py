@@ -421,6 +421,45 @@ def test_a_conversion_names_what_stays_behind(addon, room):
     ]
 
 
+def _keyed(room):
+    room.shape_key_add(name="Basis")
+
+
+def _painting(room):  # noqa: ARG001
+    bpy.ops.object.mode_set(mode="WEIGHT_PAINT")
+
+
+def _named_scale(room):
+    store(room, "scale", "FLOAT", np.ones(39755, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("prepare", "sentence"),
+    [
+        (_keyed, "has shape keys"),
+        (_painting, "weight paint mode"),
+        (_named_scale, "has an attribute 'scale', a name that the splats of a point cloud need"),
+    ],
+)
+def test_a_conversion_that_would_lose_something_is_refused(room, unchanged, prepare, sentence):
+    """The sentence says what to do; nothing is changed."""
+    prepare(room)
+    unchanged.start()
+    with pytest.raises(RuntimeError, match=sentence):
+        bpy.ops.refine.convert()
+    unchanged()
+
+
+def test_a_shared_mesh_stays_with_its_other_user(addon, room):
+    """One of two objects becomes a point cloud."""
+    other = bpy.data.objects.new("other", room.data)
+    bpy.context.scene.collection.objects.link(other)
+    bpy.ops.refine.convert()
+
+    assert bpy.data.objects["room"].type == "POINTCLOUD"
+    assert len(addon.mesh.layout.check(other)) == 39755
+
+
 def test_a_conversion_that_fails_changes_nothing(addon, room, unchanged, monkeypatch):
     """Not even a data-block is left over."""
 
