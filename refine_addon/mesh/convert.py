@@ -108,7 +108,7 @@ def _point_cloud_of(checked: SplatObject) -> bpy.types.PointCloud:
 
 
 def _new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
-    """Return a point cloud of so many points; only since 5.2 can Python ask for them."""
+    """Return a point cloud of so many points; in 5.0 and older only nodes can make them."""
     cloud = bpy.data.pointclouds.new(name)
     if hasattr(cloud, "resize"):
         cloud.resize(count)
