@@ -12,6 +12,7 @@ from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
 from .ui.operators import (
     REFINE_OT_apply,
+    REFINE_OT_convert,
     REFINE_OT_export_ply,
     REFINE_OT_plan,
     REFINE_OT_preview,
@@ -40,6 +41,7 @@ CLASSES = (
     REFINE_OT_plan,
     REFINE_OT_apply,
     REFINE_OT_preview,
+    REFINE_OT_convert,
     REFINE_OT_export_ply,
     REFINE_FH_ply,
     REFINE_PT_splats,

@@ -161,7 +161,7 @@ def plan(checked: SplatObject, budget: Budget, protect: str = "") -> Plan:
     keep = keep_mask(checked, budget, protect)
     mesh_edit.check_writable(checked.obj)
     mesh_attributes.write_attribute(checked.mesh, mesh_edit.REMOVE, "BOOLEAN", ~keep)
-    checked.mesh.update()
+    mesh_attributes.updated(checked.mesh)
     return _plan(checked, keep)
 
 

@@ -11,6 +11,7 @@ from ..core.cleaning.clean import REASONS
 from ..core.errors import RefineError
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
+from .layout import splat_count
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -49,15 +50,15 @@ def store(checked: SplatObject, cleaned: Cleaned) -> None:
     mesh_attributes.write_attribute(checked.mesh, REASON, "INT", reasons)
     counts = {name: int(np.count_nonzero(mask)) for name, mask in cleaned.found.items()}
     checked.mesh[FOUND] = json.dumps({"splats": len(reasons), "counts": counts})
-    checked.mesh.update()
+    mesh_attributes.updated(checked.mesh)
 
 
-def counts(mesh: bpy.types.Mesh) -> dict[str, int] | None:
+def counts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, int] | None:
     """Return how many floaters were found for each reason; None if nobody looked since a change."""
     try:
         noted = json.loads(mesh[FOUND])
         found = {name: int(noted["counts"][name]) for name in REASONS}
-        holds = noted["splats"] == len(mesh.vertices) and REASON in mesh.attributes
+        holds = noted["splats"] == splat_count(mesh) and REASON in mesh.attributes
     except (KeyError, TypeError, ValueError):
         return None
     return found if holds else None
@@ -89,10 +90,10 @@ def mark(checked: SplatObject, reasons: Collection[str]) -> None:
     mesh_edit.check_writable(checked.obj)
     remove = mask(checked, reasons)
     mesh_attributes.write_attribute(checked.mesh, mesh_edit.REMOVE, "BOOLEAN", remove)
-    checked.mesh.update()
+    mesh_attributes.updated(checked.mesh)
 
 
-def forget(mesh: bpy.types.Mesh) -> None:
+def forget(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
     """Remove what was found."""
     mesh_attributes.remove_attribute(mesh, REASON)
     if FOUND in mesh:

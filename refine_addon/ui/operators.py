@@ -23,6 +23,7 @@ from ..core.report import scoring_notes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.convert import converted
 from . import plans, preview, staleness
 from .import_operators import FILE_NAMES
 from .on_thread import FAILURES, Answer, OnThread, fail
@@ -258,6 +259,27 @@ class REFINE_OT_preview(OnSplats, bpy.types.Operator):
         overlay = getattr(context.space_data, "overlay", None)
         if overlay:  # outlines of a million selected points hide their colours
             overlay.show_outline_selected = self.mode == "OFF"
+        return {"FINISHED"}
+
+
+class REFINE_OT_convert(OnSplats, bpy.types.Operator):
+    """Turn a splat mesh into a point cloud of Blender's own splats, or such a point cloud back"""
+
+    bl_idname = "refine.convert"
+    bl_label = "Convert Splats"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Put the other form in the place of the active object."""
+        try:
+            obj, notes = converted(mesh_layout.check(context.object))
+        except FAILURES as error:
+            return fail(self, error)
+        plans.refresh(context)
+        for note in notes:
+            self.report({"WARNING"}, note)
+        kind = "a point cloud" if obj.type == "POINTCLOUD" else "a mesh"
+        self.report({"INFO"}, f"'{obj.name}' is {kind} now")
         return {"FINISHED"}
 
 

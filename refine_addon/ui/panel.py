@@ -8,14 +8,18 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..cameras.sets import chosen_cameras
-from ..mesh import floaters
+from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.convert import other_form
 from . import plans, preview, staleness
 from .properties import FLOATERS
 
 if TYPE_CHECKING:
     from .properties import RefineSettings
+
+
+_NONE = "Select an object that holds splats"
 
 
 class _InSidebar:
@@ -35,14 +39,17 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         layout.operator("refine.import_ply", icon="IMPORT")
         obj = context.object
         if not mesh_layout.looks_like_splats(obj):
-            layout.label(text="Select an object that holds splats", icon="INFO")
+            lost = obj is not None and native.lost_base(obj)
+            text = "Colours were lost: open it in Blender 5.2" if lost else _NONE
+            layout.label(text=text, icon="ERROR" if lost else "INFO")
             return
-        count = len(obj.data.vertices)
+        count = mesh_layout.splat_count(obj.data)
         layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
         layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
         size = mesh_layout.export_bytes(obj)
         if size is not None:
             layout.label(text=f"{size / 1e6:,.1f} MB")
+        layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
 
 
 class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
@@ -90,7 +97,9 @@ class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
             column.prop_enum(settings, "reasons", name, text=shown)
         if found is not None:
             total = sum(found[name] for name in settings.reasons)
-            layout.label(text=f"Go: {total:,} of {len(obj.data.vertices):,}", icon="TRASH")
+            layout.label(
+                text=f"Go: {total:,} of {mesh_layout.splat_count(obj.data):,}", icon="TRASH"
+            )
             layout.operator("refine.delete_floaters", icon="TRASH")
 
 

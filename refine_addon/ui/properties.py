@@ -24,6 +24,7 @@ from ..core.selection import Budget
 from ..core.task import Settings
 from ..mesh import floaters
 from ..mesh import layout as mesh_layout
+from ..mesh.edit import marking
 from . import plans
 
 if TYPE_CHECKING:
@@ -84,11 +85,11 @@ def _protectable(
 ) -> Iterator[str]:
     """Suggest what the active object has that can protect splats."""
     obj = context.object
-    if obj and obj.type == "MESH":
+    if mesh_layout.looks_like_splats(obj):
         yield from (group.name for group in obj.vertex_groups)
         for attribute in obj.data.attributes:
-            kind = (attribute.data_type, attribute.domain)
-            if kind == ("BOOLEAN", "POINT") and not attribute.name.startswith((".", "refine_")):
+            own = attribute.name.startswith((".", "refine_"))
+            if attribute.data_type in marking(obj) and attribute.domain == "POINT" and not own:
                 yield attribute.name
 
 

@@ -53,6 +53,24 @@ def test_floaters_found_in_the_panel_are_those_that_core_finds(addon, polluted):
     assert len(room.data.vertices) == count
 
 
+def test_floaters_of_native_splats_are_those_of_the_mesh(addon, polluted):
+    """Activated values differ in the last bits of single precision: the verdicts are the same."""
+    room, moved = polluted
+    bpy.ops.refine.find_floaters()
+    on_mesh = marked(addon, room)
+
+    bpy.ops.refine.convert()
+    cloud = bpy.context.object
+    bpy.ops.refine.find_floaters()
+    on_cloud = marked(addon, cloud)
+
+    assert cloud.type == "POINTCLOUD"
+    assert on_mesh[moved].any()
+    assert np.count_nonzero(on_mesh != on_cloud) <= 2
+    bpy.ops.refine.delete_floaters()
+    assert addon.mesh.layout.splat_count(cloud.data) == np.count_nonzero(~on_cloud)
+
+
 def test_a_reason_that_is_switched_off_spares_its_floaters(addon, polluted):
     """What stands in front is not looked for again: the marks follow the switches."""
     room, _ = polluted
