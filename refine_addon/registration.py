@@ -12,6 +12,7 @@ from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE
 from .ui.operators import (
     REFINE_OT_apply,
     REFINE_OT_export_ply,
+    REFINE_OT_levels,
     REFINE_OT_plan,
     REFINE_OT_preview,
     REFINE_OT_score,
@@ -37,6 +38,7 @@ CLASSES = (
     REFINE_OT_apply,
     REFINE_OT_preview,
     REFINE_OT_export_ply,
+    REFINE_OT_levels,
     REFINE_FH_ply,
     REFINE_PT_splats,
     REFINE_PT_cameras,

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from .core.absorbing.absorb import Absorbed
     from .core.formats.ply import SplatFile
     from .core.formats.registry import Packed
+    from .core.levels.lod import Level
     from .core.selection import Budget
     from .core.splats import Splats
     from .core.views import ViewSet
@@ -164,7 +165,7 @@ def plan(checked: SplatObject, budget: Budget, protect: str = "") -> Plan:
     return _plan(checked, keep)
 
 
-def apply_object(checked: SplatObject, result: Result) -> Plan:
+def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
     """Delete the splats that do not stay, and set what the others became: all of it or nothing.
 
     Everything else of the object and its mesh stays: attributes, vertex groups, custom properties,
@@ -173,7 +174,7 @@ def apply_object(checked: SplatObject, result: Result) -> Plan:
     Parameters
     ----------
     checked : SplatObject
-    result : Result
+    result : Result or Level
         What was decided of the object's splats.
 
     Returns
@@ -207,7 +208,8 @@ def _reduce(
     mesh_edit.delete_vertices(checked.obj, ~keep)
     columns = {name: values[keep] for name, values in columns.items()}
     mesh_attributes.write_columns(checked, columns)
-    del checked.mesh[RECORD]
+    if RECORD in checked.mesh:
+        del checked.mesh[RECORD]
 
 
 def absorbed_columns(checked: SplatObject, absorbed: Absorbed) -> dict[str, NDArray[Any]]:
