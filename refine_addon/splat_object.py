@@ -24,6 +24,7 @@ from .core.survivors import survivor_columns
 from .core.task import DEFAULTS, Result, Settings, Task
 from .core.whole_file import expanded, refuse_existing
 from .core.work import Progress, part, silent
+from .core.written import written_facts
 from .mesh import attributes as mesh_attributes
 from .mesh import edit as mesh_edit
 from .mesh import layout as mesh_layout
@@ -316,6 +317,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
         _check_savable(checked.obj)
     row_bytes, fixed_bytes = _file_size(checked, budget, output)
     estimates = settings.estimates or budget.psnr is not None
+    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
     task = Task(
         budget=budget,
         settings=settings,
@@ -337,6 +339,9 @@ def prune_object(  # noqa: PLR0913 - the command's options
             _reduce(checked, result.keep, columns)
             _save(target)
     clock.lap("write_s")
+    if target is not None:
+        used = views.spread(settings.views)
+        result.report.update(written_facts(target, result.scores, used, matrix=matrix))
     result.report["notes"] += modifier_notes(checked.obj)
     source, made = f"{bpy.data.filepath}#{name}", None if target is None else str(target)
     after = sizes.bytes_after if target is None else target.stat().st_size

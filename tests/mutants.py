@@ -404,6 +404,14 @@ MUTANTS = {
             "survivors of other rows",
         ),
     ],
+    "written.py": [
+        (
+            "if not np.array_equal(matrix, np.eye(4)):",
+            "if False:",
+            "the file's frame for the views'",
+        ),
+        ("if format_named(path) is None:", "if False:", "a plain PLY compared"),
+    ],
     "levels/lod.py": [
         ("keep[first.keep] = second.keep", "keep[: len(second.keep)] = second.keep", "other rows"),
         (

@@ -188,6 +188,8 @@ def _quality(done: dict[str, Any]) -> str:
     if psnr is None:
         return ""
     words = f"{in_words(psnr)} in these views"
+    if done.get("written_psnr") is not None:
+        words += f", {in_words(done['written_psnr'])} as written"
     if absorbed is None or "absorbed" in done or psnr > UNSEEN:
         return words
     return f"{words}; with --absorb {in_words(absorbed)}"

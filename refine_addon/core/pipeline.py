@@ -27,6 +27,7 @@ from .survivors import survivor_columns
 from .task import DEFAULTS, Result, Settings, Task
 from .whole_file import expanded, refuse_existing, refuse_mapped
 from .work import Progress, part, report, silent
+from .written import written_facts
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -577,6 +578,10 @@ def prune_file(  # noqa: PLR0913 - as `prune`
         made.write(written, result.keep, columns=columns, overwrite=overwrite)
         sizes = (sizes[0], written.stat().st_size)
     clock.lap("write_s")
+    if written is not None:
+        used = views.spread(settings.views)
+        result.report.update(written_facts(written, result.scores, used, threads=threads))
+        clock.lap("compare_s")
     result.report["notes"] += made.notes(result.keep)
     names = (str(file.path), None if written is None else str(written))
     complete_report(result.report, clock, Files(*names, *sizes))
