@@ -581,7 +581,6 @@ def prune_file(  # noqa: PLR0913 - as `prune`
     if written is not None:
         used = views.spread(settings.views)
         result.report.update(written_facts(written, result.scores, used, threads=threads))
-        clock.lap("compare_s")
     result.report["notes"] += made.notes(result.keep)
     names = (str(file.path), None if written is None else str(written))
     complete_report(result.report, clock, Files(*names, *sizes))
