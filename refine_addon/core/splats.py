@@ -56,11 +56,16 @@ class Splats:
 
     def up_to_degree(self, degree: int) -> Splats:
         """Return the splats without harmonics above a degree."""
-        return replace(self, sh_rest=self.sh_rest[:, : (degree + 1) ** 2 - 1])
+        return replace(self, sh_rest=self.sh_rest[:, : above_constant(degree)])
 
     def take(self, index: NDArray[Any] | slice) -> Splats:
         """Return the splats at `index` (a mask, integers or a slice), in that order."""
         return Splats(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
+
+
+def above_constant(degree: int) -> int:
+    """Return how many harmonics above the constant one a channel has."""
+    return (degree + 1) ** 2 - 1
 
 
 def opacity(logits: NDArray[Any]) -> NDArray[np.float64]:
@@ -117,8 +122,8 @@ def base_color(sh_dc: NDArray[Any]) -> NDArray[np.float64]:
     return np.clip(SH_C0 * np.asarray(sh_dc, np.float64) + 0.5, 0.0, 1.0)
 
 
-def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
-    """Rotation matrices of stored quaternions.
+def unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float64]:
+    """Quaternions of length 1.
 
     Parameters
     ----------
@@ -127,8 +132,7 @@ def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
 
     Returns
     -------
-    (..., 3, 3) float64
-        Columns are the splat's axes in the frame of the means.
+    (..., 4) float64
     """
     q = np.asarray(quaternions, np.float64)
     largest = np.max(np.abs(q), axis=-1, keepdims=True)
@@ -136,7 +140,24 @@ def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
     # Divide by the largest component first: squares of 1e200 or 1e-200 would leave the range.
     with np.errstate(under="ignore"):  # components far smaller than the largest become 0
         q = np.where(usable, q, [1.0, 0.0, 0.0, 0.0]) / np.where(usable, largest, 1.0)
-        w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+        return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+
+
+def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
+    """Rotation matrices of stored quaternions.
+
+    Parameters
+    ----------
+    quaternions : (..., 4) floating
+        See `unit_quaternions`.
+
+    Returns
+    -------
+    (..., 3, 3) float64
+        Columns are the splat's axes in the frame of the means.
+    """
+    w, x, y, z = np.moveaxis(unit_quaternions(quaternions), -1, 0)
+    with np.errstate(under="ignore"):  # products of components near 0
         rows = [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
             [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

@@ -25,6 +25,7 @@ from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from . import plans, preview, staleness
+from .import_operators import FILE_NAMES
 from .on_thread import FAILURES, Answer, OnThread, fail
 
 if TYPE_CHECKING:
@@ -43,8 +44,6 @@ _FORMATS = (
     *((form.suffix, form.suffix, f"It {form.loss}") for form in FORMATS),
 )
 """The formats of an export as Blender lists them, with tooltips."""
-
-_GLOB = ";".join(f"*{suffix}" for suffix in SUFFIXES)
 
 
 class _OnSplats:
@@ -339,7 +338,7 @@ class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
     bl_options = {"REGISTER"}
 
     filename_ext = ".ply"
-    filter_glob: StringProperty(default=_GLOB, options={"HIDDEN"})
+    filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
     suffix: EnumProperty(
         name="Format",
         description="Of the file that is picked here; what the suffix of a file name says holds",

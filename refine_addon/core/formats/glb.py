@@ -15,8 +15,15 @@ import numpy as np
 
 from ..affine import transformed
 from ..errors import RefineError
-from ..splats import Splats, base_color, opacity, opacity_logits, rotation_matrices
-from .format import Format, Sizes, codes, new_file, pieces, unit
+from ..splats import (
+    Splats,
+    base_color,
+    opacity,
+    opacity_logits,
+    rotation_matrices,
+    unit_quaternions,
+)
+from .format import Format, Sizes, codes, new_file, pieces
 from .glb_document import (
     BINARY,
     CHUNK,
@@ -304,7 +311,7 @@ def _attributes(degree: int) -> list[_Attribute]:
         return np.exp(np.asarray(splats.log_scales, np.float64))
 
     def turn(splats: Splats) -> NDArray[Any]:
-        return unit(splats.quaternions)[:, _XYZW]
+        return unit_quaternions(splats.quaternions)[:, _XYZW]
 
     def harmonic(index: int) -> Callable[[Splats], NDArray[Any]]:
         return lambda splats: splats.sh_rest[:, index]
