@@ -215,16 +215,17 @@ def test_one_splat_stays_at_least():
 
 
 @pytest.mark.slow
-def test_progress_only_rises_and_can_cancel():
+@pytest.mark.parametrize("absorb", [True, False])
+def test_progress_only_rises_and_can_cancel(absorb):
     """From 0 to 1, whatever the level; False ends it."""
-    told = []
-    lod(colourful(), cameras(), Levels((0.5, 0.2)), progress=lambda f, _: told.append(f))
+    told, levels = [], Levels((0.5, 0.2), absorb=absorb)
+    lod(colourful(), cameras(), levels, progress=lambda f, _: told.append(f))
 
     assert told == sorted(told)
     assert 0.0 <= told[0] < 0.05
     assert 0.95 < told[-1] <= 1.0
     with pytest.raises(Cancelled):
-        lod(colourful(), cameras(), Levels((0.5, 0.2)), progress=lambda f, _: f < 0.5)
+        lod(colourful(), cameras(), levels, progress=lambda f, _: f < 0.5)
 
 
 def looking(splats, size=96, focal=400.0):

@@ -227,7 +227,7 @@ def each_level(  # noqa: PLR0913 - as `lod`
     budgets, ahead = levels.budgets(len(splats)), part(progress, 0.05, 1.0)
     made = (_absorbing if levels.absorb else _deleting)(scene, budgets, ahead, threads)
     for number, (keep, left, psnr, absorbed) in enumerate(made):
-        end = 0.05 + 0.95 * (number + 1) / len(levels)
+        end = 0.05 + 0.95 * (number + 1) / len(levels) if levels.absorb else 1.0
         reach = lookout.reach(
             left, keep, absorbed.changed if absorbed else None, progress=part(progress, end, end)
         )
