@@ -59,6 +59,8 @@ MUTANTS = {
         ("count - 1)[count - 1]", "count)[count]", "off by one"),
         ("free & (values < edge)", "(values < edge)", "protection forgotten"),
         ("Fraction(repr(float(self.ratio)))", "self.ratio", "binary ratio"),
+        ("count = min(count or 0, len(self._values))", "count = count or 0", "protected counted"),
+        ("self._seen = np.sort(scores.seen[free])", "self._seen = scores.seen", "not in order"),
     ],
     "splats.py": [
         ("w, x, y, z = np", "x, y, z, w = np", "quaternion order"),
