@@ -232,10 +232,22 @@ class Tally:
     """
 
     def __init__(self, scores: Scores, protected: NDArray[np.bool_] | None = None) -> None:
-        self.scores = scores
+        self.scores, self._protected = scores, protected
         free = slice(None) if protected is None else ~protected
         self._values = np.sort(scores.values[free])
         self._seen = np.sort(scores.seen[free])
+
+    def is_of(self, scores: Scores, protected: NDArray[np.bool_] | None = None) -> bool:
+        """Tell whether scores and what is protected are equal to those it was made of."""
+        pairs = (
+            (scores.values, self.scores.values),
+            (scores.seen, self.scores.seen),
+            (protected, self._protected),
+        )
+        return all(
+            one is other if one is None or other is None else np.array_equal(one, other)
+            for one, other in pairs
+        )
 
     def removed(self, budget: Budget, row_bytes: float = 0.0, fixed_bytes: int = 0) -> int:
         """Return how many splats a budget removes.

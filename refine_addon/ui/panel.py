@@ -3,14 +3,14 @@
 # ruff: noqa: N801, RUF012 - Blender's way to name classes and set options
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import bpy
 
 from ..cameras.sets import chosen_cameras
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from . import plans, preview, staleness
+from . import plans, preview, price, staleness, wrapped
 
 if TYPE_CHECKING:
     from .properties import RefineSettings
@@ -161,12 +161,13 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         column.use_property_split = True
         column.use_property_decorate = False
         column.prop(settings, "budget")
-        column.prop(settings, settings.budget)
+        column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
         column.prop(settings, "protect")
         column.prop(settings, "absorb")
         obj = context.object
-        if mesh_layout.looks_like_splats(obj) and mesh_scores.record(obj.data):
-            _draw_plan(layout, obj, settings)
+        record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        if record:
+            _draw_plan(layout, context, record)
         progress = context.window_manager.refine_progress
         if progress >= 0.0:
             layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
@@ -196,17 +197,24 @@ def _draw_frames(
     layout.label(text=f"{len(settings.to_frames(scene))} frames", icon="CAMERA_DATA")
 
 
-def _draw_plan(layout: bpy.types.UILayout, obj: bpy.types.Object, settings: RefineSettings) -> None:
+def _draw_plan(
+    layout: bpy.types.UILayout, context: bpy.types.Context, record: dict[str, Any]
+) -> None:
+    obj, settings = context.object, context.scene.refine
+    plans.ask(context, obj)
+    if price.shows(obj.data):
+        header, body = layout.panel("REFINE_price")
+        header.label(text="Price")
+        if body:
+            row = body.row()
+            row.alignment = "CENTER"
+            row.template_icon(icon_value=price.icon(), scale=price.WIDTH)
     plan = plans.stored(obj, settings)
     if plan is None:
         layout.operator("refine.plan", icon="FILE_REFRESH")
     elif "error" in plan:
-        layout.label(text=plan["error"], icon="ERROR")
+        wrapped.label(layout, context, plan["error"], icon="ERROR")
     else:
-        gone = plan["bytes_before"] - plan["bytes_after"]
-        column = layout.column(align=True)
-        column.label(
-            text=f"Stay: {plan['kept']:,} splats, {plan['bytes_after'] / 1e6:,.1f} MB",
-            icon="CHECKMARK",
-        )
-        column.label(text=f"Go: {plan['removed']:,} splats, {gone / 1e6:,.1f} MB", icon="TRASH")
+        wrapped.label(layout, context, plans.sentence(plan, absorb=settings.absorb))
+        if remark := plans.remark(plan, record):
+            wrapped.label(layout, context, remark, icon="INFO")
