@@ -10,7 +10,8 @@ import bpy
 from ..cameras.sets import chosen_cameras
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from . import plans, preview, price, staleness, wrapped
+from . import kept, plans, preview, price, staleness, wrapped
+from .wrapped import counted
 
 if TYPE_CHECKING:
     from .properties import RefineSettings
@@ -38,7 +39,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         count = len(obj.data.vertices)
         layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
         layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
-        size = mesh_layout.export_bytes(obj)
+        size = kept.answer("bytes", context, lambda: mesh_layout.export_bytes(obj))
         if size is not None:
             layout.label(text=f"{size / 1e6:,.1f} MB")
 
@@ -61,8 +62,8 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
         if settings.source == "FRAMES":
             _draw_frames(layout, settings, context.scene)
         elif settings.source != "ACTIVE":
-            cameras = chosen_cameras(context, settings.source, settings.collection)
-            layout.label(text=f"{len(cameras)} cameras", icon="CAMERA_DATA")
+            count = kept.answer("cameras", context, lambda: len(_cameras(context)))
+            layout.label(text=counted(count, "camera"), icon="CAMERA_DATA")
 
 
 class REFINE_PT_score(_InSidebar, bpy.types.Panel):
@@ -88,13 +89,13 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         obj = context.object
         record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
         if record:
-            layout.label(
-                text=f"Scored by {record['views_used']} of {record['views_given']} views",
-                icon="CHECKMARK",
-            )
-            changed = staleness.changes(context, obj)
+            views = counted(record["views_given"], "view")
+            layout.label(text=f"Scored by {record['views_used']} of {views}", icon="CHECKMARK")
+            question = ("changes", obj.data.get(mesh_scores.RECORD))
+            changed = kept.answer(question, context, lambda: staleness.changes(context, obj))
             if changed:
-                layout.label(text=f"Score again: {', '.join(changed)}", icon="ERROR")
+                text = f"Score again: {', '.join(changed)}"
+                wrapped.label(layout, context, text, icon="ERROR")
         elif mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes:
             layout.label(text="Applied: score again for more", icon="INFO")
 
@@ -194,7 +195,12 @@ def _draw_frames(
         column.prop(settings, "frame_start")
         column.prop(settings, "frame_end")
     layout.prop(settings, "frame_step")
-    layout.label(text=f"{len(settings.to_frames(scene))} frames", icon="CAMERA_DATA")
+    layout.label(text=counted(len(settings.to_frames(scene)), "frame"), icon="CAMERA_DATA")
+
+
+def _cameras(context: bpy.types.Context) -> list[bpy.types.Object]:
+    settings = context.scene.refine
+    return chosen_cameras(context, settings.source, settings.collection)
 
 
 def _draw_plan(

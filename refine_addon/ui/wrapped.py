@@ -37,6 +37,15 @@ def label(
         icon = "BLANK1" if icon != "NONE" else icon
 
 
+def counted(number: int, what: str) -> str:
+    """Return how many there are.
+
+    >>> counted(1, "camera"), counted(1200, "view")
+    ('1 camera', '1,200 views')
+    """
+    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
+
+
 @lru_cache(maxsize=64)
 def lines(text: str, width: int, points: float) -> tuple[str, ...]:
     """Return a text in lines that are at most so many pixels wide; a word is never broken."""

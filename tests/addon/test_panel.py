@@ -125,8 +125,57 @@ def test_scores_older_than_a_change_ask_to_be_made_again(draw, room, room_camera
     old = draw()
     bpy.ops.refine.score()
 
-    assert set(old) - set(fresh) == {"Score again: object moved, settings changed"}
+    added = [text for text in old if text not in fresh]
+    assert " ".join(added) == "Score again: object moved, settings changed"
     assert not [text for text in draw() if text.startswith("Score again")]
+
+
+def test_nothing_is_asked_of_the_scene_twice_until_it_changes(
+    draw,
+    addon,
+    room,  # noqa: ARG001
+    room_cameras,
+    monkeypatch,
+):
+    """Cameras, sizes and changes are asked once; a lens or a setting that changes asks anew."""
+    asked = []
+
+    def counting(name, ask):
+        def counted(*arguments):
+            asked.append(name)
+            return ask(*arguments)
+
+        return counted
+
+    bpy.ops.refine.score()
+    panel = addon.ui.panel
+    monkeypatch.setattr(panel, "chosen_cameras", counting("cameras", panel.chosen_cameras))
+    for module, name in ((panel.staleness, "changes"), (panel.mesh_layout, "export_bytes")):
+        monkeypatch.setattr(module, name, counting(name, getattr(module, name)))
+    bpy.context.view_layer.update()
+    draw()
+    first = sorted(asked)
+    draw()
+    again = sorted(asked)
+    room_cameras.objects[0].data.lens = 99.0
+    bpy.context.view_layer.update()
+    draw()
+    lens = sorted(asked)
+    bpy.context.scene.refine.source = "VISIBLE"
+    draw()
+
+    assert first == again == ["cameras", "changes", "export_bytes"]
+    assert lens == sorted(2 * first)
+    assert sorted(asked) == sorted(3 * first)
+
+
+def test_one_is_not_counted_as_many(draw, room, room_cameras):  # noqa: ARG001
+    """A scene with one camera has "1 camera", not "1 cameras"."""
+    for camera in list(room_cameras.objects)[1:]:
+        room_cameras.objects.unlink(camera)
+    bpy.context.view_layer.update()
+
+    assert "1 camera" in draw()
 
 
 def test_while_scoring_a_bar_takes_the_place_of_the_button(draw, room):  # noqa: ARG001
