@@ -6,7 +6,9 @@ Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* 
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -25,6 +27,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from . import plans, preview, staleness
 from .on_thread import FAILURES, Answer, OnThread, fail
+from .wrapped import counted
 
 if TYPE_CHECKING:
     from ..core.scores import Scores
@@ -86,6 +89,16 @@ def _views(context: bpy.types.Context) -> ViewSet:
     )
 
 
+def _new_name(obj: bpy.types.Object) -> str:
+    """Return a name for an export that no file beside the .blend has yet."""
+    mesh = obj.data
+    pruned = mesh_scores.RANK in mesh.attributes and mesh_scores.record(mesh) is None
+    name = f"{obj.name}_{'pruned' if pruned else 'copy'}"
+    names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
+    folder = Path(bpy.path.abspath("//"))  # where the file browser starts
+    return next(f"{new}.ply" for new in names if not (folder / f"{new}.ply").exists())
+
+
 @dataclass(frozen=True, eq=False)
 class _Scoring:
     """What is to be scored, by which views and how; where all of it stood (`staleness.origin`)."""
@@ -131,7 +144,7 @@ class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
         self.report(
             {"INFO"},
             f"Scored {len(scores.values):,} splats by {scores.views_used} of "
-            f"{scores.views_given} views; {unseen:,} lie in none",
+            f"{counted(scores.views_given, 'view')}; {unseen:,} lie in none",
         )
         for note in (*scoring_notes(scores), *splat_object.modifier_notes(checked.obj)):
             self.report({"WARNING"}, note)
@@ -193,14 +206,14 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
         done = splat_object.apply_object(checked, result)
         plans.forget(checked.mesh)
         psnr = result.report["estimated_psnr"]
+        if result.absorbed:
+            self.report({"INFO"}, result.absorbed.note())
         self.report(
             {"INFO"},
             f"Kept {done.kept:,} splats, removed {done.removed:,}: "
             f"{done.bytes_before / 1e6:,.1f} -> {done.bytes_after / 1e6:,.1f} MB"
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
-        if result.absorbed:
-            self.report({"WARNING"}, result.absorbed.note())
         if changed:
             self.report(
                 {"WARNING"},
@@ -291,7 +304,7 @@ class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Ask for the file; whoever picks an existing one in the browser means to replace it."""
         if not self.filepath:
-            self.filepath = f"{context.object.name}.ply"
+            self.filepath = _new_name(context.object)
         self.overwrite = True
         return super().invoke(context, event)
 

@@ -34,7 +34,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         layout.operator("refine.import_ply", icon="IMPORT")
         obj = context.object
         if not mesh_layout.looks_like_splats(obj):
-            layout.label(text="Select an object that holds splats", icon="INFO")
+            wrapped.label(layout, context, "Select an object that holds splats", icon="INFO")
             return
         count = len(obj.data.vertices)
         layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
@@ -97,7 +97,7 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
                 text = f"Score again: {', '.join(changed)}"
                 wrapped.label(layout, context, text, icon="ERROR")
         elif mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes:
-            layout.label(text="Applied: score again for more", icon="INFO")
+            wrapped.label(layout, context, "Applied: score again for more", icon="INFO")
 
 
 class REFINE_PT_advanced(_InSidebar, bpy.types.Panel):
@@ -224,3 +224,5 @@ def _draw_plan(
         wrapped.label(layout, context, plans.sentence(plan, absorb=settings.absorb))
         if remark := plans.remark(plan, record):
             wrapped.label(layout, context, remark, icon="INFO")
+        for warning in plans.warnings(plan, record):
+            wrapped.label(layout, context, warning, icon="ERROR")

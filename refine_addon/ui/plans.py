@@ -14,6 +14,7 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import bpy
+import numpy as np
 
 from .. import splat_object
 from ..core.errors import RefineError
@@ -32,6 +33,9 @@ if TYPE_CHECKING:
 PLAN = "refine_plan"
 """Custom property of the mesh: the last plan, or why there is none, as JSON."""
 
+MANY_UNSEEN = 0.05
+"""Share of the splats above which it is said that no view has them in its image."""
+
 REST = 0.2
 """Seconds without a change after which a slider has come to rest."""
 
@@ -48,6 +52,8 @@ class _Known:
     row_bytes, fixed_bytes : int
         See `Budget.removals`.
     kinds : Histogram
+    unseen : int
+        Splats whose centre lies in none of the views.
     """
 
     holds: tuple[Any, ...]
@@ -55,6 +61,7 @@ class _Known:
     row_bytes: int
     fixed_bytes: int
     kinds: Histogram
+    unseen: int
 
 
 _known: list[_Known] = []
@@ -182,6 +189,28 @@ def remark(plan: dict[str, Any], record: dict[str, Any]) -> str:
     return "The views see too little to tell dB"
 
 
+def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
+    """Return what the cameras do not know, as far as it matters to a plan, in sentences.
+
+    Parameters
+    ----------
+    plan : dict
+        See `stored`.
+    record : dict
+        The note of the scoring.
+    """
+    found = []
+    if record["views_used"] == 1:
+        found.append("One camera decides: add others if the splats are seen from elsewhere too")
+    unseen = plan.get("unseen", 0)
+    if unseen >= MANY_UNSEEN * plan["splats"]:
+        text = f"{unseen / plan['splats']:.0%} of the splats lie in no view"
+        if "unseen_gone" in plan:
+            text += f"; {plan['unseen_gone'] / unseen:.0%} of these go"
+        found.append(text)
+    return found
+
+
 def _can_have(obj: bpy.types.Object) -> bool:
     """Tell whether an object can have a plan: it is scored, and may be written to."""
     if not mesh_layout.looks_like_splats(obj) or mesh_scores.record(obj.data) is None:
@@ -211,6 +240,7 @@ def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
         known = _know(task, _state(mesh, settings))
         plan = _noted(known, settings)
         keep = splat_object.mark_removed(checked, task)
+        plan["unseen_gone"] = int(np.count_nonzero(~keep & (known.tally.scores.seen == 0)))
         price.show(mesh, known.tally.scores, known.kinds, _place(plan, settings), keep)
     except RefineError as error:
         plan["error"] = str(error)
@@ -225,9 +255,8 @@ def _know(task: Task, state: tuple[Any, ...]) -> _Known:
     if old is not None and old.holds == state and old.tally.is_of(scores, task.protected):
         return old
     kinds = price.histogram(scores)
-    known = _Known(
-        state, Tally(scores, task.protected), int(task.row_bytes), task.fixed_bytes, kinds
-    )
+    tally, unseen = Tally(scores, task.protected), int(np.count_nonzero(scores.seen == 0))
+    known = _Known(state, tally, int(task.row_bytes), task.fixed_bytes, kinds, unseen)
     _known[:] = [known]
     return known
 
@@ -241,7 +270,7 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
     """Return the plan for a budget as plain values."""
     scores = known.tally.scores
     count, curve = len(scores.values), scores.quality
-    noted: dict[str, Any] = {"key": key(settings), "splats": count}
+    noted: dict[str, Any] = {"key": key(settings), "splats": count, "unseen": known.unseen}
     try:
         budget = settings.to_budget()
         if budget.psnr is not None and settings.absorb:

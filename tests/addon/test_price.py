@@ -165,9 +165,10 @@ def test_a_slider_says_at_once_what_the_plan_says_later(
             setattr(settings, kind, value)
             soon = dict(plans.stored(room, settings))
         plans.refresh(bpy.context)
-        later = plans.stored(room, settings)
+        later = dict(plans.stored(room, settings))
 
         assert soon.pop("marked") is False
+        assert later.pop("unseen_gone") > 0
         assert soon == later
         marked = addon.mesh.attributes.read_attribute(room.data, "refine_remove")
         assert marked.sum() == later["removed"] > 0
@@ -312,6 +313,55 @@ def test_scores_without_an_estimate_say_how_to_get_one(addon, room, room_cameras
 
     assert plans.remark(plan, record) == "Score with Auto, or with Quality as the budget, to see dB"
     assert "dB" not in plans.sentence(plan, absorb=False)
+
+
+def test_what_the_cameras_do_not_know_is_said_beside_apply(addon, room, room_cameras):
+    """By one camera most splats lie in no view, and nobody else has a say; by 72 few do."""
+    settings, plans, scores = bpy.context.scene.refine, addon.ui.plans, addon.mesh.scores
+    bpy.ops.refine.score()
+    of_all = plans.warnings(plans.stored(room, settings), scores.record(room.data))
+    for camera in list(room_cameras.objects)[1:]:
+        room_cameras.objects.unlink(camera)
+    bpy.ops.refine.score()
+    of_one = plans.warnings(plans.stored(room, settings), scores.record(room.data))
+    unseen = addon.mesh.attributes.read_attribute(room.data, "refine_seen") == 0
+    goes = addon.mesh.attributes.read_attribute(room.data, "refine_remove")
+
+    assert of_all == []
+    assert of_one == [
+        "One camera decides: add others if the splats are seen from elsewhere too",
+        f"{unseen.mean():.0%} of the splats lie in no view; {goes[unseen].mean():.0%} of these go",
+    ]
+
+
+@pytest.mark.parametrize("absorb", [False, True])
+def test_success_is_no_warning(room, room_cameras, capfd, absorb):  # noqa: ARG001
+    """Blender prints what operators report, each with its kind in front."""
+    settings = bpy.context.scene.refine
+    settings.views, settings.absorb = 4, absorb
+    bpy.ops.refine.score()
+    bpy.ops.refine.apply()
+    said = capfd.readouterr().out
+
+    assert "Info: Kept 19,878 splats" in said
+    assert ("survivors absorbed" in said) == absorb
+    assert "Warning" not in said
+
+
+def test_an_export_suggests_a_name_that_no_file_has(addon, room, room_cameras, tmp_path):  # noqa: ARG001
+    """Beside the .blend; "pruned" once splats were removed, else a copy."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+    name = addon.ui.operators._new_name
+    room = bpy.data.objects["room"]
+    before = name(room)
+    bpy.ops.refine.score()
+    scored = name(room)
+    bpy.ops.refine.apply()
+    (tmp_path / "room_pruned.ply").touch()
+    (tmp_path / "room_pruned_2.ply").touch()
+
+    assert (before, scored) == ("room_copy.ply", "room_copy.ply")
+    assert name(room) == "room_pruned_3.ply"
 
 
 def test_a_sentence_is_broken_where_the_panel_ends(addon):
