@@ -25,6 +25,7 @@ MUTANTS = {
     "frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
         ("(near if np.ptp(near) > 0.0 else near[0, 0])", "0.0", "near plane ignored"),
+        ("between & (beyond <= 0.0)", "between", "counted beside the image"),
         ("between &= depth <= far", "between &= depth < far", "far plane excluded"),
         ("np.hypot(1.0, slope)", "slope", "reach along the image only"),
         ("view.cx - view.width / 2", "view.width / 2 - view.cx", "shift mirrored"),

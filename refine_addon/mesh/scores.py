@@ -35,6 +35,7 @@ def store(
     scores: Scores,
     settings: Settings,
     origin: dict[str, Any] | None = None,
+    cameras: list[tuple[str, int]] | None = None,
 ) -> None:
     """Write scores to the attributes of an object's mesh, and note how they came to be.
 
@@ -45,6 +46,8 @@ def store(
         What `core.pipeline.score` gave, and was given.
     origin : dict, optional
         See `staleness.origin`.
+    cameras : list of (str, int), optional
+        Name of each view given, and how many splats lie in it.
 
     Raises
     ------
@@ -77,6 +80,7 @@ def store(
             "notes": scores.notes,
             "quality": scores.quality.facts() if scores.quality else None,
             "origin": origin,
+            "cameras": cameras,
         }
     )
     mesh.update()

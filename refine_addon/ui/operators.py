@@ -18,10 +18,11 @@ from bpy_extras.io_utils import ExportHelper
 
 from .. import splat_object
 from ..cameras.sets import views_from_scene
-from ..core import pipeline
+from ..core import frustum, pipeline
 from ..core.formats.registry import FORMATS, SUFFIXES, Packed
 from ..core.quality import in_words
 from ..core.report import scoring_notes
+from ..core.work import part
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
@@ -30,6 +31,8 @@ from .on_thread import FAILURES, Answer, OnThread, fail
 from .wrapped import counted
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from ..core.scores import Scores
     from ..core.splats import Splats
     from ..core.task import Result, Settings, Task
@@ -128,17 +131,27 @@ class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
         return _Scoring(splats, views, settings, quality, origin)
 
     @staticmethod
-    def work(job: _Scoring, progress: Progress) -> Scores:
-        """Score."""
-        return pipeline.score(
-            job.splats, job.views, job.settings, quality=job.quality, progress=progress
+    def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
+        """Score, and count how many splats lie in each view."""
+        ahead = part(progress, 0.0, 0.97)
+        scores = pipeline.score(
+            job.splats, job.views, job.settings, quality=job.quality, progress=ahead
         )
+        ahead = part(progress, 0.97, 1.0)
+        return scores, frustum.census(job.splats.means, job.views, progress=ahead)
 
     def finish(
-        self, context: bpy.types.Context, checked: SplatObject, job: _Scoring, scores: Scores
+        self,
+        context: bpy.types.Context,
+        checked: SplatObject,
+        job: _Scoring,
+        found: tuple[Scores, NDArray[np.int64]],
     ) -> Answer:
         """Store the scores on the mesh and say what came of it."""
-        mesh_scores.store(checked, scores, job.settings, job.origin)
+        scores, counts = found
+        names = [view.name for view in job.views]
+        cameras = list(zip(names, counts.tolist(), strict=True))
+        mesh_scores.store(checked, scores, job.settings, job.origin, cameras)
         plans.refresh(context)
         unseen = int((scores.seen == 0).sum())
         self.report(

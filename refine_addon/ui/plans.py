@@ -22,7 +22,7 @@ from ..core.quality import in_words
 from ..core.selection import Tally, quality_of
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from . import price
+from . import camera_list, price
 from .chart import Place
 
 if TYPE_CHECKING:
@@ -202,6 +202,8 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
     found = []
     if record["views_used"] == 1:
         found.append("One camera decides: add others if the splats are seen from elsewhere too")
+    if text := camera_list.warning(record):
+        found.append(text)
     unseen = plan.get("unseen", 0)
     if unseen >= MANY_UNSEEN * plan["splats"]:
         text = f"{unseen / plan['splats']:.0%} of the splats lie in no view"
@@ -233,6 +235,7 @@ def _rested() -> None:
 
 def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     settings, mesh = scene.refine, obj.data
+    camera_list.fill(mesh_scores.record(mesh) or {})
     plan: dict[str, Any] = {"key": key(settings), "splats": len(mesh.vertices)}
     try:
         checked = mesh_layout.check(obj)

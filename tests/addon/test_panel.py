@@ -48,6 +48,10 @@ class Layout:
         assert icon_value == 0
         self.drawn.append("chart")
 
+    def template_list(self, _kind, _name, data, items, *_active, **_options):
+        """Note the lines of a list."""
+        self.drawn.extend(f"{item.name}: {item.seen}" for item in getattr(data, items))
+
     def progress(self, *, text, **_options):
         """Note a bar."""
         self.drawn.append(text)
@@ -69,7 +73,8 @@ def draw(addon, monkeypatch):
             patch.setattr(addon.mesh.attributes, "read_attribute", never)
             patch.setattr(addon.mesh.attributes, "write_attribute", never)
             for cls in addon.registration.CLASSES:
-                if issubclass(cls, bpy.types.Panel):
+                panel = issubclass(cls, bpy.types.Panel)
+                if panel and getattr(cls, "poll", lambda _context: True)(bpy.context):
                     cls.draw(SimpleNamespace(layout=Layout(drawn)), bpy.context)
         return drawn
 
@@ -167,6 +172,31 @@ def test_nothing_is_asked_of_the_scene_twice_until_it_changes(
     assert first == again == ["cameras", "changes", "export_bytes"]
     assert lens == sorted(2 * first)
     assert sorted(asked) == sorted(3 * first)
+
+
+def test_each_camera_is_listed_with_what_it_sees(draw, addon, room, room_cameras, room_views):
+    """Those that see least first: one turned away sees nothing, and that is said twice."""
+    camera = room_cameras.objects[7]
+    camera.location.z += 1000.0
+    bpy.context.view_layer.update()
+    before = draw()
+    bpy.ops.refine.score()
+    drawn = draw()
+    lines = [text for text in drawn if text.startswith("0") and ": " in text]
+    counts = [int(line.split(": ")[1]) for line in lines]
+    means = addon.splat_object.gather(addon.mesh.layout.check(room)).means
+    local = room_views[0].rotation @ (means - room_views[0].center).T
+    x = room_views[0].fx * local[0] / local[2] + room_views[0].cx
+    y = room_views[0].fy * local[1] / local[2] + room_views[0].cy
+    there = (local[2] > 0) & (x >= 0) & (x <= room_views[0].width) & (y >= 0)
+    sees = int((there & (y <= room_views[0].height)).sum())
+
+    assert not any(": " in text for text in before)
+    assert len(lines) == 72
+    assert counts == sorted(counts)
+    assert counts[0] == 0 < counts[1]
+    assert f"{room_views[0].name}: {sees}" in lines
+    assert " ".join(drawn).count("No splat lies in the view of 1 camera") == 2
 
 
 def test_one_is_not_counted_as_many(draw, room, room_cameras):  # noqa: ARG001
