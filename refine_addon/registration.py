@@ -10,9 +10,11 @@ from .core.formats import images
 from .core.formats.registry import SUFFIXES
 from .ui import camera_list, kept, plans, price
 from .ui.camera_list import REFINE_PT_camera_list, REFINE_UL_cameras, RefineCamera
+from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
 from .ui.operators import (
     REFINE_OT_apply,
+    REFINE_OT_convert,
     REFINE_OT_export_ply,
     REFINE_OT_plan,
     REFINE_OT_preview,
@@ -23,6 +25,7 @@ from .ui.panel import (
     REFINE_PT_apply,
     REFINE_PT_cameras,
     REFINE_PT_export,
+    REFINE_PT_floaters,
     REFINE_PT_preview,
     REFINE_PT_score,
     REFINE_PT_splats,
@@ -35,16 +38,20 @@ CLASSES = (
     RefineSettings,
     REFINE_OT_import_ply,
     REFINE_OT_import_cameras,
+    REFINE_OT_find_floaters,
+    REFINE_OT_delete_floaters,
     REFINE_OT_score,
     REFINE_OT_plan,
     REFINE_OT_apply,
     REFINE_OT_preview,
+    REFINE_OT_convert,
     REFINE_OT_export_ply,
     REFINE_FH_ply,
     REFINE_PT_splats,
     REFINE_PT_cameras,
     REFINE_UL_cameras,
     REFINE_PT_camera_list,
+    REFINE_PT_floaters,
     REFINE_PT_score,
     REFINE_PT_advanced,
     REFINE_PT_preview,

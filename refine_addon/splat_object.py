@@ -26,6 +26,7 @@ from .core.whole_file import expanded, refuse_existing
 from .core.work import Progress, part, silent
 from .mesh import attributes as mesh_attributes
 from .mesh import edit as mesh_edit
+from .mesh import floaters as mesh_floaters
 from .mesh import layout as mesh_layout
 from .mesh.layout import SplatObject, check
 from .mesh.scores import RECORD, store, stored_scores
@@ -181,7 +182,7 @@ def mark_removed(checked: SplatObject, task: Task) -> NDArray[np.bool_]:
     keep = pipeline.decide(task).keep
     mesh_edit.check_writable(checked.obj)
     mesh_attributes.write_attribute(checked.mesh, mesh_edit.REMOVE, "BOOLEAN", ~keep)
-    checked.mesh.update()
+    mesh_attributes.updated(checked.mesh)
     return keep
 
 
@@ -221,6 +222,31 @@ def apply_object(checked: SplatObject, result: Result) -> Plan:
     return done
 
 
+def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:
+    """Delete the splats that do not stay, all of them or none; nothing else changes.
+
+    Scores tell what is missed of all splats together, so they are to be computed again.
+
+    Parameters
+    ----------
+    checked : SplatObject
+    keep : (N,) bool
+
+    Raises
+    ------
+    RefineError
+        See `mesh_edit.check_deletable`; also if nothing would be left.
+    """
+    mesh_edit.check_deletable(checked.obj)
+    if not keep.any():
+        msg = f"object '{checked.obj.name}': no splat would be left; nothing was deleted"
+        raise RefineError(msg)
+    done = _plan(checked, keep)
+    with mesh_edit.all_or_nothing(checked.obj):
+        _reduce(checked, keep, {})
+    return done
+
+
 def _reduce(
     checked: SplatObject, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
 ) -> None:
@@ -228,7 +254,9 @@ def _reduce(
     mesh_edit.delete_vertices(checked.obj, ~keep)
     columns = {name: values[keep] for name, values in columns.items()}
     mesh_attributes.write_columns(checked, columns)
-    del checked.mesh[RECORD]
+    mesh_floaters.forget(checked.mesh)
+    if RECORD in checked.mesh:
+        del checked.mesh[RECORD]
 
 
 def absorbed_columns(checked: SplatObject, absorbed: Absorbed) -> dict[str, NDArray[Any]]:

@@ -66,6 +66,10 @@ MUTANTS = {
     "splats.py": [
         ("w, x, y, z = np", "x, y, z, w = np", "quaternion order"),
         ("good &= (largest <= _LOG_LARGEST)", "good &= (largest <= 1e9)", "huge drawn"),
+        ("SINGLE_MARGIN = 2.0**-26", "SINGLE_MARGIN = 1e-7", "float32 of 1 is told from 1"),
+        ("LOG_ZERO = -104.0", "LOG_ZERO = -103.0", "what is 0 is drawn"),
+        ("sizes = np.abs(", "sizes = (", "sign of a scale"),
+        ("off = finite & other", "off = finite", "unit quaternions lose bits"),
     ],
     "spherical_harmonics.py": [
         ("points @ rotation, degree", "points @ rotation.T, degree", "inverse"),
@@ -102,7 +106,7 @@ MUTANTS = {
         ("np.minimum.reduceat(values", "np.maximum.reduceat(values", "no range"),
     ],
     "formats/dot_splat.py": [
-        ("np.exp(np.asarray(some.log_scales", "(np.asarray(some.log_scales", "log scales stored"),
+        ("= scales(some.log_scales)", "= some.log_scales", "log scales stored"),
         ("    if beyond:", "    if beyond > 31:", "a cut splat is no fault"),
     ],
     "formats/format.py": [
@@ -422,7 +426,7 @@ MUTANTS = {
     "cleaning/clean.py": [
         ("(seen.views > 0) & ", "", "who sees nothing sees past"),
         ("found[name] &= ~protected", "pass", "protected ones go"),
-        ("sizes < max(SMALL", "sizes < min(SMALL", "clusters of any size"),
+        ("sizes < SMALL", "sizes > SMALL", "clusters of any size"),
     ],
     "cleaning/clusters.py": [
         ("labels = jumped", "break", "parts that are not joined"),

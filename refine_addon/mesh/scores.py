@@ -83,7 +83,7 @@ def store(
             "cameras": cameras,
         }
     )
-    mesh.update()
+    mesh_attributes.updated(mesh)
 
 
 def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:

@@ -37,7 +37,7 @@ def answer(what: Hashable, context: bpy.types.Context, ask: Callable[[], Answer]
     """
     obj, settings = context.object, context.scene.refine
     names = settings.bl_rna.properties.keys()
-    values = tuple(getattr(settings, name) for name in names if name not in _NOT_SETTINGS)
+    values = repr([getattr(settings, name) for name in names if name not in _NOT_SETTINGS])
     key = (what, context.scene.session_uid, obj and obj.session_uid, values)
     if key not in _answers:
         _answers[key] = ask()

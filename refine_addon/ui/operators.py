@@ -26,7 +26,9 @@ from ..core.work import part
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.convert import converted
 from . import plans, preview, staleness
+from .import_operators import FILE_NAMES
 from .on_thread import FAILURES, Answer, OnThread, fail
 from .wrapped import counted
 
@@ -47,10 +49,8 @@ _FORMATS = (
 )
 """The formats of an export as Blender lists them, with tooltips."""
 
-_GLOB = ";".join(f"*{suffix}" for suffix in SUFFIXES)
 
-
-class _OnSplats:
+class OnSplats:
     """An operator on the active object, which must hold splats."""
 
     @classmethod
@@ -66,7 +66,7 @@ class _OnSplats:
         return True
 
 
-class _OnScored(_OnSplats):
+class _OnScored(OnSplats):
     """An operator on the active object, which must be scored."""
 
     @classmethod
@@ -80,7 +80,7 @@ class _OnScored(_OnSplats):
         return True
 
 
-def _views(context: bpy.types.Context) -> ViewSet:
+def chosen_views(context: bpy.types.Context) -> ViewSet:
     """Return the views of the cameras that the panel names."""
     settings = context.scene.refine
     return views_from_scene(
@@ -113,7 +113,7 @@ class _Scoring:
     origin: dict[str, Any]
 
 
-class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
+class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     """Score each splat by how much the cameras would miss it (Esc cancels)"""
 
     bl_idname = "refine.score"
@@ -123,7 +123,7 @@ class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Scoring:
         """Gather splats, views and settings."""
-        settings, views = context.scene.refine.to_settings(), _views(context)
+        settings, views = context.scene.refine.to_settings(), chosen_views(context)
         mesh_edit.check_writable(checked.obj)
         quality = settings.estimates or context.scene.refine.budget == "psnr"
         splats = splat_object.gather(checked, whole=None if quality else False)
@@ -200,7 +200,7 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
             settings.to_budget(),
             settings.protect,
             settings=settings.to_settings(),
-            views=_views(context) if settings.absorb else None,
+            views=chosen_views(context) if settings.absorb else None,
         )
 
     @staticmethod
@@ -236,7 +236,7 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
+class REFINE_OT_preview(OnSplats, bpy.types.Operator):
     """Show the splats as points, without changing them"""
 
     bl_idname = "refine.preview"
@@ -288,7 +288,28 @@ class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
+class REFINE_OT_convert(OnSplats, bpy.types.Operator):
+    """Turn a splat mesh into a point cloud of Blender's own splats, or such a point cloud back"""
+
+    bl_idname = "refine.convert"
+    bl_label = "Convert Splats"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Put the other form in the place of the active object."""
+        try:
+            obj, notes = converted(mesh_layout.check(context.object))
+        except FAILURES as error:
+            return fail(self, error)
+        plans.refresh(context)
+        for note in notes:
+            self.report({"WARNING"}, note)
+        kind = "a point cloud" if obj.type == "POINTCLOUD" else "a mesh"
+        self.report({"INFO"}, f"'{obj.name}' is {kind} now")
+        return {"FINISHED"}
+
+
+class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
     """Write the active object's splats to a file, in the format that its suffix names"""
 
     bl_idname = "refine.export_ply"
@@ -296,7 +317,7 @@ class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
     bl_options = {"REGISTER"}
 
     filename_ext = ".ply"
-    filter_glob: StringProperty(default=_GLOB, options={"HIDDEN"})
+    filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
     suffix: EnumProperty(
         name="Format",
         description="Of the file that is picked here; what the suffix of a file name says holds",

@@ -140,7 +140,8 @@ def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:  # no
     """Return the stored plan if it is that of the current budget and mesh, else None."""
     try:
         noted = _read(obj.data[PLAN])
-        holds = noted["key"] == key(settings) and noted["splats"] == len(obj.data.vertices)
+        count = mesh_layout.splat_count(obj.data)
+        holds = noted["key"] == key(settings) and noted["splats"] == count
     except (KeyError, TypeError, ValueError):
         return None
     return noted if holds else None
@@ -236,7 +237,7 @@ def _rested() -> None:
 def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     settings, mesh = scene.refine, obj.data
     camera_list.fill(mesh_scores.record(mesh) or {})
-    plan: dict[str, Any] = {"key": key(settings), "splats": len(mesh.vertices)}
+    plan: dict[str, Any] = {"key": key(settings), "splats": mesh_layout.splat_count(mesh)}
     try:
         checked = mesh_layout.check(obj)
         task = splat_object.stored_task(checked, settings.to_budget(), settings.protect)
@@ -266,7 +267,12 @@ def _know(task: Task, state: tuple[Any, ...]) -> _Known:
 
 def _state(mesh: bpy.types.Mesh, settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
     """Return what tells a scoring of an object from another, and what is protected in it."""
-    return mesh.session_uid, len(mesh.vertices), mesh.get(mesh_scores.RECORD), settings.protect
+    return (
+        mesh.session_uid,
+        mesh_layout.splat_count(mesh),
+        mesh.get(mesh_scores.RECORD),
+        settings.protect,
+    )
 
 
 def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401

@@ -241,6 +241,8 @@ class SightLines:
         footprints : Footprints
             Of these in this view.
         """
+        if self.lines[number] is not None:
+            return
         met = crowding(gaussians, footprints, self.views[number][0])
         count = min(LINES, MOST_MET / max(met, 1.0)) / len(self.views)
         columns, rows = self.pixels(number, count)
