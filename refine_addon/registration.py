@@ -26,6 +26,8 @@ from .ui.panel import (
     REFINE_PT_splats,
 )
 from .ui.properties import RefineSettings
+from .ui.view_operators import REFINE_OT_view
+from .viewport import draw
 from .webp import BlenderImages
 
 CLASSES = (
@@ -36,6 +38,7 @@ CLASSES = (
     REFINE_OT_plan,
     REFINE_OT_apply,
     REFINE_OT_preview,
+    REFINE_OT_view,
     REFINE_OT_export_ply,
     REFINE_FH_ply,
     REFINE_PT_splats,
@@ -67,6 +70,7 @@ def register() -> None:
 
 def unregister() -> None:
     """Undo `register`, in reverse."""
+    draw.stop()
     bpy.utils.unregister_cli_command(_commands.pop())
     images.use(None)
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)

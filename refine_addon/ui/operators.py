@@ -23,6 +23,7 @@ from ..core.report import scoring_notes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..viewport import draw
 from . import plans, preview, staleness
 from .on_thread import FAILURES, Answer, OnThread, fail
 
@@ -250,6 +251,7 @@ class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
                 preview.hide(obj)
             else:
                 preview.show(obj, self.mode, hide_removed=self.hide_removed)
+                draw.stop()
         except FAILURES as error:
             return fail(self, error)
         shading = getattr(context.space_data, "shading", None)

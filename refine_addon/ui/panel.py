@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..cameras.sets import chosen_cameras
+from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..viewport import draw as viewport_draw
 from . import plans, preview, staleness
+from .view_operators import MODES
 
 if TYPE_CHECKING:
     from .properties import RefineSettings
@@ -132,8 +135,10 @@ class REFINE_PT_preview(_InSidebar, bpy.types.Panel):
         layout = self.layout
         obj = context.object
         splats = mesh_layout.looks_like_splats(obj)
+        _draw_modes(layout, obj if splats else None)
         mode, hidden = preview.shown(obj) if splats else ("", False)
         row = layout.row(align=True)
+        row.label(text="Points")
         for choice, text in (("HEAT", "Heat Map"), ("COLOR", "Colour")):
             cell = row.row(align=True)
             cell.enabled = choice == "COLOR" or (splats and preview.has_heat(obj))
@@ -194,6 +199,24 @@ def _draw_frames(
         column.prop(settings, "frame_end")
     layout.prop(settings, "frame_step")
     layout.label(text=f"{len(settings.to_frames(scene))} frames", icon="CAMERA_DATA")
+
+
+def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> None:
+    """Draw the ways to see splats as splats; those that need scores wait for them."""
+    now = viewport_draw.mode()
+    needs = {"HEAT": mesh_scores.RANK, "STAYS": mesh_edit.REMOVE, "GOES": mesh_edit.REMOVE}
+    grid = layout.grid_flow(columns=2, align=True, even_columns=True)
+    for mode, text, _ in MODES[1:]:
+        cell = grid.row(align=True)
+        cell.enabled = mode == now or mode not in needs or _has(obj, needs[mode])
+        button = cell.operator("refine.view", text=text, depress=mode == now)
+        button.mode = "OFF" if mode == now else mode
+    if viewport_draw.failure():
+        layout.label(text=viewport_draw.failure(), icon="ERROR")
+
+
+def _has(obj: bpy.types.Object | None, attribute: str) -> bool:
+    return obj is not None and attribute in obj.data.attributes
 
 
 def _draw_plan(layout: bpy.types.UILayout, obj: bpy.types.Object, settings: RefineSettings) -> None:
