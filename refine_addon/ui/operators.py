@@ -212,7 +212,7 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
 
 
 class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
-    """Show the splats as points, without changing them"""
+    """Show the splats as points, or in renders as they are, without changing them"""
 
     bl_idname = "refine.preview"
     bl_label = "Preview"
@@ -230,10 +230,24 @@ class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
     hide_removed: BoolProperty(
         name="Hide What Goes", description="Hide the splats that the budget removes"
     )
+    style: EnumProperty(
+        name="Style",
+        description="What is made of each splat",
+        items=(
+            ("POINTS", "Points", "A sphere, for the viewport"),
+            ("SPLATS", "For Renders", "The Gaussian itself, for pictures that Cycles renders"),
+        ),
+        options={"SKIP_SAVE"},
+    )
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: Any) -> str:  # noqa: ANN401
         """Return the tooltip of a button."""
+        if properties.style == "SPLATS" and properties.mode != "OFF":
+            return (
+                "Let renders show the splats as they are; sets the scene to Cycles, without light "
+                "and with the view transform Standard"
+            )
         if properties.mode == "OFF":
             return "Show the plain mesh again"
         if properties.hide_removed:
@@ -250,10 +264,14 @@ class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
             if self.mode == "OFF":
                 preview.hide(obj)
             else:
-                preview.show(obj, self.mode, hide_removed=self.hide_removed)
-                draw.stop()
+                hide, style = self.hide_removed, self.style
+                preview.show(obj, self.mode, hide_removed=hide, style=style)
         except FAILURES as error:
             return fail(self, error)
+        if self.mode != "OFF" and self.style == "SPLATS":
+            preview.set_up_render(context.scene)
+            return {"FINISHED"}  # too slow for the viewport, which draws them by itself
+        draw.stop()
         shading = getattr(context.space_data, "shading", None)
         # Solid mode draws every point in one grey.
         if self.mode != "OFF" and shading and shading.type in {"SOLID", "WIREFRAME"}:

@@ -151,6 +151,8 @@ class REFINE_PT_preview(_InSidebar, bpy.types.Panel):
         button = row.operator("refine.preview", text="Hide What Goes", depress=hidden, icon=icon)
         button.mode = mode or "HEAT"
         button.hide_removed = not hidden
+        button = layout.operator("refine.preview", text="Show in Renders", icon="RENDER_STILL")
+        button.mode, button.style, button.hide_removed = "COLOR", "SPLATS", hidden
 
 
 class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
@@ -205,9 +207,10 @@ def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> Non
     """Draw the ways to see splats as splats; those that need scores wait for them."""
     now = viewport_draw.mode()
     needs = {"HEAT": mesh_scores.RANK, "STAYS": mesh_edit.REMOVE, "GOES": mesh_edit.REMOVE}
-    grid = layout.grid_flow(columns=2, align=True, even_columns=True)
-    for mode, text, _ in MODES[1:]:
-        cell = grid.row(align=True)
+    column = layout.column(align=True)
+    rows = [column.row(align=True), column.row(align=True)]
+    for place, (mode, text, _) in enumerate(MODES[1:]):
+        cell = rows[place // 2].row(align=True)
         cell.enabled = mode == now or mode not in needs or _has(obj, needs[mode])
         button = cell.operator("refine.view", text=text, depress=mode == now)
         button.mode = "OFF" if mode == now else mode

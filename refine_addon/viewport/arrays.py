@@ -39,7 +39,7 @@ class Packed:
 
     Attributes
     ----------
-    vertices : (M,) int64
+    vertices : (M,) int32
         Which vertices of the mesh they are.
     means : (M, 3) float32
         In the mesh's frame.
@@ -50,7 +50,7 @@ class Packed:
         All coefficients of red, green, blue, the constant one first.
     """
 
-    vertices: NDArray[np.int64]
+    vertices: NDArray[np.int32]
     means: NDArray[np.float32]
     covariances: NDArray[np.float32]
     opacities: NDArray[np.float32]
@@ -81,7 +81,8 @@ class Eye(NamedTuple):
 def pack(splats: Splats) -> Packed:
     """Return what is drawn of splats; with the harmonics that are to be seen."""
     opacities = opacity(splats.opacity_logits).astype(np.float32)  # (N,)
-    vertices = np.flatnonzero(drawable(splats) & (opacities >= ALPHA_CUT))
+    shown = drawable(splats) & (opacities >= ALPHA_CUT)
+    vertices = np.flatnonzero(shown).astype(np.int32)
     covariances = np.empty((len(vertices), 6), np.float32)
     harmonics = np.empty((len(vertices), splats.sh_rest.shape[1] + 1, 3), np.float16)
     rows, columns = np.triu_indices(3)
@@ -92,13 +93,12 @@ def pack(splats: Splats) -> Packed:
             axes *= np.exp(some.log_scales.astype(np.float64))[:, None, :]
             matrices = axes @ axes.transpose(0, 2, 1)
             covariances[chunk] = matrices[:, rows, columns]
-            harmonics[chunk, 0] = np.clip(some.sh_dc, -_LARGEST_HALF, _LARGEST_HALF)
-            harmonics[chunk, 1:] = np.clip(some.sh_rest, -_LARGEST_HALF, _LARGEST_HALF)
+        harmonics[chunk, 0], harmonics[chunk, 1:] = _half(some.sh_dc), _half(some.sh_rest)
     means = np.ascontiguousarray(splats.means[vertices], np.float32)
     return Packed(vertices, means, covariances, opacities[vertices], harmonics)
 
 
-def most_important_first(packed: Packed, ranks: NDArray[Any] | None = None) -> NDArray[np.int64]:
+def most_important_first(packed: Packed, ranks: NDArray[Any] | None = None) -> NDArray[np.int32]:
     """Return the splats in the order in which fewer of them are chosen, (M,).
 
     Parameters
@@ -113,7 +113,7 @@ def most_important_first(packed: Packed, ranks: NDArray[Any] | None = None) -> N
         worth = packed.opacities * sizes
     else:
         worth = np.nan_to_num(ranks[packed.vertices])
-    return np.argsort(-worth, kind="stable")
+    return np.argsort(-worth, kind="stable").astype(np.int32)
 
 
 def colors(packed: Packed, eye: Eye | None = None) -> NDArray[np.float32]:
@@ -195,8 +195,8 @@ def farthest_first(depths: NDArray[np.float32], *, perspective: bool) -> NDArray
     if not len(depths):
         return np.empty(0, np.int64)
     values = np.log(depths) if perspective else depths
-    high = values.max()
-    extent = high - values.min()
+    low, high = values.min(), values.max()
+    extent = high - low
     scale = np.float32(_KEYS / extent if extent > 0.0 else 0.0)
     keys = ((high - values) * scale).astype(np.uint16)
     return np.argsort(keys, kind="stable")
@@ -220,6 +220,13 @@ def first_of_each(counts: list[int], most: int) -> list[int]:
     if total <= most:
         return list(counts)
     return [count * most // total for count in counts]
+
+
+def _half(values: NDArray[Any]) -> NDArray[Any]:
+    """Return finite values, those beyond the range of float16 as its ends."""
+    if values.size and max(values.max(), -values.min()) > _LARGEST_HALF:
+        return np.clip(values, -_LARGEST_HALF, _LARGEST_HALF)
+    return values
 
 
 def _directions(means: NDArray[np.float32], eye: Eye) -> NDArray[np.float32]:

@@ -42,7 +42,7 @@ class Held:
         Once they are.
     ranks : (N,) floating or None
         Of their scores, of all vertices.
-    important : (M,) int64
+    important : (M,) int32 or None
         Those packed, the ones that matter most first.
     going : (M,) bool or None
         What the plan removes, of those packed.
@@ -52,7 +52,7 @@ class Held:
     future: Future[Packed] | None = None
     packed: Packed | None = None
     ranks: NDArray[Any] | None = None
-    important: NDArray[np.int64] | None = None
+    important: NDArray[np.int32] | None = None
     going: NDArray[np.bool_] | None = None
     degree: int = 0
     remove: NDArray[np.bool_] | None = field(default=None, repr=False)
@@ -98,6 +98,8 @@ class Content:
     Attributes
     ----------
     atlas : Atlas or None
+    refused : set of int
+        Identities of meshes that look like splats at first sight alone.
     changes : int
         Rises where what goes has changed, while the splats are the same.
     """
@@ -107,12 +109,12 @@ class Content:
         self.changes = 0
         self._held: dict[int, Held] = {}
         self._stale: set[int] = set()
-        self._refused: set[int] = set()  # what looks like splats at first sight alone
+        self.refused: set[int] = set()
 
     def has_changed(self, mesh: int | None = None) -> None:
         """Look at a mesh again before it is drawn; at all of them by default."""
         self._stale.update(self._held if mesh is None else [mesh])
-        self._refused.difference_update(list(self._refused) if mesh is None else [mesh])
+        self.refused.difference_update(list(self.refused) if mesh is None else [mesh])
 
     def pending(self) -> bool:
         """Tell whether splats are being packed."""
@@ -142,14 +144,14 @@ class Content:
         wanted = {}
         for obj in objects:
             mesh = obj.data.session_uid
-            if mesh in self._refused:
+            if mesh in self.refused:
                 continue
             if mesh not in self._held or mesh in self._stale:
                 self._stale.discard(mesh)
                 try:
                     self._read(check(obj))
                 except RefineError:
-                    self._refused.add(mesh)
+                    self.refused.add(mesh)
                     continue
             held = self._held[mesh]
             if held.future and held.future.done():
@@ -170,9 +172,9 @@ class Content:
             held.important = None
         held.remove = _attribute(mesh, mesh_edit.REMOVE, "BOOLEAN")
         columns = mesh_attributes.stored_columns(checked)
-        checksum = 0
+        checksum = 1
         for name in REQUIRED:
-            checksum = zlib.crc32(np.ascontiguousarray(columns[name]).data, checksum)
+            checksum = zlib.adler32(np.ascontiguousarray(columns[name]).data, checksum)
         signature = (len(checked), held.degree, checksum)
         if signature != held.signature:
             held.signature = signature

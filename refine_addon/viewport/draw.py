@@ -69,8 +69,7 @@ def show(wanted: str) -> None:
         _state.failure = ""
         _hook()
     _state.mode = wanted
-    for depsgraph in points.graphs():
-        points.hide(depsgraph)
+    _hide_points()
     _redraw()
 
 
@@ -140,7 +139,10 @@ def _draw() -> None:
     context = bpy.context
     region, region_3d, space = context.region, context.region_data, context.space_data
     objects = [obj for obj in context.view_layer.objects if _is_drawn(obj, space)]
+    refused = len(_state.content.refused)
     placed = _state.content.update(objects, _existing)
+    if len(_state.content.refused) > refused:  # Blender shows these as it did before
+        bpy.app.timers.register(_hide_points, first_interval=0.0)
     key = region.as_pointer()
     view = _state.views.pop(key, None) or View()
     _state.views[key] = view  # the one drawn last is last
@@ -191,6 +193,12 @@ def _redraw() -> None:
         area.tag_redraw()
 
 
+def _hide_points() -> None:
+    if _state.mode != "OFF":
+        for depsgraph in points.graphs():
+            points.hide(depsgraph, _state.content.refused)
+
+
 def _areas() -> list[bpy.types.Area]:
     windows = bpy.context.window_manager.windows
     return [a for window in windows for a in window.screen.areas if a.type == "VIEW_3D"]
@@ -209,14 +217,13 @@ def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = No
             data = getattr(update.id.original, "data", update.id.original)
             if isinstance(data, bpy.types.Mesh):
                 _state.content.has_changed(data.session_uid)
-    points.hide(depsgraph)
+    points.hide(depsgraph, _state.content.refused)
 
 
 @persistent
 def _undone(*_: object) -> None:
     _state.content.has_changed()
-    for depsgraph in points.graphs():
-        points.hide(depsgraph)
+    _hide_points()
 
 
 @persistent
@@ -226,6 +233,5 @@ def _leaving(*_: object) -> None:
 
 @persistent
 def _loaded(*_: object) -> None:
-    for depsgraph in points.graphs():
-        points.hide(depsgraph)
+    _hide_points()
     _redraw()

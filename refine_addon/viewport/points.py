@@ -14,13 +14,14 @@ import bpy
 from ..mesh.layout import looks_like_splats
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Container, Iterator
 
 
-def hide(depsgraph: bpy.types.Depsgraph) -> None:
-    """Show the splat objects of a view layer as their bounding boxes."""
+def hide(depsgraph: bpy.types.Depsgraph, refused: Container[int] = ()) -> None:
+    """Show the splat objects of a view layer as their bounding boxes, save some meshes'."""
     for obj, evaluated in _copies(depsgraph):
-        wanted = obj.display_type if obj.mode == "EDIT" else "BOUNDS"
+        drawn = obj.mode != "EDIT" and obj.data.session_uid not in refused
+        wanted = "BOUNDS" if drawn else obj.display_type
         if evaluated.display_type != wanted:
             evaluated.display_type = wanted
 

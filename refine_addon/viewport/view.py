@@ -97,7 +97,7 @@ class _Part(NamedTuple):
     slot: Slot
     going: NDArray[np.bool_] | None
     ranks: NDArray[Any] | None
-    important: NDArray[np.int64] | None
+    important: NDArray[np.int32] | None
     eye: Eye
 
 
@@ -185,7 +185,7 @@ class View:
         if moving:
             self._sort(full, shown, camera, mode, least.splats)
         elif self._job is None and (self._order is None or self._order.key != full):
-            self._start(full, shown, camera, mode)
+            self._start(full, shown, camera, mode, least.splats)
         self.complete = not moving and self._order is not None and self._order.key == full
         if self._order is None or self._colors is None:
             return
@@ -213,21 +213,30 @@ class View:
             self._colors = shader.texture(found.colors, 4, "RGBA16F")
             self._colors_key, self._colored = colors_key, order_key[0]
 
-    def _start(self, key: tuple[Any, ...], shown: list[Shown], camera: Camera, mode: str) -> None:
-        """Have all splats sorted, and coloured if they look otherwise from here."""
+    def _start(
+        self, key: tuple[Any, ...], shown: list[Shown], camera: Camera, mode: str, few: int
+    ) -> None:
+        """Have all splats sorted, and coloured if they look otherwise from here.
+
+        Where nothing is seen yet, only those that matter most, in their constant colours.
+        """
         parts = _parts(shown, camera)
         colors_key: tuple[Any, ...] = (key[0], mode, [p.slot.number for p in parts])
         if mode != "HEAT":
             colors_key += tuple(p.eye.place.tobytes() for p in parts if p.slot.held.degree)
-        fresh = colors_key == self._colors_key
-        work = background.start(_find, parts, camera.near, mode, None if fresh else key[0].rows)
-        self._job = (key, colors_key, work)
+        rows = None if colors_key == self._colors_key else key[0].rows
+        if self._colors is None and key[0].rows > few:
+            first = background.start(_find, parts, camera.near, mode, rows, few)
+            self._job = ((*key, few), None, first)
+        else:
+            work = background.start(_find, parts, camera.near, mode, rows)
+            self._job = (key, colors_key, work)
 
     def _sort(
         self, key: tuple[Any, ...], shown: list[Shown], camera: Camera, mode: str, most: int
     ) -> None:
         """Sort the splats that matter most, at once."""
-        key = (key, most)
+        key = (*key, most)
         if self._order is None or self._order.key != key:
             order = _order(_parts(shown, camera), camera.near, mode, most)
             self._order = _Order(shader.texture(as_texture(order), 1, "R32F"), len(order), key)
@@ -288,9 +297,14 @@ def _parts(shown: Iterable[Shown], camera: Camera) -> list[_Part]:
     return parts
 
 
-def _find(parts: list[_Part], near: float, mode: str, rows: int | None) -> _Found:
-    """Sort all splats and, in textures of so many rows, colour them; on the thread."""
-    order = _order(parts, near, mode)
+def _find(
+    parts: list[_Part], near: float, mode: str, rows: int | None, few: int | None = None
+) -> _Found:
+    """Sort splats and, in textures of so many rows, colour them; on the thread.
+
+    With `few`, only so many are sorted, and colours are constant.
+    """
+    order = _order(parts, near, mode, few)
     if rows is None:
         return _Found(as_texture(order), len(order), None)
     painted = np.zeros((rows, 4), np.float32)
@@ -299,7 +313,7 @@ def _find(parts: list[_Part], near: float, mode: str, rows: int | None) -> _Foun
         if mode == "HEAT" and ranks is not None:
             rgba = heat(slot.packed, ranks, ramp())
         else:
-            rgba = colors(slot.packed, eye)
+            rgba = colors(slot.packed, eye if few is None else None)
         painted[place] = rgba[: slot.count]
         if mode == "GOES":
             painted[place] = tinted(painted[place], TINT, TINT_SHARE)
@@ -316,8 +330,8 @@ def _order(parts: list[_Part], near: float, mode: str, most: int | None = None) 
             before, deep = in_front(slot.packed.means[:count], eye, near)
         else:
             some = important[important < slot.count][:count]
-            before, deep = in_front(slot.packed.means[some], eye, near)
-            before = some[before]
+            nearer, deep = in_front(slot.packed.means[some], eye, near)
+            before = some[nearer].astype(np.int64)
         if mode in {"STAYS", "GOES"}:
             wanted = _wanted(going, mode, before)
             before, deep = before[wanted], deep[wanted]
