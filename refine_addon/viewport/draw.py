@@ -160,9 +160,9 @@ def _draw() -> None:
 
 
 def _is_drawn(obj: bpy.types.Object, space: bpy.types.SpaceView3D) -> bool:
-    if not looks_like_splats(obj) or obj.mode == "EDIT" or not len(obj.data.vertices):
+    if not looks_like_splats(obj) or obj.data.is_editmode or not len(obj.data.vertices):
         return False
-    return obj.visible_in_viewport_get(space)
+    return obj.visible_get(viewport=space)
 
 
 def _existing() -> set[tuple[int, int]]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def hide(depsgraph: bpy.types.Depsgraph, refused: Container[int] = ()) -> None:
     """Show the splat objects of a view layer as their bounding boxes, save some meshes'."""
     for obj, evaluated in _copies(depsgraph):
-        drawn = obj.mode != "EDIT" and obj.data.session_uid not in refused
+        drawn = not obj.data.is_editmode and obj.data.session_uid not in refused
         wanted = "BOUNDS" if drawn else obj.display_type
         if evaluated.display_type != wanted:
             evaluated.display_type = wanted
