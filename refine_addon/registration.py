@@ -8,10 +8,13 @@ from bpy.props import FloatProperty, PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
+from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
 from .ui.operators import (
     REFINE_OT_apply,
+    REFINE_OT_convert,
     REFINE_OT_export_ply,
+    REFINE_OT_levels,
     REFINE_OT_plan,
     REFINE_OT_preview,
     REFINE_OT_score,
@@ -21,6 +24,7 @@ from .ui.panel import (
     REFINE_PT_apply,
     REFINE_PT_cameras,
     REFINE_PT_export,
+    REFINE_PT_floaters,
     REFINE_PT_preview,
     REFINE_PT_score,
     REFINE_PT_splats,
@@ -34,15 +38,20 @@ CLASSES = (
     RefineSettings,
     REFINE_OT_import_ply,
     REFINE_OT_import_cameras,
+    REFINE_OT_find_floaters,
+    REFINE_OT_delete_floaters,
     REFINE_OT_score,
     REFINE_OT_plan,
     REFINE_OT_apply,
     REFINE_OT_preview,
     REFINE_OT_view,
+    REFINE_OT_convert,
     REFINE_OT_export_ply,
+    REFINE_OT_levels,
     REFINE_FH_ply,
     REFINE_PT_splats,
     REFINE_PT_cameras,
+    REFINE_PT_floaters,
     REFINE_PT_score,
     REFINE_PT_advanced,
     REFINE_PT_preview,

@@ -24,8 +24,10 @@ from .core.survivors import survivor_columns
 from .core.task import DEFAULTS, Result, Settings, Task
 from .core.whole_file import expanded, refuse_existing
 from .core.work import Progress, part, silent
+from .core.written import written_facts
 from .mesh import attributes as mesh_attributes
 from .mesh import edit as mesh_edit
+from .mesh import floaters as mesh_floaters
 from .mesh import layout as mesh_layout
 from .mesh.layout import SplatObject, check
 from .mesh.scores import RECORD, store, stored_scores
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     from .core.absorbing.absorb import Absorbed
     from .core.formats.ply import SplatFile
     from .core.formats.registry import Packed
+    from .core.levels.lod import Level
     from .core.selection import Budget
     from .core.splats import Splats
     from .core.views import ViewSet
@@ -160,11 +163,11 @@ def plan(checked: SplatObject, budget: Budget, protect: str = "") -> Plan:
     keep = keep_mask(checked, budget, protect)
     mesh_edit.check_writable(checked.obj)
     mesh_attributes.write_attribute(checked.mesh, mesh_edit.REMOVE, "BOOLEAN", ~keep)
-    checked.mesh.update()
+    mesh_attributes.updated(checked.mesh)
     return _plan(checked, keep)
 
 
-def apply_object(checked: SplatObject, result: Result) -> Plan:
+def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
     """Delete the splats that do not stay, and set what the others became: all of it or nothing.
 
     Everything else of the object and its mesh stays: attributes, vertex groups, custom properties,
@@ -173,7 +176,7 @@ def apply_object(checked: SplatObject, result: Result) -> Plan:
     Parameters
     ----------
     checked : SplatObject
-    result : Result
+    result : Result or Level
         What was decided of the object's splats.
 
     Returns
@@ -200,6 +203,31 @@ def apply_object(checked: SplatObject, result: Result) -> Plan:
     return done
 
 
+def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:
+    """Delete the splats that do not stay, all of them or none; nothing else changes.
+
+    Scores tell what is missed of all splats together, so they are to be computed again.
+
+    Parameters
+    ----------
+    checked : SplatObject
+    keep : (N,) bool
+
+    Raises
+    ------
+    RefineError
+        See `mesh_edit.check_deletable`; also if nothing would be left.
+    """
+    mesh_edit.check_deletable(checked.obj)
+    if not keep.any():
+        msg = f"object '{checked.obj.name}': no splat would be left; nothing was deleted"
+        raise RefineError(msg)
+    done = _plan(checked, keep)
+    with mesh_edit.all_or_nothing(checked.obj):
+        _reduce(checked, keep, {})
+    return done
+
+
 def _reduce(
     checked: SplatObject, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
 ) -> None:
@@ -207,7 +235,9 @@ def _reduce(
     mesh_edit.delete_vertices(checked.obj, ~keep)
     columns = {name: values[keep] for name, values in columns.items()}
     mesh_attributes.write_columns(checked, columns)
-    del checked.mesh[RECORD]
+    mesh_floaters.forget(checked.mesh)
+    if RECORD in checked.mesh:
+        del checked.mesh[RECORD]
 
 
 def absorbed_columns(checked: SplatObject, absorbed: Absorbed) -> dict[str, NDArray[Any]]:
@@ -314,6 +344,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
         _check_savable(checked.obj)
     row_bytes, fixed_bytes = _file_size(checked, budget, output)
     estimates = settings.estimates or budget.psnr is not None
+    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
     task = Task(
         budget=budget,
         settings=settings,
@@ -335,6 +366,9 @@ def prune_object(  # noqa: PLR0913 - the command's options
             _reduce(checked, result.keep, columns)
             _save(target)
     clock.lap("write_s")
+    if target is not None:
+        used = views.spread(settings.views)
+        result.report.update(written_facts(target, result.scores, used, matrix=matrix))
     result.report["notes"] += modifier_notes(checked.obj)
     source, made = f"{bpy.data.filepath}#{name}", None if target is None else str(target)
     after = sizes.bytes_after if target is None else target.stat().st_size

@@ -77,6 +77,10 @@ MUTANTS = {
     "splats.py": [
         ("w, x, y, z = np", "x, y, z, w = np", "quaternion order"),
         ("good &= (largest <= _LOG_LARGEST)", "good &= (largest <= 1e9)", "huge drawn"),
+        ("SINGLE_MARGIN = 2.0**-26", "SINGLE_MARGIN = 1e-7", "float32 of 1 is told from 1"),
+        ("LOG_ZERO = -104.0", "LOG_ZERO = -103.0", "what is 0 is drawn"),
+        ("sizes = np.abs(", "sizes = (", "sign of a scale"),
+        ("off = finite & other", "off = finite", "unit quaternions lose bits"),
     ],
     "spherical_harmonics.py": [
         ("points @ rotation, degree", "points @ rotation.T, degree", "inverse"),
@@ -113,7 +117,7 @@ MUTANTS = {
         ("np.minimum.reduceat(values", "np.maximum.reduceat(values", "no range"),
     ],
     "formats/dot_splat.py": [
-        ("np.exp(np.asarray(some.log_scales", "(np.asarray(some.log_scales", "log scales stored"),
+        ("= scales(some.log_scales)", "= some.log_scales", "log scales stored"),
         ("    if beyond:", "    if beyond > 31:", "a cut splat is no fault"),
     ],
     "formats/format.py": [
@@ -409,13 +413,50 @@ MUTANTS = {
             "found.error",
             "what the other views see forgotten",
         ),
-        ("math.floor(FIRST * total)", "0", "merged from the first"),
+        ("math.floor(FIRST * began)", "0", "merged from the first"),
+        ("first = max(deleted - (began - total), 0)", "first = deleted", "a tenth of each level"),
         ("else protected[rest]", "else None", "protection forgotten"),
         (
             "keep[np.flatnonzero(rest)[absorbed.keep]] = True",
             "keep[np.flatnonzero(absorbed.keep)] = True",
             "survivors of other rows",
         ),
+    ],
+    "written.py": [
+        (
+            "if not np.array_equal(matrix, np.eye(4)):",
+            "if False:",
+            "the file's frame for the views'",
+        ),
+        ("if format_named(path) is None:", "if False:", "a plain PLY compared"),
+    ],
+    "levels/lod.py": [
+        ("keep[first.keep] = second.keep", "keep[: len(second.keep)] = second.keep", "other rows"),
+        (
+            "first.changed[second.keep] | second.changed",
+            "second.changed",
+            "changed before forgotten",
+        ),
+        ("else scene.protected[whole.keep]", "else None", "protected in the first level alone"),
+        ("origin=Origin(count, sights, psnr)", "origin=None", "each level a new original"),
+    ],
+    "levels/distance.py": [
+        ("_width_of_most(splats, changed", "_width_of_most(splats, ~changed", "the unchanged"),
+        ("<= OVERLOOKED * total:", "<= 0.0 * total:", "nothing is overlooked"),
+        (".mean(axis=(2, 4))", "[:, :, 0, :, 0]", "one pixel for its square"),
+        (
+            "steps = [factor * self.distance",
+            "steps = [self.distance / factor",
+            "nearer, not farther",
+        ),
+    ],
+    "levels/files.py": [
+        (
+            "                (folder / MANIFEST).unlink(missing_ok=True)",
+            "                pass",
+            "old manifest",
+        ),
+        ("                    path.unlink()\n", "                    pass\n", "levels left behind"),
     ],
     "scene.py": [
         ("np.where(first @ vectors < 0.0, -1.0, 1.0)", "1.0", "axes of either sign"),
@@ -433,7 +474,7 @@ MUTANTS = {
     "cleaning/clean.py": [
         ("(seen.views > 0) & ", "", "who sees nothing sees past"),
         ("found[name] &= ~protected", "pass", "protected ones go"),
-        ("sizes < max(SMALL", "sizes < min(SMALL", "clusters of any size"),
+        ("sizes < SMALL", "sizes > SMALL", "clusters of any size"),
     ],
     "cleaning/clusters.py": [
         ("labels = jumped", "break", "parts that are not joined"),
@@ -475,6 +516,7 @@ TESTS = {
     ],
     "glb": ["formats/glb_document.py"],
     "viewport_arrays": ["../viewport/arrays.py"],
+    "levels": ["levels/lod.py", "levels/distance.py", "levels/files.py"],
 }
 """Modules whose tests are not in the file of their own name; those run first."""
 

@@ -78,7 +78,7 @@ def store(
             "origin": origin,
         }
     )
-    mesh.update()
+    mesh_attributes.updated(mesh)
 
 
 def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:

@@ -21,7 +21,8 @@ from ..mesh import layout as mesh_layout
 from ..viewport import draw
 from .on_thread import FAILURES, Answer, described, fail
 
-_NAMES = tuple(f"a{suffix}" for suffix in SUFFIXES)
+FILE_NAMES = ";".join(f"*{suffix}" for suffix in SUFFIXES)
+"""What a file browser shows."""
 
 UPRIGHT_TEXT = (
     "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "
@@ -49,9 +50,7 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
     bl_options = {"REGISTER", "UNDO"}
 
     filename_ext = ".ply"
-    filter_glob: StringProperty(
-        default=";".join(f"*{suffix}" for suffix in SUFFIXES), options={"HIDDEN"}
-    )
+    filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
     files: CollectionProperty(
         type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"}
     )
@@ -163,7 +162,7 @@ class REFINE_FH_ply(bpy.types.FileHandler):
     bl_idname = "REFINE_FH_ply"
     bl_label = "Gaussian Splats (REFINE)"
     bl_import_operator = "refine.import_ply"
-    bl_file_extensions = ";".join(dict.fromkeys(Path(suffix).suffix for suffix in _NAMES))
+    bl_file_extensions = ";".join(dict.fromkeys("." + suffix.split(".")[-1] for suffix in SUFFIXES))
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:

@@ -14,20 +14,25 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from .. import splat_object
+from .. import level_objects, splat_object
 from ..cameras.sets import views_from_scene
 from ..core import pipeline
 from ..core.formats.registry import FORMATS, SUFFIXES, Packed
+from ..core.levels.lod import Level, Levels, lod
 from ..core.quality import in_words
 from ..core.report import scoring_notes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.convert import converted
 from ..viewport import draw
 from . import plans, preview, staleness
+from .import_operators import FILE_NAMES
 from .on_thread import FAILURES, Answer, OnThread, fail
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from ..core.scores import Scores
     from ..core.splats import Splats
     from ..core.task import Result, Settings, Task
@@ -42,10 +47,8 @@ _FORMATS = (
 )
 """The formats of an export as Blender lists them, with tooltips."""
 
-_GLOB = ";".join(f"*{suffix}" for suffix in SUFFIXES)
 
-
-class _OnSplats:
+class OnSplats:
     """An operator on the active object, which must hold splats."""
 
     @classmethod
@@ -61,7 +64,7 @@ class _OnSplats:
         return True
 
 
-class _OnScored(_OnSplats):
+class _OnScored(OnSplats):
     """An operator on the active object, which must be scored."""
 
     @classmethod
@@ -75,7 +78,7 @@ class _OnScored(_OnSplats):
         return True
 
 
-def _views(context: bpy.types.Context) -> ViewSet:
+def chosen_views(context: bpy.types.Context) -> ViewSet:
     """Return the views of the cameras that the panel names."""
     settings = context.scene.refine
     return views_from_scene(
@@ -98,7 +101,7 @@ class _Scoring:
     origin: dict[str, Any]
 
 
-class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
+class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     """Score each splat by how much the cameras would miss it (Esc cancels)"""
 
     bl_idname = "refine.score"
@@ -108,7 +111,7 @@ class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Scoring:
         """Gather splats, views and settings."""
-        settings, views = context.scene.refine.to_settings(), _views(context)
+        settings, views = context.scene.refine.to_settings(), chosen_views(context)
         mesh_edit.check_writable(checked.obj)
         quality = settings.estimates or context.scene.refine.budget == "psnr"
         splats = splat_object.gather(checked, whole=None if quality else False)
@@ -175,7 +178,7 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
             settings.to_budget(),
             settings.protect,
             settings=settings.to_settings(),
-            views=_views(context) if settings.absorb else None,
+            views=chosen_views(context) if settings.absorb else None,
         )
 
     @staticmethod
@@ -211,7 +214,73 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
+@dataclass(frozen=True, eq=False)
+class _Detail:
+    """What levels are to be made of, by which views and how; what is protected, (N,) bool."""
+
+    splats: Splats
+    views: ViewSet
+    levels: Levels
+    settings: Settings
+    protected: NDArray[np.bool_] | None
+
+
+class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
+    """Make objects with ever fewer of the splats, by the cameras, in a collection of their own"""
+
+    bl_idname = "refine.levels"
+    bl_label = "Make Levels"
+    bl_options = {"REGISTER", "UNDO"}
+    doing = "Making levels"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run, and if not, why."""
+        if not super().poll(context):
+            return False
+        if context.mode != "OBJECT":
+            cls.poll_message_set("Go to object mode first")
+            return False
+        return True
+
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Detail:
+        """Gather splats, views and settings."""
+        settings = context.scene.refine
+        levels, protect = settings.to_levels(), settings.protect
+        return _Detail(
+            splat_object.gather(checked, whole=True if levels.absorb else None),
+            chosen_views(context),
+            levels,
+            settings.to_settings(),
+            mesh_edit.protected_mask(checked.obj, protect) if protect else None,
+        )
+
+    @staticmethod
+    def work(job: _Detail, progress: Progress) -> list[Level]:
+        """Make the levels."""
+        return lod(
+            job.splats, job.views, job.levels, job.settings,
+            protected=job.protected, progress=progress,
+        )  # fmt: skip
+
+    def finish(
+        self,
+        _context: bpy.types.Context,
+        checked: SplatObject,
+        _job: _Detail,
+        levels: list[Level],
+    ) -> Answer:
+        """Make the objects and say what each level costs."""
+        collection = level_objects.add_levels(checked, levels)
+        told = [
+            f"{len(level.splats):,}" + (f" ({in_words(level.psnr)})" if level.psnr else "")
+            for level in levels
+        ]
+        self.report({"INFO"}, f"'{collection.name}': {', '.join(told)} splats")
+        return {"FINISHED"}
+
+
+class REFINE_OT_preview(OnSplats, bpy.types.Operator):
     """Show the splats as points, or in renders as they are, without changing them"""
 
     bl_idname = "refine.preview"
@@ -282,7 +351,28 @@ class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
+class REFINE_OT_convert(OnSplats, bpy.types.Operator):
+    """Turn a splat mesh into a point cloud of Blender's own splats, or such a point cloud back"""
+
+    bl_idname = "refine.convert"
+    bl_label = "Convert Splats"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Put the other form in the place of the active object."""
+        try:
+            obj, notes = converted(mesh_layout.check(context.object))
+        except FAILURES as error:
+            return fail(self, error)
+        plans.refresh(context)
+        for note in notes:
+            self.report({"WARNING"}, note)
+        kind = "a point cloud" if obj.type == "POINTCLOUD" else "a mesh"
+        self.report({"INFO"}, f"'{obj.name}' is {kind} now")
+        return {"FINISHED"}
+
+
+class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
     """Write the active object's splats to a file, in the format that its suffix names"""
 
     bl_idname = "refine.export_ply"
@@ -290,7 +380,7 @@ class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
     bl_options = {"REGISTER"}
 
     filename_ext = ".ply"
-    filter_glob: StringProperty(default=_GLOB, options={"HIDDEN"})
+    filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
     suffix: EnumProperty(
         name="Format",
         description="Of the file that is picked here; what the suffix of a file name says holds",

@@ -9,14 +9,20 @@ import bpy
 
 from ..cameras.sets import chosen_cameras
 from ..mesh import edit as mesh_edit
+from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.convert import other_form
 from ..viewport import draw as viewport_draw
 from . import plans, preview, staleness
+from .properties import FLOATERS
 from .view_operators import MODES
 
 if TYPE_CHECKING:
     from .properties import RefineSettings
+
+
+_NONE = "Select an object that holds splats"
 
 
 class _InSidebar:
@@ -36,14 +42,17 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         layout.operator("refine.import_ply", icon="IMPORT")
         obj = context.object
         if not mesh_layout.looks_like_splats(obj):
-            layout.label(text="Select an object that holds splats", icon="INFO")
+            lost = obj is not None and native.lost_base(obj)
+            text = "Colours were lost: open it in Blender 5.2" if lost else _NONE
+            layout.label(text=text, icon="ERROR" if lost else "INFO")
             return
-        count = len(obj.data.vertices)
+        count = mesh_layout.splat_count(obj.data)
         layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
         layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
         size = mesh_layout.export_bytes(obj)
         if size is not None:
             layout.label(text=f"{size / 1e6:,.1f} MB")
+        layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
 
 
 class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
@@ -66,6 +75,35 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
         elif settings.source != "ACTIVE":
             cameras = chosen_cameras(context, settings.source, settings.collection)
             layout.label(text=f"{len(cameras)} cameras", icon="CAMERA_DATA")
+
+
+class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
+    """What the cameras see through."""
+
+    bl_label = "Floaters"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the reasons, how many splats each takes, and the buttons."""
+        layout = self.layout
+        settings = context.scene.refine
+        progress = context.window_manager.refine_progress
+        if progress >= 0.0:
+            layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
+            return
+        layout.operator("refine.find_floaters", icon="VIEWZOOM")
+        obj = context.object
+        found = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        column = layout.column(align=True)
+        for name, text, _ in FLOATERS:
+            shown = text if found is None else f"{text}: {found[name]:,}"
+            column.prop_enum(settings, "reasons", name, text=shown)
+        if found is not None:
+            total = sum(found[name] for name in settings.reasons)
+            layout.label(
+                text=f"Go: {total:,} of {mesh_layout.splat_count(obj.data):,}", icon="TRASH"
+            )
+            layout.operator("refine.delete_floaters", icon="TRASH")
 
 
 class REFINE_PT_score(_InSidebar, bpy.types.Panel):
@@ -186,9 +224,16 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
 
     bl_label = "6 Export"
 
-    def draw(self, _context: bpy.types.Context) -> None:
-        """Draw the button."""
-        self.layout.operator("refine.export_ply", icon="EXPORT")
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the buttons."""
+        layout, settings = self.layout, context.scene.refine
+        layout.operator("refine.export_ply", icon="EXPORT")
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        column.prop(settings, "levels")
+        column.prop(settings, "nested")
+        column.operator("refine.levels", icon="MOD_DECIM")
 
 
 def _draw_frames(

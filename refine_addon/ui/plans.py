@@ -30,7 +30,7 @@ def refresh(context: bpy.types.Context) -> None:
     if obj.mode == "EDIT" or obj.data.library or obj.library:
         return
     settings = context.scene.refine
-    noted: dict[str, Any] = {"key": key(settings), "splats": len(obj.data.vertices)}
+    noted: dict[str, Any] = {"key": key(settings), "splats": mesh_layout.splat_count(obj.data)}
     try:
         checked = mesh_layout.check(obj)
         plan = splat_object.plan(checked, settings.to_budget(), settings.protect)
@@ -44,7 +44,8 @@ def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:  # no
     """Return the stored plan if it is that of the current budget and mesh, else None."""
     try:
         noted = json.loads(obj.data[PLAN])
-        holds = noted["key"] == key(settings) and noted["splats"] == len(obj.data.vertices)
+        count = mesh_layout.splat_count(obj.data)
+        holds = noted["key"] == key(settings) and noted["splats"] == count
     except (KeyError, TypeError, ValueError):
         return None
     return noted if holds else None

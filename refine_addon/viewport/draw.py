@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 from bpy.app.handlers import persistent
 
-from ..mesh.layout import looks_like_splats
+from ..mesh.layout import looks_like_splats, splat_count
 from . import background, legend, points, shader
 from .content import Content
 from .view import Camera, View
@@ -160,14 +160,14 @@ def _draw() -> None:
 
 
 def _is_drawn(obj: bpy.types.Object, space: bpy.types.SpaceView3D) -> bool:
-    if not looks_like_splats(obj) or obj.data.is_editmode or not len(obj.data.vertices):
+    if not looks_like_splats(obj) or points.is_edited(obj) or not splat_count(obj.data):
         return False
     return obj.visible_get(viewport=space)
 
 
 def _existing() -> set[tuple[int, int]]:
-    meshes = (obj for obj in bpy.data.objects if obj.type == "MESH")
-    return {(obj.session_uid, obj.data.session_uid) for obj in meshes}
+    splats = (obj for obj in bpy.data.objects if looks_like_splats(obj))
+    return {(obj.session_uid, obj.data.session_uid) for obj in splats}
 
 
 def _draw_legend() -> None:
@@ -215,7 +215,7 @@ def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = No
     for update in depsgraph.updates:
         if update.is_updated_geometry:
             data = getattr(update.id.original, "data", update.id.original)
-            if isinstance(data, bpy.types.Mesh):
+            if isinstance(data, (bpy.types.Mesh, bpy.types.PointCloud)):
                 _state.content.has_changed(data.session_uid)
     points.hide(depsgraph, _state.content.refused)
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def hide(depsgraph: bpy.types.Depsgraph, refused: Container[int] = ()) -> None:
     """Show the splat objects of a view layer as their bounding boxes, save some meshes'."""
     for obj, evaluated in _copies(depsgraph):
-        drawn = not obj.data.is_editmode and obj.data.session_uid not in refused
+        drawn = not is_edited(obj) and obj.data.session_uid not in refused
         wanted = "BOUNDS" if drawn else obj.display_type
         if evaluated.display_type != wanted:
             evaluated.display_type = wanted
@@ -32,6 +32,11 @@ def show() -> None:
         for obj, evaluated in _copies(depsgraph):
             if evaluated.display_type != obj.display_type:
                 evaluated.display_type = obj.display_type
+
+
+def is_edited(obj: bpy.types.Object) -> bool:
+    """Tell whether splats are in edit mode, of this object or of another that shares them."""
+    return obj.mode == "EDIT" or getattr(obj.data, "is_editmode", False)
 
 
 def graphs() -> Iterator[bpy.types.Depsgraph]:

@@ -39,17 +39,17 @@ struct ViewData {
 depth is tested, 0, 0."""
 
 _SPLAT_VERTEX = """
-#define at(values, row) texelFetch(values, ivec2((row) % WIDTH, (row) / WIDTH), 0)
+#define value_at(values, row) texelFetch(values, ivec2((row) % WIDTH, (row) / WIDTH), 0)
 
 void main()
 {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0); /* Not drawn. */
   place = vec2(0.0);
   paint = vec4(0.0);
-  int row = int(at(order, gl_InstanceID).r + 0.5);
-  vec4 mean = at(means, row);
-  vec4 upper = at(covariances, row);
-  vec4 lower = at(more_covariances, row);
+  int row = int(value_at(order, gl_InstanceID).r + 0.5);
+  vec4 mean = value_at(means, row);
+  vec4 upper = value_at(covariances, row);
+  vec4 lower = value_at(more_covariances, row);
   int object = int(mean.w + 0.5);
   vec4 row_x = texelFetch(matrices, ivec2(0, object), 0);
   vec4 row_y = texelFetch(matrices, ivec2(1, object), 0);
@@ -61,7 +61,7 @@ void main()
   if (!(depth > view_data.size.z)) {
     return;
   }
-  paint = at(colors, row);
+  paint = value_at(colors, row);
   float reach = 2.0 * log(paint.a / ALPHA_CUT);
   if (!(reach > 0.0)) {
     return;

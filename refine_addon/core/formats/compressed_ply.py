@@ -16,7 +16,7 @@ import numpy as np
 import plyfile
 
 from ..errors import RefineError
-from ..splats import SH_C0, opacity, opacity_logits
+from ..splats import SH_C0, above_constant, opacity, opacity_logits, unit_quaternions
 from .format import (
     Format,
     Sizes,
@@ -25,7 +25,6 @@ from .format import (
     new_file,
     pieces,
     split_largest,
-    unit,
 )
 from .ply import Origin, SplatFile
 from .ply_body import check_counts
@@ -275,7 +274,7 @@ def _places(values: NDArray[Any], ranges: NDArray[np.float32]) -> NDArray[np.flo
 
 
 def _rotations(quaternions: NDArray[Any]) -> NDArray[np.uint32]:
-    largest, others = split_largest(unit(quaternions))
+    largest, others = split_largest(unit_quaternions(quaternions))
     turns = _packed(others / np.sqrt(2.0) + 0.5, _TURNS)
     return turns | (largest.astype(np.uint32) << np.uint32(30))
 
@@ -292,7 +291,7 @@ def _header(count: int, rest: int) -> bytes:
 
 def sizes(count: int, degree: int) -> Sizes:
     """Return how large a file is; the last chunk may have fewer splats than the others."""
-    rest = 3 * ((degree + 1) ** 2 - 1)
+    rest = 3 * above_constant(degree)
     chunk = 18 * 4
     return Sizes(16 + rest + chunk / SPLATS, len(_header(count, rest)) + chunk)
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import RefineError
-from ..splats import SH_C0, base_color, opacity, opacity_logits
-from .format import Format, Sizes, codes, new_file, pieces, unit
+from ..splats import SH_C0, base_color, opacity, opacity_logits, scales, unit_quaternions
+from .format import Format, Sizes, codes, new_file, pieces
 from .ply import Origin, SplatFile
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
             shares = rows["color"] / 255.0  # (n, 4)
             splats.sh_dc[piece] = (shares[:, :3] - 0.5) / SH_C0
             splats.opacity_logits[piece] = opacity_logits(shares[:, 3])
-            splats.quaternions[piece] = unit(rows["rotation"] / _NO_TURN - 1.0)
+            splats.quaternions[piece] = unit_quaternions(rows["rotation"] / _NO_TURN - 1.0)
     return file
 
 
@@ -77,10 +77,10 @@ def write(stream: BinaryIO, splats: Splats) -> None:
         rows = np.empty(len(some), _ROW)
         rows["mean"] = some.means
         with np.errstate(under="ignore"):
-            rows["scale"] = np.exp(np.asarray(some.log_scales, np.float64))
+            rows["scale"] = scales(some.log_scales)
             rows["color"][:, :3] = codes(base_color(some.sh_dc))
             rows["color"][:, 3] = codes(opacity(some.opacity_logits))
-        turns = np.rint(unit(some.quaternions) * _NO_TURN + _NO_TURN)
+        turns = np.rint(unit_quaternions(some.quaternions) * _NO_TURN + _NO_TURN)
         rows["rotation"] = np.clip(turns, 0.0, 255.0)
         stream.write(rows.data)
 

@@ -103,20 +103,6 @@ def codes(shares: NDArray[Any], largest: int = 255) -> NDArray[np.uint8]:
     return np.asarray(np.rint(np.clip(shares, 0.0, 1.0) * largest), np.uint8)
 
 
-def unit(quaternions: NDArray[Any]) -> NDArray[np.float64]:
-    """Return quaternions (N, 4) with length 1; zero and what is not finite is the identity."""
-    q = np.asarray(quaternions, np.float64)
-    largest = np.max(np.abs(q), axis=1, keepdims=True)
-    none = ~(np.isfinite(largest) & (largest > 0.0))
-    if none.any():
-        q = np.where(none, [1.0, 0.0, 0.0, 0.0], q)
-        largest = np.where(none, 1.0, largest)
-    with np.errstate(under="ignore"):  # components far smaller than the largest
-        q = q / largest
-        q /= np.sqrt(np.einsum("ij,ij->i", q, q))[:, None]
-    return np.asarray(q, np.float64)
-
-
 def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
     """Raise `RefineError` if a file of `available` bytes is too short for what it announces."""
     if needed > available:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..splats import Splats
+from ..splats import Splats, above_constant
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -72,7 +72,7 @@ def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
     splats : Splats
         Views of the rows; what is assigned to them is in the rows.
     """
-    rest = 3 * ((degree + 1) ** 2 - 1)
+    rest = 3 * above_constant(degree)
     names = [*REQUIRED[:6], *(f"f_rest_{index}" for index in range(rest)), *REQUIRED[6:]]
     table = np.empty((count, len(names)), "<f4")
     ends = np.cumsum([3, 3, rest, 1, 3])

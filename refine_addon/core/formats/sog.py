@@ -13,13 +13,14 @@ import math
 import zipfile
 import zlib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import RefineError
 from ..foreign_files import foreign_kind
-from ..splats import opacity, opacity_logits
+from ..splats import above_constant, opacity, opacity_logits, unit_quaternions
 from .format import (
     Format,
     Sizes,
@@ -29,13 +30,11 @@ from .format import (
     new_file,
     pieces,
     split_largest,
-    unit,
 )
 from .images import Codec, codec_for
 from .ply import Origin, SplatFile
 
 if TYPE_CHECKING:
-    from pathlib import Path
     from typing import BinaryIO
 
     from numpy.typing import NDArray
@@ -45,8 +44,7 @@ if TYPE_CHECKING:
 NAME = "SOG"
 
 _VERSION = 2
-_COEFFICIENTS = {1: 3, 2: 8, 3: 15}
-"""Degree -> harmonics of a channel."""
+_DEGREES = 3
 
 _ACROSS = 64
 """Entries of the palette in a row of its image."""
@@ -238,14 +236,15 @@ def _palette(bundle: _Bundle, count: int) -> tuple[NDArray[np.float32], NDArray[
         return np.zeros((1, 0, 3), np.float32), np.zeros(count, np.intp)
     held = bundle.section("shN")
     bands, entries = held.get("bands"), held.get("count")
-    if type(bands) is not int or bands not in _COEFFICIENTS:
+    if type(bands) is not int or not 1 <= bands <= _DEGREES:
         raise bundle.wrong(place="shN.bands", problem="expected 1, 2 or 3")
     if type(entries) is not int or not 0 < entries <= 1 << _LARGEST_PALETTE:
         raise bundle.wrong(place="shN.count", problem=f"expected 1 to {1 << _LARGEST_PALETTE}")
     table = bundle.numbers("shN", "codebook", _TABLE)
-    width, rows = _ACROSS * _COEFFICIENTS[bands], -(-entries // _ACROSS)
+    coefficients = above_constant(bands)
+    width, rows = _ACROSS * coefficients, -(-entries // _ACROSS)
     image = bundle.pixels("shN", 0, width * rows, width)
-    places = image[:rows, :, :3].reshape(rows * _ACROSS, _COEFFICIENTS[bands], 3)[:entries]
+    places = image[:rows, :, :3].reshape(rows * _ACROSS, coefficients, 3)[:entries]
     pixels = bundle.pixels("shN", 1, count).reshape(-1, 4)[:count].astype(np.intp)
     labels = pixels[:, 0] + 256 * pixels[:, 1]
     if labels.max() >= entries:
@@ -270,7 +269,7 @@ def write(stream: BinaryIO, splats: Splats) -> None:
         msg = f"{count} splats: {NAME} holds {(_MOST_PIXELS // 4 * 4) ** 2}"
         raise RefineError(msg)
     height = -(-count // width)
-    codec = codec_for(_where(stream))
+    codec = codec_for(Path(str(getattr(stream, "name", NAME))))
     splats = splats.take(near_ones_together(splats.means))
     images: dict[str, NDArray[np.uint8]] = {}
 
@@ -287,7 +286,7 @@ def write(stream: BinaryIO, splats: Splats) -> None:
     whole = np.rint((places - low) / extent * 65535.0).astype(np.uint16)
     blank("means_l.webp")[:, :3] = whole & 255
     blank("means_u.webp")[:, :3] = whole >> 8
-    largest, others = split_largest(unit(splats.quaternions))
+    largest, others = split_largest(unit_quaternions(splats.quaternions))
     turns = blank("quats.webp")
     turns[:, :3] = codes(others * math.sqrt(0.5) + 0.5)
     turns[:, 3] = largest + _ROTATIONS
@@ -324,22 +323,11 @@ def write(stream: BinaryIO, splats: Splats) -> None:
             "codebook": table.tolist(),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
+    # A ZipInfo has no date of today, so a file is the same whenever it is made.
     with zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr(_dated("meta.json"), json.dumps(meta))
+        archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
         for name, image in images.items():
-            archive.writestr(_dated(name), codec.encode(image))
-
-
-def _where(stream: BinaryIO) -> Path:
-    """Return the name of what is written, for messages."""
-    from pathlib import Path  # noqa: PLC0415 - for this message alone
-
-    return Path(str(getattr(stream, "name", NAME)))
-
-
-def _dated(name: str) -> zipfile.ZipInfo:
-    """Return an entry of the archive that is the same whenever it is made."""
-    return zipfile.ZipInfo(name)
+            archive.writestr(zipfile.ZipInfo(name), codec.encode(image))
 
 
 def _tabulated(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -411,7 +399,7 @@ def sizes(_count: int, _degree: int) -> Sizes | None:
 FORMAT = Format(
     name=NAME,
     suffix=".sog",
-    degree=3,
+    degree=_DEGREES,
     loss="holds positions in 16 bits, all else in 8, takes harmonics from a palette, and sorts",
     matches=matches,
     read=read,

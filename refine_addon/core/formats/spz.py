@@ -18,8 +18,8 @@ import numpy as np
 
 from ..errors import RefineError
 from ..foreign_files import unpacked_beginning
-from ..splats import opacity, opacity_logits
-from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest, unit
+from ..splats import above_constant, opacity, opacity_logits, unit_quaternions
+from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
 from .ply import Origin, SplatFile
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class _Header:
     def blocks(self) -> dict[str, int]:
         """Return the bytes of each attribute by its name, in their order."""
         turn = 3 if self.version == _ONE_TURN else 4
-        rest = 3 * ((self.degree + 1) ** 2 - 1)
+        rest = 3 * above_constant(self.degree)
         widths = {"mean": 9, "opacity": 1, "color": 3, "scale": 3, "rotation": turn, "rest": rest}
         return {name: width * self.count for name, width in widths.items()}
 
@@ -303,7 +303,7 @@ def _fraction(splats: Splats) -> int:
 
 
 def _packed_rotations(quaternions: NDArray[Any]) -> NDArray[np.uint32]:
-    largest, others = split_largest(unit(quaternions)[:, _XYZW])
+    largest, others = split_largest(unit_quaternions(quaternions)[:, _XYZW])
     packed = largest.astype("<u4")
     for index in range(3):
         size = np.rint(np.abs(others[:, index]) * (511.0 * math.sqrt(2.0))).astype(np.uint32)

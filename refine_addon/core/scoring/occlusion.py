@@ -290,6 +290,7 @@ class Run:
         ).values
         self._sample = coverage.sample(self.gaussians)  # (m,)
         self._blocks: dict[int, tuple[Measured, NDArray[np.float64]]] = {}
+        self._weights: dict[tuple[int, ...], list[float]] = {}  # of the floor, by blocks
         self._turn = 0  # how many blocks were measured again
 
     def measure(self, which: Sequence[int], progress: Progress = silent) -> Measured:
@@ -453,11 +454,11 @@ class Run:
         which : sequence of int
         progress : callable
         """
-        sample = self._sample
+        blocks, sample = tuple(sorted(which)), self._sample
         worth = self.prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)
 
         def folds() -> Iterator[tuple[NDArray[np.float64], ...]]:
-            for number in sorted(which) if len(which) > 1 else ():
+            for number in blocks if len(blocks) > 1 else ():
                 report(progress, 0.0, "scoring")
                 block, errors = self._blocks[number]
                 others = Measured(
@@ -469,7 +470,9 @@ class Run:
                 floors = coverage.floor(worth, others.seen, 1.0 + _exponent(0.0))
                 yield combined(others, 0.0), floors, errors
 
-        return coverage.floor_weights(folds())
+        if blocks not in self._weights:
+            self._weights[blocks] = coverage.floor_weights(folds())
+        return self._weights[blocks]
 
 
 class _Removal:
