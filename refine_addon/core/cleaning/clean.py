@@ -48,7 +48,7 @@ REASONS = {
 DEFAULT_REASONS = ("front", "isolated", "giant", "needle")
 """All but the nearly transparent, which no picture shows."""
 
-DOUBTED = 0.35
+DOUBTED = 0.3
 """A splat is suspect, and may be found to be in front of surfaces, if others support less than this
 share of its light."""
 
