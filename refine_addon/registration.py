@@ -8,9 +8,13 @@ from bpy.props import FloatProperty, PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
+from .ui import camera_list, kept, plans, price
+from .ui.camera_list import REFINE_PT_camera_list, REFINE_UL_cameras, RefineCamera
+from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
 from .ui.operators import (
     REFINE_OT_apply,
+    REFINE_OT_convert,
     REFINE_OT_export_ply,
     REFINE_OT_levels,
     REFINE_OT_plan,
@@ -22,6 +26,7 @@ from .ui.panel import (
     REFINE_PT_apply,
     REFINE_PT_cameras,
     REFINE_PT_export,
+    REFINE_PT_floaters,
     REFINE_PT_preview,
     REFINE_PT_score,
     REFINE_PT_splats,
@@ -30,18 +35,25 @@ from .ui.properties import RefineSettings
 from .webp import BlenderImages
 
 CLASSES = (
+    RefineCamera,
     RefineSettings,
     REFINE_OT_import_ply,
     REFINE_OT_import_cameras,
+    REFINE_OT_find_floaters,
+    REFINE_OT_delete_floaters,
     REFINE_OT_score,
     REFINE_OT_plan,
     REFINE_OT_apply,
     REFINE_OT_preview,
+    REFINE_OT_convert,
     REFINE_OT_export_ply,
     REFINE_OT_levels,
     REFINE_FH_ply,
     REFINE_PT_splats,
     REFINE_PT_cameras,
+    REFINE_UL_cameras,
+    REFINE_PT_camera_list,
+    REFINE_PT_floaters,
     REFINE_PT_score,
     REFINE_PT_advanced,
     REFINE_PT_preview,
@@ -63,6 +75,9 @@ def register() -> None:
     bpy.types.WindowManager.refine_progress = FloatProperty(default=-1.0, options={"SKIP_SAVE"})
     bpy.types.TOPBAR_MT_file_import.append(_draw_import)
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
+    camera_list.register()
+    kept.register()
+    price.register()
     images.use(BlenderImages())
     _commands.append(bpy.utils.register_cli_command("refine", _run_command))
 
@@ -71,6 +86,10 @@ def unregister() -> None:
     """Undo `register`, in reverse."""
     bpy.utils.unregister_cli_command(_commands.pop())
     images.use(None)
+    plans.unregister()
+    price.unregister()
+    kept.unregister()
+    camera_list.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)
     bpy.types.TOPBAR_MT_file_import.remove(_draw_import)
     del bpy.types.WindowManager.refine_progress

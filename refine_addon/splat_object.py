@@ -27,6 +27,7 @@ from .core.work import Progress, part, silent
 from .core.written import written_facts
 from .mesh import attributes as mesh_attributes
 from .mesh import edit as mesh_edit
+from .mesh import floaters as mesh_floaters
 from .mesh import layout as mesh_layout
 from .mesh.layout import SplatObject, check
 from .mesh.scores import RECORD, store, stored_scores
@@ -61,6 +62,21 @@ class Plan:
     removed: int
     bytes_before: int
     bytes_after: int
+
+    @classmethod
+    def of(cls, count: int, kept: int, row_bytes: int, fixed_bytes: int) -> Plan:
+        """Return what keeping so many of `count` splats does to a file.
+
+        Parameters
+        ----------
+        count, kept : int
+        row_bytes, fixed_bytes : int
+            What a splat takes in a file of all splats, and all else in it.
+        """
+        # The header says how many splats follow, in as many digits as that takes.
+        shorter = len(str(count)) - len(str(kept))
+        sizes = (fixed_bytes + row_bytes * count, fixed_bytes - shorter + row_bytes * kept)
+        return cls(kept, count - kept, *sizes)
 
 
 def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
@@ -159,11 +175,17 @@ def plan(checked: SplatObject, budget: Budget, protect: str = "") -> Plan:
     RefineError
         See `stored_task`; also if nothing would stay, or the object is linked from a library.
     """
-    keep = keep_mask(checked, budget, protect)
+    keep = mark_removed(checked, stored_task(checked, budget, protect))
+    return _plan(checked, keep)
+
+
+def mark_removed(checked: SplatObject, task: Task) -> NDArray[np.bool_]:
+    """Mark the splats that a task (`stored_task`) removes; return which stay, (N,)."""
+    keep = pipeline.decide(task).keep
     mesh_edit.check_writable(checked.obj)
     mesh_attributes.write_attribute(checked.mesh, mesh_edit.REMOVE, "BOOLEAN", ~keep)
-    checked.mesh.update()
-    return _plan(checked, keep)
+    mesh_attributes.updated(checked.mesh)
+    return keep
 
 
 def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
@@ -202,6 +224,31 @@ def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
     return done
 
 
+def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:
+    """Delete the splats that do not stay, all of them or none; nothing else changes.
+
+    Scores tell what is missed of all splats together, so they are to be computed again.
+
+    Parameters
+    ----------
+    checked : SplatObject
+    keep : (N,) bool
+
+    Raises
+    ------
+    RefineError
+        See `mesh_edit.check_deletable`; also if nothing would be left.
+    """
+    mesh_edit.check_deletable(checked.obj)
+    if not keep.any():
+        msg = f"object '{checked.obj.name}': no splat would be left; nothing was deleted"
+        raise RefineError(msg)
+    done = _plan(checked, keep)
+    with mesh_edit.all_or_nothing(checked.obj):
+        _reduce(checked, keep, {})
+    return done
+
+
 def _reduce(
     checked: SplatObject, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
 ) -> None:
@@ -209,6 +256,7 @@ def _reduce(
     mesh_edit.delete_vertices(checked.obj, ~keep)
     columns = {name: values[keep] for name, values in columns.items()}
     mesh_attributes.write_columns(checked, columns)
+    mesh_floaters.forget(checked.mesh)
     if RECORD in checked.mesh:
         del checked.mesh[RECORD]
 
@@ -363,12 +411,8 @@ def _file_size(checked: SplatObject, budget: Budget, output: Path | None) -> tup
 
 
 def _plan(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:
-    row_bytes, fixed_bytes = mesh_attributes.file_size(checked)
     kept = int(np.count_nonzero(keep))
-    # The header says how many splats follow, in as many digits as that takes.
-    shorter = len(str(len(keep))) - len(str(kept))
-    sizes = (fixed_bytes + row_bytes * len(keep), fixed_bytes - shorter + row_bytes * kept)
-    return Plan(kept, len(keep) - kept, *sizes)
+    return Plan.of(len(keep), kept, *mesh_attributes.file_size(checked))
 
 
 def _world_columns(checked: SplatObject) -> dict[str, NDArray[Any]]:

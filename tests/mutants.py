@@ -25,6 +25,7 @@ MUTANTS = {
     "frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
         ("(near if np.ptp(near) > 0.0 else near[0, 0])", "0.0", "near plane ignored"),
+        ("between & (beyond <= 0.0)", "between", "counted beside the image"),
         ("between &= depth <= far", "between &= depth < far", "far plane excluded"),
         ("np.hypot(1.0, slope)", "slope", "reach along the image only"),
         ("view.cx - view.width / 2", "view.width / 2 - view.cx", "shift mirrored"),
@@ -59,10 +60,16 @@ MUTANTS = {
         ("count - 1)[count - 1]", "count)[count]", "off by one"),
         ("free & (values < edge)", "(values < edge)", "protection forgotten"),
         ("Fraction(repr(float(self.ratio)))", "self.ratio", "binary ratio"),
+        ("count = min(count or 0, len(self._values))", "count = count or 0", "protected counted"),
+        ("self._seen = np.sort(scores.seen[free])", "self._seen = scores.seen", "not in order"),
     ],
     "splats.py": [
         ("w, x, y, z = np", "x, y, z, w = np", "quaternion order"),
         ("good &= (largest <= _LOG_LARGEST)", "good &= (largest <= 1e9)", "huge drawn"),
+        ("SINGLE_MARGIN = 2.0**-26", "SINGLE_MARGIN = 1e-7", "float32 of 1 is told from 1"),
+        ("LOG_ZERO = -104.0", "LOG_ZERO = -103.0", "what is 0 is drawn"),
+        ("sizes = np.abs(", "sizes = (", "sign of a scale"),
+        ("off = finite & other", "off = finite", "unit quaternions lose bits"),
     ],
     "spherical_harmonics.py": [
         ("points @ rotation, degree", "points @ rotation.T, degree", "inverse"),
@@ -99,7 +106,7 @@ MUTANTS = {
         ("np.minimum.reduceat(values", "np.maximum.reduceat(values", "no range"),
     ],
     "formats/dot_splat.py": [
-        ("np.exp(np.asarray(some.log_scales", "(np.asarray(some.log_scales", "log scales stored"),
+        ("= scales(some.log_scales)", "= some.log_scales", "log scales stored"),
         ("    if beyond:", "    if beyond > 31:", "a cut splat is no fault"),
     ],
     "formats/format.py": [
@@ -456,7 +463,7 @@ MUTANTS = {
     "cleaning/clean.py": [
         ("(seen.views > 0) & ", "", "who sees nothing sees past"),
         ("found[name] &= ~protected", "pass", "protected ones go"),
-        ("sizes < max(SMALL", "sizes < min(SMALL", "clusters of any size"),
+        ("sizes < SMALL", "sizes > SMALL", "clusters of any size"),
     ],
     "cleaning/clusters.py": [
         ("labels = jumped", "break", "parts that are not joined"),

@@ -90,22 +90,85 @@ OPACITY_MARGIN = 1e-6
 """Opacities read from formats that round them are kept this far from 0 and 1, whose logits are
 infinite. The step of 8 bits is 4,000 times as large."""
 
+SINGLE_MARGIN = 2.0**-26
+"""Opacities read from float32 are kept this far from 1: float32 has no number between, and rounds
+what is this close to 1."""
 
-def opacity_logits(opacities: NDArray[Any], margin: float = OPACITY_MARGIN) -> NDArray[np.float64]:
+LOG_ZERO = -104.0
+"""Log scale and logit of what is 0 in float32: ``exp(-104)`` rounds to 0 there, ``exp(-103)`` does
+not."""
+
+
+def opacity_logits(
+    opacities: NDArray[Any], margin: float = OPACITY_MARGIN, least: float | None = None
+) -> NDArray[np.float64]:
     """Logits of opacities: the inverse of `opacity`.
 
     Parameters
     ----------
     opacities : (...) floating
-        Those outside of ``margin..1 - margin`` count as the nearer end; NaN stays NaN.
+        Those outside of ``least..1 - margin`` count as the nearer end; NaN stays NaN.
     margin : float
+    least : float, optional
+        By default `margin`.
 
     Returns
     -------
     (...) float64
     """
-    inside = np.clip(np.asarray(opacities, np.float64), margin, 1.0 - margin)
+    low = margin if least is None else least
+    inside = np.clip(np.asarray(opacities, np.float64), low, 1.0 - margin)
     return np.asarray(np.log(inside) - np.log1p(-inside))
+
+
+def single_logits(opacities: NDArray[Any]) -> NDArray[np.float64]:
+    """Logits of opacities that are held in float32, such as Blender's.
+
+    `opacity` of them, rounded to float32, is what they came from: 0 has the logit `LOG_ZERO`, and
+    1 the largest that is told from it, 18.02 (see `SINGLE_MARGIN`).
+
+    Parameters
+    ----------
+    opacities : (...) float32
+        Those outside of 0..1 count as the nearer end; NaN stays NaN.
+
+    Returns
+    -------
+    (...) float64
+
+    Examples
+    --------
+    >>> single_logits([0.0, 0.5, 1.0]).round(2).tolist()
+    [-104.0, 0.0, 18.02]
+    """
+    return opacity_logits(opacities, SINGLE_MARGIN, math.exp(LOG_ZERO))
+
+
+def scales(log_scales: NDArray[Any]) -> NDArray[np.float64]:
+    """Return the standard deviations of log scales, in float64; beyond its range 0 or infinite."""
+    with np.errstate(over="ignore", under="ignore"):
+        return np.asarray(np.exp(np.asarray(log_scales, np.float64)))
+
+
+def single_log_scales(scales: NDArray[Any]) -> NDArray[np.float64]:
+    """Log scales of standard deviations that are held in float32: the inverse of `scales`.
+
+    Parameters
+    ----------
+    scales : (...) float32
+        The sign does not count, as the covariance has squares; 0 has the log scale `LOG_ZERO`.
+
+    Returns
+    -------
+    (...) float64
+
+    Examples
+    --------
+    >>> single_log_scales([0.0, 1.0, -1.0]).tolist()
+    [-104.0, 0.0, 0.0]
+    """
+    sizes = np.abs(np.asarray(scales, np.float64))
+    return np.asarray(np.log(np.maximum(sizes, math.exp(LOG_ZERO))))
 
 
 def base_color(sh_dc: NDArray[Any]) -> NDArray[np.float64]:
@@ -141,6 +204,30 @@ def unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float64]:
     with np.errstate(under="ignore"):  # components far smaller than the largest become 0
         q = np.where(usable, q, [1.0, 0.0, 0.0, 0.0]) / np.where(usable, largest, 1.0)
         return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+
+
+def single_unit_quaternions(quaternions: NDArray[Any]) -> NDArray[np.float32]:
+    """Quaternions of length 1 in float32, as Blender holds them.
+
+    Parameters
+    ----------
+    quaternions : (N, 4) floating
+        w x y z. Those of length 1 within the rounding of float32 stay as they are, to the bit, and
+        so do those that are not finite, which no renderer can draw; zero becomes the identity.
+
+    Returns
+    -------
+    (N, 4) float32
+    """
+    with np.errstate(over="ignore", under="ignore"):  # doubles that are no floats
+        q = np.array(quaternions, np.float32)
+    finite = np.isfinite(q).all(axis=1)
+    wide = np.where(finite[:, None], q, 1.0).astype(np.float64)
+    with np.errstate(under="ignore"):
+        other = np.abs(np.einsum("ij,ij->i", wide, wide) - 1.0) > _UNIT_TOLERANCE
+    off = finite & other
+    q[off] = unit_quaternions(q[off])
+    return q
 
 
 def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
@@ -192,6 +279,7 @@ def drawable(splats: Splats) -> NDArray[np.bool_]:
     return good
 
 
+_UNIT_TOLERANCE = 5e-7  # of the squared length: four squares, each rounded to float32
 # Of type float32: with a Python float of this size, NumPy 1 would convert the column to float64,
 # which takes time and warns about signalling NaN.
 _LARGEST = np.finfo(np.float32).max

@@ -1,1 +1,1 @@
-"""A splat object's mesh: its attributes, editing, scores and how they are shown."""
+"""The data of a splat object, mesh or point cloud: attributes, editing, scores, how they show."""

@@ -2,6 +2,8 @@
 
 Log scales, logit opacities and raw harmonics are stored as they stand in the file: what Blender's
 own importer and KIRI's 3DGS Render (its `vert` form) store, so that meshes of either are read too.
+Point clouds with Blender's own splats hold them otherwise (`native`); their columns come out and
+go in as those of a mesh.
 """
 
 from __future__ import annotations
@@ -13,8 +15,8 @@ import bpy
 import numpy as np
 
 from ..core.formats.ply import SplatFile
-from ..core.splats import Splats
-from .layout import KINDS, Column, SplatObject, add_attributes, rest_count
+from ..core.splats import Splats, single_unit_quaternions
+from .layout import KINDS, Column, SplatObject, add_attributes, rest_count, splat_count
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -99,8 +101,9 @@ def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
         coefficients = planes.transpose(2, 1, 0)
     else:
         finite = np.ones(count, np.bool_)
-        for column in rest:
-            finite &= np.isfinite(read.planes([column])[0])
+        for attribute in dict.fromkeys(read.columns[name].attribute for name in rest):
+            values = np.isfinite(read_attribute(checked.mesh, attribute))
+            finite &= values if values.ndim == 1 else values.all(axis=1)
         coefficients = np.where(finite, 0.0, np.nan).astype(np.float32)[:, None, None]
         coefficients = np.broadcast_to(coefficients, (count, 1, 3))
     return Splats(
@@ -162,16 +165,30 @@ def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> 
     places = {column.name: column for column in checked.layout.columns}
     vectors: dict[str, NDArray[Any]] = {}
     for name, values in columns.items():
-        column = places[name]
-        if KINDS[column.kind].width == 1:
-            write_attribute(mesh, column.attribute, column.kind, values)
+        place = places[name].place
+        attribute = mesh.attributes[place.attribute]
+        held = place.coding.to_attribute(values) if place.coding else values
+        if KINDS[attribute.data_type].width == 1:
+            write_attribute(mesh, place.attribute, attribute.data_type, held)
             continue
-        if column.attribute not in vectors:
-            vectors[column.attribute] = read_attribute(mesh, column.attribute)
-        vectors[column.attribute][:, column.component] = values
-    for attribute, values in vectors.items():
-        write_attribute(mesh, attribute, "FLOAT_VECTOR", values)
+        if place.attribute not in vectors:
+            vectors[place.attribute] = read_attribute(mesh, place.attribute)
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
+            vectors[place.attribute][:, place.component] = held
+    for name, values in vectors.items():
+        kind = mesh.attributes[name].data_type
+        write_attribute(
+            mesh, name, kind, single_unit_quaternions(values) if kind == "QUATERNION" else values
+        )
     if columns:
+        updated(mesh)
+
+
+def updated(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
+    """Tell Blender that attributes changed."""
+    if isinstance(mesh, bpy.types.PointCloud):
+        mesh.update_tag()
+    else:
         mesh.update()
 
 
@@ -217,23 +234,35 @@ class _Reader:
         self.vectors: dict[str, NDArray[np.float32]] = {}
 
     def stored(self, name: str) -> NDArray[Any]:
-        """Return a column as the mesh holds it; unsigned integers by their bits."""
+        """Return a column as the file has it; unsigned integers by their bits.
+
+        What is held activated comes in float64, so that it can be written back unchanged.
+        """
         column = self.columns[name]
-        if column.kind == "FLOAT_VECTOR":
-            if column.attribute not in self.vectors:
-                self.vectors = {column.attribute: read_attribute(self.mesh, column.attribute)}
-            return self.vectors[column.attribute][:, column.component]
-        values = read_attribute(self.mesh, column.attribute)
+        place = column.place
+        if KINDS[self.mesh.attributes[place.attribute].data_type].width > 1:
+            if place.attribute not in self.vectors:
+                self.vectors = {place.attribute: read_attribute(self.mesh, place.attribute)}
+            values = self.vectors[place.attribute][:, place.component]
+        else:
+            values = read_attribute(self.mesh, place.attribute)
+        if place.coding:
+            return place.coding.to_file(values)
         return values.view(np.uint32) if column.dtype[1:] == "u4" else values
 
     __getitem__ = stored
 
     def planes(self, names: Sequence[str]) -> NDArray[np.float32]:
         """Return float columns as (len(names), N)."""
-        values = np.empty((len(names), len(self.mesh.vertices)), np.float32)
-        for row, name in zip(values, names, strict=True):
+        values = np.empty((len(names), splat_count(self.mesh)), np.float32)
+        pairs = zip(values, names, strict=True)
+        # Components of one attribute together: it is read once.
+        for row, name in sorted(pairs, key=lambda pair: self.columns[pair[1]].attribute):
             attribute = self.mesh.attributes[self.columns[name].attribute]
-            attribute.data.foreach_get("value", row)
+            if KINDS[attribute.data_type].width == 1:
+                attribute.data.foreach_get("value", row)
+            else:
+                row[:] = self.stored(name)
         return values
 
 
@@ -242,16 +271,16 @@ def _fill(mesh: bpy.types.Mesh, rows: NDArray[Any], columns: Iterable[Column]) -
     position = np.empty((len(rows), 3), np.float32)
     for names in _groups(list(places), rows.dtype):
         for name, plane in zip(names, _planes(rows, names), strict=True):
-            column = places[name]
-            if column.attribute == "position":
+            place = places[name].place
+            if place.attribute == "position":
                 with np.errstate(over="ignore"):
-                    position[:, column.component] = plane
+                    position[:, place.component] = plane
                 continue
-            kind = KINDS[column.kind]
+            kind = KINDS[place.kinds[0]]
             values = plane.view(np.int32) if plane.dtype == np.uint32 else plane
             with np.errstate(over="ignore"):  # doubles beyond the range become infinite, as noted
                 values = np.ascontiguousarray(values, kind.dtype)
-            mesh.attributes[column.attribute].data.foreach_set(kind.field, values)
+            mesh.attributes[place.attribute].data.foreach_set(kind.field, values)
     mesh.attributes["position"].data.foreach_set("vector", position.ravel())
 
 

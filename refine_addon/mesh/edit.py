@@ -1,4 +1,4 @@
-"""Changes to the mesh of a splat object: who may be changed, and deleting vertices fast."""
+"""Changes to the mesh or point cloud of a splat object: which may be, and deleting points fast."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from ..core.errors import RefineError
 from . import attributes as mesh_attributes
+from .layout import splat_count
 from .node_trees import chain, named_attribute, new_tree
 
 if TYPE_CHECKING:
@@ -24,47 +25,52 @@ _GROUP_VALUES = "refine_group_values"
 
 
 def check_writable(obj: bpy.types.Object) -> None:
-    """Raise `RefineError` if the mesh belongs to a library."""
+    """Raise `RefineError` if the object or its data belongs to a library."""
     if obj.data.library or obj.library:
         source = (obj.data.library or obj.library).filepath
         msg = (
             f"object '{obj.name}': is linked from {source}, which cannot be changed here; open "
-            "that file, or make the object and its mesh local"
+            "that file, or make the object and its data local"
         )
+        raise RefineError(msg)
+
+
+def check_changeable(obj: bpy.types.Object) -> None:
+    """Raise `RefineError` if the splats of an object cannot be changed as a whole."""
+    check_writable(obj)
+    label = f"object '{obj.name}'"
+    if obj.mode != "OBJECT":
+        msg = f"{label}: is in {obj.mode.replace('_', ' ').lower()} mode; go to object mode first"
+        raise RefineError(msg)
+    if getattr(obj.data, "shape_keys", None):  # point clouds have none
+        msg = f"{label}: has shape keys, which hold every vertex again; apply or delete them first"
         raise RefineError(msg)
 
 
 def check_deletable(obj: bpy.types.Object) -> None:
     """Raise `RefineError` if vertices cannot be deleted from an object."""
-    check_writable(obj)
-    mesh = obj.data
-    label = f"object '{obj.name}'"
-    if obj.mode != "OBJECT":
-        msg = f"{label}: is in {obj.mode.replace('_', ' ').lower()} mode; go to object mode first"
-        raise RefineError(msg)
-    users = mesh.users - mesh.use_fake_user
+    check_changeable(obj)
+    users = obj.data.users - obj.data.use_fake_user
     if users > 1:
         msg = (
-            f"{label}: shares its mesh '{mesh.name}' with {users - 1} other user(s), which would "
-            "lose the splats too; make it single-user first (Object > Relations)"
+            f"object '{obj.name}': shares its data '{obj.data.name}' with {users - 1} other "
+            "user(s), which would lose the splats too; make it single-user first (Object > "
+            "Relations)"
         )
-        raise RefineError(msg)
-    if mesh.shape_keys:
-        msg = f"{label}: has shape keys, which hold every vertex again; apply or delete them first"
         raise RefineError(msg)
 
 
 @contextmanager
 def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
-    """Undo what a block did to the mesh of an object if the block fails, however far it came.
+    """Undo what a block did to the data of an object if the block fails, however far it came.
 
-    A copy of the mesh stands by, which costs nothing: Blender shares attributes until one is
-    changed. Where it is needed, it takes the place and the name of the mesh.
+    A copy of the data stands by, which costs nothing: Blender shares attributes until one is
+    changed. Where it is needed, it takes the place and the name of the data.
 
     Parameters
     ----------
     obj : bpy.types.Object
-        See `check_deletable`: no other object may have its mesh.
+        See `check_deletable`: no other object may have its data.
     """
     mesh = obj.data
     before = mesh.copy()
@@ -73,10 +79,10 @@ def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
     except BaseException:
         name, before.use_fake_user = mesh.name, mesh.use_fake_user
         obj.data = before
-        bpy.data.meshes.remove(mesh)
+        bpy.data.batch_remove([mesh])
         before.name = name
         raise
-    bpy.data.meshes.remove(before)
+    bpy.data.batch_remove([before])
 
 
 def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
@@ -119,16 +125,17 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
             obj.modifiers.remove(obj.modifiers[name])
         bpy.data.node_groups.remove(tree)
         mesh_attributes.remove_attribute(obj.data, REMOVE)
-    if len(obj.data.vertices) != expected:
-        msg = (
-            f"object '{obj.name}': {len(obj.data.vertices)} splats were left, expected "
-            f"{expected}; report this"
-        )
+    left = splat_count(obj.data)
+    if left != expected:
+        msg = f"object '{obj.name}': {left} splats were left, expected {expected}; report this"
         raise RefineError(msg)
 
 
 def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
     """Return which splats a boolean point attribute or a vertex group marks.
+
+    A point cloud has no vertex groups; a float attribute marks there, which is what `convert` makes
+    of one.
 
     Parameters
     ----------
@@ -138,7 +145,7 @@ def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
     Returns
     -------
     (N,) bool
-        For a vertex group, where the weight is above 0.
+        For a vertex group or a float attribute, where the weight is above 0.
 
     Raises
     ------
@@ -146,19 +153,24 @@ def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
         If the object has neither of that name.
     """
     attribute = obj.data.attributes.get(name)
-    if attribute and (attribute.data_type, attribute.domain) == ("BOOLEAN", "POINT"):
-        return mesh_attributes.read_attribute(obj.data, name)
+    if attribute and attribute.data_type in marking(obj) and attribute.domain == "POINT":
+        return mesh_attributes.read_attribute(obj.data, name) > 0
     if name in obj.vertex_groups:
-        return _group_weights(obj, name) > 0.0
+        return group_weights(obj, name) > 0.0
     found = f" ('{name}' is {attribute.data_type} on {attribute.domain})" if attribute else ""
-    msg = (
-        f"object '{obj.name}': nothing to protect is named '{name}'{found}; expected a vertex "
-        "group or a boolean attribute on points"
-    )
+    expected = "a vertex group or a boolean attribute on points"
+    if obj.type == "POINTCLOUD":
+        expected = "a boolean or float attribute on points (a point cloud has no vertex groups)"
+    msg = f"object '{obj.name}': nothing to protect is named '{name}'{found}; expected {expected}"
     raise RefineError(msg)
 
 
-def _group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
+def marking(obj: bpy.types.Object) -> tuple[str, ...]:
+    """Return the types of point attributes that can mark splats of an object."""
+    return ("BOOLEAN", "FLOAT") if obj.type == "POINTCLOUD" else ("BOOLEAN",)
+
+
+def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
     """Return the weights of a vertex group; geometry nodes read them all at once."""
     tree = _storing_tree(name)
     # On a second object with the same mesh: the user's modifiers stay out of it.

@@ -1,4 +1,8 @@
-"""Which attribute of a mesh holds which property of a 3DGS PLY: one table, checked here."""
+"""Which attribute of an object's data holds which property of a 3DGS PLY: one table, checked here.
+
+The data is a mesh with a vertex a splat, or a point cloud; what is said of a mesh here goes for
+both. Point clouds of Blender 5.3 hold activated values under names of their own: see `native`.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +16,8 @@ import numpy as np
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED, REST_COUNTS
 from ..core.formats.ply_header import new_header
+from . import native
+from .native import Place
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,6 +43,13 @@ KINDS = {
     "BOOLEAN": Kind("value", np.bool_, 1),
     "FLOAT_VECTOR": Kind("vector", np.float32, 3),
     "BYTE_COLOR": Kind("color_srgb", np.float32, 4),
+    "FLOAT_COLOR": Kind("color", np.float32, 4),
+    "FLOAT4": Kind("vector", np.float32, 4),
+    "QUATERNION": Kind("value", np.float32, 4),
+    "FLOAT2": Kind("vector", np.float32, 2),
+    "INT16_2D": Kind("value", np.int16, 2),
+    "INT32_2D": Kind("value", np.int32, 2),
+    "FLOAT4X4": Kind("value", np.float32, 16),
 }
 """Attribute type -> field for `foreach_get`, element type, numbers in an element."""
 
@@ -52,10 +65,12 @@ STORAGE = {
 }
 """Type of a PLY property -> type of the attribute that holds it; u4 by its bits, f8 rounded."""
 
-PLACES = {"x": ("position", 0), "y": ("position", 1), "z": ("position", 2)}
+PLACES = {name: Place("position", axis, ("FLOAT_VECTOR",)) for axis, name in enumerate("xyz")}
 """Properties that Blender keeps as components of a vector."""
 
-NORMAL_PLACES = {"nx": ("normal", 0), "ny": ("normal", 1), "nz": ("normal", 2)}
+NORMAL_PLACES = {
+    f"n{axis}": Place("normal", index, ("FLOAT_VECTOR",)) for index, axis in enumerate("xyz")
+}
 """Where Blender's own PLY importer puts a file's normals."""
 
 _COUNT = rb"([\r\n]element[ \t]+vertex[ \t]+)[0-9]+"
@@ -64,6 +79,9 @@ _TAKEN = {
     *("refine_score", "refine_rank", "refine_seen"),
     *("refine_heat", "refine_color", "refine_remove"),
 }
+
+
+_TYPES = ("MESH", "POINTCLOUD")
 
 
 @dataclass(frozen=True)
@@ -76,31 +94,34 @@ class Column:
         Name of the PLY property.
     dtype : str
         Its type in the file, as in ``"<f4"``.
-    attribute : str
-        Name of the attribute.
-    component : int
-        Which number of a vector attribute; 0 for plain ones.
+    place : Place
     """
 
     name: str
     dtype: str
-    attribute: str
-    component: int = 0
+    place: Place
 
     @property
-    def kind(self) -> str:
-        """Type that the attribute must have."""
-        if self.attribute in ("position", "normal"):
-            return "FLOAT_VECTOR"
-        return STORAGE[self.dtype[1:]]
+    def attribute(self) -> str:
+        """Name of the attribute."""
+        return self.place.attribute
 
 
 @dataclass(frozen=True)
 class Layout:
-    """The columns of a splat mesh in the order of its file, and the file's header."""
+    """The columns of a splat mesh in the order of its file, and the file's header.
+
+    Attributes
+    ----------
+    columns : tuple of Column
+    header : bytes
+    native : bool
+        Whether the mesh holds Blender's own splats (`native`).
+    """
 
     columns: tuple[Column, ...]
     header: bytes
+    native: bool = False
 
     @property
     def row_dtype(self) -> np.dtype[Any]:
@@ -117,31 +138,35 @@ class SplatObject:
     Attributes
     ----------
     obj : bpy.types.Object
+        A mesh or a point cloud.
     layout : Layout
-        Which attribute of its mesh holds what.
+        Which attribute of its data holds what.
     """
 
     obj: bpy.types.Object
     layout: Layout
 
     @property
-    def mesh(self) -> bpy.types.Mesh:
-        """The object's mesh."""
+    def mesh(self) -> bpy.types.Mesh | bpy.types.PointCloud:
+        """The object's data."""
         return self.obj.data
 
     def __len__(self) -> int:
         """Return the number of splats."""
-        return len(self.obj.data.vertices)
+        return splat_count(self.obj.data)
+
+
+def splat_count(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> int:
+    """Return how many splats a mesh or a point cloud has, if it has any."""
+    return len(mesh.points if hasattr(mesh, "points") else mesh.vertices)
 
 
 def looks_like_splats(obj: bpy.types.Object | None) -> bool:
     """Tell whether an object is worth offering to the splat tools; cheap enough for a poll."""
-    return (
-        obj is not None
-        and obj.type == "MESH"
-        and "opacity" in obj.data.attributes
-        and "f_dc_0" in obj.data.attributes
-    )
+    if obj is None or obj.type not in _TYPES:
+        return False
+    attributes = obj.data.attributes
+    return ("opacity" in attributes and "f_dc_0" in attributes) or native.is_native(obj.data)
 
 
 def check(obj: bpy.types.Object) -> SplatObject:
@@ -160,12 +185,12 @@ def check(obj: bpy.types.Object) -> SplatObject:
     Raises
     ------
     RefineError
-        If the object is no mesh, is in edit mode, holds four vertices a splat, or lacks an
-        attribute; also if an attribute has the wrong type or lies on the wrong domain.
+        If the object is neither mesh nor point cloud, is in edit mode, holds four vertices a splat,
+        or lacks an attribute; also if an attribute has the wrong type or lies on the wrong domain.
     """
     label = f"object '{obj.name}'"
-    if obj.type != "MESH":
-        msg = f"{label}: is of type {obj.type}, expected a mesh whose vertices are splats"
+    if obj.type not in _TYPES:
+        msg = f"{label}: is of type {obj.type}, expected a mesh or a point cloud that holds splats"
         raise RefineError(msg)
     if obj.mode == "EDIT":
         msg = f"{label}: is in edit mode; leave edit mode first"
@@ -176,9 +201,11 @@ def check(obj: bpy.types.Object) -> SplatObject:
             "use its 'vert' form, or import the PLY file here"
         )
         raise RefineError(msg)
-    if not len(obj.data.vertices):
-        msg = f"{label}: has no vertices, expected one a splat"
+    if not splat_count(obj.data):
+        points = "points" if obj.type == "POINTCLOUD" else "vertices"
+        msg = f"{label}: has no {points}, expected one a splat"
         raise RefineError(msg)
+    native.refuse_lost_base(obj)
     layout = _remembered(obj.data) or _standard(obj)
     _check_attributes(obj, layout)
     return SplatObject(obj, layout)
@@ -195,11 +222,13 @@ def export_bytes(obj: bpy.types.Object) -> int | None:
         layout = _remembered(obj.data) or _standard(obj)
     except RefineError:
         return None
-    return len(layout.header) + layout.row_dtype.itemsize * len(obj.data.vertices)
+    return len(layout.header) + layout.row_dtype.itemsize * splat_count(obj.data)
 
 
 def rest_count(mesh: bpy.types.Mesh) -> int:
-    """Return how many ``f_rest_*`` attributes a mesh has."""
+    """Return how many ``f_rest_*`` properties a mesh has attributes for."""
+    if native.is_native(mesh):
+        return 3 * native.harmonics(mesh)
     return sum(f"f_rest_{index}" in mesh.attributes for index in range(max(REST_COUNTS)))
 
 
@@ -207,11 +236,15 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
     """Return the layout that the import noted, None if there is none that can be read."""
     try:
         noted = json.loads(mesh[LAYOUT])
-        columns = tuple(Column(*column) for column in noted["columns"])
+        places = _native_places(mesh)
+        columns = tuple(
+            Column(name, dtype, places.get(name) or _plain(dtype, attribute, component))
+            for name, dtype, attribute, component in noted["columns"]
+        )
         # Splats come and go; the count is the mesh's.
-        count = rb"\g<1>%d" % len(mesh.vertices)
+        count = rb"\g<1>%d" % splat_count(mesh)
         header = re.sub(_COUNT, count, noted["header"].encode("latin-1"), count=1)
-        layout = Layout(columns, header)
+        layout = Layout(columns, header, native.is_native(mesh))
         described = layout.row_dtype.itemsize > 0
     except (AttributeError, KeyError, TypeError, ValueError):
         # Somebody else may have written there: what does not describe a file is no layout.
@@ -219,30 +252,45 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
     return layout if described else None
 
 
+def _native_places(mesh: bpy.types.Mesh) -> dict[str, Place]:
+    """Return where a mesh of Blender's own splats holds their properties, nothing for others."""
+    return native.places(native.harmonics(mesh)) if native.is_native(mesh) else {}
+
+
+def _plain(dtype: str, attribute: str, component: int = 0) -> Place:
+    """Return the place of a property that is held as it stands in the file."""
+    kind = "FLOAT_VECTOR" if attribute in ("position", "normal") else STORAGE[dtype[1:]]
+    return Place(attribute, component, (kind,))
+
+
 def _standard(obj: bpy.types.Object) -> Layout:
     """Return the layout of the reference implementation for what the object has."""
     attributes = obj.data.attributes
     rest = [f"f_rest_{index}" for index in range(rest_count(obj.data))]
     if len(rest) not in REST_COUNTS:
+        each, of = (native.HARMONIC, 3) if native.is_native(obj.data) else ("f_rest_", 1)
+        *counts, most = (count // of for count in REST_COUNTS)
         msg = (
-            f"object '{obj.name}': has {len(rest)} attributes f_rest_*, "
-            "expected 0, 9, 24, 45 or 72 of them (degree 0 to 4)"
+            f"object '{obj.name}': has {len(rest) // of} attributes {each}*, expected "
+            f"{', '.join(map(str, counts))} or {most} of them (degree 0 to 4)"
         )
         raise RefineError(msg)
     normals: dict[str, Any] = dict.fromkeys(("nx", "ny", "nz")) if "nx" in attributes else {}
-    places = dict(PLACES)
-    if not normals and _is(attributes.get("normal"), "FLOAT_VECTOR"):
+    places = PLACES | _native_places(obj.data)
+    if not normals and _is(attributes.get("normal"), ("FLOAT_VECTOR",)):
         normals = NORMAL_PLACES
         places.update(NORMAL_PLACES)
     names = [*PLACES, *normals, *REQUIRED[3:6], *rest, *REQUIRED[6:]]
-    columns = [Column(name, "<f4", *places.get(name, (name, 0))) for name in names]
+    columns = [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in names]
+    held = {*names, *(column.attribute for column in columns)}
     dtypes = {"FLOAT": "<f4", "INT": "<i4", "INT8": "<i1"}
     for attribute in attributes:
         kind = dtypes.get(attribute.data_type)
         plain = re.fullmatch(r"(?!refine_|KIRI)[!-~]+", attribute.name) and attribute.name[0] != "."
-        if kind and plain and attribute.domain == "POINT" and attribute.name not in names:
-            columns.append(Column(attribute.name, kind, attribute.name))
-    return Layout(tuple(columns), _new_header(columns, len(obj.data.vertices)))
+        if kind and plain and attribute.domain == "POINT" and attribute.name not in held:
+            columns.append(Column(attribute.name, kind, _plain(kind, attribute.name)))
+    header = _new_header(columns, splat_count(obj.data))
+    return Layout(tuple(columns), header, native.is_native(obj.data))
 
 
 def _check_attributes(obj: bpy.types.Object, layout: Layout) -> None:
@@ -253,23 +301,25 @@ def _check_attributes(obj: bpy.types.Object, layout: Layout) -> None:
     if absent:
         there = [a.name for a in attributes if a.domain == "POINT" and a.name[0] != "."]
         more = ", ..." if len(there) > 8 else ""  # noqa: PLR2004 - a line of names
+        own = f" or Blender's own {native.NAMES}" if obj.type == "POINTCLOUD" else ""
         msg = (
             f"object '{obj.name}': has no attribute {', '.join(dict.fromkeys(absent))}; expected "
-            f"the properties of a 3DGS file on its points (it has {', '.join(there[:8])}{more})"
+            f"the properties of a 3DGS file{own} on its points "
+            f"(it has {', '.join(there[:8])}{more})"
         )
         raise RefineError(msg)
     for column in layout.columns:
         attribute = attributes[column.attribute]
-        if not _is(attribute, column.kind):
+        if not _is(attribute, column.place.kinds):
             msg = (
                 f"object '{obj.name}': attribute '{attribute.name}' is {attribute.data_type} on "
-                f"{attribute.domain}, expected {column.kind} on POINT"
+                f"{attribute.domain}, expected {' or '.join(column.place.kinds)} on POINT"
             )
             raise RefineError(msg)
 
 
-def _is(attribute: bpy.types.Attribute | None, data_type: str) -> bool:
-    return bool(attribute and attribute.data_type == data_type and attribute.domain == "POINT")
+def _is(attribute: bpy.types.Attribute | None, kinds: tuple[str, ...]) -> bool:
+    return bool(attribute and attribute.data_type in kinds and attribute.domain == "POINT")
 
 
 def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> tuple[Column, ...]:
@@ -292,18 +342,18 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
     for index, name in enumerate(rows.names or ()):
         kind = rows[name].str
         if name in PLACES:
-            columns.append(Column(name, kind, *PLACES[name]))
+            columns.append(Column(name, kind, PLACES[name]))
             continue
         # Blender keeps some names for itself, we others, and none has more than 63 bytes.
         plain = name not in _TAKEN and len(name.encode()) < 64 and name[0] != "."  # noqa: PLR2004
         place = name if plain else f"ply_{index}"
         attribute = mesh.attributes.new(place, STORAGE[kind[1:]], "POINT")
         attribute = attribute or mesh.attributes.new(f"ply_{index}", STORAGE[kind[1:]], "POINT")
-        columns.append(Column(name, kind, attribute.name))
+        columns.append(Column(name, kind, _plain(kind, attribute.name)))
     mesh[LAYOUT] = json.dumps(
         {
             "header": vertex_header(header).decode("latin-1"),
-            "columns": [[c.name, c.dtype, c.attribute, c.component] for c in columns],
+            "columns": [[c.name, c.dtype, c.attribute, c.place.component] for c in columns],
         }
     )
     return tuple(columns)

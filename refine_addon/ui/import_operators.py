@@ -19,6 +19,7 @@ from ..core.formats.registry import SUFFIXES, read_splats
 from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
 from .on_thread import FAILURES, Answer, described, fail
+from .wrapped import counted
 
 FILE_NAMES = ";".join(f"*{suffix}" for suffix in SUFFIXES)
 """What a file browser shows."""
@@ -79,7 +80,7 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
             obj.select_set(True)
         context.view_layer.objects.active = imported[-1]
         count = sum(len(obj.data.vertices) for obj in imported)
-        self.report({"INFO"}, f"Imported {count:,} splats from {len(imported)} file(s)")
+        self.report({"INFO"}, f"Imported {count:,} splats from {counted(len(imported), 'file')}")
         return {"FINISHED"}
 
     def _paths(self) -> list[Path]:
@@ -149,7 +150,7 @@ class REFINE_OT_import_cameras(_InObjectMode, bpy.types.Operator, ImportHelper):
             scene.render.resolution_percentage = 100
         if views.note:
             self.report({"WARNING"}, views.note)
-        self.report({"INFO"}, f"Imported {len(views)} cameras into '{collection.name}'")
+        self.report({"INFO"}, f"Imported {counted(len(views), 'camera')} into '{collection.name}'")
         return {"FINISHED"}
 
 

@@ -6,7 +6,9 @@ Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* 
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -16,17 +18,20 @@ from bpy_extras.io_utils import ExportHelper
 
 from .. import level_objects, splat_object
 from ..cameras.sets import views_from_scene
-from ..core import pipeline
+from ..core import frustum, pipeline
 from ..core.formats.registry import FORMATS, SUFFIXES, Packed
 from ..core.levels.lod import Level, Levels, lod
 from ..core.quality import in_words
 from ..core.report import scoring_notes
+from ..core.work import part
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.convert import converted
 from . import plans, preview, staleness
 from .import_operators import FILE_NAMES
 from .on_thread import FAILURES, Answer, OnThread, fail
+from .wrapped import counted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -46,7 +51,7 @@ _FORMATS = (
 """The formats of an export as Blender lists them, with tooltips."""
 
 
-class _OnSplats:
+class OnSplats:
     """An operator on the active object, which must hold splats."""
 
     @classmethod
@@ -62,7 +67,7 @@ class _OnSplats:
         return True
 
 
-class _OnScored(_OnSplats):
+class _OnScored(OnSplats):
     """An operator on the active object, which must be scored."""
 
     @classmethod
@@ -76,7 +81,7 @@ class _OnScored(_OnSplats):
         return True
 
 
-def _views(context: bpy.types.Context) -> ViewSet:
+def chosen_views(context: bpy.types.Context) -> ViewSet:
     """Return the views of the cameras that the panel names."""
     settings = context.scene.refine
     return views_from_scene(
@@ -86,6 +91,16 @@ def _views(context: bpy.types.Context) -> ViewSet:
         frames=settings.to_frames(context.scene),
         splats=context.object,
     )
+
+
+def _new_name(obj: bpy.types.Object) -> str:
+    """Return a name for an export that no file beside the .blend has yet."""
+    mesh = obj.data
+    pruned = mesh_scores.RANK in mesh.attributes and mesh_scores.record(mesh) is None
+    name = f"{obj.name}_{'pruned' if pruned else 'copy'}"
+    names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
+    folder = Path(bpy.path.abspath("//"))  # where the file browser starts
+    return next(f"{new}.ply" for new in names if not (folder / f"{new}.ply").exists())
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +114,7 @@ class _Scoring:
     origin: dict[str, Any]
 
 
-class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
+class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     """Score each splat by how much the cameras would miss it (Esc cancels)"""
 
     bl_idname = "refine.score"
@@ -109,7 +124,7 @@ class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Scoring:
         """Gather splats, views and settings."""
-        settings, views = context.scene.refine.to_settings(), _views(context)
+        settings, views = context.scene.refine.to_settings(), chosen_views(context)
         mesh_edit.check_writable(checked.obj)
         quality = settings.estimates or context.scene.refine.budget == "psnr"
         splats = splat_object.gather(checked, whole=None if quality else False)
@@ -117,23 +132,33 @@ class REFINE_OT_score(OnThread, _OnSplats, bpy.types.Operator):
         return _Scoring(splats, views, settings, quality, origin)
 
     @staticmethod
-    def work(job: _Scoring, progress: Progress) -> Scores:
-        """Score."""
-        return pipeline.score(
-            job.splats, job.views, job.settings, quality=job.quality, progress=progress
+    def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
+        """Score, and count how many splats lie in each view."""
+        ahead = part(progress, 0.0, 0.97)
+        scores = pipeline.score(
+            job.splats, job.views, job.settings, quality=job.quality, progress=ahead
         )
+        ahead = part(progress, 0.97, 1.0)
+        return scores, frustum.census(job.splats.means, job.views, progress=ahead)
 
     def finish(
-        self, context: bpy.types.Context, checked: SplatObject, job: _Scoring, scores: Scores
+        self,
+        context: bpy.types.Context,
+        checked: SplatObject,
+        job: _Scoring,
+        found: tuple[Scores, NDArray[np.int64]],
     ) -> Answer:
         """Store the scores on the mesh and say what came of it."""
-        mesh_scores.store(checked, scores, job.settings, job.origin)
+        scores, counts = found
+        names = [view.name for view in job.views]
+        cameras = list(zip(names, counts.tolist(), strict=True))
+        mesh_scores.store(checked, scores, job.settings, job.origin, cameras)
         plans.refresh(context)
         unseen = int((scores.seen == 0).sum())
         self.report(
             {"INFO"},
             f"Scored {len(scores.values):,} splats by {scores.views_used} of "
-            f"{scores.views_given} views; {unseen:,} lie in none",
+            f"{counted(scores.views_given, 'view')}; {unseen:,} lie in none",
         )
         for note in (*scoring_notes(scores), *splat_object.modifier_notes(checked.obj)):
             self.report({"WARNING"}, note)
@@ -176,7 +201,7 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
             settings.to_budget(),
             settings.protect,
             settings=settings.to_settings(),
-            views=_views(context) if settings.absorb else None,
+            views=chosen_views(context) if settings.absorb else None,
         )
 
     @staticmethod
@@ -195,14 +220,14 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
         done = splat_object.apply_object(checked, result)
         plans.forget(checked.mesh)
         psnr = result.report["estimated_psnr"]
+        if result.absorbed:
+            self.report({"INFO"}, result.absorbed.note())
         self.report(
             {"INFO"},
             f"Kept {done.kept:,} splats, removed {done.removed:,}: "
             f"{done.bytes_before / 1e6:,.1f} -> {done.bytes_after / 1e6:,.1f} MB"
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
-        if result.absorbed:
-            self.report({"WARNING"}, result.absorbed.note())
         if changed:
             self.report(
                 {"WARNING"},
@@ -223,7 +248,7 @@ class _Detail:
     protected: NDArray[np.bool_] | None
 
 
-class REFINE_OT_levels(OnThread, _OnSplats, bpy.types.Operator):
+class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
     """Make objects with ever fewer of the splats, by the cameras, in a collection of their own"""
 
     bl_idname = "refine.levels"
@@ -247,7 +272,7 @@ class REFINE_OT_levels(OnThread, _OnSplats, bpy.types.Operator):
         levels, protect = settings.to_levels(), settings.protect
         return _Detail(
             splat_object.gather(checked, whole=True if levels.absorb else None),
-            _views(context),
+            chosen_views(context),
             levels,
             settings.to_settings(),
             mesh_edit.protected_mask(checked.obj, protect) if protect else None,
@@ -278,7 +303,7 @@ class REFINE_OT_levels(OnThread, _OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
+class REFINE_OT_preview(OnSplats, bpy.types.Operator):
     """Show the splats as points, without changing them"""
 
     bl_idname = "refine.preview"
@@ -330,7 +355,28 @@ class REFINE_OT_preview(_OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
+class REFINE_OT_convert(OnSplats, bpy.types.Operator):
+    """Turn a splat mesh into a point cloud of Blender's own splats, or such a point cloud back"""
+
+    bl_idname = "refine.convert"
+    bl_label = "Convert Splats"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Put the other form in the place of the active object."""
+        try:
+            obj, notes = converted(mesh_layout.check(context.object))
+        except FAILURES as error:
+            return fail(self, error)
+        plans.refresh(context)
+        for note in notes:
+            self.report({"WARNING"}, note)
+        kind = "a point cloud" if obj.type == "POINTCLOUD" else "a mesh"
+        self.report({"INFO"}, f"'{obj.name}' is {kind} now")
+        return {"FINISHED"}
+
+
+class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
     """Write the active object's splats to a file, in the format that its suffix names"""
 
     bl_idname = "refine.export_ply"
@@ -359,7 +405,7 @@ class REFINE_OT_export_ply(_OnSplats, bpy.types.Operator, ExportHelper):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Ask for the file; whoever picks an existing one in the browser means to replace it."""
         if not self.filepath:
-            self.filepath = f"{context.object.name}.ply"
+            self.filepath = _new_name(context.object)
         self.overwrite = True
         return super().invoke(context, event)
 

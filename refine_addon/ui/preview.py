@@ -15,7 +15,7 @@ import bpy
 from ..core.errors import RefineError
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
-from ..mesh import heat_map
+from ..mesh import heat_map, native
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import check
 from ..mesh.node_trees import (
@@ -38,7 +38,8 @@ MODIFIER = "REFINE preview"
 MODES = {"COLOR": heat_map.COLOR, "HEAT": heat_map.HEAT}
 """What can be shown -> the colour attribute that holds it."""
 
-STYLES = ("POINTS", "SPLATS")
+STYLES = ("POINTS", "SPLATS", "CLOUD", "NATIVE")
+"""The last two are what points are for point clouds: with a file's values, with Blender's own."""
 
 MADE_BY = "refine_version"
 """Custom property of our node groups and materials: the version of the add-on that made them. Those
@@ -77,15 +78,21 @@ def show(
     Raises
     ------
     RefineError
-        If the object holds no splats or cannot be changed; for the heat map, if it was not scored.
+        If the object holds no splats or cannot be changed; for the heat map, if it was not scored;
+        for style SPLATS, if it holds Blender's own splats, which Blender draws itself.
     """
     checked = check(obj)
     mesh_edit.check_writable(obj)
+    if style == "SPLATS" and obj.type == "POINTCLOUD":
+        msg = f"object '{obj.name}': is a point cloud; convert it to a mesh to see it as splats"
+        raise RefineError(msg)
     if mode == "HEAT" and not has_heat(obj):
         msg = f"object '{obj.name}': has no heat map; score it first"
         raise RefineError(msg)
     if mode == "COLOR" and heat_map.COLOR not in obj.data.attributes:
         heat_map.write_base_color(checked)
+    if obj.type == "POINTCLOUD":
+        style = "NATIVE" if checked.layout.native else "CLOUD"
     tree = _tree(mode, style, hide_removed=hide_removed)
     modifier = obj.modifiers.get(MODIFIER) or obj.modifiers.new(MODIFIER, "NODES")
     modifier.node_group = tree
@@ -150,9 +157,12 @@ def _tree(mode: str, style: str, *, hide_removed: bool) -> bpy.types.NodeTree:
     builders: dict[str, Callable[..., list[bpy.types.Node]]] = {
         "POINTS": _points,
         "SPLATS": _splats,
+        "CLOUD": _cloud,
+        "NATIVE": _native,
     }
     nodes = [mesh_edit.add_delete(tree)] if hide_removed else []
-    chain(tree, nodes + builders[style](tree, _material(mode, style)))
+    material = _material(mode, "SPLATS" if style == "SPLATS" else "POINTS")
+    chain(tree, nodes + builders[style](tree, material))
     return tree
 
 
@@ -162,6 +172,36 @@ def _points(tree: bpy.types.NodeTree, material: bpy.types.Material) -> list[bpy.
     total = math(tree, "ADD", math(tree, "ADD", logs[0], logs[1]), logs[2])
     size = math(tree, "EXPONENT", math(tree, "DIVIDE", total, 3.0))
     opaque = logistic(tree, named_attribute(tree, "opacity", "FLOAT"))
+    return _spheres(tree, material, size, opaque)
+
+
+def _cloud(tree: bpy.types.NodeTree, material: bpy.types.Material) -> list[bpy.types.Node]:
+    """Return what `_points` does, for a point cloud."""
+    return [add(tree, "GeometryNodePointsToVertices"), *_points(tree, material)]
+
+
+def _native(tree: bpy.types.NodeTree, material: bpy.types.Material) -> list[bpy.types.Node]:
+    """Return what `_points` does, for a point cloud with Blender's own splats.
+
+    As vertices in between, they are points afterwards and no splats, which Blender would draw.
+    """
+    parts = add(tree, "ShaderNodeSeparateXYZ")
+    tree.links.new(named_attribute(tree, native.SCALE, "FLOAT_VECTOR"), parts.inputs[0])
+    x, y, z = parts.outputs
+    product = math(tree, "MULTIPLY", math(tree, "MULTIPLY", x, y), z)
+    size = math(tree, "POWER", product, 1.0 / 3.0)
+    base = add(tree, "FunctionNodeSeparateColor")
+    tree.links.new(named_attribute(tree, native.BASE, "FLOAT_COLOR"), base.inputs[0])
+    spheres = _spheres(tree, material, size, base.outputs["Alpha"])
+    return [add(tree, "GeometryNodePointsToVertices"), *spheres]
+
+
+def _spheres(
+    tree: bpy.types.NodeTree,
+    material: bpy.types.Material,
+    size: bpy.types.NodeSocket,
+    opaque: bpy.types.NodeSocket,
+) -> list[bpy.types.Node]:
     points = add(tree, "GeometryNodeMeshToPoints")
     radius = math(tree, "MULTIPLY", math(tree, "MULTIPLY", size, opaque), _POINT)
     tree.links.new(radius, points.inputs["Radius"])

@@ -3,6 +3,7 @@
 # ruff: noqa: TC002 - Blender runs the annotations
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -16,11 +17,15 @@ from bpy.props import (
     StringProperty,
 )
 
+from ..core.cleaning.clean import DEFAULT_REASONS
 from ..core.errors import RefineError
 from ..core.levels.lod import Levels
 from ..core.scoring.closed_form import ClosedForm
 from ..core.selection import Budget
 from ..core.task import Settings
+from ..mesh import floaters
+from ..mesh import layout as mesh_layout
+from ..mesh.edit import marking
 from . import plans
 
 if TYPE_CHECKING:
@@ -43,6 +48,15 @@ BUDGETS = (
 )
 """Kinds of budget, by the names that core gives them."""
 
+FLOATERS = (
+    ("front", "In Front", "Stands in front of surfaces, seen by itself"),
+    ("isolated", "Isolated", "Is in a small cluster that touches nothing else"),
+    ("giant", "Giant", "Is a huge veil across the pictures"),
+    ("needle", "Needle", "Is long and thin, and crosses the pictures"),
+    ("transparent", "Transparent", "Floats, but changes no picture that anyone would see"),
+)
+"""Reasons why a splat floats, by the names that core gives them."""
+
 SOURCES = (
     ("VISIBLE", "Visible", "All cameras that are visible in the scene"),
     ("ACTIVE", "Active", "The scene's active camera, at the current frame"),
@@ -53,7 +67,26 @@ SOURCES = (
 
 
 def _plan_again(_settings: RefineSettings, context: bpy.types.Context) -> None:
-    plans.refresh(context)
+    plans.changed(context)
+
+
+def _percent(settings: RefineSettings) -> float:
+    return 100.0 * decimal(settings.ratio)
+
+
+def _set_percent(settings: RefineSettings, value: float) -> None:
+    settings.ratio = decimal(value) / 100.0
+
+
+def _mark_floaters(settings: RefineSettings, context: bpy.types.Context) -> None:
+    """Mark the floaters of the reasons chosen as what goes, if they were looked for."""
+    obj = getattr(context, "object", None)  # not in every editor
+    if not mesh_layout.looks_like_splats(obj) or floaters.counts(obj.data) is None:
+        return
+    if obj.mode == "EDIT":
+        return
+    with contextlib.suppress(RefineError):  # *Delete Floaters* says what is wrong
+        floaters.mark(mesh_layout.check(obj), settings.reasons)
 
 
 def _protectable(
@@ -61,11 +94,11 @@ def _protectable(
 ) -> Iterator[str]:
     """Suggest what the active object has that can protect splats."""
     obj = context.object
-    if obj and obj.type == "MESH":
+    if mesh_layout.looks_like_splats(obj):
         yield from (group.name for group in obj.vertex_groups)
         for attribute in obj.data.attributes:
-            kind = (attribute.data_type, attribute.domain)
-            if kind == ("BOOLEAN", "POINT") and not attribute.name.startswith((".", "refine_")):
+            own = attribute.name.startswith((".", "refine_"))
+            if attribute.data_type in marking(obj) and attribute.domain == "POINT" and not own:
                 yield attribute.name
 
 
@@ -127,6 +160,14 @@ class RefineSettings(bpy.types.PropertyGroup):
     frame_start: IntProperty(name="Start", description="First frame", default=1)
     frame_end: IntProperty(name="End", description="Last frame", default=250)
     frame_step: IntProperty(name="Step", description="Every how many frames", default=10, min=1)
+    reasons: EnumProperty(
+        name="Floaters",
+        description="What counts as a floater",
+        items=FLOATERS,
+        options={"ENUM_FLAG"},
+        default=set(DEFAULT_REASONS),
+        update=_mark_floaters,
+    )
     budget: EnumProperty(
         name="Budget",
         description="What says how much is removed",
@@ -141,6 +182,17 @@ class RefineSettings(bpy.types.PropertyGroup):
         min=0.0,
         max=0.9999,
         update=_plan_again,
+    )
+    percent: FloatProperty(
+        name="Remove",
+        description="Share of the splats to remove, in per cent",
+        subtype="PERCENTAGE",
+        precision=1,
+        default=50.0,
+        min=0.0,
+        max=99.99,
+        get=_percent,
+        set=_set_percent,
     )
     keep: IntProperty(
         name="Keep",
@@ -185,6 +237,7 @@ class RefineSettings(bpy.types.PropertyGroup):
         name="Absorb",
         description="Survivors take over what is removed, by what the cameras see of it: far "
         "better when much is removed, and slower; the survivors change",
+        update=_plan_again,
     )
     protect: StringProperty(
         name="Protect",

@@ -111,13 +111,14 @@ def score(addon):
 
 def snapshot():
     """Return what an operator must leave alone where it fails, as plain values."""
+    kinds = ("objects", "meshes", "pointclouds", "cameras", "collections", "node_groups")
     facts = {
         kind: sorted(item.name for item in getattr(bpy.data, kind))
-        for kind in ("objects", "meshes", "cameras", "collections", "node_groups", "materials")
+        for kind in (*kinds, "materials")
     }
-    for mesh in bpy.data.meshes:
-        facts[f"mesh {mesh.name}"] = (
-            len(mesh.vertices),
+    for mesh in (*bpy.data.meshes, *bpy.data.pointclouds):
+        facts[f"{mesh.id_type} {mesh.name}"] = (
+            len(mesh.attributes["position"].data) if "position" in mesh.attributes else 0,
             sorted((a.name, a.data_type, a.domain) for a in mesh.attributes),
             sorted(mesh.keys()),
         )

@@ -173,7 +173,7 @@ def test_apply_is_one_undo_step(room, room_cameras):  # noqa: ARG001
 
 
 @pytest.mark.parametrize(
-    "name", ["score", "apply", "import_ply", "import_cameras", "levels", "preview"]
+    "name", ["score", "apply", "import_ply", "import_cameras", "levels", "preview", "convert"]
 )
 def test_operators_that_change_the_scene_can_be_undone(name):
     """Blender pushes an undo step for operators with UNDO."""
@@ -459,7 +459,7 @@ def _painting(room):  # noqa: ARG001
 
 @pytest.mark.parametrize(
     ("prepare", "reason"),
-    [(_shared, "shares its mesh"), (_keyed, "shape keys"), (_painting, "weight paint mode")],
+    [(_shared, "shares its data"), (_keyed, "shape keys"), (_painting, "weight paint mode")],
 )
 def test_an_object_that_cannot_lose_vertices_is_refused(
     room,

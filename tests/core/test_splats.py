@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from refine_addon.core import Splats
-from refine_addon.core.splats import base_color, drawable, opacity, rotation_matrices
+from refine_addon.core.splats import (
+    base_color,
+    drawable,
+    opacity,
+    rotation_matrices,
+    scales,
+    single_log_scales,
+    single_logits,
+    single_unit_quaternions,
+)
 
 
 def one(**changes) -> Splats:
@@ -45,6 +54,82 @@ def test_opacity_underflows_silently(logit):
     """What is below 1e-304 is returned as about that: far below the smallest float32."""
     with np.errstate(all="raise"):
         assert 0.0 <= opacity(np.array(logit)) < 1e-303
+
+
+def single(values):
+    """Round to float32, as Blender's attributes do."""
+    with np.errstate(all="ignore"):
+        return np.asarray(values, np.float32)
+
+
+EDGES = [0.0, 1e-45, 1e-38, 1e-7, 0.25, 0.5, 1.0 - 2.0**-24, 1.0]
+"""Opacities in float32: the ends, the smallest number, the largest below 1."""
+
+
+def test_logits_of_stored_opacities_give_them_back_to_the_bit():
+    """The logistic function of the logit, in float64, rounds to the opacity; all are finite."""
+    stored = single(EDGES)
+
+    with np.errstate(all="raise", under="ignore"):
+        logits = single_logits(stored)
+
+    assert np.isfinite(logits).all()
+    assert single(opacity(logits)).tobytes() == stored.tobytes()
+    assert logits[0] == pytest.approx(-104.0)
+    assert logits[-1] == pytest.approx(np.log(2.0**26 - 1.0))  # the logit of 1 - 2^-26
+
+
+def test_log_scales_of_stored_scales_give_them_back_to_the_bit():
+    """0 too: exp(-104) is 6.8e-46, less than half of the smallest float32, 7.0e-46."""
+    stored = single([0.0, 1e-45, 1e-38, 1e-7, 0.25, 1.0, 3e38])
+
+    with np.errstate(all="raise", under="ignore"):
+        logs = single_log_scales(stored)
+
+    assert np.isfinite(logs).all()
+    assert single(scales(logs)).tobytes() == stored.tobytes()
+    assert single_log_scales(-stored).tobytes() == logs.tobytes()
+
+
+def test_what_is_0_stays_undrawable_and_what_is_not_drawable():
+    """Opacity 0 and scale 0 on every axis are not drawn; the smallest float32 is, of either."""
+    least = np.float32(1e-45)
+    for value, seen in ((0.0, False), (least, True)):
+        logits = single(single_logits(np.array([value])))
+        logs = single(single_log_scales(np.full((1, 3), value)))
+        assert drawable(one(opacity_logits=logits)).tolist() == [seen]
+        assert drawable(one(log_scales=logs)).tolist() == [seen]
+
+
+def test_no_number_of_a_file_changes_by_a_millionth_on_the_way_through_float32():
+    """The activated value is rounded to float32, then what is stored: 6e-8 each at most.
+
+    Far from 0 the second rounding leads back: half a step of a logit of 32 is 2e-6, far more than
+    the 6e-8 by which the first one moved it.
+    """
+    values = single(np.random.default_rng(0).uniform(-80.0, 80.0, 100_000))
+
+    again = opacity(single(single_logits(single(opacity(values)))))
+    sizes = scales(single(single_log_scales(single(scales(values)))))
+
+    assert np.abs(again / opacity(values) - 1.0).max() < 2e-7
+    assert np.abs(sizes / scales(values) - 1.0).max() < 2e-7
+
+
+def test_quaternions_become_unit_and_stay_where_they_are():
+    """(0, 3, 0, 4) / 5; zero is the identity; unit ones and those not finite keep their bits."""
+    stored = single(np.random.default_rng(0).normal(size=(1000, 4)))
+    stored = single(stored / np.linalg.norm(stored.astype(float), axis=1, keepdims=True))
+    odd = single([[0, 3, 0, 4], [0, 0, 0, 0], [np.nan, 0, 0, 1], [np.inf, 0, 0, 1], [1e38] * 4])
+
+    with np.errstate(all="raise"):
+        got = single_unit_quaternions(odd)
+
+    assert single_unit_quaternions(stored).tobytes() == stored.tobytes()
+    assert got[0] == pytest.approx([0.0, 0.6, 0.0, 0.8])
+    assert got[1].tolist() == [1, 0, 0, 0]
+    assert got[2:4].tobytes() == odd[2:4].tobytes()
+    assert got[4] == pytest.approx([0.5] * 4)
 
 
 def test_base_color_is_the_constant_harmonic_and_a_half():

@@ -48,12 +48,12 @@ REASONS = {
 DEFAULT_REASONS = ("front", "isolated", "giant", "needle")
 """All but the nearly transparent, which no picture shows."""
 
-DOUBTED, LONE = 0.35, 0.25
-"""A splat is suspect if others support less than the first share of its light; below the second it
-stands alone, and may be found to be in front of surfaces."""
+DOUBTED = 0.35
+"""A splat is suspect, and may be found to be in front of surfaces, if others support less than this
+share of its light."""
 
-SMALL, SMALL_SHARE = 200, 0.001
-"""A cluster of fewer splats than this number, or than this share of all, is suspect."""
+SMALL = 100
+"""A cluster of fewer splats is suspect."""
 
 SOLID = 0.1
 """Splats of lower opacity do not hold clusters together."""
@@ -66,13 +66,17 @@ SLENDER, LONG = 10.0, 0.05
 """A needle is this many times as long as wide, and its standard deviation reaches across this share
 of a picture's longer side."""
 
-SUPPORT, GIANT_SUPPORT = 0.1, 0.3
-"""What less of the light stops near than this share has no surface. Giants cross surfaces."""
+SUPPORT, GIANT_SUPPORT, VEIL_SUPPORT = 0.2, 0.3, 0.5
+"""What less of the light stops near than this share has no surface. Giants cross surfaces; of a
+giant that is a veil, half may lie at one."""
+
+VEIL = 0.15
+"""A giant of lower opacity is a veil."""
 
 VIEWS = 3
 """So many views must see past a splat; all of them where fewer see it."""
 
-AGREE = 0.85
+AGREE = 0.6
 """Share of the views that must see past it."""
 
 VISIBLE, GIANT_VISIBLE = 4 / 255, 1 / 255
@@ -241,18 +245,19 @@ class _Run:
         support, widest = self._support(part(progress, 0.0, 0.5))
         giant = (self.gaussians.largest >= HUGE) & (widest >= GIANT)
         needle = self.slender & (widest >= LONG) & ~giant
-        doubted, lone = support < DOUBTED, support < LONE
-        small = self._clusters(~lone & ~giant, part(progress, 0.5, 0.6))
+        doubted = support < DOUBTED
+        small = self._clusters(~doubted & ~giant, part(progress, 0.5, 0.6))
         self._judge(doubted | giant | needle | small, part(progress, 0.6, 1.0))
         effect = self._effect()
         floats = ~giant & self._floats(SUPPORT) & self._agreed()
+        most = np.where(self.gaussians.alphas < VEIL, VEIL_SUPPORT, GIANT_SUPPORT)
         visible = floats & (effect >= VISIBLE)
         return {
-            "front": visible & lone & ~needle,
+            "front": visible & doubted & ~needle,
             "isolated": visible & small & ~needle,
-            "giant": giant & self._floats(GIANT_SUPPORT) & (effect >= GIANT_VISIBLE),
+            "giant": giant & self._floats(most) & (effect >= GIANT_VISIBLE),
             "needle": visible & needle,
-            "transparent": floats & lone & ~visible,
+            "transparent": floats & doubted & ~visible,
         }
 
     def _support(self, progress: Progress) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -288,7 +293,7 @@ class _Run:
         rows = np.flatnonzero(solid & (self.gaussians.alphas >= SOLID))
         small = np.zeros(len(solid), np.bool_)
         sizes = cluster_sizes(self.gaussians.take(rows), progress=progress, threads=self.threads)
-        small[rows] = sizes < max(SMALL, SMALL_SHARE * len(solid))
+        small[rows] = sizes < SMALL
         return small
 
     def _judge(self, suspects: NDArray[np.bool_], progress: Progress) -> None:
@@ -315,7 +320,7 @@ class _Run:
             count, 1, progress=progress, what=what, threads=self.threads,
         )  # fmt: skip
 
-    def _floats(self, most: float) -> NDArray[np.bool_]:
+    def _floats(self, most: float | NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which suspects have a surface behind them and less than `most` support, (M,)."""
         seen = self.evidence
         return (seen.views > 0) & (seen.near < most * (seen.near + seen.behind))

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 NEIGHBOURS = 8
 """With how many near neighbours a splat may touch."""
 
-REACH = 3.0
+REACH = 2.0
 """Two splats touch within this many standard deviations of both, along the step between them."""
 
-APART = 0.02
+APART = 0.01
 """They touch as well within this distance: of the scene's size plus the distance to its middle."""
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import RefineError
-from ..splats import SH_C0, base_color, opacity, opacity_logits, unit_quaternions
+from ..splats import SH_C0, base_color, opacity, opacity_logits, scales, unit_quaternions
 from .format import Format, Sizes, codes, new_file, pieces
 from .ply import Origin, SplatFile
 
@@ -77,7 +77,7 @@ def write(stream: BinaryIO, splats: Splats) -> None:
         rows = np.empty(len(some), _ROW)
         rows["mean"] = some.means
         with np.errstate(under="ignore"):
-            rows["scale"] = np.exp(np.asarray(some.log_scales, np.float64))
+            rows["scale"] = scales(some.log_scales)
             rows["color"][:, :3] = codes(base_color(some.sh_dc))
             rows["color"][:, 3] = codes(opacity(some.opacity_logits))
         turns = np.rint(unit_quaternions(some.quaternions) * _NO_TURN + _NO_TURN)

@@ -16,11 +16,13 @@ import numpy as np
 from ..affine import transformed
 from ..errors import RefineError
 from ..splats import (
+    SINGLE_MARGIN,
     Splats,
     base_color,
     opacity,
     opacity_logits,
     rotation_matrices,
+    scales,
     unit_quaternions,
 )
 from .format import Format, Sizes, codes, new_file, pieces
@@ -54,9 +56,6 @@ _DEGREES = 3
 
 _FLOAT, _BYTE = 5126, 5121
 _POINTS, _VERTICES = 0, 34962
-
-_MARGIN = 2.0**-26
-"""Opacities are kept this far from 0 and 1: float32 has no number between that and 1."""
 
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Between the frame of captures and that of glTF, either way."""
@@ -230,7 +229,7 @@ class _Part:
                 means=np.asarray(self._means(piece), np.float32),
                 log_scales=np.log(self._scales(piece), dtype=np.float32),
                 quaternions=np.asarray(self._turns(piece), np.float32)[:, _WXYZ],
-                opacity_logits=opacity_logits(self._opacities(piece)[:, 0], _MARGIN),
+                opacity_logits=opacity_logits(self._opacities(piece)[:, 0], SINGLE_MARGIN),
                 sh_dc=np.asarray(harmonics[0], np.float32),
                 sh_rest=np.stack([*harmonics[1:]], axis=1)
                 if self.degree
@@ -308,7 +307,7 @@ def _attributes(degree: int) -> list[_Attribute]:
         return codes(np.hstack([base_color(splats.sh_dc), opaque(splats)]))
 
     def scale(splats: Splats) -> NDArray[Any]:
-        return np.exp(np.asarray(splats.log_scales, np.float64))
+        return scales(splats.log_scales)
 
     def turn(splats: Splats) -> NDArray[Any]:
         return unit_quaternions(splats.quaternions)[:, _XYZW]

@@ -1,0 +1,220 @@
+"""From a splat mesh to a point cloud of Blender's own splats, and back; nothing is lost.
+
+A Blender object keeps its type for life, so that another object takes the place of the first:
+with its name, transform, parent, collections and custom properties, and for all that refers to it.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import bpy
+
+from ..core.errors import RefineError
+from . import attributes as mesh_attributes
+from . import heat_map, native
+from .edit import check_changeable, group_weights
+from .layout import KINDS, STORAGE, SplatObject, check, rest_count
+from .node_trees import add, chain, new_tree
+
+if TYPE_CHECKING:
+    from .layout import Column
+
+_TRANSFORM = (
+    *("rotation_mode", "location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle"),
+    *("scale", "delta_location", "delta_rotation_euler", "delta_rotation_quaternion"),
+    *("delta_scale", "parent", "parent_type", "parent_bone", "parent_vertices"),
+    "matrix_parent_inverse",
+)
+_LOOKS = ("hide_viewport", "hide_render", "hide_select", "pass_index", "color", "show_in_front")
+
+
+def converted(checked: SplatObject) -> tuple[bpy.types.Object, list[str]]:
+    """Put an object of the other form in the place of one: a point cloud for a mesh, or a mesh.
+
+    Point attributes, scores, materials and custom properties come along. Vertex groups become float
+    attributes with their weights. A mesh gets Blender's own splats, activated in single precision,
+    with quaternions of length 1; from these, logits and logarithms are taken as docs/conventions.md
+    says.
+
+    Parameters
+    ----------
+    checked : SplatObject
+        It is gone afterwards.
+
+    Returns
+    -------
+    obj : bpy.types.Object
+    notes : list of str
+        What did not come along, in sentences.
+
+    Raises
+    ------
+    RefineError
+        See `edit.check_changeable`; also if the object is a point cloud that holds the properties
+        of a file under their own names, or has another attribute of a name that the new form
+        needs. Nothing is changed then.
+    """
+    old = checked.obj
+    check_changeable(old)
+    if old.type == "POINTCLOUD" and not checked.layout.native:
+        msg = f"object '{old.name}': is a point cloud without {native.NAMES}: nothing to convert"
+        raise RefineError(msg)
+    notes = _left(old)
+    data = _mesh_of(checked) if checked.layout.native else _point_cloud_of(checked)
+    obj = bpy.data.objects.new(old.name, data)
+    try:
+        _fill(checked, obj)
+    except BaseException:
+        bpy.data.objects.remove(obj)
+        bpy.data.batch_remove([data])
+        raise
+    _take_place(old, obj)
+    return obj, notes
+
+
+def _left(old: bpy.types.Object) -> list[str]:
+    """Return what of an object cannot come along, in sentences."""
+    notes, data = [], old.data
+    modifiers = [modifier.name for modifier in old.modifiers if "REFINE" not in modifier.name]
+    if modifiers:
+        notes.append(f"its modifiers ({', '.join(modifiers)}) were left behind")
+    if getattr(data, "edges", ()):
+        notes.append(f"its {len(data.edges)} edges and {len(data.polygons)} faces were left behind")
+    strange = [a.name for a in data.attributes if a.domain == "POINT" and not _copied(a)]
+    strange = [name for name in strange if name[0] != "."]
+    if strange:
+        notes.append(f"its attributes {', '.join(strange)} were left behind")
+    return [f"object '{old.name}': {note}" for note in notes]
+
+
+def _copied(attribute: bpy.types.Attribute) -> bool:
+    return attribute.domain == "POINT" and attribute.data_type in KINDS
+
+
+def _point_cloud_of(checked: SplatObject) -> bpy.types.PointCloud:
+    """Return a new point cloud with the attributes of Blender's own splats, to be filled."""
+    cloud = _new_point_cloud(checked.mesh.name, len(checked))
+    # Before Blender 5.3 there is but one type of point clouds.
+    kinds = cloud.bl_rna.properties.get("type")
+    if kinds and native.TYPE in kinds.enum_items:
+        cloud.type = native.TYPE
+    types = bpy.types.Attribute.bl_rna.properties["data_type"].enum_items.keys()
+    for place in native.places(rest_count(checked.mesh) // 3).values():
+        if place.attribute not in cloud.attributes:
+            kind = next(kind for kind in place.kinds if kind in types)
+            cloud.attributes.new(place.attribute, kind, "POINT")
+    return cloud
+
+
+def _new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
+    """Return a point cloud of so many points; in 5.0 and older only nodes can make them."""
+    cloud = bpy.data.pointclouds.new(name)
+    if hasattr(cloud, "resize"):
+        cloud.resize(count)
+        return cloud
+    helper, tree = bpy.data.objects.new("REFINE points", cloud), new_tree("REFINE points")
+    try:
+        points = add(tree, "GeometryNodePoints")
+        chain(tree, [])
+        end = next(node for node in tree.nodes if node.bl_idname == "NodeGroupOutput")
+        points.inputs["Count"].default_value = count
+        tree.links.new(points.outputs[0], end.inputs[0])
+        helper.modifiers.new("REFINE points", "NODES").node_group = tree
+        with bpy.context.temp_override(object=helper, active_object=helper):
+            bpy.ops.object.modifier_apply(modifier="REFINE points")
+        mesh_attributes.remove_attribute(cloud, "radius")
+    finally:
+        bpy.data.objects.remove(helper)
+        bpy.data.node_groups.remove(tree)
+    return cloud
+
+
+def _mesh_of(checked: SplatObject) -> bpy.types.Mesh:
+    """Return a new mesh with the attributes of a file of splats, to be filled."""
+    mesh = bpy.data.meshes.new(checked.mesh.name)
+    mesh.vertices.add(len(checked))
+    for column in _moved(checked):
+        if column.name not in ("x", "y", "z"):
+            mesh.attributes.new(column.name, STORAGE[column.dtype[1:]], "POINT")
+    return mesh
+
+
+def _moved(checked: SplatObject) -> list[Column]:
+    """Return the columns that lie elsewhere in the other form: those that make a splat."""
+    places = native.places(rest_count(checked.mesh) // 3)
+    return [column for column in checked.layout.columns if column.name in {*"xyz", *places}]
+
+
+def _fill(checked: SplatObject, obj: bpy.types.Object) -> None:
+    """Give a new object what the old one holds."""
+    old, data = checked.obj, obj.data
+    columns = _moved(checked)
+    held = {column.attribute for column in columns} | {heat_map.COLOR}  # that of a preview
+    needed = set(data.attributes.keys())
+    for attribute in list(checked.mesh.attributes):
+        if _copied(attribute) and attribute.name not in held and attribute.name[0] != ".":
+            if attribute.name in needed:
+                msg = (
+                    f"object '{old.name}': has an attribute '{attribute.name}', a name that the "
+                    f"splats of a {other_form(checked.mesh).lower()} need; rename it first"
+                )
+                raise RefineError(msg)
+            values = mesh_attributes.read_attribute(checked.mesh, attribute.name)
+            mesh_attributes.write_attribute(data, attribute.name, attribute.data_type, values)
+    for group in old.vertex_groups:
+        if group.name not in data.attributes:
+            values = group_weights(old, group.name)
+            mesh_attributes.write_attribute(data, group.name, "FLOAT", values)
+    for source, target in ((checked.mesh, data), (old, obj)):
+        for key, value in source.items():
+            target[key] = value.to_dict() if hasattr(value, "to_dict") else value
+    for material in checked.mesh.materials:
+        data.materials.append(material)
+    stored, target = mesh_attributes.stored_columns(checked), check(obj)
+    places = {column.name: column.attribute for column in target.layout.columns}
+    for attribute in dict.fromkeys(places[column.name] for column in columns):
+        some = [column.name for column in columns if places[column.name] == attribute]
+        mesh_attributes.write_columns(target, {name: stored[name] for name in some})
+
+
+def _take_place(old: bpy.types.Object, new: bpy.types.Object) -> None:
+    """Put a new object where an old one is, for the scene and all that refers to it."""
+    for name in (*_TRANSFORM, *_LOOKS):
+        setattr(new, name, getattr(old, name))
+    for constraint in old.constraints:
+        new.constraints.copy(constraint)
+    if old.animation_data:
+        _animate(old.animation_data, new.animation_data_create())
+    name, data = old.name, old.data
+    layer = bpy.context.view_layer
+    there = old.name in layer.objects
+    active, selected = layer.objects.active == old, there and old.select_get()
+    hidden = there and old.hide_get()
+    old.user_remap(new)
+    bpy.data.objects.remove(old)
+    if not data.users:
+        name_of_data = data.name
+        bpy.data.batch_remove([data])
+        new.data.name = name_of_data
+    new.name = name
+    layer.update()
+    if there:
+        new.select_set(selected)
+        new.hide_set(hidden)
+        if active:
+            layer.objects.active = new
+
+
+def _animate(old: bpy.types.AnimData, new: bpy.types.AnimData) -> None:
+    """Give an object the action and the drivers of another."""
+    new.action = old.action
+    if getattr(old, "action_slot", None):  # since Blender 4.4
+        new.action_slot = old.action_slot
+    for driver in old.drivers:
+        new.drivers.from_existing(src_driver=driver)
+
+
+def other_form(data: Any) -> str:  # noqa: ANN401 - an object's data
+    """Return what `converted` makes of an object's data, in words."""
+    return "Mesh" if native.is_native(data) else "Point Cloud"

@@ -1,0 +1,100 @@
+"""Floaters that were found on a mesh: why each splat may go, and which of them are to go."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..core.cleaning.clean import REASONS
+from ..core.errors import RefineError
+from . import attributes as mesh_attributes
+from . import edit as mesh_edit
+from .layout import splat_count
+
+if TYPE_CHECKING:
+    from collections.abc import Collection
+
+    import bpy
+    from numpy.typing import NDArray
+
+    from ..core.cleaning.clean import Cleaned
+    from .layout import SplatObject
+
+REASON = "refine_floats"
+"""Integer point attribute: 0, or the place of the splat's reason in `REASONS`, from 1."""
+
+FOUND = "refine_floaters"
+"""Custom property of the mesh: how many floaters were found for each reason, as JSON."""
+
+
+def store(checked: SplatObject, cleaned: Cleaned) -> None:
+    """Write what was found to an object's mesh.
+
+    Raises
+    ------
+    RefineError
+        If the object cannot be written to, or no longer has as many splats.
+    """
+    mesh_edit.check_writable(checked.obj)
+    if len(checked) != len(cleaned.keep):
+        msg = (
+            f"object '{checked.obj.name}': has {len(checked)} splats, floaters were looked for "
+            f"among {len(cleaned.keep)}; look again"
+        )
+        raise RefineError(msg)
+    reasons = np.zeros(len(cleaned.keep), np.int32)
+    for number, name in enumerate(REASONS, start=1):
+        reasons[cleaned.found[name]] = number
+    mesh_attributes.write_attribute(checked.mesh, REASON, "INT", reasons)
+    counts = {name: int(np.count_nonzero(mask)) for name, mask in cleaned.found.items()}
+    checked.mesh[FOUND] = json.dumps({"splats": len(reasons), "counts": counts})
+    mesh_attributes.updated(checked.mesh)
+
+
+def counts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, int] | None:
+    """Return how many floaters were found for each reason; None if nobody looked since a change."""
+    try:
+        noted = json.loads(mesh[FOUND])
+        found = {name: int(noted["counts"][name]) for name in REASONS}
+        holds = noted["splats"] == splat_count(mesh) and REASON in mesh.attributes
+    except (KeyError, TypeError, ValueError):
+        return None
+    return found if holds else None
+
+
+def mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.bool_]:
+    """Return which splats float for one of some reasons, (N,).
+
+    Raises
+    ------
+    RefineError
+        If nobody looked for floaters since the splats changed.
+    """
+    if counts(checked.mesh) is None:
+        msg = f"object '{checked.obj.name}': look for floaters first"
+        raise RefineError(msg)
+    numbers = [number for number, name in enumerate(REASONS, start=1) if name in reasons]
+    return np.isin(mesh_attributes.read_attribute(checked.mesh, REASON), numbers)
+
+
+def mark(checked: SplatObject, reasons: Collection[str]) -> None:
+    """Mark the floaters of some reasons as what goes, for the preview.
+
+    Raises
+    ------
+    RefineError
+        See `mask`; also if the object cannot be written to.
+    """
+    mesh_edit.check_writable(checked.obj)
+    remove = mask(checked, reasons)
+    mesh_attributes.write_attribute(checked.mesh, mesh_edit.REMOVE, "BOOLEAN", remove)
+    mesh_attributes.updated(checked.mesh)
+
+
+def forget(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
+    """Remove what was found."""
+    mesh_attributes.remove_attribute(mesh, REASON)
+    if FOUND in mesh:
+        del mesh[FOUND]

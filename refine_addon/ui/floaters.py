@@ -1,0 +1,104 @@
+"""Operators that find splats which float, by what the cameras see, and delete them."""
+
+# ruff: noqa: D400, N801, TC002 - Blender's names and tooltips; annotations are run
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import bpy
+import numpy as np
+
+from .. import splat_object
+from ..core.cleaning.clean import Cleaned, Cleaning, clean
+from ..mesh import edit as mesh_edit
+from ..mesh import floaters
+from ..mesh import layout as mesh_layout
+from . import plans
+from .on_thread import FAILURES, Answer, OnThread, fail
+from .operators import OnSplats, chosen_views
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..core.splats import Splats
+    from ..core.views import ViewSet
+    from ..core.work import Progress
+    from ..mesh.layout import SplatObject
+
+
+@dataclass(frozen=True, eq=False)
+class _Looking:
+    """Where to look for floaters: splats and views as they stand in the world."""
+
+    splats: Splats
+    views: ViewSet
+    settings: Cleaning
+    protected: NDArray[np.bool_] | None
+
+
+class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
+    """Find splats that stand where the cameras see that nothing is; nothing is deleted (Esc cancels)"""  # noqa: E501 - a tooltip is one line
+
+    bl_idname = "refine.find_floaters"
+    bl_label = "Find Floaters"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's way to set options
+    doing = "Looking for floaters"
+
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Looking:
+        """Gather splats and views."""
+        settings = context.scene.refine
+        mesh_edit.check_writable(checked.obj)
+        protect = settings.protect
+        return _Looking(
+            splat_object.gather(checked),
+            chosen_views(context),
+            Cleaning(tuple(settings.reasons), settings.views),
+            mesh_edit.protected_mask(checked.obj, protect) if protect else None,
+        )
+
+    @staticmethod
+    def work(job: _Looking, progress: Progress) -> Cleaned:
+        """Look."""
+        return clean(
+            job.splats, job.views, job.settings, protected=job.protected, progress=progress
+        )
+
+    def finish(
+        self, context: bpy.types.Context, checked: SplatObject, _job: _Looking, cleaned: Cleaned
+    ) -> Answer:
+        """Store what was found, mark it as what goes, and say it."""
+        floaters.store(checked, cleaned)
+        floaters.mark(checked, context.scene.refine.reasons)
+        self.report({"INFO"}, f"Floaters: {cleaned.in_words()}")
+        return {"FINISHED"}
+
+
+class REFINE_OT_delete_floaters(OnSplats, bpy.types.Operator):
+    """Delete the floaters that were found, for the reasons that are switched on"""
+
+    bl_idname = "refine.delete_floaters"
+    bl_label = "Delete Floaters"
+    bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's way to set options
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run, and if not, why."""
+        if not super().poll(context):
+            return False
+        if floaters.counts(context.object.data) is None:
+            cls.poll_message_set("Find floaters first")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Delete them."""
+        try:
+            checked = mesh_layout.check(context.object)
+            keep = ~floaters.mask(checked, context.scene.refine.reasons)
+            done = splat_object.delete_splats(checked, keep)
+        except FAILURES as error:
+            return fail(self, error)
+        plans.forget(checked.mesh)
+        self.report({"INFO"}, f"Deleted {done.removed:,} floaters, {done.kept:,} splats stay")
+        return {"FINISHED"}
