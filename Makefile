@@ -19,7 +19,7 @@ test-core: $(DEV)     ## core alone, in seconds: without slow tests, few random 
 test-numpy: $(DEV)    ## core on the oldest and the newest NumPy that a supported Blender carries
 	$(PY) .ci/numpy_ends.py
 
-test-e2e: $(DEV) build ## the installed zip in real Blenders; skips, with the reason, those not to be had
+test-e2e: $(BENCH) build ## the installed zip in real Blenders; skips, with the reason, those not to be had
 	$(PY) -m pytest tests/e2e --ignore tests/e2e/test_window.py
 	# Mouse clicks against a software renderer fail now and then on a busy machine: a test that
 	# fails gets one more try, and failing twice fails the build.

@@ -32,6 +32,8 @@ from .ui.panel import (
     REFINE_PT_splats,
 )
 from .ui.properties import RefineSettings
+from .ui.view_operators import REFINE_OT_view
+from .viewport import draw
 from .webp import BlenderImages
 
 CLASSES = (
@@ -45,6 +47,7 @@ CLASSES = (
     REFINE_OT_plan,
     REFINE_OT_apply,
     REFINE_OT_preview,
+    REFINE_OT_view,
     REFINE_OT_convert,
     REFINE_OT_export_ply,
     REFINE_OT_levels,
@@ -84,6 +87,7 @@ def register() -> None:
 
 def unregister() -> None:
     """Undo `register`, in reverse."""
+    draw.stop()
     bpy.utils.unregister_cli_command(_commands.pop())
     images.use(None)
     plans.unregister()

@@ -1,4 +1,4 @@
-"""Deliberate faults in core, each of which the core tests must catch: ``make mutants``.
+"""Deliberate faults in core and in what views draw, to be caught by its tests: ``make mutants``.
 
     python tests/mutants.py [module ...]
 
@@ -18,6 +18,20 @@ from pathlib import Path
 PROJECT = Path(__file__).resolve().parent.parent
 
 MUTANTS = {
+    "../viewport/arrays.py": [
+        ("keys = ((high - values) * scale)", "keys = ((values - low) * scale)", "nearest first"),
+        (
+            "away = means - eye.place.astype(np.float32)",
+            "away = eye.place - means",
+            "seen from behind",
+        ),
+        ("(depths > near) &", "(depths > 0.0) &", "near plane ignored"),
+        (
+            "axes @ axes.transpose(0, 2, 1)",
+            "axes.transpose(0, 2, 1) @ axes",
+            "turned the other way",
+        ),
+    ],
     "work.py": [
         ("            cancelled.set()\n", "", "what runs is not told"),
         ("time.monotonic() - told >= _REPORT_INTERVAL", "False", "one thread not asked"),
@@ -504,6 +518,7 @@ TESTS = {
         "formats/registry.py",
     ],
     "glb": ["formats/glb_document.py"],
+    "viewport_arrays": ["../viewport/arrays.py"],
     "levels": ["levels/lod.py", "levels/distance.py", "levels/files.py"],
 }
 """Modules whose tests are not in the file of their own name; those run first."""

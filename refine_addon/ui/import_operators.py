@@ -18,6 +18,7 @@ from ..core.errors import RefineError
 from ..core.formats.registry import SUFFIXES, read_splats
 from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
+from ..viewport import draw
 from .on_thread import FAILURES, Answer, described, fail
 from .wrapped import counted
 
@@ -79,6 +80,8 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
         for obj in imported:
             obj.select_set(True)
         context.view_layer.objects.active = imported[-1]
+        if not bpy.app.background:
+            draw.show("SCENE")
         count = sum(len(obj.data.vertices) for obj in imported)
         self.report({"INFO"}, f"Imported {count:,} splats from {counted(len(imported), 'file')}")
         return {"FINISHED"}

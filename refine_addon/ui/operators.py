@@ -28,6 +28,7 @@ from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
+from ..viewport import draw
 from . import plans, preview, staleness
 from .import_operators import FILE_NAMES
 from .on_thread import FAILURES, Answer, OnThread, fail
@@ -304,7 +305,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_preview(OnSplats, bpy.types.Operator):
-    """Show the splats as points, without changing them"""
+    """Show the splats as points, or in renders as they are, without changing them"""
 
     bl_idname = "refine.preview"
     bl_label = "Preview"
@@ -322,10 +323,24 @@ class REFINE_OT_preview(OnSplats, bpy.types.Operator):
     hide_removed: BoolProperty(
         name="Hide What Goes", description="Hide the splats that the budget removes"
     )
+    style: EnumProperty(
+        name="Style",
+        description="What is made of each splat",
+        items=(
+            ("POINTS", "Points", "A sphere, for the viewport"),
+            ("SPLATS", "For Renders", "The Gaussian itself, for pictures that Cycles renders"),
+        ),
+        options={"SKIP_SAVE"},
+    )
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: Any) -> str:  # noqa: ANN401
         """Return the tooltip of a button."""
+        if properties.style == "SPLATS" and properties.mode != "OFF":
+            return (
+                "Let renders show the splats as they are; sets the scene to Cycles, without light "
+                "and with the view transform Standard"
+            )
         if properties.mode == "OFF":
             return "Show the plain mesh again"
         if properties.hide_removed:
@@ -342,9 +357,14 @@ class REFINE_OT_preview(OnSplats, bpy.types.Operator):
             if self.mode == "OFF":
                 preview.hide(obj)
             else:
-                preview.show(obj, self.mode, hide_removed=self.hide_removed)
+                hide, style = self.hide_removed, self.style
+                preview.show(obj, self.mode, hide_removed=hide, style=style)
         except FAILURES as error:
             return fail(self, error)
+        if self.mode != "OFF" and self.style == "SPLATS":
+            preview.set_up_render(context.scene)
+            return {"FINISHED"}  # too slow for the viewport, which draws them by itself
+        draw.stop()
         shading = getattr(context.space_data, "shading", None)
         # Solid mode draws every point in one grey.
         if self.mode != "OFF" and shading and shading.type in {"SOLID", "WIREFRAME"}:

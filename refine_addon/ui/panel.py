@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Any
 import bpy
 
 from ..cameras.sets import chosen_cameras
+from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
+from ..viewport import draw as viewport_draw
 from . import kept, plans, preview, price, staleness, wrapped
 from .properties import FLOATERS
+from .view_operators import MODES
 from .wrapped import counted
 
 if TYPE_CHECKING:
@@ -171,8 +174,10 @@ class REFINE_PT_preview(_InSidebar, bpy.types.Panel):
         layout = self.layout
         obj = context.object
         splats = mesh_layout.looks_like_splats(obj)
+        _draw_modes(layout, obj if splats else None)
         mode, hidden = preview.shown(obj) if splats else ("", False)
         row = layout.row(align=True)
+        row.label(text="Points")
         for choice, text in (("HEAT", "Heat Map"), ("COLOR", "Colour")):
             cell = row.row(align=True)
             cell.enabled = choice == "COLOR" or (splats and preview.has_heat(obj))
@@ -185,6 +190,8 @@ class REFINE_PT_preview(_InSidebar, bpy.types.Panel):
         button = row.operator("refine.preview", text="Hide What Goes", depress=hidden, icon=icon)
         button.mode = mode or "HEAT"
         button.hide_removed = not hidden
+        button = layout.operator("refine.preview", text="Show in Renders", icon="RENDER_STILL")
+        button.mode, button.style, button.hide_removed = "COLOR", "SPLATS", hidden
 
 
 class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
@@ -241,6 +248,25 @@ def _draw_frames(
         column.prop(settings, "frame_end")
     layout.prop(settings, "frame_step")
     layout.label(text=counted(len(settings.to_frames(scene)), "frame"), icon="CAMERA_DATA")
+
+
+def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> None:
+    """Draw the ways to see splats as splats; those that need scores wait for them."""
+    now = viewport_draw.mode()
+    needs = {"HEAT": mesh_scores.RANK, "STAYS": mesh_edit.REMOVE, "GOES": mesh_edit.REMOVE}
+    column = layout.column(align=True)
+    rows = [column.row(align=True), column.row(align=True)]
+    for place, (mode, text, _) in enumerate(MODES[1:]):
+        cell = rows[place // 2].row(align=True)
+        cell.enabled = mode == now or mode not in needs or _has(obj, needs[mode])
+        button = cell.operator("refine.view", text=text, depress=mode == now)
+        button.mode = "OFF" if mode == now else mode
+    if viewport_draw.failure():
+        layout.label(text=viewport_draw.failure(), icon="ERROR")
+
+
+def _has(obj: bpy.types.Object | None, attribute: str) -> bool:
+    return obj is not None and attribute in obj.data.attributes
 
 
 def _cameras(context: bpy.types.Context) -> list[bpy.types.Object]:

@@ -90,7 +90,7 @@ def test_an_empty_scene_says_what_to_do_first(draw):
     """All six steps are there from the start."""
     drawn = draw()
 
-    buttons = ["import_ply", "import_cameras", "score", "preview", "apply", "export_ply"]
+    buttons = ["import_ply", "import_cameras", "score", "view", "preview", "apply", "export_ply"]
     assert [b for b in buttons if f"refine.{b}" in drawn] == buttons
     assert "Select an object that holds splats" in drawn
 

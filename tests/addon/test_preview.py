@@ -160,3 +160,15 @@ def test_a_rendered_splat_is_a_gaussian(addon, core, tmp_path):
     assert abs(image[80, 120 + 42, 0] - 185 / 255) < 0.03
     assert abs(image[80 - 42, 120, 0] - 185 / 255) < 0.03
     assert abs(image[2, 2, 0] - 20 / 255) < 0.02
+
+
+def test_the_button_for_renders_sets_up_splats_and_scene(room):
+    """The style of true Gaussians, Cycles, and colours as they are; *Off* takes the first back."""
+    bpy.ops.refine.preview(mode="COLOR", style="SPLATS")
+    scene = bpy.context.scene
+    shown = room.modifiers["REFINE preview"].node_group.name
+    bpy.ops.refine.preview(mode="OFF")
+
+    assert shown == "REFINE color splats"
+    assert (scene.render.engine, scene.view_settings.view_transform) == ("CYCLES", "Standard")
+    assert not room.modifiers

@@ -151,19 +151,28 @@ class Binary(Blender):
         """Run a script in Blender as it is fresh from the factory."""
         return self.blender("--factory-startup", "--python-exit-code", "1", "--python", *words)
 
-    def window_step(self, name: str, blend: Path, /, **arguments: Any) -> Any:
-        """Run a step on an open file, in a window of 1600 x 1000 pixels.
+    def window_step(
+        self,
+        name: str,
+        blend: Path | None = None,
+        /,
+        *,
+        size: tuple[int, int] = (1600, 1000),
+        **arguments: Any,
+    ) -> Any:
+        """Run a step in a window of some pixels, on an open file or the default scene.
 
         The step's `main` is a generator; each value it yields is how many seconds to leave
         Blender to itself. See `step` for the other parameters, the result and the error.
         """
 
         def window(*words: str) -> subprocess.CompletedProcess[str]:
-            xvfb = ("xvfb-run", "--auto-servernum", "--server-args=-screen 0 1600x1000x24")
-            size = ("--enable-event-simulate", "--window-geometry", "0", "0", "1600", "1000")
-            return self.run(
-                *(*xvfb, "blender", "--factory-startup", *size, blend, "--python", *words)
-            )
+            width, height = map(str, size)
+            screen = f"--server-args=-screen 0 {width}x{height}x24"
+            blender = ["xvfb-run", "--auto-servernum", screen, "blender", "--factory-startup"]
+            place = ["--enable-event-simulate", "--window-geometry", "0", "0", width, height]
+            file = [] if blend is None else [blend]
+            return self.run(*blender, *place, *file, "--python", *words)
 
         return self._result(name, arguments, window)
 

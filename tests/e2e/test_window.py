@@ -7,7 +7,13 @@ import shutil
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
+import numpy as np
 from blenders import PROJECT
+from PIL import Image
+
+from benchmarks.renderer.rasterizer import render
+from refine_addon.core.formats.ply import read_ply
+from refine_addon.core.views import View
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,3 +53,62 @@ def test_score_apply_undo_and_preview_by_hand(binary: Binary, blend: Path):
     assert found["applied"] == {"vertices": 19_878, "scored": True}
     assert found["undone"] == found["scored"]
     assert found["previewed"] == found["scored"]
+
+
+def test_the_viewport_shows_splats_as_the_reference_renderer(
+    binary: Binary, cloud: Path, cameras: Path
+):
+    """At least 28 dB between the picture of the window and the renderer, on black, in Solid.
+
+    Of 39,755 splats those before the camera are drawn. With a plan, what stays and what goes are
+    these; half go. A linked duplicate doubles them, and hidden adds none. Nothing is stored: the
+    saved object is shown as before, and without the extension it is so again, with its handler
+    gone.
+    """
+    try:
+        found = binary.window_step(
+            "view",
+            size=(800, 500),
+            cloud=cloud,
+            cameras=cameras,
+            picture=binary.work / "view-{}.png",
+            blend=binary.work / "saved.blend",
+        )
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+
+    assert found["after import"] == found["still on"] == "SCENE"
+    assert found["failure"] == ""
+    assert _psnr(found["camera"], binary.work / "view-SCENE.png", cloud) > 28.0
+    assert found["HEAT"] == found["SCENE"] == found["STAYS"] + found["GOES"] <= 39_755
+    assert 0 < found["GOES"] <= 39_755 // 2
+    assert found["two"] == 2 * found["one hidden"]
+    assert found["undone"] == found["one hidden"]
+    assert found["stored"] == found["shown as"] == "TEXTURED"
+    assert found["handlers"] == 1
+
+
+def _psnr(seen: dict, picture: Path, cloud: Path) -> float:
+    """Return how close a view in a picture of the screen is to the reference renderer, dB."""
+    view, window = np.array(seen["view"]), np.array(seen["window"])
+    width, height = seen["size"]
+    rotation = np.diag([1.0, -1.0, -1.0]) @ view[:3, :3]
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)  # float32
+    camera = View(
+        rotation=rotation,
+        center=-rotation.T @ np.diag([1.0, -1.0, -1.0]) @ view[:3, 3],
+        fx=window[0, 0] * width / 2,
+        fy=window[1, 1] * height / 2,
+        cx=(1.0 - window[0, 2]) * width / 2,
+        cy=(1.0 + window[1, 2]) * height / 2,
+        width=width,
+        height=height,
+    )
+    near = window[2, 3] / (window[2, 2] - 1.0)
+    expected = render(read_ply(cloud).splats(), camera, near=near).clip(0.0, 1.0)
+    left, top = seen["left"], seen["top"]
+    with Image.open(picture) as screen:
+        shown = np.asarray(screen.convert("RGB"))[top : top + height, left : left + width] / 255.0
+    return float(-10.0 * np.log10(np.mean((shown - expected) ** 2)))

@@ -1,0 +1,47 @@
+"""The operator that draws splats in the 3D views."""
+
+# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import bpy
+from bpy.props import EnumProperty
+
+from ..viewport import draw
+
+if TYPE_CHECKING:
+    from .on_thread import Answer
+
+MODES = (
+    ("OFF", "Off", "Show the plain points of the mesh again"),
+    ("SCENE", "Scene", "Show the splats as they are"),
+    ("HEAT", "Heat", "Colour each splat by its rank: dark goes first, yellow goes last"),
+    ("STAYS", "What Stays", "Show what Apply would leave"),
+    ("GOES", "What Goes", "Show what Apply would remove, in orange"),
+)
+
+
+class REFINE_OT_view(bpy.types.Operator):
+    """Draw the splats in the 3D views; nothing in the scene is changed"""
+
+    bl_idname = "refine.view"
+    bl_label = "Show Splats"
+    bl_options = {"INTERNAL"}
+
+    mode: EnumProperty(name="Show", description="What is drawn", items=MODES)
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Tell whether there is a window to draw in."""
+        return not bpy.app.background
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: Any) -> str:  # noqa: ANN401
+        """Return the tooltip of a button."""
+        return next(text for mode, _, text in MODES if mode == properties.mode)
+
+    def execute(self, _context: bpy.types.Context) -> Answer:
+        """Draw, or stop it."""
+        draw.show(self.mode)
+        return {"FINISHED"}

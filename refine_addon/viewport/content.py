@@ -1,0 +1,238 @@
+"""What there is to draw: the splats of meshes, packed once, and their textures."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..core.errors import RefineError
+from ..core.formats.ply import REQUIRED
+from ..mesh import attributes as mesh_attributes
+from ..mesh import edit as mesh_edit
+from ..mesh import scores as mesh_scores
+from ..mesh.layout import check, sh_degree
+from . import background, shader
+from .arrays import MOST, Packed, as_texture, first_of_each, most_important_first, pack
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from concurrent.futures import Future
+
+    import bpy
+    import gpu
+    from numpy.typing import NDArray
+
+    from ..mesh.layout import SplatObject
+
+
+@dataclass(eq=False)
+class Held:
+    """The splats of a mesh.
+
+    Attributes
+    ----------
+    signature : tuple
+        What they were packed from.
+    future : Future or None
+        While they are packed.
+    packed : Packed or None
+        Once they are.
+    ranks : (N,) floating or None
+        Of their scores, of all vertices.
+    important : (M,) int32 or None
+        Those packed, the ones that matter most first.
+    going : (M,) bool or None
+        What the plan removes, of those packed.
+    """
+
+    signature: tuple[Any, ...] = ()
+    future: Future[Packed] | None = None
+    packed: Packed | None = None
+    ranks: NDArray[Any] | None = None
+    important: NDArray[np.int32] | None = None
+    going: NDArray[np.bool_] | None = None
+    degree: int = 0
+    remove: NDArray[np.bool_] | None = field(default=None, repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Slot:
+    """The place of an object in the textures: rows ``start`` to ``start + count``."""
+
+    held: Held
+    packed: Packed
+    number: int
+    start: int
+    count: int
+
+
+@dataclass(frozen=True, eq=False)
+class Atlas:
+    """The splats of several objects in one set of textures, so that they blend as one.
+
+    Attributes
+    ----------
+    slots : mapping of (int, int) to Slot
+        By the identities of object and mesh.
+    means, covariances, more_covariances : GPUTexture
+        A texel a splat: place and number of the slot; xx, xy, xz, yy; yz, zz.
+    """
+
+    slots: dict[tuple[int, int], Slot]
+    means: gpu.types.GPUTexture
+    covariances: gpu.types.GPUTexture
+    more_covariances: gpu.types.GPUTexture
+
+    @property
+    def rows(self) -> int:
+        """Number of splats."""
+        return sum(slot.count for slot in self.slots.values())
+
+
+class Content:
+    """What all views draw from.
+
+    Attributes
+    ----------
+    atlas : Atlas or None
+    refused : set of int
+        Identities of meshes that look like splats at first sight alone.
+    changes : int
+        Rises where what goes has changed, while the splats are the same.
+    """
+
+    def __init__(self) -> None:
+        self.atlas: Atlas | None = None
+        self.changes = 0
+        self._held: dict[int, Held] = {}
+        self._stale: set[int] = set()
+        self.refused: set[int] = set()
+
+    def has_changed(self, mesh: int | None = None) -> None:
+        """Look at a mesh again before it is drawn; at all of them by default."""
+        self._stale.update(self._held if mesh is None else [mesh])
+        self.refused.difference_update(list(self.refused) if mesh is None else [mesh])
+
+    def pending(self) -> bool:
+        """Tell whether splats are being packed."""
+        return any(held.future for held in self._held.values())
+
+    def ready(self) -> bool:
+        """Tell whether splats have been packed that no view has drawn."""
+        return any(held.future and held.future.done() for held in self._held.values())
+
+    def update(
+        self, objects: list[bpy.types.Object], existing: Callable[[], set[tuple[int, int]]]
+    ) -> dict[tuple[int, int], bpy.types.Object]:
+        """Make what is needed to draw some objects.
+
+        Parameters
+        ----------
+        objects : list of bpy.types.Object
+            That hold splats, not in edit mode.
+        existing : callable
+            Gives the identities of all objects of the file and their meshes.
+
+        Returns
+        -------
+        mapping of (int, int) to bpy.types.Object
+            Those that can be drawn by now, by their place in `atlas`.
+        """
+        wanted = {}
+        for obj in objects:
+            mesh = obj.data.session_uid
+            if mesh in self.refused:
+                continue
+            if mesh not in self._held or mesh in self._stale:
+                self._stale.discard(mesh)
+                try:
+                    self._read(check(obj))
+                except RefineError:
+                    self.refused.add(mesh)
+                    continue
+            held = self._held[mesh]
+            if held.future and held.future.done():
+                held.packed, held.future, held.important = held.future.result(), None, None
+                self._mark(held)
+            if held.packed is not None:
+                wanted[obj.session_uid, mesh] = obj
+        self._place(set(wanted), existing)
+        return wanted
+
+    def _read(self, checked: SplatObject) -> None:
+        """Read of a mesh what has changed."""
+        mesh = checked.mesh
+        held = self._held.setdefault(mesh.session_uid, Held())
+        held.degree = sh_degree(mesh)
+        before, held.ranks = held.ranks, _attribute(mesh, mesh_scores.RANK, "FLOAT")
+        if before is None or held.ranks is None or not np.array_equal(before, held.ranks):
+            held.important = None
+        held.remove = _attribute(mesh, mesh_edit.REMOVE, "BOOLEAN")
+        columns = mesh_attributes.stored_columns(checked)
+        checksum = 1
+        for name in REQUIRED:
+            checksum = zlib.adler32(np.ascontiguousarray(columns[name]).data, checksum)
+        signature = (len(checked), held.degree, checksum)
+        if signature != held.signature:
+            held.signature = signature
+            held.future = background.start(pack, mesh_attributes.splats_from_object(checked))
+        elif held.packed is not None:
+            self._mark(held)
+
+    def _mark(self, held: Held) -> None:
+        """Note which of the splats that are drawn matter, and which the plan removes."""
+        packed = held.packed
+        if packed is None:
+            return
+        held.going = None if held.remove is None else held.remove[packed.vertices]
+        if held.important is None:
+            held.important = most_important_first(packed, held.ranks)
+        self.changes += 1
+
+    def _place(
+        self, wanted: set[tuple[int, int]], existing: Callable[[], set[tuple[int, int]]]
+    ) -> None:
+        """Make the textures again if splats came or became others."""
+        slots = self.atlas.slots if self.atlas else {}
+        fresh = {
+            key for key in wanted if key in slots and slots[key].packed is self._held[key[1]].packed
+        }
+        if fresh == wanted:
+            return
+        keys = sorted(wanted | (slots.keys() & existing()))
+        keys = [key for key in keys if self._held[key[1]].packed is not None]
+        meshes = {mesh for _, mesh in keys}
+        self._held = {m: h for m, h in self._held.items() if m in meshes or h.future}
+        self.atlas = _atlas(keys, self._held)
+
+
+def _atlas(keys: list[tuple[int, int]], held: dict[int, Held]) -> Atlas:
+    packs = [packed for _, mesh in keys if (packed := held[mesh].packed) is not None]
+    counts = first_of_each([len(packed) for packed in packs], MOST)
+    slots, start = {}, 0
+    for number, (key, packed, count) in enumerate(zip(keys, packs, counts, strict=True)):
+        slots[key] = Slot(held[key[1]], packed, number, start, count)
+        start += count
+    means = np.empty((start, 4), np.float32)
+    covariances = np.empty((start, 6), np.float32)
+    for slot in slots.values():
+        rows = slice(slot.start, slot.start + slot.count)
+        means[rows, :3] = slot.packed.means[: slot.count]
+        means[rows, 3] = slot.number
+        covariances[rows] = slot.packed.covariances[: slot.count]
+    return Atlas(
+        slots,
+        shader.texture(as_texture(means), 4, "RGBA32F"),
+        shader.texture(as_texture(covariances[:, :4]), 4, "RGBA32F"),
+        shader.texture(as_texture(covariances[:, 4:]), 2, "RG32F"),
+    )
+
+
+def _attribute(mesh: bpy.types.Mesh, name: str, kind: str) -> NDArray[Any] | None:
+    attribute = mesh.attributes.get(name)
+    if not attribute or (attribute.data_type, attribute.domain) != (kind, "POINT"):
+        return None
+    return mesh_attributes.read_attribute(mesh, name)

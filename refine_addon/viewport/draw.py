@@ -1,0 +1,237 @@
+"""The drawing of splats, on and off, and what keeps it true to the scene."""
+
+from __future__ import annotations
+
+import traceback
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import numpy as np
+from bpy.app.handlers import persistent
+
+from ..mesh.layout import looks_like_splats, splat_count
+from . import background, legend, points, shader
+from .content import Content
+from .view import Camera, View
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
+"""What can be drawn: nothing, all as it is, coloured by rank, what Apply leaves, what it takes."""
+
+_TICK = 0.03  # seconds
+_VIEWS = 16  # regions remembered
+
+
+class _State:
+    """All that is there while splats are drawn; nothing of it is stored anywhere."""
+
+    def __init__(self) -> None:
+        self.mode = "OFF"
+        self.failure = ""
+        self.content = Content()
+        self.views: dict[int, View] = {}
+        self.handles: list[Any] = []
+
+
+_state = _State()
+
+
+def mode() -> str:
+    """Return which of `MODES` is shown."""
+    return _state.mode
+
+
+def failure() -> str:
+    """Return why nothing can be drawn here, or an empty text."""
+    return _state.failure
+
+
+def complete() -> bool:
+    """Tell whether every view shows all it is to show."""
+    return all(view.complete for view in _state.views.values()) and not _state.content.pending()
+
+
+def drawn(region: bpy.types.Region) -> int:
+    """Return how many splats a region shows."""
+    view = _state.views.get(region.as_pointer())
+    return view.count if view else 0
+
+
+def show(wanted: str) -> None:
+    """Draw splats in all 3D views, or stop it."""
+    if wanted == "OFF":
+        stop()
+        return
+    if _state.mode == "OFF":
+        _state.failure = ""
+        _hook()
+    _state.mode = wanted
+    _hide_points()
+    _redraw()
+
+
+def stop() -> None:
+    """Draw nothing, and forget all that was held."""
+    if _state.mode == "OFF":
+        return
+    _state.mode = "OFF"
+    _unhook()
+    background.stop()
+    _forget()
+    shader.forget()
+    points.show()
+    _redraw()
+
+
+def _forget() -> None:
+    _state.content, _state.views = Content(), {}
+
+
+def _hook() -> None:
+    space, handlers = bpy.types.SpaceView3D, bpy.app.handlers
+    _state.handles = [
+        space.draw_handler_add(partial(_guarded, _draw), (), "WINDOW", "POST_VIEW"),
+        space.draw_handler_add(partial(_guarded, _draw_legend), (), "WINDOW", "POST_PIXEL"),
+    ]
+    handlers.depsgraph_update_post.append(_updated)
+    handlers.frame_change_post.append(_updated)
+    handlers.undo_post.append(_undone)
+    handlers.redo_post.append(_undone)
+    handlers.load_pre.append(_leaving)
+    handlers.load_post.append(_loaded)
+
+
+def _unhook() -> None:
+    handlers = bpy.app.handlers
+    for handle in _state.handles:
+        bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")
+    _state.handles = []
+    for handler, listeners in (
+        (_updated, (handlers.depsgraph_update_post, handlers.frame_change_post)),
+        (_undone, (handlers.undo_post, handlers.redo_post)),
+        (_leaving, (handlers.load_pre,)),
+        (_loaded, (handlers.load_post,)),
+    ):
+        for listener in listeners:
+            if handler in listener:
+                listener.remove(handler)
+    if bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.unregister(_tick)
+
+
+def _guarded(work: Callable[[], None]) -> None:
+    """Draw; what fails fails once, and the points are shown again."""
+    if _state.mode == "OFF" or _state.failure:
+        return
+    try:
+        work()
+    except Exception as error:  # noqa: BLE001 - Blender would print it at every redraw
+        traceback.print_exc()
+        _state.failure = f"Splats cannot be drawn here: {error}"
+        # Handlers must not be removed while they run.
+        bpy.app.timers.register(stop, first_interval=0.0)
+
+
+def _draw() -> None:
+    context = bpy.context
+    region, region_3d, space = context.region, context.region_data, context.space_data
+    objects = [obj for obj in context.view_layer.objects if _is_drawn(obj, space)]
+    refused = len(_state.content.refused)
+    placed = _state.content.update(objects, _existing)
+    if len(_state.content.refused) > refused:  # Blender shows these as it did before
+        bpy.app.timers.register(_hide_points, first_interval=0.0)
+    key = region.as_pointer()
+    view = _state.views.pop(key, None) or View()
+    _state.views[key] = view  # the one drawn last is last
+    while len(_state.views) > _VIEWS:
+        del _state.views[next(iter(_state.views))]
+    camera = Camera(
+        np.array(region_3d.view_matrix, np.float64),
+        np.array(region_3d.window_matrix, np.float64),
+        (region.width, region.height),
+    )
+    solid = any(obj not in objects for obj in context.visible_objects)
+    view.draw(_state.content, placed, camera, _state.mode, solid=solid)
+    if view.waits() and not bpy.app.timers.is_registered(_tick):
+        bpy.app.timers.register(_tick, first_interval=_TICK)
+
+
+def _is_drawn(obj: bpy.types.Object, space: bpy.types.SpaceView3D) -> bool:
+    if not looks_like_splats(obj) or points.is_edited(obj) or not splat_count(obj.data):
+        return False
+    return obj.visible_get(viewport=space)
+
+
+def _existing() -> set[tuple[int, int]]:
+    splats = (obj for obj in bpy.data.objects if looks_like_splats(obj))
+    return {(obj.session_uid, obj.data.session_uid) for obj in splats}
+
+
+def _draw_legend() -> None:
+    legend.draw(bpy.context, _state.mode)
+
+
+def _tick() -> float | None:
+    """Redraw the views that have more to show, until none has."""
+    if _state.mode == "OFF":
+        return None
+    ready = _state.content.ready()
+    for region in _regions():
+        view = _state.views.get(region.as_pointer())
+        if view is None or ready or view.due():
+            region.tag_redraw()
+    return None if complete() else _TICK
+
+
+def _redraw() -> None:
+    for region in _regions():
+        region.tag_redraw()
+    for area in _areas():
+        area.tag_redraw()
+
+
+def _hide_points() -> None:
+    if _state.mode != "OFF":
+        for depsgraph in points.graphs():
+            points.hide(depsgraph, _state.content.refused)
+
+
+def _areas() -> list[bpy.types.Area]:
+    windows = bpy.context.window_manager.windows
+    return [a for window in windows for a in window.screen.areas if a.type == "VIEW_3D"]
+
+
+def _regions() -> list[bpy.types.Region]:
+    return [r for area in _areas() for r in area.regions if r.type == "WINDOW"]
+
+
+@persistent
+def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
+    if depsgraph is None:
+        return
+    for update in depsgraph.updates:
+        if update.is_updated_geometry:
+            data = getattr(update.id.original, "data", update.id.original)
+            if isinstance(data, (bpy.types.Mesh, bpy.types.PointCloud)):
+                _state.content.has_changed(data.session_uid)
+    points.hide(depsgraph, _state.content.refused)
+
+
+@persistent
+def _undone(*_: object) -> None:
+    _state.content.has_changed()
+    _hide_points()
+
+
+@persistent
+def _leaving(*_: object) -> None:
+    _forget()
+
+
+@persistent
+def _loaded(*_: object) -> None:
+    _hide_points()
+    _redraw()

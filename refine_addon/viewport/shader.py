@@ -1,0 +1,215 @@
+"""The two shaders: splats into a picture of their own, and that picture into the view.
+
+EWA splatting (Zwicker et al. 2002, Eq. 31) by the rules of the reference implementation. Colours
+are blended as they are encoded for the display, as splats are trained; a view's own framebuffer
+would decode them first. So splats are blended in a picture apart, and put into the view as a whole.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import TYPE_CHECKING
+
+import gpu
+import numpy as np
+from gpu_extras.batch import batch_for_shader
+
+from ..core.rendering import ALPHA_CUT, ALPHA_MAX, LOW_PASS
+from .arrays import WIDTH
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_CONSTANTS = f"""
+#define WIDTH {WIDTH}
+#define LOW_PASS {LOW_PASS}
+#define ALPHA_MAX {ALPHA_MAX}
+#define ALPHA_CUT {ALPHA_CUT}
+#define BEYOND 0.3
+"""
+
+_VIEW = """
+struct ViewData {
+  mat4 projection;
+  vec4 size;
+  vec4 choices;
+};
+"""
+"""size: pixels across, pixels up, near, texels of depth per pixel. choices: perspective, whether
+depth is tested, 0, 0."""
+
+_SPLAT_VERTEX = """
+#define value_at(values, row) texelFetch(values, ivec2((row) % WIDTH, (row) / WIDTH), 0)
+
+void main()
+{
+  gl_Position = vec4(2.0, 2.0, 2.0, 1.0); /* Not drawn. */
+  place = vec2(0.0);
+  paint = vec4(0.0);
+  int row = int(value_at(order, gl_InstanceID).r + 0.5);
+  vec4 mean = value_at(means, row);
+  vec4 upper = value_at(covariances, row);
+  vec4 lower = value_at(more_covariances, row);
+  int object = int(mean.w + 0.5);
+  vec4 row_x = texelFetch(matrices, ivec2(0, object), 0);
+  vec4 row_y = texelFetch(matrices, ivec2(1, object), 0);
+  vec4 row_z = texelFetch(matrices, ivec2(2, object), 0);
+  vec4 local = vec4(mean.xyz, 1.0);
+  vec3 seen = vec3(dot(row_x, local), dot(row_y, local), dot(row_z, local));
+  bool perspective = view_data.choices.x > 0.5;
+  float depth = -seen.z;
+  if (!(depth > view_data.size.z)) {
+    return;
+  }
+  paint = value_at(colors, row);
+  float reach = 2.0 * log(paint.a / ALPHA_CUT);
+  if (!(reach > 0.0)) {
+    return;
+  }
+  vec4 clip = view_data.projection * vec4(seen, 1.0);
+  vec3 ndc = clip.xyz / clip.w;
+
+  /* Gradients of column and row, px per unit of the object; slopes are clamped as in training. */
+  vec2 scale = 0.5 * view_data.size.xy;
+  vec2 focal = vec2(view_data.projection[0][0], view_data.projection[1][1]);
+  vec3 to_column = focal.x * scale.x * row_x.xyz;
+  vec3 to_row = focal.y * scale.y * row_y.xyz;
+  if (perspective) {
+    vec2 middle = vec2(view_data.projection[2][0], view_data.projection[2][1]);
+    vec2 most = vec2(1.0 + BEYOND);
+    vec2 slope = clamp(seen.xy / depth, (middle - most) / focal, (middle + most) / focal);
+    to_column = focal.x * scale.x / depth * (row_x.xyz + slope.x * row_z.xyz);
+    to_row = focal.y * scale.y / depth * (row_y.xyz + slope.y * row_z.xyz);
+  }
+  mat3 shape = mat3(upper.x, upper.y, upper.z,
+                    upper.y, upper.w, lower.x,
+                    upper.z, lower.x, lower.y);
+  vec3 along_column = shape * to_column;
+  float xx = dot(to_column, along_column) + LOW_PASS;
+  float xy = dot(to_row, along_column);
+  float yy = dot(to_row, shape * to_row) + LOW_PASS;
+
+  /* Its axes: eigenvectors times standard deviations. */
+  float mean_square = 0.5 * (xx + yy);
+  float radius = length(vec2(0.5 * (xx - yy), xy));
+  float longest = mean_square + radius;
+  float shortest = (xx * yy - xy * xy) / longest;
+  if (!(shortest > 0.0) || longest > 1e12) {
+    return;
+  }
+  vec2 direction = vec2(1.0, 0.0);
+  if (radius > 1e-6 * mean_square) {
+    direction = xx > yy ? normalize(vec2(longest - yy, xy)) : normalize(vec2(xy, longest - xx));
+  }
+  place = corner * sqrt(reach);
+  vec2 offset = place.x * sqrt(longest) * direction +
+                place.y * sqrt(shortest) * vec2(-direction.y, direction.x);
+  gl_Position = vec4(ndc.xy + offset / scale, ndc.z, 1.0);
+}
+"""
+
+_SPLAT_FRAGMENT = """
+void main()
+{
+  float alpha = min(ALPHA_MAX, paint.a * exp(-0.5 * dot(place, place)));
+  if (alpha < ALPHA_CUT) {
+    discard;
+  }
+  if (view_data.choices.y > 0.5) {
+    ivec2 texel = ivec2(gl_FragCoord.xy * view_data.size.w);
+    if (gl_FragCoord.z > texelFetch(depths, min(texel, textureSize(depths, 0) - 1), 0).r) {
+      discard;
+    }
+  }
+  color = vec4(paint.rgb * alpha, alpha);
+}
+"""
+
+_PICTURE_VERTEX = """
+void main()
+{
+  uv = 0.5 * corner + 0.5;
+  gl_Position = vec4(corner, 0.0, 1.0);
+}
+"""
+
+# The view's framebuffer encodes what it is given by the curve of sRGB (IEC 61966-2-1).
+_PICTURE_FRAGMENT = """
+void main()
+{
+  ivec2 size = textureSize(picture, 0);
+  vec2 at = clamp(uv * vec2(size) - 0.5, vec2(0.0), vec2(size) - 1.0);
+  ivec2 low = ivec2(at);
+  ivec2 high = min(low + 1, size - 1);
+  vec2 share = at - vec2(low);
+  vec4 found = mix(
+      mix(texelFetch(picture, low, 0), texelFetch(picture, ivec2(high.x, low.y), 0), share.x),
+      mix(texelFetch(picture, ivec2(low.x, high.y), 0), texelFetch(picture, high, 0), share.x),
+      share.y);
+  vec3 shown = clamp(found.rgb, 0.0, 1.0);
+  vec3 curved = pow((shown + 0.055) / 1.055, vec3(2.4));
+  color = vec4(mix(shown / 12.92, curved, step(vec3(0.04045), shown)), found.a);
+}
+"""
+
+
+@cache
+def splats() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
+    """Return the shader of splats, and the quad that is drawn once for each."""
+    info = gpu.types.GPUShaderCreateInfo()
+    info.typedef_source(_CONSTANTS + _VIEW)
+    info.uniform_buf(0, "ViewData", "view_data")
+    names = ("order", "means", "covariances", "more_covariances", "colors", "matrices", "depths")
+    for slot, name in enumerate(names):
+        info.sampler(slot, "FLOAT_2D", name)
+    between = gpu.types.GPUStageInterfaceInfo("refine_splat")
+    between.smooth("VEC2", "place")
+    between.flat("VEC4", "paint")
+    return _made(info, between, _SPLAT_VERTEX, _SPLAT_FRAGMENT)
+
+
+@cache
+def picture() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
+    """Return the shader that puts a picture into a view, and the quad that covers it."""
+    info = gpu.types.GPUShaderCreateInfo()
+    info.sampler(0, "FLOAT_2D", "picture")
+    between = gpu.types.GPUStageInterfaceInfo("refine_picture")
+    between.smooth("VEC2", "uv")
+    return _made(info, between, _PICTURE_VERTEX, _PICTURE_FRAGMENT)
+
+
+def forget() -> None:
+    """Let go of the shaders."""
+    splats.cache_clear()
+    picture.cache_clear()
+
+
+def texture(values: NDArray[np.float32], channels: int, kind: str) -> gpu.types.GPUTexture:
+    """Return rows of texels on the graphics card.
+
+    Parameters
+    ----------
+    values : (R, C * channels) float32
+    channels : int
+    kind : str
+        Format of the texture.
+    """
+    size = (values.shape[1] // channels, values.shape[0])
+    flat = np.ascontiguousarray(values, np.float32).reshape(-1)
+    return gpu.types.GPUTexture(size, format=kind, data=gpu.types.Buffer("FLOAT", len(flat), flat))
+
+
+def _made(
+    info: gpu.types.GPUShaderCreateInfo,
+    between: gpu.types.GPUStageInterfaceInfo,
+    vertex: str,
+    fragment: str,
+) -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
+    info.vertex_in(0, "VEC2", "corner")
+    info.vertex_out(between)
+    info.fragment_out(0, "VEC4", "color")
+    info.vertex_source(vertex)
+    info.fragment_source(fragment)
+    made = gpu.shader.create_from_info(info)
+    corners = [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)]
+    return made, batch_for_shader(made, "TRI_STRIP", {"corner": corners})

@@ -1,0 +1,376 @@
+"""What one 3D view shows: its order of the splats, their colours from its eye, its picture.
+
+While a view moves, the splats that matter most are sorted at once and drawn; once it rests, all of
+them are sorted and coloured on the thread, and drawn when that is done.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import gpu
+import numpy as np
+
+from ..mesh.heat_map import ramp
+from . import background, shader
+from .arrays import (
+    Eye,
+    as_texture,
+    colors,
+    farthest_first,
+    first_of_each,
+    heat,
+    in_front,
+    tinted,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from concurrent.futures import Future
+
+    import bpy
+    from numpy.typing import NDArray
+
+    from .content import Atlas, Content, Slot
+
+REST = 0.2
+"""Seconds without a change after which a view rests."""
+
+TINT, TINT_SHARE = (1.0, 0.15, 0.0), 0.55
+"""What goes is shown in this colour, by that share."""
+
+
+class Moving(NamedTuple):
+    """What is drawn while a view moves: at most so many splats, each so many pixels wide."""
+
+    splats: int
+    pixels: int
+
+
+BY_CARD, BY_PROCESSOR = Moving(300_000, 1), Moving(20_000, 3)
+
+
+class Camera(NamedTuple):
+    """Where a view looks from and how.
+
+    Attributes
+    ----------
+    view : (4, 4) float64
+        World to camera: x right, y up, z back.
+    projection : (4, 4) float64
+    size : (int, int)
+        Pixels across and up.
+    """
+
+    view: NDArray[np.float64]
+    projection: NDArray[np.float64]
+    size: tuple[int, int]
+
+    @property
+    def perspective(self) -> bool:
+        """Whether farther things look smaller."""
+        return bool(self.projection[3, 3] == 0.0)
+
+    @property
+    def near(self) -> float:
+        """Depth of the near plane."""
+        p = self.projection
+        return float(p[2, 3] / (p[2, 2] - 1.0) if self.perspective else (p[2, 3] + 1.0) / p[2, 2])
+
+    def key(self) -> bytes:
+        """Return what tells it from another."""
+        return self.view.tobytes() + self.projection.tobytes() + bytes(str(self.size), "ascii")
+
+
+class Shown(NamedTuple):
+    """An object in a view: its place in the textures and its matrix to the camera, (4, 4)."""
+
+    slot: Slot
+    matrix: NDArray[np.float64]
+
+
+class _Part(NamedTuple):
+    """What the thread needs of one object."""
+
+    slot: Slot
+    going: NDArray[np.bool_] | None
+    ranks: NDArray[Any] | None
+    important: NDArray[np.int32] | None
+    eye: Eye
+
+
+class _Found(NamedTuple):
+    """What the thread found."""
+
+    order: NDArray[np.float32]
+    drawn: int
+    colors: NDArray[np.float32] | None
+
+
+@dataclass(eq=False)
+class _Order:
+    """The splats that are drawn, back to front, on the graphics card."""
+
+    texture: gpu.types.GPUTexture
+    count: int
+    key: object
+
+
+class View:
+    """One region of a 3D view."""
+
+    def __init__(self) -> None:
+        self._picture: gpu.types.GPUTexture | None = None
+        self._drawn: object = None
+        self._depths: NDArray[np.float32] | None = None
+        self._order: _Order | None = None
+        self._colors: gpu.types.GPUTexture | None = None
+        self._colors_key: object = None
+        self._colored: Atlas | None = None
+        self._job: tuple[object, object, Future[_Found]] | None = None
+        self._camera_key = b""
+        self._changed = 0.0
+        self.complete = False
+        self.count = 0
+
+    def waits(self) -> bool:
+        """Tell whether this is not yet all that is to be seen."""
+        return not self.complete
+
+    def due(self) -> bool:
+        """Tell whether drawing again would show more."""
+        if self._job:
+            return self._job[2].done()
+        return not self.complete and time.monotonic() - self._changed >= REST
+
+    def draw(
+        self,
+        content: Content,
+        objects: dict[tuple[int, int], bpy.types.Object],
+        camera: Camera,
+        mode: str,
+        *,
+        solid: bool,
+    ) -> None:
+        """Draw some objects into the framebuffer of the view.
+
+        Parameters
+        ----------
+        content : Content
+        objects : mapping of (int, int) to bpy.types.Object
+            See `Content.update`.
+        camera : Camera
+        mode : str
+            One of `draw.MODES`.
+        solid : bool
+            Whether anything but splats is in the view.
+        """
+        atlas = content.atlas
+        if atlas is None or not objects:
+            self.complete, self.count = not content.pending(), 0
+            return
+        shown = [
+            Shown(atlas.slots[key], camera.view @ np.array(obj.matrix_world, np.float64))
+            for key, obj in objects.items()
+        ]
+        matrices = b"".join(s.matrix.tobytes() for s in shown)
+        moving = self._moves(camera.key() + matrices)
+        full = (atlas, content.changes, mode, matrices, camera.perspective, camera.near)
+        self._take()
+        least = BY_PROCESSOR if gpu.platform.device_type_get() == "SOFTWARE" else BY_CARD
+        if self._colored is not atlas:
+            self._order, self._colors = None, None
+        if moving:
+            self._sort(full, shown, camera, mode, least.splats)
+        elif self._job is None and (self._order is None or self._order.key != full):
+            self._start(full, shown, camera, mode, least.splats)
+        self.complete = not moving and self._order is not None and self._order.key == full
+        if self._order is None or self._colors is None:
+            return
+        self.count = self._order.count
+        self._paint(atlas, shown, camera, 1 if self.complete else least.pixels, solid=solid)
+        _put(self._picture)
+
+    def _moves(self, key: bytes) -> bool:
+        """Tell whether the view, or an object in it, has moved in the last moments."""
+        now = time.monotonic()
+        if key != self._camera_key:
+            self._changed = now if self._camera_key else 0.0
+            self._camera_key = key
+        return now - self._changed < REST
+
+    def _take(self) -> None:
+        """Take what the thread has found."""
+        if self._job is None or not self._job[2].done():
+            return
+        order_key, colors_key, future = self._job
+        self._job = None
+        found = future.result()
+        self._order = _Order(shader.texture(found.order, 1, "R32F"), found.drawn, order_key)
+        if found.colors is not None:
+            self._colors = shader.texture(found.colors, 4, "RGBA16F")
+            self._colors_key, self._colored = colors_key, order_key[0]
+
+    def _start(
+        self, key: tuple[Any, ...], shown: list[Shown], camera: Camera, mode: str, few: int
+    ) -> None:
+        """Have all splats sorted, and coloured if they look otherwise from here.
+
+        Where nothing is seen yet, only those that matter most, in their constant colours.
+        """
+        parts = _parts(shown, camera)
+        colors_key: tuple[Any, ...] = (key[0], mode, [p.slot.number for p in parts])
+        if mode != "HEAT":
+            colors_key += tuple(p.eye.place.tobytes() for p in parts if p.slot.held.degree)
+        rows = None if colors_key == self._colors_key else key[0].rows
+        if self._colors is None and key[0].rows > few:
+            first = background.start(_find, parts, camera.near, mode, rows, few)
+            self._job = ((*key, few), None, first)
+        else:
+            work = background.start(_find, parts, camera.near, mode, rows)
+            self._job = (key, colors_key, work)
+
+    def _sort(
+        self, key: tuple[Any, ...], shown: list[Shown], camera: Camera, mode: str, most: int
+    ) -> None:
+        """Sort the splats that matter most, at once."""
+        key = (*key, most)
+        if self._order is None or self._order.key != key:
+            order = _order(_parts(shown, camera), camera.near, mode, most)
+            self._order = _Order(shader.texture(as_texture(order), 1, "R32F"), len(order), key)
+
+    def _paint(
+        self, atlas: Atlas, shown: list[Shown], camera: Camera, pixels: int, *, solid: bool
+    ) -> None:
+        """Draw the splats into the picture, unless it shows them already."""
+        depths = _depths(camera.size) if solid else None
+        size = tuple(max(1, length // pixels) for length in camera.size)
+        wanted = (self._order.key, self._colors_key, self._camera_key, size)
+        if self._picture and wanted == self._drawn and _same(depths, self._depths):
+            return
+        self._drawn, self._depths = wanted, depths
+        if not self._picture or (self._picture.width, self._picture.height) != size:
+            self._picture = gpu.types.GPUTexture(size, format="RGBA16F")
+        flat = np.ones((1, 1), np.float32) if depths is None else depths
+        rows = np.zeros((1 + max(s.slot.number for s in shown), 12), np.float32)
+        for s in shown:
+            rows[s.slot.number] = s.matrix[:3].reshape(-1)
+        # Held until they are drawn: the shader does not keep what it is given.
+        matrices, occluders = shader.texture(rows, 4, "RGBA32F"), shader.texture(flat, 1, "R32F")
+        program, quad = shader.splats()
+        numbers = np.zeros(24, np.float32)
+        numbers[:16] = camera.projection.T.reshape(-1)
+        numbers[16:20] = (*size, camera.near, camera.size[0] / size[0])
+        numbers[20:22] = (camera.perspective, solid)
+        block = gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", 24, numbers))
+        frame = gpu.types.GPUFrameBuffer(color_slots=self._picture)
+        with frame.bind():
+            frame.clear(color=(0.0, 0.0, 0.0, 0.0))
+            if self._order.count:
+                gpu.state.blend_set("ALPHA_PREMULT")
+                gpu.state.depth_test_set("NONE")
+                program.bind()
+                program.uniform_block("view_data", block)
+                program.uniform_sampler("order", self._order.texture)
+                program.uniform_sampler("means", atlas.means)
+                program.uniform_sampler("covariances", atlas.covariances)
+                program.uniform_sampler("more_covariances", atlas.more_covariances)
+                program.uniform_sampler("colors", self._colors)
+                program.uniform_sampler("matrices", matrices)
+                program.uniform_sampler("depths", occluders)
+                quad.draw_instanced(program, instance_count=self._order.count)
+                gpu.state.blend_set("NONE")
+
+
+def _parts(shown: Iterable[Shown], camera: Camera) -> list[_Part]:
+    parts = []
+    for slot, matrix in shown:
+        if camera.perspective:
+            place = np.linalg.pinv(matrix)[:3, 3]
+        else:
+            place = np.linalg.pinv(matrix)[:3, :3] @ (0.0, 0.0, -1.0)
+        held = slot.held
+        eye = Eye(-matrix[2], place, camera.perspective)
+        parts.append(_Part(slot, held.going, held.ranks, held.important, eye))
+    return parts
+
+
+def _find(
+    parts: list[_Part], near: float, mode: str, rows: int | None, few: int | None = None
+) -> _Found:
+    """Sort splats and, in textures of so many rows, colour them; on the thread.
+
+    With `few`, only so many are sorted, and colours are constant.
+    """
+    order = _order(parts, near, mode, few)
+    if rows is None:
+        return _Found(as_texture(order), len(order), None)
+    painted = np.zeros((rows, 4), np.float32)
+    for slot, _, ranks, _, eye in parts:
+        place = slice(slot.start, slot.start + slot.count)
+        if mode == "HEAT" and ranks is not None:
+            rgba = heat(slot.packed, ranks, ramp())
+        else:
+            rgba = colors(slot.packed, eye if few is None else None)
+        painted[place] = rgba[: slot.count]
+        if mode == "GOES":
+            painted[place] = tinted(painted[place], TINT, TINT_SHARE)
+    return _Found(as_texture(order), len(order), as_texture(painted))
+
+
+def _order(parts: list[_Part], near: float, mode: str, most: int | None = None) -> NDArray[Any]:
+    """Return the rows of the textures that are drawn, the farthest first."""
+    counts = [part.slot.count for part in parts]
+    counts = counts if most is None else first_of_each(counts, most)
+    rows, depths = [], []
+    for (slot, going, _, important, eye), count in zip(parts, counts, strict=True):
+        if count == slot.count or important is None:
+            before, deep = in_front(slot.packed.means[:count], eye, near)
+        else:
+            some = important[important < slot.count][:count]
+            nearer, deep = in_front(slot.packed.means[some], eye, near)
+            before = some[nearer].astype(np.int64)
+        if mode in {"STAYS", "GOES"}:
+            wanted = _wanted(going, mode, before)
+            before, deep = before[wanted], deep[wanted]
+        rows.append(before + slot.start)
+        depths.append(deep)
+    perspective = parts[0].eye.perspective
+    return np.concatenate(rows)[farthest_first(np.concatenate(depths), perspective=perspective)]
+
+
+def _wanted(
+    going: NDArray[np.bool_] | None, mode: str, rows: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Return which rows stay, or go; without a plan all stay."""
+    if going is None:
+        return np.full(len(rows), mode == "STAYS")
+    return going[rows] if mode == "GOES" else ~going[rows]
+
+
+def _depths(size: tuple[int, int]) -> NDArray[np.float32]:
+    """Return the depths that Blender has drawn in the view, (H, W)."""
+    width, height = size
+    buffer = gpu.types.Buffer("FLOAT", width * height)
+    gpu.state.active_framebuffer_get().read_depth(0, 0, width, height, data=buffer)
+    return np.frombuffer(memoryview(buffer), np.float32).reshape(height, width)
+
+
+def _same(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
+    if one is None or other is None:
+        return one is other
+    return np.array_equal(one, other)
+
+
+def _put(picture: gpu.types.GPUTexture) -> None:
+    """Put a picture into the framebuffer that is bound."""
+    program, quad = shader.picture()
+    gpu.state.blend_set("ALPHA_PREMULT")
+    gpu.state.depth_test_set("NONE")
+    gpu.state.depth_mask_set(False)
+    program.bind()
+    program.uniform_sampler("picture", picture)
+    quad.draw(program)
+    gpu.state.blend_set("NONE")
