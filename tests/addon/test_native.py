@@ -572,3 +572,17 @@ def test_blenders_own_import_is_what_these_tests_build(addon, core, file, tmp_pa
     bpy.ops.refine.import_ply(filepath=str(ROOM / "point_cloud.ply"))
     bpy.ops.refine.convert()
     assert bpy.context.object.data.type == "GAUSSIAN_SPLAT"
+
+
+@pytest.mark.parametrize("nested", [True, False])
+def test_levels_of_detail_of_native_splats_are_native(cloud, room_cameras, nested):  # noqa: ARG001
+    """Copies reduced by the same apply: points of .1 and .05 of 39,755, rounded up."""
+    settings = bpy.context.scene.refine
+    settings.levels, settings.nested, settings.views = "0.1, 0.05", nested, 6
+
+    assert bpy.ops.refine.levels() == {"FINISHED"}
+
+    levels = [bpy.data.objects[f"room_lod{number}"] for number in (1, 2)]
+    assert [level.type for level in levels] == ["POINTCLOUD", "POINTCLOUD"]
+    assert [len(level.data.points) for level in levels] == [3976, 1988]
+    assert len(cloud.data.points) == 39755

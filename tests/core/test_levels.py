@@ -323,6 +323,7 @@ def test_files_of_levels_and_a_manifest_are_written(tmp_path):
     told = json.loads((out / "lod.json").read_text())
     assert {name: done[name] for name in told} == told
     assert next(iter(told)) == "lod"
+    assert told["nested"] is True
     assert [entry["splats"] for entry in told["levels"]] == [288, 144]
     for entry in told["levels"]:
         assert (out / entry["file"]).stat().st_size == entry["bytes"]

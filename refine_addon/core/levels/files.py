@@ -142,6 +142,7 @@ def lod_file(  # noqa: PLR0913 - as `pipeline.prune_file`
             },
             "views": len(views),
             "distances": distances,
+            "nested": not levels.absorb,
             "goal_psnr": goal,
             "levels": entries,
         }
@@ -152,7 +153,6 @@ def lod_file(  # noqa: PLR0913 - as `pipeline.prune_file`
         **facts,
         "files": {"input": str(source), "folder": str(folder), "manifest": MANIFEST},
         "settings": asdict(settings),
-        "absorb": levels.absorb,
         "timings": clock.timings,
         "notes": notes,
     }
