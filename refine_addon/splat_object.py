@@ -24,6 +24,7 @@ from .core.survivors import survivor_columns
 from .core.task import DEFAULTS, Result, Settings, Task
 from .core.whole_file import expanded, refuse_existing
 from .core.work import Progress, part, silent
+from .core.written import written_facts
 from .mesh import attributes as mesh_attributes
 from .mesh import edit as mesh_edit
 from .mesh import floaters as mesh_floaters
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from .core.absorbing.absorb import Absorbed
     from .core.formats.ply import SplatFile
     from .core.formats.registry import Packed
+    from .core.levels.lod import Level
     from .core.selection import Budget
     from .core.splats import Splats
     from .core.views import ViewSet
@@ -186,7 +188,7 @@ def mark_removed(checked: SplatObject, task: Task) -> NDArray[np.bool_]:
     return keep
 
 
-def apply_object(checked: SplatObject, result: Result) -> Plan:
+def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
     """Delete the splats that do not stay, and set what the others became: all of it or nothing.
 
     Everything else of the object and its mesh stays: attributes, vertex groups, custom properties,
@@ -195,7 +197,7 @@ def apply_object(checked: SplatObject, result: Result) -> Plan:
     Parameters
     ----------
     checked : SplatObject
-    result : Result
+    result : Result or Level
         What was decided of the object's splats.
 
     Returns
@@ -363,6 +365,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
         _check_savable(checked.obj)
     row_bytes, fixed_bytes = _file_size(checked, budget, output)
     estimates = settings.estimates or budget.psnr is not None
+    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
     task = Task(
         budget=budget,
         settings=settings,
@@ -384,6 +387,9 @@ def prune_object(  # noqa: PLR0913 - the command's options
             _reduce(checked, result.keep, columns)
             _save(target)
     clock.lap("write_s")
+    if target is not None:
+        used = views.spread(settings.views)
+        result.report.update(written_facts(target, result.scores, used, matrix=matrix))
     result.report["notes"] += modifier_notes(checked.obj)
     source, made = f"{bpy.data.filepath}#{name}", None if target is None else str(target)
     after = sizes.bytes_after if target is None else target.stat().st_size

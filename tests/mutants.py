@@ -402,13 +402,50 @@ MUTANTS = {
             "found.error",
             "what the other views see forgotten",
         ),
-        ("math.floor(FIRST * total)", "0", "merged from the first"),
+        ("math.floor(FIRST * began)", "0", "merged from the first"),
+        ("first = max(deleted - (began - total), 0)", "first = deleted", "a tenth of each level"),
         ("else protected[rest]", "else None", "protection forgotten"),
         (
             "keep[np.flatnonzero(rest)[absorbed.keep]] = True",
             "keep[np.flatnonzero(absorbed.keep)] = True",
             "survivors of other rows",
         ),
+    ],
+    "written.py": [
+        (
+            "if not np.array_equal(matrix, np.eye(4)):",
+            "if False:",
+            "the file's frame for the views'",
+        ),
+        ("if format_named(path) is None:", "if False:", "a plain PLY compared"),
+    ],
+    "levels/lod.py": [
+        ("keep[first.keep] = second.keep", "keep[: len(second.keep)] = second.keep", "other rows"),
+        (
+            "first.changed[second.keep] | second.changed",
+            "second.changed",
+            "changed before forgotten",
+        ),
+        ("else scene.protected[whole.keep]", "else None", "protected in the first level alone"),
+        ("origin=Origin(count, sights, psnr)", "origin=None", "each level a new original"),
+    ],
+    "levels/distance.py": [
+        ("_width_of_most(splats, changed", "_width_of_most(splats, ~changed", "the unchanged"),
+        ("<= OVERLOOKED * total:", "<= 0.0 * total:", "nothing is overlooked"),
+        (".mean(axis=(2, 4))", "[:, :, 0, :, 0]", "one pixel for its square"),
+        (
+            "steps = [factor * self.distance",
+            "steps = [self.distance / factor",
+            "nearer, not farther",
+        ),
+    ],
+    "levels/files.py": [
+        (
+            "                (folder / MANIFEST).unlink(missing_ok=True)",
+            "                pass",
+            "old manifest",
+        ),
+        ("                    path.unlink()\n", "                    pass\n", "levels left behind"),
     ],
     "scene.py": [
         ("np.where(first @ vectors < 0.0, -1.0, 1.0)", "1.0", "axes of either sign"),
@@ -467,6 +504,7 @@ TESTS = {
         "formats/registry.py",
     ],
     "glb": ["formats/glb_document.py"],
+    "levels": ["levels/lod.py", "levels/distance.py", "levels/files.py"],
 }
 """Modules whose tests are not in the file of their own name; those run first."""
 

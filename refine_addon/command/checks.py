@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from ..core import RefineError
 from ..core.formats.registry import format_named
+from ..core.levels.files import MANIFEST, check_goal, is_manifest, level_paths
 from . import options
 from .report import is_report
 
@@ -29,6 +30,8 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     _check_report(parser, given)
     for path in _outputs(given):
         _check_output(parser, path)
+    if given.command == "lod":
+        _check_manifest(parser, given)
     if given.command in ("info", "convert"):
         return
     try:
@@ -54,6 +57,9 @@ def _check_settings(parser: argparse.ArgumentParser, given: argparse.Namespace) 
     if given.command == "clean":
         options.cleaning(given)
         return
+    if given.command == "lod":
+        options.levels(given)
+        check_goal(given.distance_psnr)
     settings = options.settings(given)
     if given.command == "prune":
         options.budget(given).refuse_meaningless(settings.method, frustum=settings.frustum)
@@ -70,6 +76,9 @@ def open_blend() -> str:
 
 def _outputs(given: argparse.Namespace) -> list[Path]:
     """Return the splat files to be made."""
+    if given.command == "lod":
+        count = len(given.psnr or given.levels or options.DEFAULT_LEVELS)
+        return level_paths(given.inputs[0], given.output_dir, count, given.format)
     if getattr(given, "output_dir", None):
         return [given.output_dir / path.name for path in given.inputs]
     return [given.output] if getattr(given, "output", None) else []
@@ -80,6 +89,8 @@ def _check_report(parser: argparse.ArgumentParser, given: argparse.Namespace) ->
     if given.report is None:
         return
     others = [*given.inputs, *_outputs(given), getattr(given, "cameras", None)]
+    if given.command == "lod":
+        others.append(given.output_dir / MANIFEST)
     if given.scene:
         others.append(open_blend())
     path = os.path.realpath(given.report)
@@ -102,6 +113,14 @@ def _check_output(parser: argparse.ArgumentParser, path: Path) -> None:
     beginning = _beginning(path)
     if beginning is not None and not beginning.startswith(b"ply"):
         parser.error(f"{path} exists and is no PLY: write to another name")
+
+
+def _check_manifest(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Refuse a folder in which another file has the name of the manifest."""
+    path = given.output_dir / MANIFEST
+    beginning = _beginning(path) if given.overwrite else None
+    if beginning is not None and not is_manifest(beginning):
+        parser.error(f"{path} exists and lists no levels: write to another folder")
 
 
 def _beginning(path: Path) -> bytes | None:

@@ -6,13 +6,16 @@ import argparse
 from pathlib import Path
 from typing import Any, NoReturn
 
-from ..core import METHODS, REASONS, Budget, Cleaning, ClosedForm, RefineError, Settings
+from ..core import METHODS, REASONS, Budget, Cleaning, ClosedForm, Levels, RefineError, Settings
 from ..core.formats.registry import SUFFIXES
+from ..core.levels.files import GOAL
 from ..core.whole_file import expanded
 from ..version import VERSION
 from .terminal import shown
 
 DEFAULT_RATIO = 0.5
+
+DEFAULT_LEVELS = (0.5, 0.25, 0.12, 0.06)
 
 FORMATS = ", ".join(SUFFIXES)
 
@@ -39,6 +42,7 @@ def make_parser() -> argparse.ArgumentParser:
     _add_prune(commands)
     _add_score(commands)
     _add_clean(commands)
+    _add_lod(commands)
     _add_convert(commands)
     info = commands.add_parser("info", help="say what is in files of splats")
     info.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help="files of splats")
@@ -133,6 +137,58 @@ def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     _add_common(scoring)
 
 
+def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+    making = commands.add_parser("lod", help="write levels of detail, each with what it costs")
+    making.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a file of splats")
+    making.add_argument(
+        "-o",
+        "--output-dir",
+        type=_path,
+        metavar="DIR",
+        required=True,
+        help="for NAME.lod1.ply and so on, and lod.json; made if it is not there",
+    )
+    amount = making.add_mutually_exclusive_group()
+    amount.add_argument(
+        "--levels",
+        type=_numbers,
+        default=(),
+        metavar="S,S,...",
+        help="share of the splats that stays in each, the finest first (default "
+        f"{','.join(f'{share:g}' for share in DEFAULT_LEVELS)})",
+    )
+    amount.add_argument(
+        "--psnr",
+        type=_numbers,
+        default=(),
+        metavar="DB,DB,...",
+        help="or how close each stays to the original in these views, in dB",
+    )
+    making.add_argument(
+        "--nested",
+        action="store_true",
+        help="only delete: each level is some of the splats of the one before, unchanged; by "
+        "default survivors absorb what goes, which is far better, and --method does not matter",
+    )
+    making.add_argument(
+        "--format",
+        choices=SUFFIXES,
+        default=SUFFIXES[0],
+        metavar="SUFFIX",
+        help=f"of the files: {FORMATS} (default {SUFFIXES[0]})",
+    )
+    making.add_argument(
+        "--distance-psnr",
+        type=float,
+        default=GOAL,
+        metavar="DB",
+        help="also say from how far away each level stays this close to the original (default "
+        f"{GOAL:g})",
+    )
+    _add_scoring(making)
+    _add_common(making)
+
+
 def _add_convert(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     convert = commands.add_parser("convert", help="write a file of splats in another format")
     convert.add_argument("inputs", nargs=1, type=_given, metavar="IN", help="known by its content")
@@ -199,6 +255,15 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="print errors only")
 
 
+def _numbers(text: str) -> tuple[float, ...]:
+    """Return numbers between commas."""
+    try:
+        return tuple(float(word) for word in text.split(","))
+    except ValueError as error:
+        msg = f"expected numbers with commas between them, got {text!r}"
+        raise argparse.ArgumentTypeError(msg) from error
+
+
 def _name(text: str) -> str:
     """Return what is there; a variable that a script did not set is a mistake, not a default."""
     if not text:
@@ -232,6 +297,12 @@ def settings(options: argparse.Namespace) -> Settings:
 def cleaning(options: argparse.Namespace) -> Cleaning:
     """Return what to clean away, or raise `RefineError` where a value cannot be."""
     return Cleaning(getattr(options, "reasons", Cleaning.reasons), options.views)
+
+
+def levels(options: argparse.Namespace) -> Levels:
+    """Return which levels to make, or raise `RefineError` where a value cannot be."""
+    shares = () if options.psnr else options.levels or DEFAULT_LEVELS
+    return Levels(shares, options.psnr, absorb=not options.nested)
 
 
 def budget(options: argparse.Namespace) -> Budget:

@@ -16,6 +16,7 @@ from ..core.report import scoring_notes
 from ..core.whole_file import refuse_existing, refuse_mapped
 from . import report
 from .info import describe
+from .lod import make_levels
 from .options import budget, cleaning, settings
 from .terminal import Terminal, complain, described
 
@@ -42,6 +43,7 @@ def execute(options: argparse.Namespace) -> bool:
         "prune": _prune,
         "score": _score,
         "clean": _clean,
+        "lod": _lod,
         "convert": _convert,
         "info": _info,
     }
@@ -186,6 +188,8 @@ def _quality(done: dict[str, Any]) -> str:
     if psnr is None:
         return ""
     words = f"{in_words(psnr)} in these views"
+    if done.get("written_psnr") is not None:
+        words += f", {in_words(done['written_psnr'])} as written"
     if absorbed is None or "absorbed" in done or psnr > UNSEEN:
         return words
     return f"{words}; with --absorb {in_words(absorbed)}"
@@ -281,6 +285,12 @@ def _clean_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
         "cleaned": found.facts(),
         "notes": made.notes(found.keep),
     }
+
+
+def _lod(run: _Run) -> None:
+    options = run.options
+    views, source = _views(options), options.inputs[0]
+    run.attempt(str(source), lambda: make_levels(options, run.terminal, source, views))
 
 
 def _info(run: _Run) -> None:

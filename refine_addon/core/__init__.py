@@ -12,6 +12,8 @@ from .cleaning.clean import REASONS, Cleaned, Cleaning, clean
 from .errors import Cancelled, RefineError
 from .formats.ply import SplatFile, read_ply
 from .formats.registry import as_written, read_splats
+from .levels.files import lod_file
+from .levels.lod import Level, Levels, lod
 from .pipeline import prune, prune_file, score
 from .scores import Scores
 from .scoring.closed_form import ClosedForm
@@ -30,6 +32,8 @@ __all__ = [
     "Cleaned",
     "Cleaning",
     "ClosedForm",
+    "Level",
+    "Levels",
     "Occlusion",
     "RefineError",
     "Result",
@@ -41,6 +45,8 @@ __all__ = [
     "ViewSet",
     "as_written",
     "clean",
+    "lod",
+    "lod_file",
     "prune",
     "prune_file",
     "rank",

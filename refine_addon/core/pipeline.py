@@ -19,6 +19,7 @@ from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
 from .cleaning.clean import clean
 from .formats.registry import Packed, as_written, read_splats, refuse_unknown_size
+from .quality import left_to_lose
 from .report import Clock, Files, complete_report, make_report
 from .scoring import auto, closed_form, occlusion, sight_lines
 from .selection import Budget
@@ -26,6 +27,7 @@ from .survivors import survivor_columns
 from .task import DEFAULTS, Result, Settings, Task
 from .whole_file import expanded, refuse_existing, refuse_mapped
 from .work import Progress, part, report, silent
+from .written import written_facts
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -333,9 +335,12 @@ def _absorbed(
     scores, goal = known[0], task.budget.psnr
     if goal is not None and scores.quality is None:
         scores = with_quality(scores, threads=threads)
-    used = views.spread(task.settings.views)
+    used, origin = views.spread(task.settings.views), task.origin
+    sights = scores.sights if origin is None else origin.sights
     best: tuple[Absorbed, float | None] | None = None
     offset, tries = 0.0, 1 if goal is None else TRIES
+    if goal is not None and origin is not None:
+        offset = goal - left_to_lose(goal, origin.psnr)
     for number in range(tries):
         if goal is not None:
             curve = selection.quality_of(scores)
@@ -345,11 +350,12 @@ def _absorbed(
         ahead = part(progress, low, high)
         absorbed = absorb_removed(
             splats, views, count, task.settings, known=known, protected=task.protected,
+            began=None if origin is None else origin.count,
             progress=part(ahead, 0.0, 0.95), threads=threads,
         )  # fmt: skip
         psnr = None
-        if scores.sights is not None:
-            psnr = scores.sights.against(
+        if sights is not None:
+            psnr = sights.against(
                 absorbed.splats, used, progress=part(ahead, 0.95, 1.0), threads=threads
             )
         if goal is None or psnr is None:
@@ -419,6 +425,7 @@ def absorb_removed(  # noqa: PLR0913 - as `prune`
     settings: Settings = DEFAULTS,
     *,
     known: tuple[Scores, Measured] | None = None,
+    began: int | None = None,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
@@ -433,6 +440,9 @@ def absorb_removed(  # noqa: PLR0913 - as `prune`
         How many survive.
     known : tuple of Scores and Measured, optional
         The results of `occlusion.score_once` for these splats and views, if known.
+    began : int, optional
+        How many splats there were before some of them became these by absorbing. What is deleted
+        first, and how patient merging is, go by the share that has gone of those.
     protected : (N,) bool, optional
         Splats that are neither removed nor changed.
 
@@ -449,7 +459,10 @@ def absorb_removed(  # noqa: PLR0913 - as `prune`
     scores, measured = known or _score_once(
         splats, views, settings, part(progress, 0.0, 0.2), threads
     )
-    first = max(min(math.floor(FIRST * total), total - count), 0)
+    began = total if began is None else began
+    # How many of all are deleted before any are merged, and how many of those are still there.
+    deleted = max(min(math.floor(FIRST * began), began - count), 0)
+    first = max(deleted - (began - total), 0)
     # Undrawable splats have the lowest scores, so these go first.
     rest = selection.select(scores, Budget(keep=total - first), protected=protected)
     # The deleted splats hid almost nothing, so the first stage need not measure again.
@@ -471,7 +484,7 @@ def absorb_removed(  # noqa: PLR0913 - as `prune`
     with np.errstate(under="ignore"):  # as in `score`
         absorbed = absorbing.absorb(
             splats.take(rest), used, measure, count,
-            protected=None if protected is None else protected[rest],
+            began=began - deleted, protected=None if protected is None else protected[rest],
             progress=part(progress, 0.2, 1.0), threads=threads,
         )  # fmt: skip
     keep = np.zeros(total, np.bool_)
@@ -565,6 +578,9 @@ def prune_file(  # noqa: PLR0913 - as `prune`
         made.write(written, result.keep, columns=columns, overwrite=overwrite)
         sizes = (sizes[0], written.stat().st_size)
     clock.lap("write_s")
+    if written is not None:
+        used = views.spread(settings.views)
+        result.report.update(written_facts(written, result.scores, used, threads=threads))
     result.report["notes"] += made.notes(result.keep)
     names = (str(file.path), None if written is None else str(written))
     complete_report(result.report, clock, Files(*names, *sizes))

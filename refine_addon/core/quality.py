@@ -6,6 +6,7 @@ itself, at most 100, and of these the mean. `scoring.sight_lines` estimates it.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -129,6 +130,28 @@ def absorbed_from(psnr: NDArray[np.float64], gains: NDArray[np.float64]) -> NDAr
     found = (constant + part * gains).clip(0.0)
     gain = np.interp(SHARES, (PLAIN, *TAKEN_OVER), np.concatenate([[0.0], found]))
     return np.minimum.accumulate(np.minimum(psnr + gain, PSNR_CAP))
+
+
+def left_to_lose(goal: float, psnr: float | None) -> float:
+    """Return which PSNR a second change may have by itself so that both together reach `goal`, dB.
+
+    The squared errors of changes that have nothing to do with each other add up.
+
+    Parameters
+    ----------
+    goal : float
+    psnr : float or None
+        Of the first change; None if there was none.
+
+    Examples
+    --------
+    >>> round(left_to_lose(40.0, 43.0103), 2), left_to_lose(40.0, 39.0)
+    (43.01, inf)
+    """
+    if psnr is None:
+        return goal
+    left = 10.0 ** (-goal / 10.0) - 10.0 ** (-psnr / 10.0)
+    return -10.0 * math.log10(left) if left > 0.0 else math.inf
 
 
 def in_words(psnr: float) -> str:

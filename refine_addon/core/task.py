@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
     from .absorbing.absorb import Absorbed
     from .scores import Scores
+    from .scoring.sight_lines import SightLines
     from .selection import Budget, RowBytes
     from .splats import Splats
     from .views import ViewSet
@@ -84,6 +85,25 @@ DEFAULTS = Settings()
 
 
 @dataclass(frozen=True, eq=False)
+class Origin:
+    """The splats that those of a task became of, by absorbing.
+
+    Attributes
+    ----------
+    count : int
+        How many there were.
+    sights : SightLines or None
+        What the views saw of them: the estimated PSNR is against that.
+    psnr : float or None
+        The estimated PSNR that is left before the task, dB.
+    """
+
+    count: int
+    sights: SightLines | None
+    psnr: float | None
+
+
+@dataclass(frozen=True, eq=False)
 class Task:
     """What `decide` needs; all data are arrays, whether they came from a file or from Blender.
 
@@ -106,6 +126,8 @@ class Task:
         survive; which ones, and their new values, come from merging, whatever the method.
     row_bytes, fixed_bytes : float or (N,) int64, int
         See `Budget.removals`.
+    origin : Origin or None
+        To absorb: what the splats were before they absorbed others; None where they did not.
     """
 
     budget: Budget
@@ -117,6 +139,7 @@ class Task:
     absorb: bool = False
     row_bytes: RowBytes = 0.0
     fixed_bytes: int = 0
+    origin: Origin | None = None
 
     def scene(self) -> tuple[Splats, ViewSet]:
         """Return splats and views.

@@ -16,10 +16,11 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from .. import splat_object
+from .. import level_objects, splat_object
 from ..cameras.sets import views_from_scene
 from ..core import frustum, pipeline
 from ..core.formats.registry import FORMATS, SUFFIXES, Packed
+from ..core.levels.lod import Level, Levels, lod
 from ..core.quality import in_words
 from ..core.report import scoring_notes
 from ..core.work import part
@@ -233,6 +234,72 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
                 f"The scores were from before a change ({', '.join(changed)}); undo and "
                 "score again if it is to count",
             )
+        return {"FINISHED"}
+
+
+@dataclass(frozen=True, eq=False)
+class _Detail:
+    """What levels are to be made of, by which views and how; what is protected, (N,) bool."""
+
+    splats: Splats
+    views: ViewSet
+    levels: Levels
+    settings: Settings
+    protected: NDArray[np.bool_] | None
+
+
+class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
+    """Make objects with ever fewer of the splats, by the cameras, in a collection of their own"""
+
+    bl_idname = "refine.levels"
+    bl_label = "Make Levels"
+    bl_options = {"REGISTER", "UNDO"}
+    doing = "Making levels"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run, and if not, why."""
+        if not super().poll(context):
+            return False
+        if context.mode != "OBJECT":
+            cls.poll_message_set("Go to object mode first")
+            return False
+        return True
+
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Detail:
+        """Gather splats, views and settings."""
+        settings = context.scene.refine
+        levels, protect = settings.to_levels(), settings.protect
+        return _Detail(
+            splat_object.gather(checked, whole=True if levels.absorb else None),
+            chosen_views(context),
+            levels,
+            settings.to_settings(),
+            mesh_edit.protected_mask(checked.obj, protect) if protect else None,
+        )
+
+    @staticmethod
+    def work(job: _Detail, progress: Progress) -> list[Level]:
+        """Make the levels."""
+        return lod(
+            job.splats, job.views, job.levels, job.settings,
+            protected=job.protected, progress=progress,
+        )  # fmt: skip
+
+    def finish(
+        self,
+        _context: bpy.types.Context,
+        checked: SplatObject,
+        _job: _Detail,
+        levels: list[Level],
+    ) -> Answer:
+        """Make the objects and say what each level costs."""
+        collection = level_objects.add_levels(checked, levels)
+        told = [
+            f"{len(level.splats):,}" + (f" ({in_words(level.psnr)})" if level.psnr else "")
+            for level in levels
+        ]
+        self.report({"INFO"}, f"'{collection.name}': {', '.join(told)} splats")
         return {"FINISHED"}
 
 

@@ -219,9 +219,16 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
 
     bl_label = "6 Export"
 
-    def draw(self, _context: bpy.types.Context) -> None:
-        """Draw the button."""
-        self.layout.operator("refine.export_ply", icon="EXPORT")
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the buttons."""
+        layout, settings = self.layout, context.scene.refine
+        layout.operator("refine.export_ply", icon="EXPORT")
+        column = layout.column()
+        column.use_property_split = True
+        column.use_property_decorate = False
+        column.prop(settings, "levels")
+        column.prop(settings, "nested")
+        column.operator("refine.levels", icon="MOD_DECIM")
 
 
 def _draw_frames(

@@ -19,6 +19,7 @@ from bpy.props import (
 
 from ..core.cleaning.clean import DEFAULT_REASONS
 from ..core.errors import RefineError
+from ..core.levels.lod import Levels
 from ..core.scoring.closed_form import ClosedForm
 from ..core.selection import Budget
 from ..core.task import Settings
@@ -246,6 +247,17 @@ class RefineSettings(bpy.types.PropertyGroup):
         update=_plan_again,
     )
 
+    levels: StringProperty(
+        name="Levels",
+        description="Shares of the splats that stay in the levels of detail, the finest first",
+        default="0.5, 0.25, 0.12, 0.06",
+    )
+    nested: BoolProperty(
+        name="Nested",
+        description="Only delete: each level is some of the splats of the one before, unchanged. "
+        "Else survivors absorb what goes, which is far better",
+    )
+
     def to_settings(self) -> Settings:
         """Return the settings of core.
 
@@ -271,6 +283,21 @@ class RefineSettings(bpy.types.PropertyGroup):
         value = getattr(self, self.budget)
         amount: dict[str, Any] = {self.budget: value if self.budget == "keep" else decimal(value)}
         return Budget(**amount)
+
+    def to_levels(self) -> Levels:
+        """Return the levels of detail of core.
+
+        Raises
+        ------
+        RefineError
+            If they cannot be.
+        """
+        try:
+            shares = tuple(float(word) for word in self.levels.split(","))
+        except ValueError as error:
+            msg = f"Levels is {self.levels!r}, expected numbers with commas between them"
+            raise RefineError(msg) from error
+        return Levels(shares, absorb=not self.nested)
 
     def to_frames(self, scene: bpy.types.Scene) -> range:
         """Return the frames whose views count."""

@@ -173,7 +173,7 @@ def test_apply_is_one_undo_step(room, room_cameras):  # noqa: ARG001
 
 
 @pytest.mark.parametrize(
-    "name", ["score", "apply", "import_ply", "import_cameras", "preview", "convert"]
+    "name", ["score", "apply", "import_ply", "import_cameras", "levels", "preview", "convert"]
 )
 def test_operators_that_change_the_scene_can_be_undone(name):
     """Blender pushes an undo step for operators with UNDO."""

@@ -110,6 +110,7 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     measure: Measure,
     keep_count: int,
     *,
+    began: int | None = None,
     protected: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
@@ -126,6 +127,9 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
         See `Measure`; called once in each stage.
     keep_count : int
         How many survive, or more if more are protected. Undrawable splats go first.
+    began : int, optional
+        How many splats there were before some of them became these; `patience` goes by the share
+        that has gone of those. By default these are the first.
     protected : (N,) bool, optional
         Splats that are neither removed nor changed.
     progress : callable, optional
@@ -153,7 +157,7 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     scene = scene_of(splats.means, drawable(splats), views)
     # Of each splat left: its row among the N, and how many of the N it stands for.
     origin, members = np.arange(count), np.ones(count, np.int64)
-    factor = patience(1.0 - goal / max(count, 1))
+    factor = patience(1.0 - goal / max(began or count, 1))
     stages = math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE)) if goal < count else 0
     sums: ViewSums | None = None
     for stage in range(stages):

@@ -66,8 +66,12 @@ SLENDER, LONG = 10.0, 0.05
 """A needle is this many times as long as wide, and its standard deviation reaches across this share
 of a picture's longer side."""
 
-SUPPORT, GIANT_SUPPORT = 0.2, 0.3
-"""What less of the light stops near than this share has no surface. Giants cross surfaces."""
+SUPPORT, GIANT_SUPPORT, VEIL_SUPPORT = 0.2, 0.3, 0.5
+"""What less of the light stops near than this share has no surface. Giants cross surfaces; of a
+giant that is a veil, half may lie at one."""
+
+VEIL = 0.15
+"""A giant of lower opacity is a veil."""
 
 VIEWS = 3
 """So many views must see past a splat; all of them where fewer see it."""
@@ -246,11 +250,12 @@ class _Run:
         self._judge(doubted | giant | needle | small, part(progress, 0.6, 1.0))
         effect = self._effect()
         floats = ~giant & self._floats(SUPPORT) & self._agreed()
+        most = np.where(self.gaussians.alphas < VEIL, VEIL_SUPPORT, GIANT_SUPPORT)
         visible = floats & (effect >= VISIBLE)
         return {
             "front": visible & doubted & ~needle,
             "isolated": visible & small & ~needle,
-            "giant": giant & self._floats(GIANT_SUPPORT) & (effect >= GIANT_VISIBLE),
+            "giant": giant & self._floats(most) & (effect >= GIANT_VISIBLE),
             "needle": visible & needle,
             "transparent": floats & doubted & ~visible,
         }
@@ -315,7 +320,7 @@ class _Run:
             count, 1, progress=progress, what=what, threads=self.threads,
         )  # fmt: skip
 
-    def _floats(self, most: float) -> NDArray[np.bool_]:
+    def _floats(self, most: float | NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which suspects have a surface behind them and less than `most` support, (M,)."""
         seen = self.evidence
         return (seen.views > 0) & (seen.near < most * (seen.near + seen.behind))

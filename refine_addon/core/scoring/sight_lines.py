@@ -137,6 +137,21 @@ class Lines:
             Of the splats that are met.
         """
         count = len(self.columns) * len(self.rows)
+        line, owner, weight = self.contributions()
+        channels = [np.bincount(line, weight * channel.take(owner), count) for channel in colors]
+        return np.stack(channels).clip(0.0, 1.0)
+
+    def contributions(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+        """Return what the lines see: r of the things that they meet.
+
+        Returns
+        -------
+        line, owner : (r,) int32
+            As the attributes.
+        weight : (r,) float32
+            Transmittance times alpha: what part of the pixel it makes up.
+        """
+        count = len(self.columns) * len(self.rows)
         through = np.cumsum(self.dark, dtype=np.float64)
         last = np.flatnonzero(self.line[1:] != self.line[:-1])  # of each line but the last
         before = np.zeros(count)  # the sum over all lines before each
@@ -145,9 +160,7 @@ class Lines:
         front -= before.take(self.line)
         seen = np.flatnonzero(front > _DARK)
         line, owner = self.line.take(seen), self.owner.take(seen)
-        weight = self.alpha.take(seen) * np.exp(front.take(seen).astype(np.float32))  # (s,)
-        channels = [np.bincount(line, weight * channel.take(owner), count) for channel in colors]
-        return np.stack(channels).clip(0.0, 1.0)
+        return line, owner, self.alpha.take(seen) * np.exp(front.take(seen).astype(np.float32))
 
     def taken_over(
         self, colors: NDArray[np.float64], keep: NDArray[np.bool_]
@@ -386,8 +399,8 @@ class SightLines:
             with np.errstate(under="ignore"):
                 footprints = projection.project(gaussians, scene, view)
                 other = meet(gaussians, footprints, lines.columns, lines.rows)
-                seen = other.colors(_colors(splats, gaussians.index[other.met], view))
-                whole = lines.colors(_colors(self.splats, self.index[lines.met], view))
+                seen = other.colors(colors_from(splats, gaussians.index[other.met], view))
+                whole = lines.colors(colors_from(self.splats, self.index[lines.met], view))
             return np.array([psnr_of(seen, whole, view)])
 
         found = self._mean(compare, self._judges(), part(progress, 0.2, 1.0), threads)
@@ -418,7 +431,7 @@ class SightLines:
         def compare(number: int, lines: Lines) -> NDArray[np.float64]:
             view = self.views[number][0]
             with np.errstate(under="ignore"):
-                colors = _colors(self.splats, self.index[lines.met], view)
+                colors = colors_from(self.splats, self.index[lines.met], view)
             whole, values = lines.colors(colors), []
             own = place.take(lines.met)  # (u,)
             for count in counts:
@@ -444,7 +457,7 @@ class SightLines:
         def compare(number: int, lines: Lines) -> NDArray[np.float64]:
             view = self.views[number][0]
             with np.errstate(under="ignore"):
-                colors = _colors(self.splats, self.index[lines.met], view)
+                colors = colors_from(self.splats, self.index[lines.met], view)
             whole, own, gains = lines.colors(colors), place.take(lines.met), []
             for count in counts:
                 keep = own >= count  # (u,)
@@ -507,7 +520,7 @@ def _places(
     return place
 
 
-def _colors(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float64]:
+def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float64]:
     """Return the colours in which a view sees some splats, (3, n), at least 0.
 
     Parameters

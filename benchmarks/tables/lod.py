@@ -1,0 +1,98 @@
+"""Levels of detail side by side: ours from one another, in one go, nested; and splat-transform's.
+
+::
+
+    python -m benchmarks.tables.lod SCENE_DIR ... [--views 10]
+
+Held-out PSNR at each level against renders of the original, and seconds of the processor: of each
+level where it is made by itself, and of all of them where they come from one run. The train views
+decide, some of the test views judge. Where splat-transform is not installed, its lines are missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from refine_addon.core import Levels, lod, prune, read_ply
+
+from ..baselines import splat_transform
+from .evaluate import Evaluator, read_scene
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from refine_addon.core.splats import Splats
+
+    from .evaluate import Scene
+
+SHARES = (0.5, 0.25, 0.12, 0.06)
+
+
+def from_one_another(scene: Scene) -> Iterator[tuple[Splats, str]]:
+    """Yield the levels of `lod`, and the PSNR that it estimates."""
+    for level in lod(scene.splats, scene.train, Levels(SHARES)):
+        yield level.splats, f" [{level.psnr:.1f}]"
+
+
+def nested(scene: Scene) -> Iterator[tuple[Splats, str]]:
+    """Yield the levels of `lod` by deletion, and the PSNR that it estimates."""
+    for level in lod(scene.splats, scene.train, Levels(SHARES, absorb=False)):
+        yield level.splats, f" [{level.psnr:.1f}]"
+
+
+def in_one_go(scene: Scene) -> Iterator[tuple[Splats, str]]:
+    """Yield what absorbing makes of the original for each level by itself."""
+    for budget in Levels(SHARES).budgets(len(scene.splats)):
+        start = time.process_time()
+        made = prune(scene.splats, scene.train, budget, absorb=True).absorbed
+        assert made is not None  # noqa: S101 - it was asked for
+        yield made.splats, f" ({time.process_time() - start:.0f} s)"
+
+
+def decimated(source: Path, flag: str, count: int) -> Iterator[tuple[Splats, str]]:
+    """Yield what splat-transform makes of a file of `count` splats for each level by itself."""
+    for share in SHARES:
+        with tempfile.TemporaryDirectory() as folder:
+            target = Path(folder) / "a.ply"
+            kept = Levels((share,)).budgets(count)[0].keep or 0
+            run = splat_transform.decimate(source, target, flag, kept)
+            yield read_ply(target).splats(), f" ({run.busy:.0f} s)"
+
+
+def main() -> int:
+    """Print a table for each scene."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE_DIR")
+    parser.add_argument("--views", type=int, default=10, help="how many judge (default 10)")
+    options = parser.parse_args()
+    for folder in options.scenes:
+        scene = read_scene(folder)
+        judge = Evaluator(scene.splats, scene.test.spread(options.views), metrics=("psnr",))
+        source, count = folder / "point_cloud.ply", len(scene.splats)
+        ways = {
+            "each from the one before": from_one_another(scene),
+            "each from the original": in_one_go(scene),
+            "nested": nested(scene),
+        }
+        if splat_transform.find() is not None:
+            for flag in splat_transform.FLAGS:
+                ways[f"splat-transform {flag}"] = decimated(source, flag, count)
+        print(f"{folder.name}: {count} splats, shares {SHARES}", flush=True)
+        for name, levels in ways.items():
+            start, cells = time.process_time(), []
+            made = list(levels)
+            seconds = time.process_time() - start
+            for splats, note in made:
+                psnr = judge.evaluate(splats).renders.mean["psnr"]
+                cells.append(f"{psnr:.1f}{note}")
+            print(f"  {name}: {', '.join(cells)}; {seconds:.0f} s in this process", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

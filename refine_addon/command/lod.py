@@ -1,0 +1,56 @@
+"""What ``lod`` does, and what it says of the levels."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from ..core.levels.files import lod_file
+from ..core.quality import in_words
+from .options import levels, settings
+
+if TYPE_CHECKING:
+    import argparse
+    from pathlib import Path
+
+    from ..core import ViewSet
+    from .terminal import Terminal
+
+
+def make_levels(
+    options: argparse.Namespace, terminal: Terminal, source: Path, views: ViewSet
+) -> dict[str, Any]:
+    """Make the levels of a file and say what each costs; return the report."""
+    done = lod_file(
+        source,
+        options.output_dir,
+        views,
+        levels(options),
+        settings(options),
+        suffix=options.format,
+        goal=options.distance_psnr,
+        overwrite=options.overwrite,
+        progress=terminal.progress(source.name),
+    )
+    terminal.clear()
+    count, seconds = done["source"]["splats"], done["timings"]["total_s"]
+    terminal.say(
+        f"{source}: {len(done['levels'])} levels of {count:,} splats, {seconds:.2f} s "
+        f"-> {options.output_dir}"
+    )
+    for entry in done["levels"]:
+        terminal.say(f"  {_in_words(entry, done['goal_psnr'])}")
+    for note in done["notes"]:
+        terminal.say(f"  note: {note}")
+    return done
+
+
+def _in_words(entry: dict[str, Any], goal: float) -> str:
+    """Return what there is to know of a level, on one line."""
+    parts = [f"{entry['splats']:,} splats", f"{entry['bytes'] / 1e6:,.1f} MB"]
+    if entry["psnr"] is not None:
+        parts.append(in_words(entry["psnr"]))
+    far = entry["distance_psnr"]
+    if far is not None:
+        parts.append(f"{goal:g} dB from {far:.3g} away")
+    parts.append(f"under a pixel from {entry['distance_pixel']:.3g}")
+    return f"{entry['file']}: {', '.join(parts)}"

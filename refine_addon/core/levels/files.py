@@ -1,0 +1,202 @@
+"""Levels of detail as files in a folder, and the manifest that lists them."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from dataclasses import asdict
+from typing import TYPE_CHECKING
+
+from ..errors import RefineError
+from ..formats.registry import SUFFIXES, as_written, read_splats
+from ..quality import PSNR_CAP
+from ..report import Clock
+from ..survivors import survivor_columns
+from ..task import DEFAULTS
+from ..whole_file import expanded, mode_of, refuse_existing, refuse_mapped, whole_file
+from ..work import Progress, silent
+from .lod import Levels, each_level, short
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+    from typing import Any
+
+    from ..formats.ply import SplatFile
+    from ..task import Settings
+    from ..views import ViewSet
+    from .lod import Level
+
+MANIFEST = "lod.json"
+
+GOAL = 40.0
+"""The PSNR from which on a level is hard to tell from the original, dB."""
+
+_BEGINNING = b'{"lod":'
+
+
+def level_paths(source: Path, folder: Path, count: int, suffix: str = ".ply") -> list[Path]:
+    """Return the names of the files of `count` levels.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> [path.as_posix() for path in level_paths(Path("a/b.compressed.ply"), Path("out"), 2)]
+    ['out/b.lod1.ply', 'out/b.lod2.ply']
+    """
+    ends = sorted(SUFFIXES, key=len, reverse=True)
+    end = next((end for end in ends if source.name.lower().endswith(end)), source.suffix)
+    name = source.name[: len(source.name) - len(end)] or source.name
+    return [folder / f"{name}.lod{number}{suffix}" for number in range(1, count + 1)]
+
+
+def is_manifest(beginning: bytes) -> bool:
+    """Return whether a file that begins like this is a manifest of levels, or empty."""
+    words = b"".join(beginning.split())
+    return not words or words.startswith(_BEGINNING)
+
+
+def check_goal(goal: float) -> None:
+    """Raise `RefineError` if no PSNR for a distance can be `goal`, dB."""
+    if not 0.0 < goal < PSNR_CAP:
+        msg = f"PSNR for a distance is {goal}, expected more than 0 and less than {PSNR_CAP:g} dB"
+        raise RefineError(msg)
+
+
+def lod_file(  # noqa: PLR0913 - as `pipeline.prune_file`
+    source: Path | str,
+    folder: Path | str,
+    views: ViewSet,
+    levels: Levels,
+    settings: Settings = DEFAULTS,
+    *,
+    suffix: str = ".ply",
+    goal: float = GOAL,
+    overwrite: bool = False,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Make levels of detail of a file of splats: a file each, and `MANIFEST`, written last.
+
+    Parameters
+    ----------
+    source : path-like
+        The file to read, of any format (`read_splats`); level 0, which is not written again.
+    folder : path-like
+        Where the files go, named as by `level_paths`; made if it is not there.
+    views, levels, settings, progress, threads
+        See `lod`.
+    suffix : str
+        Of the files, which names their format.
+    goal : float
+        The PSNR that the manifest's ``distance_psnr`` is for, dB.
+    overwrite : bool
+        Whether files may be replaced.
+
+    Returns
+    -------
+    dict
+        The report: what the manifest says, sizes, settings, timings, notes.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `lod`, `read_splats` and `SplatFile.write`. Files that were new are removed again then,
+        and where files were to be replaced, no manifest is left.
+    """
+    clock = Clock()
+    folder, source = expanded(folder), expanded(source)
+    check_goal(goal)
+    paths = level_paths(source, folder, len(levels), suffix)
+    with _new_files(folder, [*paths, folder / MANIFEST], overwrite=overwrite) as written:
+        file = read_splats(source)
+        for path in paths:
+            refuse_mapped(path, source)
+        clock.lap("read_s")
+        entries, notes = [], [views.note] if views.note else []
+        made = each_level(
+            file.splats(), views, levels, settings,
+            progress=progress, threads=threads,
+        )  # fmt: skip
+        for path, level in zip(paths, made, strict=True):
+            if overwrite:
+                (folder / MANIFEST).unlink(missing_ok=True)
+            distances = [short(far) for far, _ in level.reach.psnr]
+            found = _write(file, level, path, overwrite=overwrite)
+            written.append(path)
+            notes += [note for note in found if note not in notes]
+            entries.append(
+                {
+                    **level.facts(goal),
+                    "file": path.name,
+                    "bytes": path.stat().st_size,
+                }
+            )
+        clock.lap("levels_s")
+        facts = {
+            "lod": 1,
+            "source": {
+                "file": source.name,
+                "splats": len(file),
+                "bytes": file.stored_bytes,
+            },
+            "views": len(views),
+            "distances": distances,
+            "goal_psnr": goal,
+            "levels": entries,
+        }
+        with whole_file(folder / MANIFEST, overwrite=overwrite) as stream:
+            stream.write(json.dumps(facts, indent=2, allow_nan=False).encode() + b"\n")
+    clock.stop()
+    return {
+        **facts,
+        "files": {"input": str(source), "folder": str(folder), "manifest": MANIFEST},
+        "settings": asdict(settings),
+        "absorb": levels.absorb,
+        "timings": clock.timings,
+        "notes": notes,
+    }
+
+
+def _write(file: SplatFile, level: Level, path: Path, *, overwrite: bool) -> list[str]:
+    """Write the file of a level; return what there is to say of it, in sentences."""
+    made = as_written(file, path)
+    columns = survivor_columns(file.rows, level.absorbed) if level.absorbed else {}
+    made.write(path, level.keep, columns=columns, overwrite=overwrite)
+    return made.notes(level.keep)
+
+
+@contextlib.contextmanager
+def _new_files(folder: Path, paths: list[Path], *, overwrite: bool) -> Iterator[list[Path]]:
+    """Make a folder for files; if the block fails, remove those that it wrote anew.
+
+    Yields
+    ------
+    list of Path
+        To be filled with what was written.
+
+    Raises
+    ------
+    RefineError
+        If the folder cannot be made, or a file exists and may not be replaced.
+    """
+    written: list[Path] = []
+    try:
+        there = mode_of(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        msg = f"{folder}: cannot be made ({getattr(error, 'strerror', None) or error})"
+        raise RefineError(msg) from error
+    try:
+        for path in paths:
+            refuse_existing(path, overwrite=overwrite)
+        old = [path for path in paths if mode_of(path)]
+        yield written
+    except BaseException:
+        with contextlib.suppress(OSError):
+            for path in written:
+                if path not in old:
+                    path.unlink()
+            if not there:
+                folder.rmdir()
+        raise

@@ -1,0 +1,64 @@
+"""How close the pictures stay with what a file of a lossy format holds."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .affine import is_uniform, transformed
+from .formats.registry import format_named, read_splats
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from .scores import Scores
+    from .views import ViewSet
+
+
+def written_facts(
+    path: Path,
+    scores: Scores,
+    views: ViewSet,
+    *,
+    matrix: NDArray[np.float64] | None = None,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Return what a report says of a file that was written; nothing of a plain PLY, which is exact.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it is read again.
+    scores : Scores
+        Of the splats that it was made of; their lines of sight tell the PSNR.
+    views : ViewSet
+        Those that the lines belong to.
+    matrix : (4, 4) float64, optional
+        From the frame of the file to that of the views; by default they are the same.
+    threads : int, optional
+
+    Returns
+    -------
+    dict
+        ``written_psnr``: the estimated PSNR in dB against the pictures of all splats, with what the
+        format rounds and leaves out; None where nothing tells it, or
+        the matrix scales directions differently, which harmonics cannot express.
+
+    Raises
+    ------
+    RefineError
+        See `read_splats`.
+    """
+    if format_named(path) is None:
+        return {}
+    matrix = np.eye(4) if matrix is None else matrix
+    if scores.sights is None or not is_uniform(matrix):
+        return {"written_psnr": None}
+    splats = read_splats(path).splats()
+    if not np.array_equal(matrix, np.eye(4)):
+        splats = transformed(splats, matrix)
+    psnr = scores.sights.against(splats, views, threads=threads)
+    return {"written_psnr": None if psnr is None else round(psnr, 2)}

@@ -1,0 +1,418 @@
+"""Levels of detail: nested, each from the one before, and from how far away each will do."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from refine_addon.core import (
+    Budget,
+    Cancelled,
+    Levels,
+    RefineError,
+    Settings,
+    Splats,
+    View,
+    ViewSet,
+    lod,
+    lod_file,
+    pipeline,
+    prune,
+    read_cameras,
+    read_ply,
+    read_splats,
+)
+from refine_addon.core.absorbing import absorb as absorbing
+from refine_addon.core.formats.ply import SplatFile
+from refine_addon.core.levels import distance
+from refine_addon.core.levels.distance import Lookout
+
+from .test_cleaning import cameras, joined, made, wall
+
+ROOM = Path(__file__).parents[1] / "data/room_small"
+DELETED = Levels((0.5, 0.25), absorb=False)
+QUICK = Settings("closed-form")
+
+
+def colourful():
+    """Return the wall of 576 splats in as many colours."""
+    colors = np.random.default_rng(5).uniform(-1.0, 1.0, (576, 3)).astype(np.float32)
+    return replace(wall(), sh_dc=colors)
+
+
+def equal(one, other):
+    """Say whether two sets of splats are the same to the bit."""
+    pairs = ((getattr(one, item.name), getattr(other, item.name)) for item in fields(Splats))
+    return all(np.array_equal(a, b) for a, b in pairs)
+
+
+def file_of(splats, path):
+    """Write splats to a PLY."""
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    names += [f"scale_{k}" for k in range(3)] + [f"rot_{k}" for k in range(4)]
+    columns = (
+        splats.means, splats.sh_dc, splats.opacity_logits[:, None], splats.log_scales,
+        splats.quaternions,
+    )  # fmt: skip
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]
+    head = "\n".join([*lines, *(f"property float {name}" for name in names), "end_header", ""])
+    path.write_bytes(head.encode() + np.hstack(columns).astype("<f4").tobytes())
+    return path
+
+
+@pytest.mark.slow
+def test_deleting_keeps_rows_of_the_level_before_as_they_were():
+    """Of 576 splats, .5, .3 and .1 are 288, 173 (172.8) and 58 (57.6): rounded up, as with prune.
+
+    One ranking decides, that of a prune by the same method: the kept sets are the same ones.
+    """
+    splats, views = colourful(), cameras()
+
+    levels = lod(splats, views, Levels((0.5, 0.3, 0.1), absorb=False))
+
+    assert [len(level.splats) for level in levels] == [288, 173, 58]
+    assert [level.number for level in levels] == [1, 2, 3]
+    before = np.ones(576, np.bool_)
+    for level, ratio in zip(levels, (0.5, 0.7, 0.9), strict=True):
+        assert level.absorbed is None
+        assert equal(level.splats, splats.take(level.keep))
+        assert not np.any(level.keep & ~before)
+        np.testing.assert_array_equal(level.keep, prune(splats, views, Budget(ratio=ratio)).keep)
+        before = level.keep
+
+
+@pytest.mark.slow
+def test_the_first_level_is_what_prune_absorbs():
+    """It is made from the original, as prune's result is: equal to the bit."""
+    splats, views = colourful(), cameras()
+    wanted = prune(splats, views, Budget(keep=288), absorb=True)
+
+    first = lod(splats, views, Levels((0.5, 0.25)))[0]
+
+    np.testing.assert_array_equal(first.keep, wanted.keep)
+    assert equal(first.splats, wanted.absorbed.splats)
+    assert first.psnr == wanted.report["estimated_psnr"]
+
+
+@pytest.mark.slow
+def test_each_level_is_absorbed_from_the_one_before():
+    """Its rows are among those before; one that is unchanged there stayed the original's."""
+    splats, views = colourful(), cameras()
+
+    levels = lod(splats, views, Levels((0.6, 0.3, 0.15)))
+
+    before = levels[0]
+    for level in levels[1:]:
+        assert not np.any(level.keep & ~before.keep)
+        assert level.psnr < before.psnr
+        was = before.absorbed.changed[level.keep[before.keep]]
+        assert not np.any(was & ~level.absorbed.changed)
+        still = np.flatnonzero(~level.absorbed.changed)
+        rows = np.flatnonzero(level.keep)[still]
+        assert equal(level.splats.take(still), joined_in_double(splats.take(rows)))
+        told = level.absorbed
+        assert told.merged + told.deleted + len(level.splats) == 576
+        before = level
+    assert levels[2].absorbed.changed.any()
+
+
+def joined_in_double(splats):
+    """Return splats in float64, which holds float32 exactly."""
+    return Splats(**{f.name: getattr(splats, f.name).astype(np.float64) for f in fields(Splats)})
+
+
+@pytest.mark.slow
+def test_what_absorbed_before_is_not_thinned_by_a_tenth_again(monkeypatch):
+    """Of 576, 57 are deleted before any merge; of the 288 left, none are, since 288 went already.
+
+    Patience goes by what has gone of the 519: 1 - 288/519, then 1 - 144/519.
+    """
+    given, shares, whole, plain = [], [], absorbing.absorb, absorbing.patience
+    monkeypatch.setattr(
+        pipeline.absorbing,
+        "absorb",
+        lambda splats, *rest, **named: given.append(len(splats)) or whole(splats, *rest, **named),
+    )
+    monkeypatch.setattr(absorbing, "patience", lambda share: shares.append(share) or plain(share))
+
+    lod(colourful(), cameras(), Levels((0.5, 0.25)))
+
+    assert given == [519, 288]
+    assert shares == [1.0 - 288 / 519, 1.0 - 144 / 519]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("absorb", [True, False])
+def test_protected_splats_are_in_all_levels_unchanged(absorb):
+    """60 of 576 are protected; the last level keeps 115 (115.2 rounds up to 116)."""
+    splats, protected = colourful(), np.arange(576) % 10 == 3
+
+    for level in lod(splats, cameras(), Levels((0.5, 0.2), absorb=absorb), protected=protected):
+        assert level.keep[protected].all()
+        there = protected[level.keep]
+        wanted = splats.take(protected)
+        found = level.splats.take(there)
+        assert equal(found, joined_in_double(wanted) if absorb else wanted)
+    assert len(level.splats) == 116
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("absorb", [True, False])
+def test_levels_by_psnr_lie_near_it(absorb):
+    """Deleting keeps at least it by the curve; absorbing comes as near as prune does, .7 dB.
+
+    Between the shares of the curve, straight lines are off by some tenths on so small a scene.
+    """
+    splats, views = read_ply(ROOM / "point_cloud.ply").splats(), read_cameras(ROOM / "cameras.json")
+    splats, views = splats.take(slice(0, None, 8)), views.take(range(0, 72, 6))
+
+    levels = lod(splats, views, Levels(psnr=(34.0, 28.0), absorb=absorb))
+
+    assert levels[0].psnr == pytest.approx(34.0, abs=1.0)
+    assert levels[1].psnr == pytest.approx(28.0, abs=1.0)
+    assert len(levels[1].splats) < len(levels[0].splats) < len(splats)
+
+
+@pytest.mark.slow
+def test_the_psnr_of_a_level_is_against_the_original():
+    """The estimate of the second level is that of its splats against all, not against the first."""
+    splats, views = colourful(), cameras()
+    levels = lod(splats, views, Levels((0.5, 0.2)))
+    sights = pipeline.score(splats, views, Settings("occlusion")).sights
+
+    assert levels[1].psnr == pytest.approx(sights.against(levels[1].splats, views), abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("given", "word"),
+    [
+        ({}, "got none"),
+        ({"shares": (0.5,), "psnr": (40.0,)}, "got both"),
+        ({"shares": (1.0,)}, "less than 1"),
+        ({"shares": (0.5, 0.0)}, "more than 0"),
+        ({"shares": (math.nan,)}, "level is nan"),
+        ({"shares": (0.25, 0.5)}, "0.5 comes after 0.25"),
+        ({"shares": (0.5, 0.5)}, "expected less"),
+        ({"psnr": (30.0, 40.0)}, "40.0 comes after 30.0"),
+        ({"psnr": (100.0,)}, "less than 100 dB"),
+        ({"shares": tuple(0.9**k for k in range(1, 18))}, "at most 16"),
+    ],
+)
+def test_levels_that_cannot_be_are_refused(given, word):
+    """Shares lie between 0 and 1, PSNR between 0 and 100 dB; both fall."""
+    with pytest.raises(RefineError, match=word):
+        Levels(**given)
+
+
+def test_one_splat_stays_at_least():
+    """.001 of 5 splats are none, but a level without any is no level."""
+    assert Levels((0.5, 0.001)).budgets(5) == [Budget(keep=3), Budget(keep=1)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("absorb", [True, False])
+def test_progress_only_rises_and_can_cancel(absorb):
+    """From 0 to 1, whatever the level; False ends it."""
+    told, levels = [], Levels((0.5, 0.2), absorb=absorb)
+    lod(colourful(), cameras(), levels, progress=lambda f, _: told.append(f))
+
+    assert told == sorted(told)
+    assert 0.0 <= told[0] < 0.05
+    assert 0.95 < told[-1] <= 1.0
+    with pytest.raises(Cancelled):
+        lod(colourful(), cameras(), levels, progress=lambda f, _: f < 0.5)
+
+
+def looking(splats, size=96, focal=400.0):
+    """Return a lookout of one view straight at the wall, 4 away."""
+    half = size / 2
+    view = View(np.eye(3), np.zeros(3), focal, focal, half, half, size, size, name="a")
+    return Lookout(splats, ViewSet((view,)))
+
+
+def test_the_distance_is_that_of_what_is_seen():
+    """The image of 96 px at f = 400 shows .96 of the wall at z = 4: 4 to 4.06 away."""
+    assert looking(colourful()).distance == pytest.approx(4.03, abs=0.03)
+
+
+def test_the_geometric_error_is_the_width_of_what_changed():
+    """A veil of standard deviation .5 before the wall: 1 wide, so under a pixel from 400 on."""
+    splats = joined(colourful(), made([[0.0, 0.0, 3.0]], 0.5, 0.5, 0.2))
+    lookout, keep = looking(splats), np.arange(577) < 576
+
+    reach = lookout.reach(splats.take(keep), keep)
+
+    assert reach.error == pytest.approx(1.0, rel=1e-6)
+    assert reach.pixel == pytest.approx(400.0, rel=1e-6)
+
+
+def test_a_survivor_that_grew_counts_as_wide_as_it_is():
+    """The veil stays, but became twice as wide: 2."""
+    splats = joined(colourful(), made([[0.0, 0.0, 3.0]], 0.5, 0.5, 0.2))
+    level = joined(colourful(), made([[0.0, 0.0, 3.0]], 1.0, 0.5, 0.2))
+
+    reach = looking(splats).reach(level, np.ones(577, np.bool_), np.arange(577) == 576)
+
+    assert reach.error == pytest.approx(2.0, rel=1e-6)
+
+
+def test_what_makes_up_a_hundredth_is_overlooked():
+    """The same veil with opacity .005 makes up less than a hundredth of any pixel."""
+    splats = joined(colourful(), made([[0.0, 0.0, 3.0]], 0.5, 0.005, 0.2))
+    keep = np.arange(577) < 576
+
+    assert looking(splats).reach(splats.take(keep), keep).error == 0.0
+
+
+def test_an_even_change_is_seen_from_any_distance():
+    """All splats .1 darker: every pixel by .097 to .1, as the wall lets 3 % through at most.
+
+    That is 20 to 20.3 dB, however many pixels are averaged.
+    """
+    splats = wall()
+    darker = replace(splats, sh_dc=splats.sh_dc - np.float32(0.1 / 0.28209479))
+
+    reach = looking(splats).reach(darker, np.ones(576, np.bool_))
+
+    psnr = [value for _, value in reach.psnr]
+    assert psnr == pytest.approx([psnr[0]] * 5, abs=0.001)
+    assert 20.0 < psnr[0] < 20.3
+    far = [step for step, _ in reach.psnr]
+    assert far == pytest.approx([far[0] * k for k in (1, 2, 4, 8, 16)])
+
+
+def test_a_change_that_evens_out_fades_with_the_distance():
+    """Pixels alternately .1 up and down: 20 dB from near, nothing in squares of 2 and more."""
+    change = np.where(np.indices((32, 32)).sum(axis=0) % 2, 0.1, -0.1)[None] * np.ones((3, 1, 1))
+
+    found = [distance._psnr(change, size) for size in distance.FACTORS]
+
+    assert found == pytest.approx([20.0, 100.0, 100.0, 100.0, 100.0])
+
+
+def test_small_pictures_are_looked_at_whole():
+    """15 columns are fewer than one square of 16; 200 hold four, evenly spread."""
+    assert distance._patches(15).tolist() == list(range(15))
+    columns = distance._patches(200)
+    assert len(np.unique(columns)) == 64
+    assert columns[[0, 16, 32, 48]].tolist() == [17, 67, 117, 167]
+    assert columns[-1] == 182
+
+
+def test_where_the_views_see_too_little_no_distance_is_said():
+    """An image of 10 x 10 has 100 lines, fewer than the 256 that an estimate needs."""
+    reach = looking(colourful(), size=10).reach(colourful(), np.ones(576, np.bool_))
+
+    assert reach.psnr == ()
+    assert reach.within(10.0) is None
+
+
+def test_files_of_levels_and_a_manifest_are_written(tmp_path):
+    """The bytes of kept rows are the source's; the manifest says what the report says."""
+    source = file_of(colourful(), tmp_path / "a.ply")
+    out = tmp_path / "out"
+
+    done = lod_file(source, out, cameras(2), DELETED, QUICK)
+
+    assert sorted(path.name for path in out.iterdir()) == ["a.lod1.ply", "a.lod2.ply", "lod.json"]
+    told = json.loads((out / "lod.json").read_text())
+    assert {name: done[name] for name in told} == told
+    assert next(iter(told)) == "lod"
+    assert [entry["splats"] for entry in told["levels"]] == [288, 144]
+    for entry in told["levels"]:
+        assert (out / entry["file"]).stat().st_size == entry["bytes"]
+    rows = read_ply(source).rows
+    wanted = prune(colourful(), cameras(2), Budget(ratio=0.75), QUICK).keep
+    np.testing.assert_array_equal(read_ply(out / "a.lod2.ply").rows, rows[wanted])
+
+
+@pytest.mark.slow
+def test_files_of_absorbed_levels_hold_the_survivors(tmp_path):
+    """In float32, rounded once."""
+    source = file_of(colourful(), tmp_path / "a.ply")
+    levels = lod(read_ply(source).splats(), cameras(), Levels((0.5, 0.25)))
+
+    lod_file(source, tmp_path, cameras(), Levels((0.5, 0.25)))
+
+    written = read_ply(tmp_path / "a.lod2.ply").splats()
+    np.testing.assert_array_equal(written.means, levels[1].splats.means.astype(np.float32))
+    np.testing.assert_array_equal(
+        written.opacity_logits, levels[1].splats.opacity_logits.astype(np.float32)
+    )
+
+
+@pytest.mark.parametrize("suffix", [".splat", ".glb", ".compressed.ply"])
+def test_levels_are_written_in_any_format(tmp_path, suffix):
+    """As many splats, in a file that is read by its content, with what the format loses noted."""
+    source = file_of(colourful(), tmp_path / "a.ply")
+    levels = Levels((0.5,), absorb=False)
+
+    done = lod_file(source, tmp_path, cameras(2), levels, QUICK, suffix=suffix)
+
+    assert done["levels"][0]["file"] == f"a.lod1{suffix}"
+    assert len(read_splats(tmp_path / f"a.lod1{suffix}")) == 288
+    assert any(suffix in note for note in done["notes"])
+
+
+@pytest.mark.parametrize("name", ["a.lod2.ply", "lod.json"])
+def test_no_file_is_replaced_unless_told(tmp_path, name):
+    """Said before any work, and nothing else is written."""
+    source = file_of(colourful(), tmp_path / "a.ply")
+    (tmp_path / name).write_text("mine")
+
+    with pytest.raises(RefineError, match="exists already"):
+        lod_file(source, tmp_path, cameras(), Levels((0.5, 0.25)))
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["a.ply", name])
+    lod_file(source, tmp_path, cameras(2), DELETED, QUICK, overwrite=True)
+    assert (tmp_path / name).read_bytes()[:4] != b"mine"
+
+
+def failing_second(monkeypatch, error):
+    """Let the second file that is written raise."""
+    whole, calls = SplatFile.write, []
+
+    def write(self, *rest, **named):
+        calls.append(1)
+        if len(calls) == 2:
+            raise error
+        return whole(self, *rest, **named)
+
+    monkeypatch.setattr(SplatFile, "write", write)
+
+
+@pytest.mark.parametrize("error", [RefineError("no space"), KeyboardInterrupt()])
+def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, monkeypatch, error):
+    """The folder that was made for them goes too."""
+    source = file_of(colourful(), tmp_path / "a.ply")
+    failing_second(monkeypatch, error)
+
+    with pytest.raises(type(error)):
+        lod_file(source, tmp_path / "out", cameras(2), DELETED, QUICK)
+
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_no_manifest_lists_levels_of_two_runs(tmp_path, monkeypatch):
+    """Where replacing fails at the second level, the first is replaced and the manifest is gone."""
+    source = file_of(colourful(), tmp_path / "a.ply")
+    lod_file(source, tmp_path, cameras(2), DELETED, QUICK)
+    failing_second(monkeypatch, RefineError("no space"))
+
+    with pytest.raises(RefineError):
+        lod_file(source, tmp_path, cameras(2), DELETED, QUICK, overwrite=True)
+
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["a.lod1.ply", "a.lod2.ply", "a.ply"]
+
+
+@pytest.mark.parametrize("goal", [0.0, 100.0, math.nan])
+def test_a_distance_for_no_psnr_is_refused(tmp_path, goal):
+    """Before anything is read: there is no such file."""
+    with pytest.raises(RefineError, match="PSNR for a distance"):
+        lod_file(tmp_path / "a.ply", tmp_path, cameras(), Levels((0.5,)), goal=goal)
