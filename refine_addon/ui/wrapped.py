@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 _TAKEN = 52
 """Pixels of a sidebar at scale 1 that are not text: margins, tabs, scroll bar."""
 
-_ICON = 20
-"""Pixels of an icon and its gap, at scale 1."""
+_ICON = 30
+"""Pixels that an icon and the gaps around it take of a line, at scale 1."""
 
 _USUAL = 280
 """Pixels that the sidebar has where nothing tells, which is its default at scale 1."""

@@ -46,7 +46,7 @@ def test_score_apply_undo_and_preview_by_hand(binary: Binary, blend: Path):
     assert priced["chart"]
     assert priced["images"] == 0
     assert sliding["percent"] == slid["percent"] > 55.0
-    assert sliding["marked"] == priced["marked"] == 19_877
+    assert priced["marked"] == 19_877
     assert slid["marked"] == math.floor(Fraction(str(slid["ratio"])) * 39_755)
     assert sliding["sentence"] == slid["sentence"] != priced["sentence"]
     assert f"Keeps {39_755 - slid['marked']:,} of" in slid["sentence"]

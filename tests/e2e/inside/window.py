@@ -55,7 +55,7 @@ def main(name: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
     found["priced"] = price(name)
     yield from hand.slide("refine.percent", 60)
     found["sliding"] = price(name)
-    yield from until(lambda: price(name)["marked"] != found["priced"]["marked"], "marks follow")
+    yield from until(lambda: price(name)["rested"], "marks follow")
     yield from picture(pictures, "2-slid")
     found["slid"] = price(name)
     bpy.context.scene.refine.percent = 50.0
@@ -98,6 +98,7 @@ def price(name: str) -> dict[str, Any]:
         "percent": settings.percent,
         "ratio": settings.to_budget().ratio,
         "sentence": ui.plans.sentence(plan, absorb=settings.absorb) if plan else "",
+        "rested": bool(plan) and plan.get("marked", True),
         "marked": sum(mark.value for mark in marks),
         "chart": ui.price.shows(obj.data) and ui.price.icon() > 0,
         "images": len([image for image in bpy.data.images if image.users]),
