@@ -8,6 +8,8 @@ from bpy.props import FloatProperty, PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
+from .ui import camera_list, kept, plans, price
+from .ui.camera_list import REFINE_PT_camera_list, REFINE_UL_cameras, RefineCamera
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
 from .ui.operators import (
@@ -35,6 +37,7 @@ from .viewport import draw
 from .webp import BlenderImages
 
 CLASSES = (
+    RefineCamera,
     RefineSettings,
     REFINE_OT_import_ply,
     REFINE_OT_import_cameras,
@@ -51,6 +54,8 @@ CLASSES = (
     REFINE_FH_ply,
     REFINE_PT_splats,
     REFINE_PT_cameras,
+    REFINE_UL_cameras,
+    REFINE_PT_camera_list,
     REFINE_PT_floaters,
     REFINE_PT_score,
     REFINE_PT_advanced,
@@ -73,6 +78,9 @@ def register() -> None:
     bpy.types.WindowManager.refine_progress = FloatProperty(default=-1.0, options={"SKIP_SAVE"})
     bpy.types.TOPBAR_MT_file_import.append(_draw_import)
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
+    camera_list.register()
+    kept.register()
+    price.register()
     images.use(BlenderImages())
     _commands.append(bpy.utils.register_cli_command("refine", _run_command))
 
@@ -82,6 +90,10 @@ def unregister() -> None:
     draw.stop()
     bpy.utils.unregister_cli_command(_commands.pop())
     images.use(None)
+    plans.unregister()
+    price.unregister()
+    kept.unregister()
+    camera_list.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)
     bpy.types.TOPBAR_MT_file_import.remove(_draw_import)
     del bpy.types.WindowManager.refine_progress

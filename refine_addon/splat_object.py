@@ -63,6 +63,21 @@ class Plan:
     bytes_before: int
     bytes_after: int
 
+    @classmethod
+    def of(cls, count: int, kept: int, row_bytes: int, fixed_bytes: int) -> Plan:
+        """Return what keeping so many of `count` splats does to a file.
+
+        Parameters
+        ----------
+        count, kept : int
+        row_bytes, fixed_bytes : int
+            What a splat takes in a file of all splats, and all else in it.
+        """
+        # The header says how many splats follow, in as many digits as that takes.
+        shorter = len(str(count)) - len(str(kept))
+        sizes = (fixed_bytes + row_bytes * count, fixed_bytes - shorter + row_bytes * kept)
+        return cls(kept, count - kept, *sizes)
+
 
 def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
     """Return an object's splats as they stand in the world, for scoring.
@@ -160,11 +175,17 @@ def plan(checked: SplatObject, budget: Budget, protect: str = "") -> Plan:
     RefineError
         See `stored_task`; also if nothing would stay, or the object is linked from a library.
     """
-    keep = keep_mask(checked, budget, protect)
+    keep = mark_removed(checked, stored_task(checked, budget, protect))
+    return _plan(checked, keep)
+
+
+def mark_removed(checked: SplatObject, task: Task) -> NDArray[np.bool_]:
+    """Mark the splats that a task (`stored_task`) removes; return which stay, (N,)."""
+    keep = pipeline.decide(task).keep
     mesh_edit.check_writable(checked.obj)
     mesh_attributes.write_attribute(checked.mesh, mesh_edit.REMOVE, "BOOLEAN", ~keep)
     mesh_attributes.updated(checked.mesh)
-    return _plan(checked, keep)
+    return keep
 
 
 def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
@@ -390,12 +411,8 @@ def _file_size(checked: SplatObject, budget: Budget, output: Path | None) -> tup
 
 
 def _plan(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:
-    row_bytes, fixed_bytes = mesh_attributes.file_size(checked)
     kept = int(np.count_nonzero(keep))
-    # The header says how many splats follow, in as many digits as that takes.
-    shorter = len(str(len(keep))) - len(str(kept))
-    sizes = (fixed_bytes + row_bytes * len(keep), fixed_bytes - shorter + row_bytes * kept)
-    return Plan(kept, len(keep) - kept, *sizes)
+    return Plan.of(len(keep), kept, *mesh_attributes.file_size(checked))
 
 
 def _world_columns(checked: SplatObject) -> dict[str, NDArray[Any]]:

@@ -39,6 +39,7 @@ MUTANTS = {
     "frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
         ("(near if np.ptp(near) > 0.0 else near[0, 0])", "0.0", "near plane ignored"),
+        ("between & (beyond <= 0.0)", "between", "counted beside the image"),
         ("between &= depth <= far", "between &= depth < far", "far plane excluded"),
         ("np.hypot(1.0, slope)", "slope", "reach along the image only"),
         ("view.cx - view.width / 2", "view.width / 2 - view.cx", "shift mirrored"),
@@ -73,6 +74,8 @@ MUTANTS = {
         ("count - 1)[count - 1]", "count)[count]", "off by one"),
         ("free & (values < edge)", "(values < edge)", "protection forgotten"),
         ("Fraction(repr(float(self.ratio)))", "self.ratio", "binary ratio"),
+        ("count = min(count or 0, len(self._values))", "count = count or 0", "protected counted"),
+        ("self._seen = np.sort(scores.seen[free])", "self._seen = scores.seen", "not in order"),
     ],
     "splats.py": [
         ("w, x, y, z = np", "x, y, z, w = np", "quaternion order"),

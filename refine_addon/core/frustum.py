@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from .work import Progress, for_chunks, silent
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
 
 _STACK = 16
 """Rows of one matrix product: so few that BLAS starts no threads, which would slow down ours."""
+
+_POINTS = 4096
+"""Points that are counted at a time: what is known of them in all views stays in the caches."""
 
 _STEEPEST = 1e100
 """Limit of a focal length over half the image: its product with any length can be squared."""
@@ -156,6 +161,47 @@ class Frustums:
         if held is None or held.size < size:
             held = self._own.memory = np.empty(size)
         return held[:size].reshape(shape)
+
+
+def census(
+    points: NDArray[np.floating[Any]],
+    views: ViewSet,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> NDArray[np.int64]:
+    """Return how many of N points lie in each of V views, (V,); those not finite lie in none.
+
+    Parameters
+    ----------
+    points : (N, 3) floating
+        World units.
+    views : ViewSet
+        A view without a near plane of its own begins at its centre.
+    progress : callable, optional
+        ``progress(fraction, what)``; returning ``False`` cancels.
+    threads : int, optional
+
+    Raises
+    ------
+    Cancelled
+        If `progress` answers ``False``.
+    """
+    origin = views.middle()[0]
+    frustums = Frustums(views, origin, float(np.finfo(np.float64).tiny))
+    found = np.zeros((-(-len(points) // _POINTS), len(views)), np.int64)
+
+    def work(piece: slice) -> None:
+        local = np.ones((4, min(piece.stop, len(points)) - piece.start))
+        with np.errstate(invalid="ignore", over="ignore", under="ignore"):
+            local[:3] = (points[piece] - origin).T
+            local[:, ~np.isfinite(local).all(axis=0)] = np.nan
+            _, beyond, between = frustums.project(local, slice(0, len(views)))
+            inside = between & (beyond <= 0.0)
+        found[piece.start // _POINTS] = np.count_nonzero(inside, axis=1)
+
+    for_chunks(work, len(points), _POINTS, progress=progress, what="counting", threads=threads)
+    return np.asarray(found.sum(axis=0))
 
 
 def _rows(views: ViewSet, centers: NDArray[np.float64]) -> NDArray[np.float64]:

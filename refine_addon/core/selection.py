@@ -196,23 +196,109 @@ def select(
     values = scores.values
     keep = np.ones(len(values), np.bool_)  # (N,), as `free`
     free = np.ones(len(values), np.bool_) if protected is None else ~protected
-    removals = budget.removals(len(values), row_bytes, fixed_bytes)
-    if budget.psnr is not None:
-        removals = math.floor(quality_of(scores).share(budget.psnr) * len(values))
+    removals = _removals(scores, budget, row_bytes, fixed_bytes)
     if budget.threshold is not None:
         keep[free & (values < budget.threshold)] = False
     elif budget.min_seen is not None:
-        # In exact fractions: a splat that lies in 16 of 64 views lies in 25 % of them, and stays.
-        least = Fraction(repr(float(budget.min_seen))) * scores.views_used / 100
-        keep[free & (scores.seen < math.ceil(least))] = False
+        keep[free & (scores.seen < _least_seen(budget.min_seen, scores.views_used))] = False
     elif removals:
         _remove_lowest(keep, values, free, min(removals, int(np.count_nonzero(free))))
     elif removals is None:
         _remove_until_fitting(keep, values, free, budget, np.asarray(row_bytes), fixed_bytes)
-    if not keep.any():
-        msg = f"{budget.kind} would remove all {len(values)} splats; nothing was removed"
-        raise RefineError(msg)
+    _refuse_none_left(budget, len(values), int(np.count_nonzero(keep)))
     return keep
+
+
+class Tally:
+    """How many splats `select` removes, for budget after budget: a search in what is sorted once.
+
+    Parameters
+    ----------
+    scores : Scores
+    protected : (N,) bool, optional
+        Splats that are not removed.
+
+    Attributes
+    ----------
+    scores : Scores
+
+    Examples
+    --------
+    >>> from refine_addon.core.scores import Scores
+    >>> values, seen = np.array([0.5, 0.1, 0.9], np.float32), np.array([1, 0, 2], np.int32)
+    >>> tally = Tally(Scores(values, seen, views_used=2, undrawable=0))
+    >>> tally.removed(Budget(threshold=0.6)), tally.removed(Budget(keep=2))
+    (2, 1)
+    """
+
+    def __init__(self, scores: Scores, protected: NDArray[np.bool_] | None = None) -> None:
+        self.scores, self._protected = scores, protected
+        free = slice(None) if protected is None else ~protected
+        self._values = np.sort(scores.values[free])
+        self._seen = np.sort(scores.seen[free])
+
+    def is_of(self, scores: Scores, protected: NDArray[np.bool_] | None = None) -> bool:
+        """Tell whether scores and what is protected are equal to those it was made of."""
+        pairs = (
+            (scores.values, self.scores.values),
+            (scores.seen, self.scores.seen),
+            (protected, self._protected),
+        )
+        return all(
+            one is other if one is None or other is None else np.array_equal(one, other)
+            for one, other in pairs
+        )
+
+    def removed(self, budget: Budget, row_bytes: float = 0.0, fixed_bytes: int = 0) -> int:
+        """Return how many splats a budget removes.
+
+        Parameters
+        ----------
+        budget : Budget
+        row_bytes, fixed_bytes
+            See `Budget.removals`; all rows are equally long.
+
+        Raises
+        ------
+        RefineError
+            See `select`.
+        """
+        scores = self.scores
+        budget.refuse_meaningless(scores.method, frustum=scores.frustum)
+        count = _removals(scores, budget, row_bytes, fixed_bytes)
+        if budget.threshold is not None:
+            with np.errstate(over="ignore"):  # beyond the range of float32 all splats are below
+                count = int(np.searchsorted(self._values, np.float32(budget.threshold)))
+        elif budget.min_seen is not None:
+            least = _least_seen(budget.min_seen, scores.views_used)
+            count = int(np.searchsorted(self._seen, least))
+        count = min(count or 0, len(self._values))
+        _refuse_none_left(budget, len(scores.values), len(scores.values) - count)
+        return count
+
+
+def _removals(scores: Scores, budget: Budget, row_bytes: RowBytes, fixed_bytes: int) -> int | None:
+    """Return how many splats a budget removes, of those with the lowest scores.
+
+    None where each splat's score, number of views or length of row tells whether it goes.
+    """
+    if budget.psnr is not None:
+        return math.floor(quality_of(scores).share(budget.psnr) * len(scores.values))
+    return budget.removals(len(scores.values), row_bytes, fixed_bytes)
+
+
+def _least_seen(percentage: float, views: int) -> int:
+    """Return in how many of the views a splat must lie to stay.
+
+    In exact fractions: a splat that lies in 16 of 64 views lies in 25 % of them, and stays.
+    """
+    return math.ceil(Fraction(repr(float(percentage))) * views / 100)
+
+
+def _refuse_none_left(budget: Budget, before: int, after: int) -> None:
+    if not after:
+        msg = f"{budget.kind} would remove all {before} splats; nothing was removed"
+        raise RefineError(msg)
 
 
 def quality_of(scores: Scores) -> Quality:

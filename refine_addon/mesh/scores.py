@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,6 +35,7 @@ def store(
     scores: Scores,
     settings: Settings,
     origin: dict[str, Any] | None = None,
+    cameras: list[tuple[str, int]] | None = None,
 ) -> None:
     """Write scores to the attributes of an object's mesh, and note how they came to be.
 
@@ -44,6 +46,8 @@ def store(
         What `core.pipeline.score` gave, and was given.
     origin : dict, optional
         See `staleness.origin`.
+    cameras : list of (str, int), optional
+        Name of each view given, and how many splats lie in it.
 
     Raises
     ------
@@ -76,6 +80,7 @@ def store(
             "notes": scores.notes,
             "quality": scores.quality.facts() if scores.quality else None,
             "origin": origin,
+            "cameras": cameras,
         }
     )
     mesh_attributes.updated(mesh)
@@ -84,10 +89,22 @@ def store(
 def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
     """Return how a mesh was scored, None if it was not."""
     try:
-        noted = json.loads(mesh[RECORD])
-        complete = noted.keys() >= {"splats", "settings", "views_given", "views_used"}
+        return _parsed(mesh[RECORD])
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
+
+
+@lru_cache(maxsize=4)
+def _parsed(text: str) -> dict[str, Any] | None:
+    """Return a note as values, which nobody may change: it is asked for whenever a panel is drawn.
+
+    Raises
+    ------
+    TypeError, ValueError, AttributeError
+        If it is none.
+    """
+    noted = json.loads(text)
+    complete = noted.keys() >= {"splats", "settings", "views_given", "views_used"}
     return noted if complete else None
 
 

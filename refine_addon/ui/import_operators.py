@@ -20,6 +20,7 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
 from ..viewport import draw
 from .on_thread import FAILURES, Answer, described, fail
+from .wrapped import counted
 
 FILE_NAMES = ";".join(f"*{suffix}" for suffix in SUFFIXES)
 """What a file browser shows."""
@@ -82,7 +83,7 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
         if not bpy.app.background:
             draw.show("SCENE")
         count = sum(len(obj.data.vertices) for obj in imported)
-        self.report({"INFO"}, f"Imported {count:,} splats from {len(imported)} file(s)")
+        self.report({"INFO"}, f"Imported {count:,} splats from {counted(len(imported), 'file')}")
         return {"FINISHED"}
 
     def _paths(self) -> list[Path]:
@@ -152,7 +153,7 @@ class REFINE_OT_import_cameras(_InObjectMode, bpy.types.Operator, ImportHelper):
             scene.render.resolution_percentage = 100
         if views.note:
             self.report({"WARNING"}, views.note)
-        self.report({"INFO"}, f"Imported {len(views)} cameras into '{collection.name}'")
+        self.report({"INFO"}, f"Imported {counted(len(views), 'camera')} into '{collection.name}'")
         return {"FINISHED"}
 
 

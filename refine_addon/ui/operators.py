@@ -6,7 +6,9 @@ Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* 
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -16,11 +18,12 @@ from bpy_extras.io_utils import ExportHelper
 
 from .. import level_objects, splat_object
 from ..cameras.sets import views_from_scene
-from ..core import pipeline
+from ..core import frustum, pipeline
 from ..core.formats.registry import FORMATS, SUFFIXES, Packed
 from ..core.levels.lod import Level, Levels, lod
 from ..core.quality import in_words
 from ..core.report import scoring_notes
+from ..core.work import part
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
@@ -29,6 +32,7 @@ from ..viewport import draw
 from . import plans, preview, staleness
 from .import_operators import FILE_NAMES
 from .on_thread import FAILURES, Answer, OnThread, fail
+from .wrapped import counted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -90,6 +94,16 @@ def chosen_views(context: bpy.types.Context) -> ViewSet:
     )
 
 
+def _new_name(obj: bpy.types.Object) -> str:
+    """Return a name for an export that no file beside the .blend has yet."""
+    mesh = obj.data
+    pruned = mesh_scores.RANK in mesh.attributes and mesh_scores.record(mesh) is None
+    name = f"{obj.name}_{'pruned' if pruned else 'copy'}"
+    names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
+    folder = Path(bpy.path.abspath("//"))  # where the file browser starts
+    return next(f"{new}.ply" for new in names if not (folder / f"{new}.ply").exists())
+
+
 @dataclass(frozen=True, eq=False)
 class _Scoring:
     """What is to be scored, by which views and how; where all of it stood (`staleness.origin`)."""
@@ -119,23 +133,33 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         return _Scoring(splats, views, settings, quality, origin)
 
     @staticmethod
-    def work(job: _Scoring, progress: Progress) -> Scores:
-        """Score."""
-        return pipeline.score(
-            job.splats, job.views, job.settings, quality=job.quality, progress=progress
+    def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
+        """Score, and count how many splats lie in each view."""
+        ahead = part(progress, 0.0, 0.97)
+        scores = pipeline.score(
+            job.splats, job.views, job.settings, quality=job.quality, progress=ahead
         )
+        ahead = part(progress, 0.97, 1.0)
+        return scores, frustum.census(job.splats.means, job.views, progress=ahead)
 
     def finish(
-        self, context: bpy.types.Context, checked: SplatObject, job: _Scoring, scores: Scores
+        self,
+        context: bpy.types.Context,
+        checked: SplatObject,
+        job: _Scoring,
+        found: tuple[Scores, NDArray[np.int64]],
     ) -> Answer:
         """Store the scores on the mesh and say what came of it."""
-        mesh_scores.store(checked, scores, job.settings, job.origin)
+        scores, counts = found
+        names = [view.name for view in job.views]
+        cameras = list(zip(names, counts.tolist(), strict=True))
+        mesh_scores.store(checked, scores, job.settings, job.origin, cameras)
         plans.refresh(context)
         unseen = int((scores.seen == 0).sum())
         self.report(
             {"INFO"},
             f"Scored {len(scores.values):,} splats by {scores.views_used} of "
-            f"{scores.views_given} views; {unseen:,} lie in none",
+            f"{counted(scores.views_given, 'view')}; {unseen:,} lie in none",
         )
         for note in (*scoring_notes(scores), *splat_object.modifier_notes(checked.obj)):
             self.report({"WARNING"}, note)
@@ -197,14 +221,14 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
         done = splat_object.apply_object(checked, result)
         plans.forget(checked.mesh)
         psnr = result.report["estimated_psnr"]
+        if result.absorbed:
+            self.report({"INFO"}, result.absorbed.note())
         self.report(
             {"INFO"},
             f"Kept {done.kept:,} splats, removed {done.removed:,}: "
             f"{done.bytes_before / 1e6:,.1f} -> {done.bytes_after / 1e6:,.1f} MB"
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
-        if result.absorbed:
-            self.report({"WARNING"}, result.absorbed.note())
         if changed:
             self.report(
                 {"WARNING"},
@@ -401,7 +425,7 @@ class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Ask for the file; whoever picks an existing one in the browser means to replace it."""
         if not self.filepath:
-            self.filepath = f"{context.object.name}.ply"
+            self.filepath = _new_name(context.object)
         self.overwrite = True
         return super().invoke(context, event)
 

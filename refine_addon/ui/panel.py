@@ -3,7 +3,7 @@
 # ruff: noqa: N801, RUF012 - Blender's way to name classes and set options
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import bpy
 
@@ -14,9 +14,10 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
 from ..viewport import draw as viewport_draw
-from . import plans, preview, staleness
+from . import kept, plans, preview, price, staleness, wrapped
 from .properties import FLOATERS
 from .view_operators import MODES
+from .wrapped import counted
 
 if TYPE_CHECKING:
     from .properties import RefineSettings
@@ -44,12 +45,12 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         if not mesh_layout.looks_like_splats(obj):
             lost = obj is not None and native.lost_base(obj)
             text = "Colours were lost: open it in Blender 5.2" if lost else _NONE
-            layout.label(text=text, icon="ERROR" if lost else "INFO")
+            wrapped.label(layout, context, text, icon="ERROR" if lost else "INFO")
             return
         count = mesh_layout.splat_count(obj.data)
         layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
         layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
-        size = mesh_layout.export_bytes(obj)
+        size = kept.answer("bytes", context, lambda: mesh_layout.export_bytes(obj))
         if size is not None:
             layout.label(text=f"{size / 1e6:,.1f} MB")
         layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
@@ -73,8 +74,8 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
         if settings.source == "FRAMES":
             _draw_frames(layout, settings, context.scene)
         elif settings.source != "ACTIVE":
-            cameras = chosen_cameras(context, settings.source, settings.collection)
-            layout.label(text=f"{len(cameras)} cameras", icon="CAMERA_DATA")
+            count = kept.answer("cameras", context, lambda: len(_cameras(context)))
+            layout.label(text=counted(count, "camera"), icon="CAMERA_DATA")
 
 
 class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
@@ -129,15 +130,15 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         obj = context.object
         record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
         if record:
-            layout.label(
-                text=f"Scored by {record['views_used']} of {record['views_given']} views",
-                icon="CHECKMARK",
-            )
-            changed = staleness.changes(context, obj)
+            views = counted(record["views_given"], "view")
+            layout.label(text=f"Scored by {record['views_used']} of {views}", icon="CHECKMARK")
+            question = ("changes", obj.data.get(mesh_scores.RECORD))
+            changed = kept.answer(question, context, lambda: staleness.changes(context, obj))
             if changed:
-                layout.label(text=f"Score again: {', '.join(changed)}", icon="ERROR")
+                text = f"Score again: {', '.join(changed)}"
+                wrapped.label(layout, context, text, icon="ERROR")
         elif mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes:
-            layout.label(text="Applied: score again for more", icon="INFO")
+            wrapped.label(layout, context, "Applied: score again for more", icon="INFO")
 
 
 class REFINE_PT_advanced(_InSidebar, bpy.types.Panel):
@@ -206,12 +207,13 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         column.use_property_split = True
         column.use_property_decorate = False
         column.prop(settings, "budget")
-        column.prop(settings, settings.budget)
+        column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
         column.prop(settings, "protect")
         column.prop(settings, "absorb")
         obj = context.object
-        if mesh_layout.looks_like_splats(obj) and mesh_scores.record(obj.data):
-            _draw_plan(layout, obj, settings)
+        record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        if record:
+            _draw_plan(layout, context, record)
         progress = context.window_manager.refine_progress
         if progress >= 0.0:
             layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
@@ -245,7 +247,7 @@ def _draw_frames(
         column.prop(settings, "frame_start")
         column.prop(settings, "frame_end")
     layout.prop(settings, "frame_step")
-    layout.label(text=f"{len(settings.to_frames(scene))} frames", icon="CAMERA_DATA")
+    layout.label(text=counted(len(settings.to_frames(scene)), "frame"), icon="CAMERA_DATA")
 
 
 def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> None:
@@ -267,17 +269,31 @@ def _has(obj: bpy.types.Object | None, attribute: str) -> bool:
     return obj is not None and attribute in obj.data.attributes
 
 
-def _draw_plan(layout: bpy.types.UILayout, obj: bpy.types.Object, settings: RefineSettings) -> None:
+def _cameras(context: bpy.types.Context) -> list[bpy.types.Object]:
+    settings = context.scene.refine
+    return chosen_cameras(context, settings.source, settings.collection)
+
+
+def _draw_plan(
+    layout: bpy.types.UILayout, context: bpy.types.Context, record: dict[str, Any]
+) -> None:
+    obj, settings = context.object, context.scene.refine
+    plans.ask(context, obj)
+    if price.shows(obj.data):
+        header, body = layout.panel("REFINE_price")
+        header.label(text="Price")
+        if body:
+            row = body.row()
+            row.alignment = "CENTER"
+            row.template_icon(icon_value=price.icon(), scale=price.WIDTH)
     plan = plans.stored(obj, settings)
     if plan is None:
         layout.operator("refine.plan", icon="FILE_REFRESH")
     elif "error" in plan:
-        layout.label(text=plan["error"], icon="ERROR")
+        wrapped.label(layout, context, plan["error"], icon="ERROR")
     else:
-        gone = plan["bytes_before"] - plan["bytes_after"]
-        column = layout.column(align=True)
-        column.label(
-            text=f"Stay: {plan['kept']:,} splats, {plan['bytes_after'] / 1e6:,.1f} MB",
-            icon="CHECKMARK",
-        )
-        column.label(text=f"Go: {plan['removed']:,} splats, {gone / 1e6:,.1f} MB", icon="TRASH")
+        wrapped.label(layout, context, plans.sentence(plan, absorb=settings.absorb))
+        if remark := plans.remark(plan, record):
+            wrapped.label(layout, context, remark, icon="INFO")
+        for warning in plans.warnings(plan, record):
+            wrapped.label(layout, context, warning, icon="ERROR")

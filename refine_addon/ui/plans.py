@@ -1,49 +1,145 @@
-"""What the budget of the panel would do, worked out when something changes, not when drawn."""
+"""What the budget of the panel would do, worked out when something changes, not when drawn.
+
+What a slider needs at once, the number of splats that stay and what they cost, is looked up in what
+is known of the last scoring (`_Known`). What takes longer at a million splats waits until the
+slider has come to rest (`refresh`): reading what is protected, marking what goes.
+"""
 
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
+
+import bpy
+import numpy as np
 
 from .. import splat_object
 from ..core.errors import RefineError
+from ..core.quality import in_words
+from ..core.selection import Tally, quality_of
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from . import camera_list, price
+from .chart import Place
 
 if TYPE_CHECKING:
-    import bpy
+    from ..core.quality import Quality
+    from ..core.task import Task
+    from .chart import Histogram
 
 PLAN = "refine_plan"
 """Custom property of the mesh: the last plan, or why there is none, as JSON."""
 
+MANY_UNSEEN = 0.05
+"""Share of the splats above which it is said that no view has them in its image."""
+
+REST = 0.2
+"""Seconds without a change after which a slider has come to rest."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What does not change while the budget does: of one object at one scoring.
+
+    Attributes
+    ----------
+    holds : tuple
+        What it depends on; see `_state`.
+    tally : Tally
+    row_bytes, fixed_bytes : int
+        See `Budget.removals`.
+    kinds : Histogram
+    unseen : int
+        Splats whose centre lies in none of the views.
+    """
+
+    holds: tuple[Any, ...]
+    tally: Tally
+    row_bytes: int
+    fixed_bytes: int
+    kinds: Histogram
+    unseen: int
+
+
+_known: list[_Known] = []
+"""One at most: that of the object that was looked at last."""
+
+_waiting: list[tuple[str, str]] = []
+"""Names of scene and object whose plan is to be made as soon as the slider rests; one at most."""
+
+_tried: list[tuple[Any, ...]] = []
+"""For what the panel last asked to have a plan made; one at most. Not each draw asks again."""
+
+
+def unregister() -> None:
+    """Forget all, and make no more plans."""
+    if bpy.app.timers.is_registered(_rested):
+        bpy.app.timers.unregister(_rested)
+    for kept in (_known, _waiting, _tried):
+        kept.clear()
+
 
 def key(settings: Any) -> str:  # noqa: ANN401 - RefineSettings, which imports this module
     """Return what a plan depends on, to tell whether a stored one still holds."""
-    return f"{settings.budget} {getattr(settings, settings.budget)!r} {settings.protect!r}"
+    budget = f"{settings.budget} {getattr(settings, settings.budget)!r} {settings.protect!r}"
+    return f"{budget} absorb" if settings.absorb else budget
+
+
+def changed(context: bpy.types.Context) -> None:
+    """Take in another budget: say at once what it comes to, and do the rest when it rests."""
+    obj = getattr(context, "object", None)  # not in every editor
+    if bpy.app.background:
+        refresh(context)
+    elif obj is not None and _can_have(obj):
+        at_once(context.scene, obj)
+        wait(context.scene, obj, REST)
+
+
+def at_once(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
+    """Store what the budget comes to, if enough is known of the object; nothing is marked yet."""
+    settings, mesh = scene.refine, obj.data
+    if not _known or _known[0].holds != _state(mesh, settings):
+        return
+    plan = _noted(_known[0], settings)
+    mesh[PLAN] = json.dumps(plan | {"marked": False})
+    price.move(mesh, _place(plan, settings))
 
 
 def refresh(context: bpy.types.Context) -> None:
-    """Work out the plan for the active object if it has scores, and store it on its mesh."""
-    obj = getattr(context, "object", None)  # not in every editor
-    if not mesh_layout.looks_like_splats(obj) or mesh_scores.record(obj.data) is None:
+    """Work out the plan for the active object if it has scores, store it, and mark what goes."""
+    obj = getattr(context, "object", None)
+    if obj is not None and _can_have(obj):
+        _refresh(context.scene, obj)
+
+
+def ask(context: bpy.types.Context, obj: bpy.types.Object) -> None:
+    """Have a plan and its chart made soon where they are missing; to be called when drawn."""
+    settings, mesh = context.scene.refine, obj.data
+    plan = stored(obj, settings)
+    drawn = price.shows(mesh) and price.fits(context.preferences)
+    if bpy.app.background or (plan and drawn and plan.get("marked", True)) or not _can_have(obj):
         return
-    if obj.mode == "EDIT" or obj.data.library or obj.library:
-        return
-    settings = context.scene.refine
-    noted: dict[str, Any] = {"key": key(settings), "splats": mesh_layout.splat_count(obj.data)}
-    try:
-        checked = mesh_layout.check(obj)
-        plan = splat_object.plan(checked, settings.to_budget(), settings.protect)
-        noted.update(vars(plan))
-    except RefineError as error:
-        noted["error"] = str(error)
-    obj.data[PLAN] = json.dumps(noted)
+    state = (*_state(mesh, settings), key(settings), price.look_of(context.preferences))
+    if _tried != [state] and not _waiting:
+        _tried[:] = [state]
+        wait(context.scene, obj, 0.0)
+
+
+def wait(scene: bpy.types.Scene, obj: bpy.types.Object, seconds: float) -> None:
+    """Have the plan of an object made after so long, unless another is asked for meanwhile."""
+    _waiting[:] = [(scene.name, obj.name)]
+    if bpy.app.timers.is_registered(_rested):
+        bpy.app.timers.unregister(_rested)
+    bpy.app.timers.register(_rested, first_interval=seconds)
 
 
 def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:  # noqa: ANN401
     """Return the stored plan if it is that of the current budget and mesh, else None."""
     try:
-        noted = json.loads(obj.data[PLAN])
+        noted = _read(obj.data[PLAN])
         count = mesh_layout.splat_count(obj.data)
         holds = noted["key"] == key(settings) and noted["splats"] == count
     except (KeyError, TypeError, ValueError):
@@ -55,3 +151,174 @@ def forget(mesh: bpy.types.Mesh) -> None:
     """Remove the stored plan."""
     if PLAN in mesh:
         del mesh[PLAN]
+
+
+def sentence(plan: dict[str, Any], *, absorb: bool) -> str:
+    """Return what a plan without an error comes to, as one sentence.
+
+    Parameters
+    ----------
+    plan : dict
+        See `stored`.
+    absorb : bool
+        Whether survivors absorb what goes.
+
+    Examples
+    --------
+    >>> plan = {"splats": 100, "kept": 50, "bytes_before": 5e6, "bytes_after": 2.5e6}
+    >>> sentence(plan | {"psnr": 38.2, "psnr_absorbed": 45.9}, absorb=False)
+    'Keeps 50 of 100, 2.5 of 5.0 MB, about 38 dB in these views (Absorb: about 46)'
+    """
+    text = (
+        f"Keeps {'about ' if plan.get('about') else ''}{plan['kept']:,} of {plan['splats']:,}, "
+        f"{plan['bytes_after'] / 1e6:,.1f} of {plan['bytes_before'] / 1e6:,.1f} MB"
+    )
+    if "psnr" not in plan:
+        return text
+    ways = [in_words(plan[name]) for name in ("psnr", "psnr_absorbed")]
+    here, other = ways[::-1] if absorb else ways
+    named = "without Absorb" if absorb else "Absorb"
+    return f"{text}, {here} in these views ({named}: {other.removesuffix(' dB')})"
+
+
+def remark(plan: dict[str, Any], record: dict[str, Any]) -> str:
+    """Return what else there is to say of a plan and of the note of the scoring, or ""."""
+    if "psnr" in plan:
+        return str(plan.get("remark", ""))
+    if record.get("method") == "closed-form":
+        return "Score with Auto, or with Quality as the budget, to see dB"
+    return "The views see too little to tell dB"
+
+
+def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
+    """Return what the cameras do not know, as far as it matters to a plan, in sentences.
+
+    Parameters
+    ----------
+    plan : dict
+        See `stored`.
+    record : dict
+        The note of the scoring.
+    """
+    found = []
+    if record["views_used"] == 1:
+        found.append("One camera decides: add others if the splats are seen from elsewhere too")
+    if text := camera_list.warning(record):
+        found.append(text)
+    unseen = plan.get("unseen", 0)
+    if unseen >= MANY_UNSEEN * plan["splats"]:
+        text = f"{unseen / plan['splats']:.0%} of the splats lie in no view"
+        if "unseen_gone" in plan:
+            text += f"; {plan['unseen_gone'] / unseen:.0%} of these go"
+        found.append(text)
+    return found
+
+
+def _can_have(obj: bpy.types.Object) -> bool:
+    """Tell whether an object can have a plan: it is scored, and may be written to."""
+    if not mesh_layout.looks_like_splats(obj) or mesh_scores.record(obj.data) is None:
+        return False
+    return obj.mode != "EDIT" and not obj.data.library and not obj.library
+
+
+def _rested() -> None:
+    """Make the plan that is waited for; Blender's timer calls it once."""
+    for scene_name, name in _waiting:
+        scene, obj = bpy.data.scenes.get(scene_name), bpy.data.objects.get(name)
+        if scene is not None and obj is not None and _can_have(obj):
+            _refresh(scene, obj)
+    _waiting.clear()
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D":
+                area.tag_redraw()
+
+
+def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
+    settings, mesh = scene.refine, obj.data
+    camera_list.fill(mesh_scores.record(mesh) or {})
+    plan: dict[str, Any] = {"key": key(settings), "splats": mesh_layout.splat_count(mesh)}
+    try:
+        checked = mesh_layout.check(obj)
+        task = splat_object.stored_task(checked, settings.to_budget(), settings.protect)
+        known = _know(task, _state(mesh, settings))
+        plan = _noted(known, settings)
+        keep = splat_object.mark_removed(checked, task)
+        plan["unseen_gone"] = int(np.count_nonzero(~keep & (known.tally.scores.seen == 0)))
+        price.show(mesh, known.tally.scores, known.kinds, _place(plan, settings), keep)
+    except RefineError as error:
+        plan["error"] = str(error)
+    mesh[PLAN] = json.dumps(plan)
+
+
+def _know(task: Task, state: tuple[Any, ...]) -> _Known:
+    """Return what holds for any budget; what was known before, where it still does."""
+    scores = task.scores
+    assert scores is not None  # noqa: S101 - a task of what is stored
+    old = _known[0] if _known else None
+    if old is not None and old.holds == state and old.tally.is_of(scores, task.protected):
+        return old
+    kinds = price.histogram(scores)
+    tally, unseen = Tally(scores, task.protected), int(np.count_nonzero(scores.seen == 0))
+    known = _Known(state, tally, int(task.row_bytes), task.fixed_bytes, kinds, unseen)
+    _known[:] = [known]
+    return known
+
+
+def _state(mesh: bpy.types.Mesh, settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
+    """Return what tells a scoring of an object from another, and what is protected in it."""
+    return (
+        mesh.session_uid,
+        mesh_layout.splat_count(mesh),
+        mesh.get(mesh_scores.RECORD),
+        settings.protect,
+    )
+
+
+def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
+    """Return the plan for a budget as plain values."""
+    scores = known.tally.scores
+    count, curve = len(scores.values), scores.quality
+    noted: dict[str, Any] = {"key": key(settings), "splats": count, "unseen": known.unseen}
+    try:
+        budget = settings.to_budget()
+        if budget.psnr is not None and settings.absorb:
+            gone = math.floor(quality_of(scores).share(budget.psnr, absorb=True) * count)
+            noted["about"] = True
+        else:
+            gone = known.tally.removed(budget, known.row_bytes, known.fixed_bytes)
+    except RefineError as error:
+        return noted | {"error": str(error)}
+    sizes = splat_object.Plan.of(count, count - gone, known.row_bytes, known.fixed_bytes)
+    noted |= vars(sizes)
+    if curve is None:
+        return noted
+    noted |= {
+        "psnr": curve.at(gone / count),
+        "psnr_absorbed": curve.at(gone / count, absorb=True),
+    }
+    if budget.psnr is not None:
+        noted["remark"] = _reached(curve, budget.psnr, gone, absorb=settings.absorb)
+    return noted
+
+
+def _reached(curve: Quality, goal: float, gone: int, *, absorb: bool) -> str:
+    """Return what to say where a PSNR as budget is out of reach, or ""."""
+    if not gone:
+        return f"By the estimate nothing can go at {goal:g} dB"
+    least = (curve.absorbed if absorb else curve.psnr)[-1]
+    if goal < least:
+        share = curve.shares[-1]
+        return f"The estimate ends at {share:.0%} removed, {in_words(least)}: no more goes"
+    return ""
+
+
+def _place(plan: dict[str, Any], settings: Any) -> Place | None:  # noqa: ANN401
+    if "error" in plan:
+        return None
+    return Place(plan["removed"] / plan["splats"], settings.absorb)
+
+
+@lru_cache(maxsize=4)
+def _read(text: str) -> dict[str, Any]:
+    return dict(json.loads(text))

@@ -67,7 +67,15 @@ SOURCES = (
 
 
 def _plan_again(_settings: RefineSettings, context: bpy.types.Context) -> None:
-    plans.refresh(context)
+    plans.changed(context)
+
+
+def _percent(settings: RefineSettings) -> float:
+    return 100.0 * decimal(settings.ratio)
+
+
+def _set_percent(settings: RefineSettings, value: float) -> None:
+    settings.ratio = decimal(value) / 100.0
 
 
 def _mark_floaters(settings: RefineSettings, context: bpy.types.Context) -> None:
@@ -175,6 +183,17 @@ class RefineSettings(bpy.types.PropertyGroup):
         max=0.9999,
         update=_plan_again,
     )
+    percent: FloatProperty(
+        name="Remove",
+        description="Share of the splats to remove, in per cent",
+        subtype="PERCENTAGE",
+        precision=1,
+        default=50.0,
+        min=0.0,
+        max=99.99,
+        get=_percent,
+        set=_set_percent,
+    )
     keep: IntProperty(
         name="Keep",
         description="How many splats stay",
@@ -218,6 +237,7 @@ class RefineSettings(bpy.types.PropertyGroup):
         name="Absorb",
         description="Survivors take over what is removed, by what the cameras see of it: far "
         "better when much is removed, and slower; the survivors change",
+        update=_plan_again,
     )
     protect: StringProperty(
         name="Protect",

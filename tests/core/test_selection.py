@@ -12,7 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core import Budget, RefineError, Scores, rank, select
+from refine_addon.core.quality import Quality
 from refine_addon.core.scores import shares_gone
+from refine_addon.core.selection import Tally
 from tests.strategies import masks, scores
 
 
@@ -200,6 +202,36 @@ def test_protected_splats_stay_whatever_the_budget():
     assert (
         select(scored([0, 1, 0, 1]), Budget(keep=1), protected=~keep | keep).tolist() == [True] * 4
     )
+
+
+BUDGETS = st.one_of(
+    st.floats(0.0, 0.999).map(lambda share: Budget(ratio=share)),
+    st.integers(1, 40).map(lambda count: Budget(keep=count)),
+    st.floats(1e-6, 1e-3).map(lambda size: Budget(max_mb=size)),
+    st.floats(-1.0, 1e39).map(lambda score: Budget(threshold=score)),
+    st.sampled_from([0.1, 0.3]).map(lambda score: Budget(threshold=score)),
+    st.floats(0.0, 100.0).map(lambda percentage: Budget(min_seen=percentage)),
+    st.floats(1.0, 99.0).map(lambda psnr: Budget(psnr=psnr)),
+)
+
+
+@given(values=scores(), budget=BUDGETS, data=st.data())
+def test_a_tally_counts_what_a_selection_removes(values, budget, data):
+    """For every kind of budget, with protected splats or none, and refuses what it refuses."""
+    count = len(values)
+    seen = data.draw(st.lists(st.integers(0, 64), min_size=count, max_size=count))
+    protected = data.draw(st.one_of(st.none(), masks(count)))
+    curve = Quality(np.array([0.2, 0.5, 0.8]), np.array([50.0, 40.0, 30.0]), np.zeros(3))
+    known = replace(scored(values, seen), quality=curve)
+    sizes = {"row_bytes": 20.0, "fixed_bytes": 100}
+
+    try:
+        keep = select(known, budget, protected=protected, **sizes)
+    except RefineError as refused:
+        with pytest.raises(RefineError, match=re.escape(str(refused))):
+            Tally(known, protected).removed(budget, **sizes)
+    else:
+        assert Tally(known, protected).removed(budget, **sizes) == count - np.count_nonzero(keep)
 
 
 def test_a_budget_is_exactly_one_number():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import RefineError, View, ViewSet
+from refine_addon.core.frustum import census
 
 
 def view(center=(0.0, 0.0, 0.0), **changes) -> View:
@@ -215,3 +216,15 @@ def test_of_a_regular_rig_the_same_views_are_chosen_however_it_lies(count):
     assert [view.name for view in turned.spread(count)] == names
     backwards = views.take(range(71, -1, -1)).spread(count)
     assert sorted(view.name for view in backwards) == sorted(names)
+
+
+def test_points_are_counted_in_each_view():
+    """Along +z at (0, 0, 2): in the view from 0, not in one that begins at 3, nor in one behind.
+
+    A point 2.1 to the side at depth 2 is outside: the image ends at 50 px, 1 a unit at depth 1.
+    """
+    points = np.array([[0, 0, 2], [2.1, 0, 2], [np.nan, 0, 2], [0, np.inf, 2]], np.float32)
+    views = ViewSet((view(), view(near=3.0), view([0, 0, 2.5]), view([2.1, 0, 0])))
+
+    assert census(points, views).tolist() == [1, 0, 0, 1]
+    assert census(points, views.take([0, 0, 3]), threads=1).tolist() == [1, 1, 1]

@@ -26,8 +26,8 @@ DRIVER = Path(__file__).parent / "inside" / "run_step.py"
 MODULES = ("bpy-4.2.23", "bpy-4.5.15", "bpy-5.0.1")
 BINARIES = ("trixie", "sid")
 
-# Seconds. The slowest step is the window's: about 50 on two idle cores.
-PATIENCE = 300
+# Seconds. The slowest step is the window's: about 80 on two idle cores, far more on busy ones.
+PATIENCE = 600
 
 
 class StepError(AssertionError):

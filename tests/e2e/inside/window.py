@@ -1,7 +1,8 @@
-"""Use the panel as a person does: its tab, *Score*, *Apply*, Ctrl+Z, *Heat Map*."""
+"""Use the panel as a person does: its tab, *Score*, a slider, *Apply*, Ctrl+Z, *Heat Map*."""
 
 from __future__ import annotations
 
+import importlib
 import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -47,8 +48,17 @@ def main(name: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
 
     yield from hand.click("refine.score(")
     yield from until(lambda: state(name)["scored"], "there are scores")
-    yield from picture(pictures, "2-scored")
     found["scored"] = state(name)
+
+    yield from hand.scroll(down=True)
+    yield from picture(pictures, "2-scored")
+    found["priced"] = price(name)
+    yield from hand.slide("refine.percent", 60)
+    found["sliding"] = price(name)
+    yield from until(lambda: price(name)["marked"] != found["priced"]["marked"], "marks follow")
+    yield from picture(pictures, "2-slid")
+    found["slid"] = price(name)
+    bpy.context.scene.refine.percent = 50.0
 
     bpy.data.objects[name].location.x += 0.1
     yield from picture(pictures, "3-moved")  # the scores are older than that, says the panel
@@ -64,6 +74,7 @@ def main(name: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
     found["undone"] = state(name)
 
     # Last, since every frame is slow from here on: the view now draws materials.
+    yield from hand.scroll(down=False)
     yield from hand.click("refine.preview(mode='HEAT'")
     yield from until(lambda: bpy.data.objects[name].modifiers, "there is a preview")
     yield from picture(pictures, "6-heat", settle=20.0)  # EEVEE compiles its shaders
@@ -75,6 +86,22 @@ def state(name: str) -> dict[str, Any]:
     """Return what the panel's buttons are to change; by name, as undo replaces the object."""
     mesh = bpy.data.objects[name].data
     return {"vertices": len(mesh.vertices), "scored": "refine_score" in mesh.attributes}
+
+
+def price(name: str) -> dict[str, Any]:
+    """Return what the panel says of the budget: its slider, its sentence, its chart, its marks."""
+    ui = importlib.import_module(f"{extension.MODULE}.ui")
+    obj, settings = bpy.data.objects[name], bpy.context.scene.refine
+    plan = ui.plans.stored(obj, settings)
+    marks = obj.data.attributes["refine_remove"].data
+    return {
+        "percent": settings.percent,
+        "ratio": settings.to_budget().ratio,
+        "sentence": ui.plans.sentence(plan, absorb=settings.absorb) if plan else "",
+        "marked": sum(mark.value for mark in marks),
+        "chart": ui.price.shows(obj.data) and ui.price.icon() > 0,
+        "images": len([image for image in bpy.data.images if image.users]),
+    }
 
 
 def picture(folder: str, name: str, settle: float = 2.0) -> Generator[float, None, None]:
@@ -173,13 +200,49 @@ class Hand:
         message = f"the tab {TAB} has no button for {call}"
         raise LookupError(message)
 
+    def scroll(self, *, down: bool) -> Generator[float, None, None]:
+        """Turn the wheel over the sidebar as far as it goes."""
+        region = self.sidebar
+        yield from self.move(region.x + region.width // 2, region.y + region.height // 2)
+        kind = "WHEELDOWNMOUSE" if down else "WHEELUPMOUSE"
+        for _ in range(40):
+            self.window.event_simulate(type=kind, value="PRESS", **self.at)
+            yield A_MOMENT
+
+    def slide(self, path: str, pixels: int) -> Generator[float, None, None]:
+        """Drag the slider of a property to the right.
+
+        Raises
+        ------
+        LookupError
+            If the sidebar shows no such slider.
+        """
+        region = self.sidebar
+        x = region.x + int(0.6 * region.width)
+        for y in range(region.y + region.height - STEP, region.y, -STEP):
+            yield from self.move(x, y)
+            if self.copied(bpy.ops.ui.copy_data_path_button).endswith(path):
+                self.window.event_simulate(type="LEFTMOUSE", value="PRESS", **self.at)
+                yield A_MOMENT
+                for moved in range(0, pixels, 5):
+                    yield from self.move(x + moved, y)
+                self.window.event_simulate(type="LEFTMOUSE", value="RELEASE", **self.at)
+                yield A_MOMENT
+                return
+        message = f"the tab {TAB} has no slider for {path}"
+        raise LookupError(message)
+
     def button(self) -> str:
         """Return the Python call of the button under the mouse, empty where there is none."""
+        return self.copied(bpy.ops.ui.copy_python_command_button)
+
+    def copied(self, operator: Any) -> str:
+        """Return what an operator copies of the button under the mouse, empty if nothing."""
         manager = bpy.context.window_manager
         manager.clipboard = ""
         with bpy.context.temp_override(window=self.window, area=self.area, region=self.sidebar):
-            if bpy.ops.ui.copy_python_command_button.poll():
-                bpy.ops.ui.copy_python_command_button()
+            if operator.poll():
+                operator()
         return manager.clipboard
 
     def undo(self) -> Generator[float, None, None]:

@@ -1,0 +1,62 @@
+"""What panels say of the scene, asked once until the scene changes, not at each draw."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import bpy
+from bpy.app.handlers import persistent
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable
+
+Answer = TypeVar("Answer")
+
+_answers: dict[Hashable, Any] = {}
+
+_EVENTS = ("depsgraph_update_post", "frame_change_post", "undo_post", "redo_post", "load_post")
+"""After these anything may be otherwise. A change of the settings is one of them too."""
+
+
+_NOT_SETTINGS = {"rna_type", "name"}  # of every group of properties
+
+
+def answer(what: Hashable, context: bpy.types.Context, ask: Callable[[], Answer]) -> Answer:
+    """Return what `ask` answered last of the active object and the settings, if nothing changed.
+
+    What a script changes without telling Blender, such as a custom property, counts from the next
+    change on.
+
+    Parameters
+    ----------
+    what : hashable
+        The question, apart from the object and the settings.
+    context : bpy.types.Context
+    ask : callable
+        Reads the scene, the active object and the panel's settings, and nothing else.
+    """
+    obj, settings = context.object, context.scene.refine
+    names = settings.bl_rna.properties.keys()
+    values = repr([getattr(settings, name) for name in names if name not in _NOT_SETTINGS])
+    key = (what, context.scene.session_uid, obj and obj.session_uid, values)
+    if key not in _answers:
+        _answers[key] = ask()
+    return _answers[key]
+
+
+@persistent
+def _forget(*_arguments: object) -> None:
+    _answers.clear()
+
+
+def register() -> None:
+    """Hear of changes."""
+    for event in _EVENTS:
+        getattr(bpy.app.handlers, event).append(_forget)
+
+
+def unregister() -> None:
+    """Hear of changes no more."""
+    for event in _EVENTS:
+        getattr(bpy.app.handlers, event).remove(_forget)
+    _forget()

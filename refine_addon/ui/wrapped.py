@@ -1,0 +1,60 @@
+"""Sentences in a panel, broken into lines where it ends: Blender cuts what is wider."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import blf
+
+if TYPE_CHECKING:
+    import bpy
+
+_TAKEN = 52
+"""Pixels of a sidebar at scale 1 that are not text: margins, tabs, scroll bar."""
+
+_ICON = 20
+"""Pixels of an icon and its gap, at scale 1."""
+
+_USUAL = 280
+"""Pixels that the sidebar has where nothing tells, which is its default at scale 1."""
+
+
+def label(
+    layout: bpy.types.UILayout, context: bpy.types.Context, text: str, icon: str = "NONE"
+) -> None:
+    """Draw a sentence in as many lines as it takes, with the icon at the first."""
+    scale = context.preferences.system.ui_scale or 1.0  # there is none without a screen
+    region = context.region
+    room = (region.width if region else _USUAL * scale) - _TAKEN * scale
+    if icon != "NONE":
+        room -= _ICON * scale
+    points = context.preferences.ui_styles[0].widget.points * scale
+    column = layout.column(align=True)
+    column.scale_y = 0.8  # the lines of one sentence stand closer together than buttons
+    for line in lines(text, int(room), points):
+        column.label(text=line, icon=icon)
+        icon = "BLANK1" if icon != "NONE" else icon
+
+
+def counted(number: int, what: str) -> str:
+    """Return how many there are.
+
+    >>> counted(1, "camera"), counted(1200, "view")
+    ('1 camera', '1,200 views')
+    """
+    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
+
+
+@lru_cache(maxsize=64)
+def lines(text: str, width: int, points: float) -> tuple[str, ...]:
+    """Return a text in lines that are at most so many pixels wide; a word is never broken."""
+    blf.size(0, points)
+    found: list[str] = []
+    for word in text.split():
+        longer = f"{found[-1]} {word}" if found else word
+        if found and blf.dimensions(0, longer)[0] <= width:
+            found[-1] = longer
+        else:
+            found.append(word)
+    return tuple(found)
