@@ -59,9 +59,9 @@ def main(cloud: str, cameras: str, picture: str, blend: str) -> Generator[float,
     bpy.ops.wm.open_mainfile(filepath=blend)
     yield 1.0
     found["still on"], found["failure"] = show.draw.mode(), show.draw.failure()
-    before = len(bpy.app.handlers.depsgraph_update_post)
+    found["handlers"] = [handlers()]
     extension.disable()
-    found["handlers"] = before - len(bpy.app.handlers.depsgraph_update_post)
+    found["handlers"].append(handlers())
     graph = bpy.context.window_manager.windows[0].view_layer.depsgraph
     found["shown as"] = bpy.data.objects["renamed"].evaluated_get(graph).display_type
     return found
@@ -87,6 +87,12 @@ def handle(show: Show) -> Generator[float, None, dict[str, int]]:
     show.call(bpy.ops.ed.undo)
     found["undone"] = yield from show.settle()
     return found
+
+
+def handlers() -> int:
+    """Return how many handlers of the drawing Blender calls after updates."""
+    modules = [handler.__module__ for handler in bpy.app.handlers.depsgraph_update_post]
+    return modules.count(f"{extension.MODULE}.viewport.draw")
 
 
 class Show:
