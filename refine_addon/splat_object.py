@@ -347,7 +347,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     Returns
     -------
     dict
-        The report, as of `refine_addon.core.pipeline.prune_file`.
+        The report, as of `refine_addon.core.file_to_file.prune_file`.
 
     Raises
     ------

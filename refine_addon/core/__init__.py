@@ -10,11 +10,12 @@ In short::
 from .cameras.read import read_cameras
 from .cleaning.clean import REASONS, Cleaned, Cleaning, clean
 from .errors import Cancelled, RefineError
+from .file_to_file import prune_file
 from .formats.ply import SplatFile, read_ply
 from .formats.registry import as_written, read_splats
 from .levels.files import lod_file
 from .levels.lod import Level, Levels, lod
-from .pipeline import prune, prune_file, score
+from .pipeline import prune, score
 from .scores import Scores
 from .scoring.closed_form import ClosedForm
 from .scoring.occlusion import Occlusion

@@ -63,7 +63,7 @@ def check_goal(goal: float) -> None:
         raise RefineError(msg)
 
 
-def lod_file(  # noqa: PLR0913 - as `pipeline.prune_file`
+def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
     source: Path | str,
     folder: Path | str,
     views: ViewSet,
