@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import bpy
@@ -14,6 +14,36 @@ from .objects import SHEAR, camera_from_view, turned, view_from_camera, world_ma
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which cameras decide: what the panel and the command name, and a .blend keeps.
+
+    Attributes
+    ----------
+    source : {"ACTIVE", "SELECTED", "VISIBLE", "COLLECTION", "FRAMES"}
+    collection : bpy.types.Collection or None
+        For COLLECTION.
+    frames : range or None
+        For FRAMES.
+    """
+
+    source: str
+    collection: bpy.types.Collection | None = None
+    frames: range | None = None
+
+    @classmethod
+    def of_scene(cls, scene: bpy.types.Scene) -> Choice:
+        """Return what is chosen in the panel, as the scene keeps it."""
+        settings = scene.refine
+        return cls(settings.source, settings.collection, settings.to_frames(scene))
+
+    def views(self, context: bpy.types.Context, splats: bpy.types.Object | None) -> ViewSet:
+        """Return the views of these cameras; see `views_from_scene`."""
+        return views_from_scene(
+            context, self.source, collection=self.collection, frames=self.frames, splats=splats
+        )
 
 
 def create_cameras(

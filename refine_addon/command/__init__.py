@@ -1,11 +1,12 @@
 """The command: ``blender -b [scene.blend] --command refine ...``, ``python -m refine_addon ...``.
 
 Both parse the same arguments and run the same pipeline. Only ``--object``, and the cameras of an
-open scene, need Blender; they are imported where they are used.
+open scene (`scene_cameras`), need Blender; they are imported where they are used.
 
 In the order in which they work: `signals` listens for Ctrl-C, `flow` goes from arguments to exit
 code, `options` parses, `checks` refuses what cannot go together, `runs` does the work (for ``info``
-with `info`), `report` writes down what was done. `terminal` is all that prints.
+with `info`) by the views that `cameras` returns, `report` writes down what was done. `terminal` is
+all that prints; `pace` tells the time left.
 """
 
 from __future__ import annotations

@@ -153,6 +153,19 @@ def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
             parser.error("--object needs -o OUT.ply, --save or --dry-run")
     else:
         _check_files(parser, given)
+    if given.source or given.frames:
+        _check_choice(parser, given)
+
+
+def _check_choice(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Refuse a choice among the cameras of the .blend where another one holds."""
+    option = "--source" if given.source else "--frames"
+    if not given.object:
+        parser.error(f"{option} goes with --object; for INPUT files give --cameras")
+    if given.cameras is not None:
+        parser.error(f"expected --cameras or {option}, and not both")
+    if given.frames and given.source and given.source[0] != "FRAMES":
+        parser.error("--frames goes with --source frames alone, or without --source")
 
 
 def _check_files(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:

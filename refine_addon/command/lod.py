@@ -13,11 +13,16 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ..core import ViewSet
+    from ..core.work import Progress
     from .terminal import Terminal
 
 
 def make_levels(
-    options: argparse.Namespace, terminal: Terminal, source: Path, views: ViewSet
+    options: argparse.Namespace,
+    terminal: Terminal,
+    source: Path,
+    views: ViewSet,
+    progress: Progress,
 ) -> dict[str, Any]:
     """Make the levels of a file and say what each costs; return the report."""
     done = lod_file(
@@ -29,7 +34,7 @@ def make_levels(
         suffix=options.format,
         goal=options.distance_psnr,
         overwrite=options.overwrite,
-        progress=terminal.progress(source.name),
+        progress=progress,
     )
     terminal.clear()
     count, seconds = done["source"]["splats"], done["timings"]["total_s"]

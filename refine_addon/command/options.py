@@ -19,6 +19,38 @@ DEFAULT_LEVELS = (0.5, 0.25, 0.12, 0.06)
 
 FORMATS = ", ".join(SUFFIXES)
 
+SOURCES = ("visible", "active", "selected", "frames", "collection:NAME")
+"""What --source takes: the choices of the panel, in small letters."""
+
+BLENDER = "blender -b scene.blend --command "
+"""What stands before ``refine`` in an example that needs Blender."""
+
+EXAMPLES = {
+    "prune": (
+        "refine prune in.ply --cameras cameras.json --ratio 0.7 -o out.ply",
+        "refine prune *.ply --cameras cameras.json --psnr 40 --output-dir pruned",
+        "refine prune in.ply --cameras sparse/0 --max-mb 5 --absorb -o out.ply",
+        f"{BLENDER}refine prune --object Splats -o out.ply",
+        f"{BLENDER}refine prune --object Splats --frames 1:250:10 --save",
+        f"{BLENDER}refine prune --object Splats --source collection:Shot --dry-run",
+    ),
+    "score": ("refine score in.ply --cameras cameras.json -o scored.ply",),
+    "clean": (
+        "refine clean in.ply --cameras cameras.json",
+        "refine clean in.ply --cameras cameras.json --reasons front isolated -o out.ply",
+    ),
+    "lod": (
+        "refine lod in.ply --cameras cameras.json -o levels",
+        "refine lod in.ply --cameras cameras.json --psnr 45,40,35 --format .spz -o levels",
+    ),
+    "convert": ("refine convert in.ply out.spz",),
+    "info": ("refine info in.ply", "refine info *.ply --report report.json"),
+}
+"""Under the help of each subcommand."""
+
+LAST_FRAME = 1_048_574
+"""The last frame that Blender knows, and with a minus the first."""
+
 
 class _Parser(argparse.ArgumentParser):
     """A parser whose complaints can be shown, whatever the arguments hold."""
@@ -44,17 +76,46 @@ def make_parser() -> argparse.ArgumentParser:
     _add_clean(commands)
     _add_lod(commands)
     _add_convert(commands)
-    info = commands.add_parser("info", help="say what is in files of splats")
+    info = _add(commands, "info", "say what is in files of splats")
     info.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help="files of splats")
     _add_common(info)
     return parser
 
 
+def _add(commands: Any, name: str, purpose: str) -> argparse.ArgumentParser:  # noqa: ANN401 - as below
+    """Return the parser of a new subcommand, with examples under its help."""
+    examples = "\n".join(f"  {example}" for example in EXAMPLES[name])
+    return commands.add_parser(
+        name,
+        help=purpose,
+        description=f"{purpose[0].upper()}{purpose[1:]}.",
+        epilog=f"examples:\n{examples}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
 def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
-    prune = commands.add_parser("prune", help="remove the splats the cameras would miss least")
+    prune = _add(commands, "prune", "remove the splats the cameras would miss least")
     prune.add_argument("inputs", nargs="*", type=_given, metavar="INPUT", help=f"files: {FORMATS}")
     prune.add_argument(
-        "--object", type=_name, metavar="NAME", help="prune this splat object of the open .blend"
+        "--object",
+        type=_name,
+        metavar="NAME",
+        help="prune this splat object of the open .blend, by the cameras that are chosen in the "
+        "panel there; of the panel's other settings none counts",
+    )
+    prune.add_argument(
+        "--source",
+        type=_source,
+        metavar="WHICH",
+        help=f"with --object: which cameras decide instead, one of {', '.join(SOURCES)}",
+    )
+    prune.add_argument(
+        "--frames",
+        type=_frames,
+        metavar="A:B:STEP",
+        help="with --object: the active camera decides, at frame A and every STEP-th after it to B "
+        "(every one without STEP); --source frames alone takes the panel's range",
     )
     prune.add_argument(
         "--save", action="store_true", help="with --object: delete the splats there and save"
@@ -109,7 +170,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
 
 
 def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
-    cleaning = commands.add_parser("clean", help="remove what the cameras see to float in the air")
+    cleaning = _add(commands, "clean", "remove what the cameras see to float in the air")
     cleaning.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a file of splats")
     cleaning.add_argument(
         "-o", "--output", type=_path, metavar="OUT.ply", help="without it, only say what would go"
@@ -128,7 +189,7 @@ def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
 
 
 def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
-    scoring = commands.add_parser("score", help="write the file with a float property refine_score")
+    scoring = _add(commands, "score", "write the file with a float property refine_score")
     scoring.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a file of splats")
     scoring.add_argument(
         "-o", "--output", type=_path, metavar="OUT.ply", required=True, help="the file to make"
@@ -138,7 +199,7 @@ def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
 
 
 def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
-    making = commands.add_parser("lod", help="write levels of detail, each with what it costs")
+    making = _add(commands, "lod", "write levels of detail, each with what it costs")
     making.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a file of splats")
     making.add_argument(
         "-o",
@@ -190,7 +251,7 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
 
 
 def _add_convert(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
-    convert = commands.add_parser("convert", help="write a file of splats in another format")
+    convert = _add(commands, "convert", "write a file of splats in another format")
     convert.add_argument("inputs", nargs=1, type=_given, metavar="IN", help="known by its content")
     convert.add_argument("output", type=_path, metavar="OUT", help=f"by its suffix: {FORMATS}")
     _add_common(convert)
@@ -201,7 +262,8 @@ def _add_cameras(parser: argparse.ArgumentParser) -> None:
         "--cameras",
         type=_given,
         metavar="FILE_OR_FOLDER",
-        help="cameras.json, transforms.json or a COLMAP model; default: the open scene's cameras",
+        help="cameras.json, transforms.json or a COLMAP model; default: the visible cameras of the "
+        "open scene",
     )
 
 
@@ -270,6 +332,35 @@ def _name(text: str) -> str:
         msg = "expected a name, got none"
         raise argparse.ArgumentTypeError(msg)
     return text
+
+
+def _source(text: str) -> tuple[str, str]:
+    """Return the kind of source as the panel names it, and the name of a collection or ""."""
+    kind, colon, name = text.partition(":")
+    if (f"{kind}:NAME" if colon else kind) not in SOURCES or (colon and not name):
+        msg = f"expected one of {', '.join(SOURCES)}, got {text!r}"
+        raise argparse.ArgumentTypeError(msg)
+    return kind.upper(), name
+
+
+def _frames(text: str) -> range:
+    """Return the frames between colons, both ends included."""
+    numbers = text.split(":")
+    try:
+        first, last, step = map(int, numbers if numbers[2:] else [*numbers, "1"])
+    except ValueError as error:
+        msg = f"expected A:B:STEP or A:B in whole numbers, got {text!r}"
+        raise argparse.ArgumentTypeError(msg) from error
+    if step < 1 or max(abs(first), abs(last)) > LAST_FRAME:
+        msg = (
+            f"expected A:B:STEP with frames from {-LAST_FRAME} to {LAST_FRAME} and a step of at "
+            f"least 1, got {text!r}"
+        )
+        raise argparse.ArgumentTypeError(msg)
+    if last < first:
+        msg = f"expected at least one frame, got {text!r}, which starts after it ends"
+        raise argparse.ArgumentTypeError(msg)
+    return range(first, last + 1, step)
 
 
 def _given(text: str) -> Path:

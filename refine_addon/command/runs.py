@@ -9,15 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core import RefineError, as_written, clean, prune_file, read_cameras, read_splats, score
+from ..core import RefineError, as_written, clean, prune_file, read_splats, score
 from ..core.errors import printable
 from ..core.quality import UNSEEN, in_words
 from ..core.report import scoring_notes
 from ..core.whole_file import refuse_existing, refuse_mapped
 from . import report
+from .cameras import deciding
 from .info import describe
 from .lod import make_levels
 from .options import budget, cleaning, settings
+from .pace import Pace
 from .terminal import Terminal, complain, described
 
 if TYPE_CHECKING:
@@ -61,11 +63,33 @@ class _Run:
         self.entries: list[dict[str, Any]] = []
         self.failed = False
         self._started = time.perf_counter()
+        self._pace = Pace([_size(path) for path in options.inputs] or [0])
+        self._cameras: dict[str, Any] = {}
+
+    def views(self) -> ViewSet:
+        """Return the views that decide, and note where they are from for the report."""
+        views, facts = deciding(self.options)
+        self._cameras = {"cameras": facts}
+        return views
+
+    def named(self, name: str) -> str:
+        """Return what to call the file under way; see `Pace.named`."""
+        return self._pace.named(name)
+
+    def progress(self, name: str) -> Callable[[float, str], None]:
+        """Return what draws how much of the file under way is done, and the time left."""
+        return self.terminal.progress(self.named(name), self._pace.left)
+
+    def say_cameras(self) -> None:
+        """Say which cameras of the scene decided; those of a file were named by the user."""
+        if words := self._cameras["cameras"].get("words"):
+            self.terminal.say(f"  cameras: {words}")
 
     def attempt(self, label: str, work: Callable[[], dict[str, Any]]) -> None:
         """Do one input's work; note its error, so that the others go on."""
+        self._pace.next()
         try:
-            self.entries.append({"status": "done", **work()})
+            self.entries.append({"status": "done", **work(), **self._cameras})
         except (RefineError, OSError, MemoryError) as error:
             self.failed = True
             message = str(error) if isinstance(error, RefineError) else described(error)
@@ -94,10 +118,11 @@ class _Run:
 
 def _prune(run: _Run) -> None:
     options = run.options
-    views = _views(options)
     if options.object:
-        run.attempt(options.object, lambda: _prune_object(run, views))
-    elif options.output_dir and not options.dry_run:
+        run.attempt(options.object, lambda: _prune_object(run))
+        return
+    views = run.views()
+    if options.output_dir and not options.dry_run:
         _make_folder(options.output_dir)
     for source in options.inputs:
         run.attempt(str(source), lambda source=source: _prune_one(run, source, views))
@@ -126,20 +151,20 @@ def _prune_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
         cleaning=cleaning(options) if options.clean else None,
         overwrite=options.overwrite,
         dry_run=options.dry_run,
-        progress=run.terminal.progress(source.name),
+        progress=run.progress(source.name),
     )
     run.terminal.clear()
     _say_result(run, str(source), result.report)
     return result.report
 
 
-def _prune_object(run: _Run, views: ViewSet) -> dict[str, Any]:
+def _prune_object(run: _Run) -> dict[str, Any]:
     from .. import splat_object  # noqa: PLC0415 - needs Blender
 
     options = run.options
     done = splat_object.prune_object(
         options.object,
-        views,
+        run.views(),
         budget(options),
         settings(options),
         absorb=options.absorb,
@@ -147,7 +172,7 @@ def _prune_object(run: _Run, views: ViewSet) -> dict[str, Any]:
         save=options.save,
         dry_run=options.dry_run,
         overwrite=options.overwrite,
-        progress=run.terminal.progress(options.object),
+        progress=run.progress(options.object),
     )
     run.terminal.clear()
     _say_result(run, options.object, done)
@@ -166,7 +191,10 @@ def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
         f"{done['timings']['total_s']:.2f} s",
     ]
     target = f" -> {files['output']}" if files["output"] else ""
-    run.terminal.say(f"{label}: {', '.join(parts)}{target}")
+    run.terminal.say(f"{run.named(label)}: {', '.join(parts)}{target}")
+    run.say_cameras()
+    cleaned = sum(count for count in done.get("cleaned", {}).values() if isinstance(count, int))
+    _say_unseen(run, splats["unseen"], splats["before"] - cleaned)
     if "cleaned" in done:
         run.terminal.say(f"  cleaned: {done['cleaned']['words']}")
     quality = _quality(done)
@@ -174,6 +202,12 @@ def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
         run.terminal.say(f"  quality: {quality}")
     for note in done["notes"]:
         run.terminal.say(f"  note: {note}")
+
+
+def _say_unseen(run: _Run, unseen: int, scored: int) -> None:
+    """Say how many of the splats that were scored no view holds, if any."""
+    if unseen:
+        run.terminal.say(f"  {unseen:,} of {scored:,} splats lie in no view")
 
 
 def _megabytes(before: int, after: int | None) -> str:
@@ -197,7 +231,7 @@ def _quality(done: dict[str, Any]) -> str:
 
 def _score(run: _Run) -> None:
     options = run.options
-    views = _views(options)
+    views = run.views()
     source = options.inputs[0]
     run.attempt(str(source), lambda: _score_one(run, source, views))
 
@@ -207,20 +241,21 @@ def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     output = options.output
     refuse_existing(output, overwrite=options.overwrite)
     file = read_splats(source)
-    scores = score(
-        file.splats(), views, settings(options), progress=run.terminal.progress(source.name)
-    )
+    scores = score(file.splats(), views, settings(options), progress=run.progress(source.name))
     file.write(output, columns={"refine_score": scores.values}, overwrite=options.overwrite)
     run.terminal.clear()
     run.terminal.say(
         f"{source}: scored {len(file):,} splats by {scores.views_used} views -> {output}"
     )
+    run.say_cameras()
+    unseen = int(np.count_nonzero(scores.seen == 0))
+    _say_unseen(run, unseen, len(file))
     notes = scoring_notes(scores)
     for note in notes:
         run.terminal.say(f"  note: {note}")
     return {
         "files": {"input": str(source), "output": str(output)},
-        "splats": {"before": len(file), "undrawable": scores.undrawable},
+        "splats": {"before": len(file), "undrawable": scores.undrawable, "unseen": unseen},
         "views": {"given": len(views), "used": scores.views_used},
         "settings": asdict(settings(options)),
         "weights": scores.facts,
@@ -259,7 +294,7 @@ def _convert_one(run: _Run, source: Path) -> dict[str, Any]:
 
 
 def _clean(run: _Run) -> None:
-    views, source = _views(run.options), run.options.inputs[0]
+    views, source = run.views(), run.options.inputs[0]
     run.attempt(str(source), lambda: _clean_one(run, source, views))
 
 
@@ -269,7 +304,7 @@ def _clean_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
         refuse_existing(options.output, overwrite=options.overwrite)
         refuse_mapped(options.output, source)
     file = read_splats(source)
-    progress = run.terminal.progress(source.name)
+    progress = run.progress(source.name)
     found = clean(file.splats(), views, cleaning(options), progress=progress)
     made = as_written(file, options.output)
     if options.output:
@@ -289,8 +324,11 @@ def _clean_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
 
 def _lod(run: _Run) -> None:
     options = run.options
-    views, source = _views(options), options.inputs[0]
-    run.attempt(str(source), lambda: make_levels(options, run.terminal, source, views))
+    views, source = run.views(), options.inputs[0]
+    run.attempt(
+        str(source),
+        lambda: make_levels(options, run.terminal, source, views, run.progress(source.name)),
+    )
 
 
 def _info(run: _Run) -> None:
@@ -307,11 +345,9 @@ def _info_one(run: _Run, source: Path) -> dict[str, Any]:
     return {"input": str(source), **facts}
 
 
-def _views(options: argparse.Namespace) -> ViewSet:
-    if options.cameras is not None:
-        return read_cameras(options.cameras)
-    import bpy  # noqa: PLC0415
-
-    from ..cameras import sets as camera_sets  # noqa: PLC0415
-
-    return camera_sets.visible_views(bpy.context.scene)
+def _size(path: Path) -> int:
+    """Return the bytes of a file, 0 where reading it will fail anyway."""
+    try:
+        return path.stat().st_size
+    except (OSError, ValueError):
+        return 0

@@ -66,14 +66,26 @@ class Terminal:
         if not self._quiet:
             _write("stdout", f"{shown(text)}\n")
 
-    def progress(self, label: str) -> Callable[[float, str], None]:
-        """Return a callback that draws on a terminal and is silent elsewhere."""
+    def progress(
+        self, label: str, left: Callable[[float], str] = lambda _fraction: ""
+    ) -> Callable[[float, str], None]:
+        """Return a callback that draws on a terminal and is silent elsewhere.
+
+        Parameters
+        ----------
+        label : str
+            What is worked on.
+        left : callable, optional
+            Returns how much time the rest takes, in words, for the fraction done.
+        """
         if not self._draws:
             return lambda _fraction, _what: None
         label = shown(label)
 
         def draw(fraction: float, what: str) -> None:
-            _write("stderr", f"{_CLEAR}{label}: {what} {fraction:4.0%}")
+            rest = left(fraction)
+            comma = ", " if rest else ""
+            _write("stderr", f"{_CLEAR}{label}: {what} {fraction:4.0%}{comma}{rest}")
 
         return draw
 

@@ -17,7 +17,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
 from .. import level_objects, splat_object
-from ..cameras.sets import views_from_scene
+from ..cameras.sets import Choice
 from ..core import frustum, pipeline
 from ..core.formats.registry import FORMATS, SUFFIXES, Packed
 from ..core.levels.lod import Level, Levels, lod
@@ -84,14 +84,7 @@ class _OnScored(OnSplats):
 
 def chosen_views(context: bpy.types.Context) -> ViewSet:
     """Return the views of the cameras that the panel names."""
-    settings = context.scene.refine
-    return views_from_scene(
-        context,
-        settings.source,
-        collection=settings.collection,
-        frames=settings.to_frames(context.scene),
-        splats=context.object,
-    )
+    return Choice.of_scene(context.scene).views(context, context.object)
 
 
 def _new_name(obj: bpy.types.Object) -> str:

@@ -342,24 +342,26 @@ def test_the_report_of_a_prune_is_complete_and_plain(folder):
 
 
 def test_the_report_of_scores_is_plain_too(folder):
-    """Counts, weights and the files' names."""
+    """Counts, weights and the files' names; unseen is what no view counts as seen."""
+    seen = score(read_ply("in.ply").splats(), read_cameras("cameras.json"), Settings()).seen
+    unseen = int(np.count_nonzero(seen == 0))
     assert command.main([*SCORE, "-o", "out.ply", "--report", "report.json"]) == 0
 
     (entry,) = json.loads((folder / "report.json").read_text())["results"]
     assert entry["files"] == {"input": "in.ply", "output": "out.ply"}
-    assert entry["splats"] == {"before": COUNT, "undrawable": 0}
+    assert entry["splats"] == {"before": COUNT, "undrawable": 0, "unseen": unseen}
     assert all(map(math.isfinite, numbers(entry)))
 
 
 @pytest.mark.usefixtures("folder")
 def test_the_summary_says_what_went_and_where_it_is(capsys):
-    """One line a file: counts, megabytes, views, seconds, the output; nothing on stderr."""
+    """Counts, megabytes, views, seconds, the output; what no view sees; nothing on stderr."""
     assert command.main([*PRUNE, *CLOSED, "-o", "out.ply", "--keep", "9"]) == 0
 
     said = capsys.readouterr()
     pattern = (
         r"in\.ply: kept 9 of 60 splats \(85\.0% removed\), 0\.0 -> 0\.0 MB, by 5 of 5 views, "
-        r"\d+\.\d\d s -> out\.ply\n"
+        r"\d+\.\d\d s -> out\.ply\n  \d+ of 60 splats lie in no view\n"
     )
     assert re.fullmatch(pattern, said.out)
     assert said.err == ""

@@ -86,6 +86,20 @@ def test_prune_cleans_before_the_budget_counts(files, capsys, absorb):
     assert (read_ply(out).splats().means[:, 2] > 3.0).all()
 
 
+def test_unseen_splats_are_counted_of_those_that_cleaning_left(files, capsys):
+    """Of 577, one floats; of the other 576, those count that land outside of all six images.
+
+    They lie at a depth of 4 and the focal length is 60, half of an image 40 by 30: a splat is seen
+    from within 2.67 beside and 2 above of it.
+    """
+    places = wall().means[:, None, :2] - np.array([view.center[:2] for view in cameras()])
+    unseen = int((np.abs(places) > [8 / 3, 2.0]).any(axis=2).all(axis=1).sum())
+
+    assert call(files, "prune", "--clean", "--dry-run") == 0
+    assert 0 < unseen < SIDE**2
+    assert f"\n  {unseen} of 576 splats lie in no view\n" in capsys.readouterr().out
+
+
 def test_clean_goes_with_files_alone(files, capsys):
     """Objects are not cleaned by the command."""
     assert main(["prune", "--clean", "--object", "Splats"]) == 2
