@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from .core.formats.ply import SplatFile
     from .core.formats.registry import Packed
     from .core.levels.lod import Level
+    from .core.scores import Scores
     from .core.selection import Budget
     from .core.splats import Splats
     from .core.views import ViewSet
@@ -312,6 +313,37 @@ def export_object(
     made = as_written(file, target)
     made.write(target, keep, overwrite=overwrite)
     return made
+
+
+def score_object(
+    name: str, views: ViewSet, settings: Settings, *, progress: Progress = silent
+) -> tuple[SplatFile, Scores, list[str]]:
+    """Score an object of the open scene; nothing in the scene changes.
+
+    Parameters
+    ----------
+    name : str
+        Of the object.
+    views, settings, progress
+        See `refine_addon.core.pipeline.score`.
+
+    Returns
+    -------
+    SplatFile
+        The file that the object would be.
+    Scores
+        Of its splats.
+    list of str
+        See `modifier_notes`.
+
+    Raises
+    ------
+    RefineError
+        See `gather` and `refine_addon.core.pipeline.score`; also if there is no such object.
+    """
+    checked = check(find(name))
+    scores = pipeline.score(gather(checked), views, settings, progress=progress)
+    return mesh_attributes.file_from_object(checked), scores, modifier_notes(checked.obj)
 
 
 def prune_object(  # noqa: PLR0913 - the command's options

@@ -38,10 +38,12 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
         _check_settings(parser, given)
     except RefineError as error:
         parser.error(str(error))
+    if given.command in ("prune", "score"):
+        _check_source(parser, given)
     if given.command == "prune":
         _check_prune(parser, given)
-    elif given.command == "score" and format_named(given.output):
-        parser.error(f"-o {given.output}: only a .ply holds scores")
+    elif given.command == "score":
+        _check_score(parser, given)
     if given.cameras is None and not (given.scene and open_blend()):
         parser.error("no cameras: give --cameras, or open a .blend that has some")
 
@@ -137,28 +139,15 @@ def _beginning(path: Path) -> bytes | None:
         raise RefineError(msg) from error
 
 
-def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
-    if given.clean and given.object:
-        parser.error("--clean goes with INPUT files, not with --object")
+def _check_source(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Refuse an object beside files or out of Blender, and a choice of cameras beside another."""
     if bool(given.inputs) == bool(given.object):
         parser.error("expected INPUT files or --object NAME, and not both")
-    if given.object:
-        if not given.scene:
-            parser.error(
-                "--object needs Blender: blender -b scene.blend --command refine prune ..."
-            )
-        if given.output_dir:
-            parser.error("--object is written with -o, not with --output-dir")
-        if not (given.output or given.save or given.dry_run):
-            parser.error("--object needs -o OUT.ply, --save or --dry-run")
-    else:
-        _check_files(parser, given)
-    if given.source or given.frames:
-        _check_choice(parser, given)
-
-
-def _check_choice(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
-    """Refuse a choice among the cameras of the .blend where another one holds."""
+    if given.object and not given.scene:
+        command = f"blender -b scene.blend --command refine {given.command} ..."
+        parser.error(f"--object needs Blender: {command}")
+    if not (given.source or given.frames):
+        return
     option = "--source" if given.source else "--frames"
     if not given.object:
         parser.error(f"{option} goes with --object; for INPUT files give --cameras")
@@ -166,6 +155,25 @@ def _check_choice(parser: argparse.ArgumentParser, given: argparse.Namespace) ->
         parser.error(f"expected --cameras or {option}, and not both")
     if given.frames and given.source and given.source[0] != "FRAMES":
         parser.error("--frames goes with --source frames alone, or without --source")
+
+
+def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    if given.clean and given.object:
+        parser.error("--clean goes with INPUT files, not with --object")
+    if given.object:
+        if given.output_dir:
+            parser.error("--object is written with -o, not with --output-dir")
+        if not (given.output or given.save or given.dry_run):
+            parser.error("--object needs -o OUT.ply, --save or --dry-run")
+    else:
+        _check_files(parser, given)
+
+
+def _check_score(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    if len(given.inputs) > 1:
+        parser.error(f"expected one INPUT, got {len(given.inputs)}")
+    if format_named(given.output):
+        parser.error(f"-o {given.output}: only a .ply holds scores")
 
 
 def _check_files(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:

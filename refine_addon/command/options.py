@@ -34,7 +34,10 @@ EXAMPLES = {
         f"{BLENDER}refine prune --object Splats --frames 1:250:10 --save",
         f"{BLENDER}refine prune --object Splats --source collection:Shot --dry-run",
     ),
-    "score": ("refine score in.ply --cameras cameras.json -o scored.ply",),
+    "score": (
+        "refine score in.ply --cameras cameras.json -o scored.ply",
+        f"{BLENDER}refine score --object Splats -o scored.ply",
+    ),
     "clean": (
         "refine clean in.ply --cameras cameras.json",
         "refine clean in.ply --cameras cameras.json --reasons front isolated -o out.ply",
@@ -97,26 +100,7 @@ def _add(commands: Any, name: str, purpose: str) -> argparse.ArgumentParser:  # 
 def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     prune = _add(commands, "prune", "remove the splats the cameras would miss least")
     prune.add_argument("inputs", nargs="*", type=_given, metavar="INPUT", help=f"files: {FORMATS}")
-    prune.add_argument(
-        "--object",
-        type=_name,
-        metavar="NAME",
-        help="prune this splat object of the open .blend, by the cameras that are chosen in the "
-        "panel there; of the panel's other settings none counts",
-    )
-    prune.add_argument(
-        "--source",
-        type=_source,
-        metavar="WHICH",
-        help=f"with --object: which cameras decide instead, one of {', '.join(SOURCES)}",
-    )
-    prune.add_argument(
-        "--frames",
-        type=_frames,
-        metavar="A:B:STEP",
-        help="with --object: the active camera decides, at frame A and every STEP-th after it to B "
-        "(every one without STEP); --source frames alone takes the panel's range",
-    )
+    _add_object(prune)
     prune.add_argument(
         "--save", action="store_true", help="with --object: delete the splats there and save"
     )
@@ -190,7 +174,8 @@ def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
 
 def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     scoring = _add(commands, "score", "write the file with a float property refine_score")
-    scoring.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a file of splats")
+    scoring.add_argument("inputs", nargs="*", type=_given, metavar="INPUT", help="a file of splats")
+    _add_object(scoring)
     scoring.add_argument(
         "-o", "--output", type=_path, metavar="OUT.ply", required=True, help="the file to make"
     )
@@ -255,6 +240,29 @@ def _add_convert(commands: Any) -> None:  # noqa: ANN401 - argparse does not nam
     convert.add_argument("inputs", nargs=1, type=_given, metavar="IN", help="known by its content")
     convert.add_argument("output", type=_path, metavar="OUT", help=f"by its suffix: {FORMATS}")
     _add_common(convert)
+
+
+def _add_object(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--object",
+        type=_name,
+        metavar="NAME",
+        help="in place of INPUT: this splat object of the open .blend, by the cameras that are "
+        "chosen in the panel there; of the panel's other settings none counts",
+    )
+    parser.add_argument(
+        "--source",
+        type=_source,
+        metavar="WHICH",
+        help=f"with --object: which cameras decide instead, one of {', '.join(SOURCES)}",
+    )
+    parser.add_argument(
+        "--frames",
+        type=_frames,
+        metavar="A:B:STEP",
+        help="with --object: the active camera decides, at frame A and every STEP-th after it to B "
+        "(every one without STEP); --source frames alone takes the panel's range",
+    )
 
 
 def _add_cameras(parser: argparse.ArgumentParser) -> None:

@@ -16,6 +16,7 @@ from ..core.report import scoring_notes
 from ..core.whole_file import refuse_existing, refuse_mapped
 from . import report
 from .cameras import deciding
+from .checks import open_blend
 from .info import describe
 from .lod import make_levels
 from .options import budget, cleaning, settings
@@ -24,9 +25,11 @@ from .terminal import Terminal, complain, described
 
 if TYPE_CHECKING:
     import argparse
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from ..core import ViewSet
+    from ..core.formats.ply import SplatFile
+    from ..core.scores import Scores
 
 
 def execute(options: argparse.Namespace) -> bool:
@@ -231,6 +234,9 @@ def _quality(done: dict[str, Any]) -> str:
 
 def _score(run: _Run) -> None:
     options = run.options
+    if options.object:
+        run.attempt(options.object, lambda: _score_object(run))
+        return
     views = run.views()
     source = options.inputs[0]
     run.attempt(str(source), lambda: _score_one(run, source, views))
@@ -238,25 +244,46 @@ def _score(run: _Run) -> None:
 
 def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     options = run.options
-    output = options.output
-    refuse_existing(output, overwrite=options.overwrite)
+    refuse_existing(options.output, overwrite=options.overwrite)
     file = read_splats(source)
     scores = score(file.splats(), views, settings(options), progress=run.progress(source.name))
+    return _write_scores(run, str(source), file, scores)
+
+
+def _score_object(run: _Run) -> dict[str, Any]:
+    from .. import splat_object  # noqa: PLC0415 - needs Blender
+
+    options = run.options
+    refuse_existing(options.output, overwrite=options.overwrite)
+    file, scores, notes = splat_object.score_object(
+        options.object, run.views(), settings(options), progress=run.progress(options.object)
+    )
+    done = _write_scores(run, options.object, file, scores, notes)
+    done["files"]["input"] = f"{open_blend()}#{options.object}"
+    return done
+
+
+def _write_scores(
+    run: _Run, label: str, file: SplatFile, scores: Scores, more_notes: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Write a file with its scores and say what came of it; return the report."""
+    options = run.options
+    output = options.output
     file.write(output, columns={"refine_score": scores.values}, overwrite=options.overwrite)
     run.terminal.clear()
     run.terminal.say(
-        f"{source}: scored {len(file):,} splats by {scores.views_used} views -> {output}"
+        f"{label}: scored {len(file):,} splats by {scores.views_used} views -> {output}"
     )
     run.say_cameras()
     unseen = int(np.count_nonzero(scores.seen == 0))
     _say_unseen(run, unseen, len(file))
-    notes = scoring_notes(scores)
+    notes = [*scoring_notes(scores), *more_notes]
     for note in notes:
         run.terminal.say(f"  note: {note}")
     return {
-        "files": {"input": str(source), "output": str(output)},
+        "files": {"input": label, "output": str(output)},
         "splats": {"before": len(file), "undrawable": scores.undrawable, "unseen": unseen},
-        "views": {"given": len(views), "used": scores.views_used},
+        "views": {"given": scores.views_given, "used": scores.views_used},
         "settings": asdict(settings(options)),
         "weights": scores.facts,
         "notes": notes,

@@ -5,9 +5,12 @@ from __future__ import annotations
 import json
 import math
 import re
+from pathlib import Path
 
 import bpy
 import pytest
+
+ROOM = Path(__file__).parents[1] / "data/room_small"
 
 CLOSED = ["--method", "closed-form"]
 
@@ -101,6 +104,38 @@ def test_panel_and_command_keep_the_same_set_of_a_saved_scene(addon, animated, t
     said = capsys.readouterr().out
     assert f"\n  cameras: {words}, as chosen in the panel\n" in said
     assert f"\n  cameras: {words}, as the command line says\n" in said
+
+
+def test_an_object_is_scored_as_its_file_is(addon, room, room_cameras, tmp_path, capsys):
+    """By the collection that holds the cameras of the file: equal bytes, and nothing is changed."""
+    assert bpy.context.scene.refine.collection == room_cameras
+    source, cameras = ROOM / "point_cloud.ply", ROOM / "cameras.json"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+    attributes = sorted(room.data.attributes.keys())
+    told = tmp_path / "report.json"
+    by_object = ["score", "--object", "room", "-o", str(tmp_path / "object.ply"), *CLOSED]
+    by_file = ["score", str(source), "--cameras", str(cameras), "-o", str(tmp_path / "file.ply")]
+
+    assert addon.command.main([*by_object, "--report", str(told)], scene=True) == 0
+    assert addon.command.main([*by_file, *CLOSED]) == 0
+    assert (tmp_path / "object.ply").read_bytes() == (tmp_path / "file.ply").read_bytes()
+    assert sorted(room.data.attributes.keys()) == attributes
+    words = "those in collection 'cameras', as chosen in the panel"
+    assert f"\n  cameras: {words}\n" in capsys.readouterr().out
+    entry = json.loads(told.read_text())["results"][0]
+    assert entry["files"]["input"] == f"{bpy.data.filepath}#room"
+    assert entry["cameras"]["words"] == words
+
+
+def test_an_object_is_scored_by_the_cameras_that_are_named(addon, animated, tmp_path):
+    """By another choice it scores otherwise; an output that exists is refused."""
+    outputs = [tmp_path / f"{name}.ply" for name in ("five", "one")]
+    for output, source in zip(outputs, (f"collection:{animated.name}", "active"), strict=True):
+        words = ["score", "--object", "room", "-o", str(output), "--source", source, *CLOSED]
+        assert addon.command.main(words, scene=True) == 0
+        assert addon.command.main(words, scene=True) == 1
+
+    assert outputs[0].read_bytes() != outputs[1].read_bytes()
 
 
 def test_frames_without_a_range_are_those_of_the_panel(addon, animated, tmp_path):  # noqa: ARG001
