@@ -38,8 +38,6 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
         _check_settings(parser, given)
     except RefineError as error:
         parser.error(str(error))
-    if given.command in ("prune", "score"):
-        _check_source(parser, given)
     if given.command == "prune":
         _check_prune(parser, given)
     elif given.command == "score":
@@ -160,6 +158,7 @@ def _check_source(parser: argparse.ArgumentParser, given: argparse.Namespace) ->
 def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     if given.clean and given.object:
         parser.error("--clean goes with INPUT files, not with --object")
+    _check_source(parser, given)
     if given.object:
         if given.output_dir:
             parser.error("--object is written with -o, not with --output-dir")
@@ -170,6 +169,7 @@ def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
 
 
 def _check_score(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    _check_source(parser, given)
     if len(given.inputs) > 1:
         parser.error(f"expected one INPUT, got {len(given.inputs)}")
     if format_named(given.output):
