@@ -11,7 +11,7 @@ demo: $(DEV)          ## the main job: the committed room, its cameras, half of 
 	$(PY) docs/demo.py
 
 test: $(BENCH)        ## core, add-on and benchmark tests, all of them
-	$(PY) -m pytest
+	$(PY) -m pytest -n auto --maxprocesses 4 --dist worksteal
 
 test-core: $(DEV)     ## core alone, in seconds: without slow tests, few random examples
 	$(PY) -m pytest tests/core -m "not slow" --hypothesis-profile=quick -n auto

@@ -9,7 +9,8 @@ NumPy of `make test`, which lies between: that keeps CI well inside an hour.
 import subprocess
 import sys
 
-TOOLS = ["pytest", "hypothesis", "mpmath"]
+TOOLS = ["pytest", "pytest-xdist", "hypothesis", "mpmath"]
+SIDE_BY_SIDE = ["-n", "auto", "--maxprocesses", "4", "--dist", "worksteal"]
 NOT_SLOW = ["-m", "not slow"]
 QUICK = [*NOT_SLOW, "--hypothesis-profile=quick"]
 
@@ -22,7 +23,9 @@ def tested(folder: str, packages: list[str], *options: str) -> None:
     versions = "import numpy, plyfile; from importlib.metadata import version as v; "
     versions += "print('NumPy', v('numpy'), 'and plyfile', v('plyfile'), flush=True)"
     subprocess.run([python, "-c", versions], check=True)
-    done = subprocess.run([python, "-m", "pytest", "tests/core", "-q", *options], check=False)
+    done = subprocess.run(
+        [python, "-m", "pytest", "tests/core", "-q", *SIDE_BY_SIDE, *options], check=False
+    )
     if done.returncode:
         sys.exit(done.returncode)
 
