@@ -56,7 +56,7 @@ def registered(commands: dict[object, str]) -> list[str]:
     for name in dir(bpy.app.handlers):
         functions = getattr(bpy.app.handlers, name)
         if isinstance(functions, list):
-            lines += [f"handler {name} {function.__qualname__}" for function in functions]
+            lines += [f"handler {name} {f.__module__}.{f.__qualname__}" for f in functions]
     for keymap in bpy.context.window_manager.keyconfigs.addon.keymaps:
         lines += [f"key {keymap.name} {item.idname}" for item in keymap.keymap_items]
     return sorted(lines)
