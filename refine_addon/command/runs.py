@@ -339,13 +339,16 @@ def _clean_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     run.terminal.clear()
     kept, to = int(found.keep.sum()), f" -> {options.output}" if options.output else ""
     run.terminal.say(f"{source}: {found.in_words()}; {kept:,} of {len(file):,} splats stay{to}")
+    notes = made.notes(found.keep)
+    for note in notes:
+        run.terminal.say(f"  note: {note}")
     return {
         "files": {"input": str(source), "output": str(options.output) if to else None},
         "splats": {"before": len(file), "kept": kept, "removed": len(file) - kept},
         "views": {"given": len(views)},
         "settings": asdict(found.settings),
         "cleaned": found.facts(),
-        "notes": made.notes(found.keep),
+        "notes": notes,
     }
 
 

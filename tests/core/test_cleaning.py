@@ -194,3 +194,12 @@ def test_connected_parts_have_one_number():
     ring = random.permutation(1000)
 
     assert not connected(1000, ring, np.roll(ring, 1)).any()
+
+
+def test_cameras_that_see_nothing_are_refused():
+    """They look the other way: nothing can be judged, which is not the same as nothing to do."""
+    turned = np.diag([-1.0, 1.0, -1.0])
+    away = ViewSet(tuple(replace(view, rotation=turned) for view in cameras().views))
+
+    with pytest.raises(RefineError, match="no camera sees the splats"):
+        clean(wall(), away)

@@ -105,3 +105,9 @@ def test_clean_goes_with_files_alone(files, capsys):
     assert main(["prune", "--clean", "--object", "Splats"]) == 2
     assert "--clean goes with INPUT files" in capsys.readouterr().err
     assert call(files, "clean", "--views", "-1") == 2
+
+
+def test_clean_says_what_a_lossy_format_does_to_what_stays(files, capsys):
+    """As `prune` and `convert` do: `.splat` has a note of its own."""
+    assert call(files, "clean", "-o", str(files / "out.splat")) == 0
+    assert "  note: .splat " in capsys.readouterr().out

@@ -30,7 +30,7 @@ from refine_addon.core import (
 from refine_addon.core.absorbing import absorb as absorbing
 from refine_addon.core.formats.ply import SplatFile
 from refine_addon.core.levels import distance
-from refine_addon.core.levels.distance import Lookout
+from refine_addon.core.levels.distance import Lookout, Reach
 
 from .test_cleaning import cameras, joined, made, wall
 
@@ -249,6 +249,16 @@ def test_the_geometric_error_is_the_width_of_what_changed():
 
     assert reach.error == pytest.approx(1.0, rel=1e-6)
     assert reach.pixel == pytest.approx(400.0, rel=1e-6)
+
+
+def test_no_level_has_a_smaller_geometric_error_than_one_before(monkeypatch):
+    """A viewer that goes by 3D Tiles' rule would never choose the one before."""
+    errors = iter((3.0, 1.0, 4.0))
+    monkeypatch.setattr(Lookout, "reach", lambda *_, **__: Reach(next(errors), (), 1.0))
+
+    levels = lod(colourful(), cameras(), Levels((0.5, 0.3, 0.1), absorb=False))
+
+    assert [level.reach.error for level in levels] == [3.0, 3.0, 4.0]
 
 
 def test_a_survivor_that_grew_counts_as_wide_as_it_is():

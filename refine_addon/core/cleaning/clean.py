@@ -195,7 +195,7 @@ def clean(
     Raises
     ------
     RefineError
-        If nothing would be left.
+        If nothing would be left, or no view sees any splat.
     Cancelled
         If `progress` answers ``False``.
     """
@@ -285,6 +285,13 @@ class _Run:
         lights, supports, widths = (np.array(arrays) for arrays in zip(*blocks, strict=True))
         light = lights.sum(axis=0)
         lit = light > 0.0
+        if count and not lit.any():
+            msg = (
+                f"no camera sees the splats: none of {count} that can be drawn is met from any of "
+                f"{len(self.sights.views)} views; check that cameras and splats share their frame "
+                "and unit"
+            )
+            raise RefineError(msg)
         support = supports.sum(axis=0) / np.where(lit, light, 1.0)
         return np.where(lit, support, 1.0), widths.max(axis=0)
 

@@ -225,12 +225,16 @@ def each_level(  # noqa: PLR0913 - as `lod`
     scene = Task(Budget(ratio=0.0), settings, splats, views, protected=protected)
     lookout = Lookout(splats, views, progress=part(progress, 0.0, 0.05), threads=threads)
     budgets, ahead = levels.budgets(len(splats)), part(progress, 0.05, 1.0)
+    coarsest = 0.0
     made = (_absorbing if levels.absorb else _deleting)(scene, budgets, ahead, threads)
     for number, (keep, left, psnr, absorbed) in enumerate(made):
         end = 0.05 + 0.95 * (number + 1) / len(levels) if levels.absorb else 1.0
         reach = lookout.reach(
             left, keep, absorbed.changed if absorbed else None, progress=part(progress, end, end)
         )
+        # What a level has changed is changed in all after it, though they may measure as less.
+        coarsest = max(coarsest, reach.error)
+        reach = replace(reach, error=coarsest)
         asked = (levels.shares or levels.psnr)[number]
         yield Level(number + 1, asked, keep, left, psnr, reach, absorbed)
 
