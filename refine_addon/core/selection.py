@@ -198,7 +198,7 @@ def select(
     free = np.ones(len(values), np.bool_) if protected is None else ~protected
     removals = _removals(scores, budget, row_bytes, fixed_bytes)
     if budget.threshold is not None:
-        keep[free & (values < budget.threshold)] = False
+        keep[free & (values < _single(budget.threshold))] = False
     elif budget.min_seen is not None:
         keep[free & (scores.seen < _least_seen(budget.min_seen, scores.views_used))] = False
     elif removals:
@@ -267,14 +267,19 @@ class Tally:
         budget.refuse_meaningless(scores.method, frustum=scores.frustum)
         count = _removals(scores, budget, row_bytes, fixed_bytes)
         if budget.threshold is not None:
-            with np.errstate(over="ignore"):  # beyond the range of float32 all splats are below
-                count = int(np.searchsorted(self._values, np.float32(budget.threshold)))
+            count = int(np.searchsorted(self._values, _single(budget.threshold)))
         elif budget.min_seen is not None:
             least = _least_seen(budget.min_seen, scores.views_used)
             count = int(np.searchsorted(self._seen, least))
         count = min(count or 0, len(self._values))
         _refuse_none_left(budget, len(scores.values), len(scores.values) - count)
         return count
+
+
+def _single(threshold: float) -> np.float32:
+    """Return a threshold in the precision of scores; beyond its range all of them are below."""
+    with np.errstate(over="ignore"):
+        return np.float32(threshold)
 
 
 def _removals(scores: Scores, budget: Budget, row_bytes: RowBytes, fixed_bytes: int) -> int | None:

@@ -365,3 +365,14 @@ def test_shares_of_fewer_splats_are_the_quotients(count, data):
     places = np.array(data.draw(st.lists(st.integers(1, count), min_size=1)))
 
     np.testing.assert_array_equal(np.float32(places / count), shares_gone(places, count))
+
+
+def test_a_threshold_beyond_the_range_of_scores_removes_all_that_are_finite():
+    """Rounded to single precision it is infinite, without a warning from any NumPy."""
+    known = Scores(
+        np.array([0.0, np.inf], np.float32), np.array([0, 1]), views_used=2, undrawable=0
+    )
+
+    keep = select(known, Budget(threshold=3.4028235677973366e38))
+
+    assert keep.tolist() == [False, True]
