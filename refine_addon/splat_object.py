@@ -156,7 +156,7 @@ def stored_task(
         splats=None if views is None else gather(checked, whole=True),
         views=views,
         scores=stored_scores(checked),
-        protected=mesh_edit.protected_mask(checked.obj, protect) if protect else None,
+        protected=mesh_edit.protected_mask(checked.obj, protect),
         absorb=views is not None,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
@@ -168,24 +168,10 @@ def keep_mask(checked: SplatObject, budget: Budget, protect: str = "") -> NDArra
     return pipeline.decide(stored_task(checked, budget, protect)).keep
 
 
-def plan(checked: SplatObject, budget: Budget, protect: str = "") -> Plan:
-    """Return what Apply without Absorb would do, and mark the splats that would go.
-
-    Raises
-    ------
-    RefineError
-        See `stored_task`; also if nothing would stay, or the object is linked from a library.
-    """
-    keep = mark_removed(checked, stored_task(checked, budget, protect))
-    return _plan(checked, keep)
-
-
 def mark_removed(checked: SplatObject, task: Task) -> NDArray[np.bool_]:
     """Mark the splats that a task (`stored_task`) removes; return which stay, (N,)."""
     keep = pipeline.decide(task).keep
-    mesh_edit.check_writable(checked.obj)
-    mesh_attributes.write_attribute(checked.mesh, mesh_edit.REMOVE, "BOOLEAN", ~keep)
-    mesh_attributes.updated(checked.mesh)
+    mesh_edit.mark_removed(checked.obj, ~keep)
     return keep
 
 
@@ -437,8 +423,7 @@ def _file_size(checked: SplatObject, budget: Budget, output: Path | None) -> tup
         return mesh_attributes.file_size(checked)
     if budget.max_mb is not None:
         refuse_unknown_size(form)
-    degree = min(mesh_layout.sh_degree(checked.mesh), form.degree)
-    sizes = form.sizes(len(checked), degree)
+    sizes = form.sizes_without_more(len(checked), mesh_layout.sh_degree(checked.mesh))
     return (sizes.row, sizes.fixed) if sizes else (0.0, 0)
 
 

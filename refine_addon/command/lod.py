@@ -44,8 +44,7 @@ def make_levels(
     )
     for entry in done["levels"]:
         terminal.say(f"  {_in_words(entry, done['goal_psnr'])}")
-    for note in done["notes"]:
-        terminal.say(f"  note: {note}")
+    terminal.notes(done["notes"])
     return done
 
 

@@ -203,8 +203,7 @@ def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
     quality = _quality(done)
     if quality:
         run.terminal.say(f"  quality: {quality}")
-    for note in done["notes"]:
-        run.terminal.say(f"  note: {note}")
+    run.terminal.notes(done["notes"])
 
 
 def _say_unseen(run: _Run, unseen: int, scored: int) -> None:
@@ -278,8 +277,7 @@ def _write_scores(
     unseen = int(np.count_nonzero(scores.seen == 0))
     _say_unseen(run, unseen, len(file))
     notes = [*scoring_notes(scores), *more_notes]
-    for note in notes:
-        run.terminal.say(f"  note: {note}")
+    run.terminal.notes(notes)
     return {
         "files": {"input": label, "output": str(output)},
         "splats": {"before": len(file), "undrawable": scores.undrawable, "unseen": unseen},
@@ -306,8 +304,7 @@ def _convert_one(run: _Run, source: Path) -> dict[str, Any]:
     run.terminal.say(
         f"{source}: {len(file):,} splats, {_megabytes(file.stored_bytes, size)} -> {output}"
     )
-    for note in notes:
-        run.terminal.say(f"  note: {note}")
+    run.terminal.notes(notes)
     return {
         "files": {
             "input": str(source),
@@ -340,8 +337,7 @@ def _clean_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     kept, to = int(found.keep.sum()), f" -> {options.output}" if options.output else ""
     run.terminal.say(f"{source}: {found.in_words()}; {kept:,} of {len(file):,} splats stay{to}")
     notes = made.notes(found.keep)
-    for note in notes:
-        run.terminal.say(f"  note: {note}")
+    run.terminal.notes(notes)
     return {
         "files": {"input": str(source), "output": str(options.output) if to else None},
         "splats": {"before": len(file), "kept": kept, "removed": len(file) - kept},

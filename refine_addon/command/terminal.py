@@ -8,7 +8,7 @@ import unicodedata
 from typing import TYPE_CHECKING, Literal, TextIO
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
 
 _OBEYED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 """Categories of characters that a terminal obeys, or cannot show, and nobody reads."""
@@ -65,6 +65,11 @@ class Terminal:
         """Print a line, unless quiet."""
         if not self._quiet:
             _write("stdout", f"{shown(text)}\n")
+
+    def notes(self, notes: Iterable[str]) -> None:
+        """Print what else the user should know of a result, a line each."""
+        for note in notes:
+            self.say(f"  note: {note}")
 
     def progress(
         self, label: str, left: Callable[[float], str] = lambda _fraction: ""

@@ -131,7 +131,20 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
         raise RefineError(msg)
 
 
-def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
+def mark_removed(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
+    """Mark splats, (N,), as what goes, for all previews.
+
+    Raises
+    ------
+    RefineError
+        See `check_writable`.
+    """
+    check_writable(obj)
+    mesh_attributes.write_attribute(obj.data, REMOVE, "BOOLEAN", remove)
+    mesh_attributes.updated(obj.data)
+
+
+def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
     """Return which splats a boolean point attribute or a vertex group marks.
 
     A point cloud has no vertex groups; a float attribute marks there, which is what `convert` makes
@@ -141,17 +154,20 @@ def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
     ----------
     obj : bpy.types.Object
     name : str
+        Empty for none.
 
     Returns
     -------
-    (N,) bool
-        For a vertex group or a float attribute, where the weight is above 0.
+    (N,) bool or None
+        For a vertex group or a float attribute, where the weight is above 0; None without a name.
 
     Raises
     ------
     RefineError
         If the object has neither of that name.
     """
+    if not name:
+        return None
     attribute = obj.data.attributes.get(name)
     if attribute and attribute.data_type in marking(obj) and attribute.domain == "POINT":
         return mesh_attributes.read_attribute(obj.data, name) > 0

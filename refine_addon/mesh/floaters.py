@@ -12,6 +12,7 @@ from ..core.errors import RefineError
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
 from .layout import splat_count
+from .notes import parsed
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -56,7 +57,7 @@ def store(checked: SplatObject, cleaned: Cleaned) -> None:
 def counts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, int] | None:
     """Return how many floaters were found for each reason; None if nobody looked since a change."""
     try:
-        noted = json.loads(mesh[FOUND])
+        noted = parsed(mesh[FOUND])
         found = {name: int(noted["counts"][name]) for name in REASONS}
         holds = noted["splats"] == splat_count(mesh) and REASON in mesh.attributes
     except (KeyError, TypeError, ValueError):
@@ -87,10 +88,7 @@ def mark(checked: SplatObject, reasons: Collection[str]) -> None:
     RefineError
         See `mask`; also if the object cannot be written to.
     """
-    mesh_edit.check_writable(checked.obj)
-    remove = mask(checked, reasons)
-    mesh_attributes.write_attribute(checked.mesh, mesh_edit.REMOVE, "BOOLEAN", remove)
-    mesh_attributes.updated(checked.mesh)
+    mesh_edit.mark_removed(checked.obj, mask(checked, reasons))
 
 
 def forget(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from ..core.selection import rank
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
 from . import heat_map
+from .notes import parsed
 
 if TYPE_CHECKING:
     import bpy
@@ -89,22 +89,10 @@ def store(
 def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
     """Return how a mesh was scored, None if it was not."""
     try:
-        return _parsed(mesh[RECORD])
+        noted: dict[str, Any] = parsed(mesh[RECORD])
+        complete = noted.keys() >= {"splats", "settings", "views_given", "views_used"}
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
-
-
-@lru_cache(maxsize=4)
-def _parsed(text: str) -> dict[str, Any] | None:
-    """Return a note as values, which nobody may change: it is asked for whenever a panel is drawn.
-
-    Raises
-    ------
-    TypeError, ValueError, AttributeError
-        If it is none.
-    """
-    noted = json.loads(text)
-    complete = noted.keys() >= {"splats", "settings", "views_given", "views_used"}
     return noted if complete else None
 
 

@@ -49,12 +49,11 @@ class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
         """Gather splats and views."""
         settings = context.scene.refine
         mesh_edit.check_writable(checked.obj)
-        protect = settings.protect
         return _Looking(
             splat_object.gather(checked),
             chosen_views(context),
             Cleaning(tuple(settings.reasons), settings.views),
-            mesh_edit.protected_mask(checked.obj, protect) if protect else None,
+            mesh_edit.protected_mask(checked.obj, settings.protect),
         )
 
     @staticmethod

@@ -19,7 +19,7 @@ from bpy_extras.io_utils import ExportHelper
 from .. import level_objects, splat_object
 from ..cameras.sets import Choice
 from ..core import frustum, pipeline
-from ..core.formats.registry import FORMATS, SUFFIXES, Packed
+from ..core.formats.registry import FORMATS, Packed, without_suffix
 from ..core.levels.lod import Level, Levels, lod
 from ..core.quality import in_words
 from ..core.report import scoring_notes
@@ -263,13 +263,13 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Detail:
         """Gather splats, views and settings."""
         settings = context.scene.refine
-        levels, protect = settings.to_levels(), settings.protect
+        levels = settings.to_levels()
         return _Detail(
             splat_object.gather(checked, whole=True if levels.absorb else None),
             chosen_views(context),
             levels,
             settings.to_settings(),
-            mesh_edit.protected_mask(checked.obj, protect) if protect else None,
+            mesh_edit.protected_mask(checked.obj, settings.protect),
         )
 
     @staticmethod
@@ -424,12 +424,8 @@ class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
 
     def check(self, _context: bpy.types.Context) -> bool:
         """Give the file name the suffix of the format that is chosen; return whether it changed."""
-        bare = self.filepath
-        for suffix in sorted(SUFFIXES, key=len, reverse=True):
-            if bare.lower().endswith(suffix):
-                bare = bare[: -len(suffix)]
-                break
-        before, self.filepath = self.filepath, bare + self.suffix
+        before = self.filepath
+        self.filepath = without_suffix(before) + self.suffix
         return before != self.filepath
 
     def execute(self, context: bpy.types.Context) -> Answer:

@@ -88,9 +88,7 @@ class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
         """Draw the reasons, how many splats each takes, and the buttons."""
         layout = self.layout
         settings = context.scene.refine
-        progress = context.window_manager.refine_progress
-        if progress >= 0.0:
-            layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
+        if _draw_progress(layout, context):
             return
         layout.operator("refine.find_floaters", icon="VIEWZOOM")
         obj = context.object
@@ -122,9 +120,7 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         column.prop(settings, "method")
         if settings.method == "auto":
             column.prop(settings, "tolerance")
-        progress = context.window_manager.refine_progress
-        if progress >= 0.0:
-            layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
+        if _draw_progress(layout, context):
             return
         layout.operator("refine.score", icon="CAMERA_DATA")
         obj = context.object
@@ -214,9 +210,7 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
         if record:
             _draw_plan(layout, context, record)
-        progress = context.window_manager.refine_progress
-        if progress >= 0.0:
-            layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
+        if _draw_progress(layout, context):
             return
         layout.operator("refine.apply", icon="TRASH")
 
@@ -236,6 +230,14 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
         column.prop(settings, "levels")
         column.prop(settings, "nested")
         column.operator("refine.levels", icon="MOD_DECIM")
+
+
+def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
+    """Draw how far an operator is that works on a thread; return whether one does."""
+    progress = context.window_manager.refine_progress
+    if progress >= 0.0:
+        layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
+    return bool(progress >= 0.0)
 
 
 def _draw_frames(

@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -22,6 +21,7 @@ from ..core.quality import in_words
 from ..core.selection import Tally, quality_of
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..mesh.notes import parsed
 from . import camera_list, price
 from .chart import Place
 
@@ -139,7 +139,7 @@ def wait(scene: bpy.types.Scene, obj: bpy.types.Object, seconds: float) -> None:
 def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:  # noqa: ANN401
     """Return the stored plan if it is that of the current budget and mesh, else None."""
     try:
-        noted = _read(obj.data[PLAN])
+        noted: dict[str, Any] = parsed(obj.data[PLAN])
         count = mesh_layout.splat_count(obj.data)
         holds = noted["key"] == key(settings) and noted["splats"] == count
     except (KeyError, TypeError, ValueError):
@@ -317,8 +317,3 @@ def _place(plan: dict[str, Any], settings: Any) -> Place | None:  # noqa: ANN401
     if "error" in plan:
         return None
     return Place(plan["removed"] / plan["splats"], settings.absorb)
-
-
-@lru_cache(maxsize=4)
-def _read(text: str) -> dict[str, Any]:
-    return dict(json.loads(text))

@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..core.formats.format import pieces
 from ..core.rendering import ALPHA_CUT
 from ..core.spherical_harmonics import colors as colors_along
-from ..core.splats import SH_C0, drawable, opacity, rotation_matrices
+from ..core.splats import SH_C0, drawable, opacity, rotation_matrices, scales
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from numpy.typing import NDArray
 
     from ..core.splats import Splats
@@ -28,7 +27,6 @@ WIDTH = 4096
 MOST = 1 << 24
 """Splats drawn at most: float32, in which a texture holds their order, counts no further."""
 
-_CHUNK = 1 << 15
 _KEYS = 65535.0
 _LARGEST_HALF = 65504.0
 
@@ -86,11 +84,11 @@ def pack(splats: Splats) -> Packed:
     covariances = np.empty((len(vertices), 6), np.float32)
     harmonics = np.empty((len(vertices), splats.sh_rest.shape[1] + 1, 3), np.float16)
     rows, columns = np.triu_indices(3)
-    for chunk in _chunks(len(vertices)):
+    for chunk in pieces(len(vertices)):
         some = splats.take(vertices[chunk])
         with np.errstate(under="ignore", over="ignore"):
             axes = rotation_matrices(some.quaternions)
-            axes *= np.exp(some.log_scales.astype(np.float64))[:, None, :]
+            axes *= scales(some.log_scales)[:, None, :]
             matrices = axes @ axes.transpose(0, 2, 1)
             covariances[chunk] = matrices[:, rows, columns]
         harmonics[chunk, 0], harmonics[chunk, 1:] = _half(some.sh_dc), _half(some.sh_rest)
@@ -127,7 +125,7 @@ def colors(packed: Packed, eye: Eye | None = None) -> NDArray[np.float32]:
     """
     found = np.empty((len(packed), 4), np.float32)
     found[:, 3] = packed.opacities
-    for chunk in _chunks(len(packed)):
+    for chunk in pieces(len(packed)):
         coefficients = packed.harmonics[chunk].astype(np.float32)
         if eye is None:
             rgb = 0.5 + SH_C0 * coefficients[:, 0]
@@ -238,8 +236,3 @@ def _directions(means: NDArray[np.float32], eye: Eye) -> NDArray[np.float32]:
     lengths = np.linalg.norm(away, axis=1, keepdims=True)
     away /= np.where(lengths > 0.0, lengths, np.float32(1.0))
     return away
-
-
-def _chunks(count: int) -> Iterator[slice]:
-    for start in range(0, count, _CHUNK):
-        yield slice(start, start + _CHUNK)

@@ -75,6 +75,10 @@ class Format:
     write: Callable[[BinaryIO, Splats], None]
     sizes: Callable[[int, int], Sizes | None]
 
+    def sizes_without_more(self, count: int, degree: int) -> Sizes | None:
+        """Return `sizes` of splats of any degree: without the harmonics that it does not hold."""
+        return self.sizes(count, min(degree, self.degree))
+
 
 def new_file(path: Path, origin: Origin, count: int, degree: int) -> tuple[SplatFile, Splats]:
     """Return a file of `count` splats whose values are still to be set.

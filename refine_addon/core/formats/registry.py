@@ -39,6 +39,8 @@ FORMATS: tuple[Format, ...] = (
 SUFFIXES = (".ply", *(form.suffix for form in FORMATS))
 """Endings of the files that are read and written."""
 
+_LONGEST_FIRST = sorted(SUFFIXES, key=len, reverse=True)
+
 NOT_WRITTEN = (".ksplat", ".gltf", ".lcc")
 """Endings of other splat formats: a PLY of such a name would mislead."""
 
@@ -106,6 +108,12 @@ def format_named(path: Path) -> Format | None:
         msg = f"{path}: {path.suffix} is not written, expected one of {', '.join(SUFFIXES)}"
         raise RefineError(msg)
     return form
+
+
+def without_suffix(name: str) -> str:
+    """Return a file name without the ending of a format of splats, if it has one."""
+    end = next((end for end in _LONGEST_FIRST if name.lower().endswith(end)), "")
+    return name[: len(name) - len(end)]
 
 
 def refuse_unknown_size(form: Format) -> None:
@@ -257,5 +265,4 @@ class Packed:
         return splats.up_to_degree(self.form.degree)
 
     def _sizes(self, count: int) -> Sizes | None:
-        degree = min(self.file.splats().sh_degree, self.form.degree)
-        return self.form.sizes(count, degree)
+        return self.form.sizes_without_more(count, self.file.splats().sh_degree)

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from ..errors import RefineError
-from ..formats.registry import SUFFIXES, as_written, read_splats
+from ..formats.registry import as_written, read_splats, without_suffix
 from ..quality import PSNR_CAP
 from ..report import Clock
 from ..survivors import survivor_columns
@@ -44,9 +44,8 @@ def level_paths(source: Path, folder: Path, count: int, suffix: str = ".ply") ->
     >>> [path.as_posix() for path in level_paths(Path("a/b.compressed.ply"), Path("out"), 2)]
     ['out/b.lod1.ply', 'out/b.lod2.ply']
     """
-    ends = sorted(SUFFIXES, key=len, reverse=True)
-    end = next((end for end in ends if source.name.lower().endswith(end)), source.suffix)
-    name = source.name[: len(source.name) - len(end)] or source.name
+    name = without_suffix(source.name)
+    name = source.stem if name == source.name else name or source.name
     return [folder / f"{name}.lod{number}{suffix}" for number in range(1, count + 1)]
 
 

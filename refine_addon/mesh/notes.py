@@ -1,0 +1,19 @@
+"""What custom properties of a mesh say, as JSON."""
+
+from __future__ import annotations
+
+import json
+from functools import lru_cache
+from typing import Any
+
+
+@lru_cache(maxsize=16)
+def parsed(text: str) -> Any:  # noqa: ANN401 - whatever was noted
+    """Return a note as values, which nobody may change: panels ask whenever they are drawn.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If it is no text, or no JSON.
+    """
+    return json.loads(text)
