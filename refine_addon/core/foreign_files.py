@@ -79,10 +79,9 @@ def foreign_kind(path: Path, head: bytes) -> str:
         return f"an SPZ file: {_READ}"
     if head.startswith(GZIP):
         return "compressed with gzip: unpack it first"
-    if head.startswith(_ZIP) and (suffix == ".sog" or _lists_sog(path)):
-        return f"a SOG file: {_READ}"
     if head.startswith(_ZIP):
-        return "a ZIP archive: unpack it first"
+        sog = suffix == ".sog" or _lists_sog(path)
+        return f"a SOG file: {_READ}" if sog else "a ZIP archive: unpack it first"
     if suffix == ".spz" and head and not head.startswith(b"ply"):
         return f"a damaged SPZ file: begins with {head[:4]!r}, expected {_SPZ!r} or {GZIP!r}"
     return ""

@@ -17,8 +17,8 @@ import numpy as np
 from . import selection
 from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
-from .quality import left_to_lose
-from .report import Clock, make_report
+from .quality import left_to_lose, out_of_reach
+from .report import Clock, make_report, size_in_words
 from .scoring import auto, closed_form, occlusion, sight_lines
 from .selection import Budget
 from .task import DEFAULTS, Result, Settings, Task
@@ -257,12 +257,26 @@ def decide(
     facts |= _quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
     if psnr is None and scores.sights is not None:
         facts["notes"].append(UNSEEN)
+    facts["budget_remark"] = _remark(task, keep, psnr)
+    if facts["budget_remark"]:
+        facts["notes"].append(facts["budget_remark"])
     if absorbed:
         facts["absorbed"] = absorbed.facts()
         facts["notes"].append(absorbed.note())
         if known and task.settings.method == "closed-form":
             facts["notes"].append("absorbing measures by occlusion: closed-form was not used")
     return Result(keep, scores, facts, absorbed)
+
+
+def _remark(task: Task, keep: NDArray[np.bool_], psnr: float | None) -> str:
+    """Return why a budget is out of reach or removes nothing, or ""."""
+    budget, gone = task.budget, len(keep) - int(np.count_nonzero(keep))
+    if budget.psnr is not None:
+        return out_of_reach(budget.psnr, gone, len(keep), psnr)
+    if budget.max_mb is not None and not gone:
+        rows = np.broadcast_to(task.row_bytes, len(keep)).sum() + task.fixed_bytes
+        return f"already {size_in_words(int(rows))}: nothing was removed"
+    return ""
 
 
 def _quality_facts(

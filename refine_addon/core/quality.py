@@ -154,6 +154,36 @@ def left_to_lose(goal: float, psnr: float | None) -> float:
     return -10.0 * math.log10(left) if left > 0.0 else math.inf
 
 
+def out_of_reach(goal: float, gone: int, count: int, psnr: float | None) -> str:
+    """Return what to say where a PSNR as budget cannot be had, or "".
+
+    Parameters
+    ----------
+    goal : float
+        The PSNR, dB.
+    gone, count : int
+        How many splats go, of how many.
+    psnr : float or None
+        The estimate with these removed, dB.
+
+    Examples
+    --------
+    >>> out_of_reach(99.0, 0, 100, 100.0)
+    'by the estimate nothing can go at 99 dB'
+    >>> out_of_reach(10.0, 95, 100, 16.2)
+    'the estimate ends at 95% removed, about 16 dB: for 10 dB no more goes'
+    """
+    if not gone:
+        return f"by the estimate nothing can go at {goal:g} dB"
+    at_end = gone >= math.floor(SHARES[-1] * count)
+    if at_end and psnr is not None and psnr > goal:
+        share = f"{SHARES[-1]:.0%}"
+        return (
+            f"the estimate ends at {share} removed, {in_words(psnr)}: for {goal:g} dB no more goes"
+        )
+    return ""
+
+
 def in_words(psnr: float) -> str:
     """Return an estimate as a user needs it.
 

@@ -90,7 +90,10 @@ def test_version_4_says_what_is_missing(tmp_path, monkeypatch):
         (gzip.compress(header(3, 2**32 - 1) + bytes(99)), "truncated: 4294967295 splats need "),
         (gzip.compress(header(3, 1000) + bytes(99)), "truncated: 1000 splats (unpacked) need 29"),
         (gzip.compress(header(3) + bytes(29))[:-2], "truncated: the gzip stream has no end"),
-        (gzip.compress(header(3) + bytes(29))[:-8] + bytes(8), "a damaged SPZ file: its gzip stream breaks at "),
+        (
+            gzip.compress(header(3) + bytes(29))[:-8] + bytes(8),
+            "a damaged SPZ file: its gzip stream breaks at ",
+        ),
         (gzip.compress(header(4) + bytes(99)), "SPZ version 4 inside of gzip"),
         (header(4, 2**32 - 1, streams=6) + struct.pack("<I12x", 32) + bytes(96), "stream 'mean'"),
         (header(4, streams=2) + struct.pack("<I12x", 32) + bytes(96), "byte 15: 2 streams, expect"),
@@ -118,10 +121,9 @@ def test_a_file_that_lies_is_refused(tmp_path, data, expected):
 @pytest.mark.parametrize(
     ("data", "expected"),
     [
-        (b"\x1f\x8b\x08\0" + bytes(6) + b"\x06" + bytes(99), "a damaged SPZ file: its gzip stream "
-         "breaks at byte 10 (Error -3"),
+        (b"\x1f\x8b\x08\0" + bytes(6) + b"\x06" + bytes(99), "a damaged SPZ file: its gzip strea"),
         (gzip.compress(b"NGSX" + bytes(99)), "no SPZ file: its gzip stream begins with b'NGSX', e"),
-        (b"NGXP" + bytes(99), "a damaged SPZ file: begins with b'NGXP', expected b'NGSP' or b'\\x1f"),
+        (b"NGXP" + bytes(99), "a damaged SPZ file: begins with b'NGXP', expected b'NGSP' or "),
     ],
     ids=["stream", "inside", "open"],
 )  # fmt: skip
