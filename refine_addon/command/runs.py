@@ -226,8 +226,10 @@ def _quality(done: dict[str, Any]) -> str:
     words = f"{in_words(psnr)} in these views"
     if done.get("written_psnr") is not None:
         words += f", {in_words(done['written_psnr'])} as written"
-    if absorbed is None or "absorbed" in done or psnr > UNSEEN:
+    if "absorbed" in done or psnr > UNSEEN:
         return words
+    if absorbed is None:
+        return f"{words}; {done['estimated_psnr_absorbed_note']}"
     return f"{words}; with --absorb {in_words(absorbed)}"
 
 

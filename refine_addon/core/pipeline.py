@@ -17,7 +17,7 @@ import numpy as np
 from . import selection
 from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
-from .quality import left_to_lose, out_of_reach
+from .quality import FEWEST, left_to_lose, out_of_reach
 from .report import Clock, make_report, size_in_words
 from .scoring import auto, closed_form, occlusion, sight_lines
 from .selection import Budget
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 UNSEEN = "the views see too little for an estimate of the pictures' quality"
 UNESTIMATED = "the closed form estimates the pictures' quality only if a PSNR is the budget"
+UNFORETOLD = f"what absorbing reaches is not foretold for fewer than {FEWEST:,} splats"
 """Why there is no estimate: notes of the report."""
 
 TRIES = 3
@@ -294,15 +295,18 @@ def _quality_facts(
         Whether survivors absorbed the others.
     """
     curve, other = scores.quality, psnr if absorbed else None
-    if curve is not None and not absorbed:
+    if curve is not None and curve.foretold and not absorbed:
         other = curve.at(1.0 - float(np.mean(keep)), absorb=True)
-    why = None
+    why = why_other = None
     if psnr is None:
         why = UNESTIMATED if scores.sights is None else UNSEEN
+    if other is None:
+        why_other = UNFORETOLD if psnr is not None else why
     return {
         "estimated_psnr": None if psnr is None else round(psnr, 2),
         "estimated_psnr_absorbed": None if other is None else round(other, 2),
         "estimated_psnr_note": why,
+        "estimated_psnr_absorbed_note": why_other,
         "quality": curve.facts() if curve is not None else None,
     }
 

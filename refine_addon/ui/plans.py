@@ -174,6 +174,8 @@ def sentence(plan: dict[str, Any], *, absorb: bool) -> str:
     )
     if "psnr" not in plan:
         return text
+    if "psnr_absorbed" not in plan:  # not foretold
+        return f"{text}, {in_words(plan['psnr'])} in these views{' without Absorb' * absorb}"
     ways = [in_words(plan[name]) for name in ("psnr", "psnr_absorbed")]
     here, other = ways[::-1] if absorb else ways
     named = "without Absorb" if absorb else "Absorb"
@@ -292,10 +294,9 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
     noted |= vars(sizes)
     if curve is None:
         return noted
-    noted |= {
-        "psnr": curve.at(gone / count),
-        "psnr_absorbed": curve.at(gone / count, absorb=True),
-    }
+    noted["psnr"] = curve.at(gone / count)
+    if curve.foretold:
+        noted["psnr_absorbed"] = curve.at(gone / count, absorb=True)
     if budget.psnr is not None:
         psnr = curve.at(gone / count, absorb=settings.absorb)
         remark = out_of_reach(budget.psnr, gone, count, psnr)
