@@ -481,6 +481,8 @@ MUTANTS = {
         ("(seen.views > 0) & ", "", "who sees nothing sees past"),
         ("found[name] &= ~protected", "pass", "protected ones go"),
         ("sizes < SMALL", "sizes > SMALL", "clusters of any size"),
+        ("most | (some & (effect >= LOUD))", "most | some", "few views for what hardly shows"),
+        ("(WIDE / np.maximum(widest, WIDE))", "1.0", "haze over the picture stays"),
     ],
     "cleaning/clusters.py": [
         ("labels = jumped", "break", "parts that are not joined"),
