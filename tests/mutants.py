@@ -155,6 +155,8 @@ MUTANTS = {
         ("wider = spread > widest", "wider = spread < widest", "halved along the narrowest"),
     ],
     "formats/spz.py": [
+        ("for size in (_STEP, 1):", "for size in (_STEP,):", "damage to a step alone"),
+        (" and head.startswith(GZIP)", "", "any file by its name"),
         ("(whole << 8) >> 8", "whole", "positions without sign"),
         ("[:, _WXYZ]", "", "rotations x y z w"),
         (
@@ -433,7 +435,15 @@ MUTANTS = {
         ),
         ("if format_named(path) is None:", "if False:", "a plain PLY compared"),
     ],
+    "quality.py": [
+        (" - halvings * np.array(FEWER)", "", "few splats that gain as much"),
+    ],
+    "report.py": [
+        ("missing = made.left_out(keep)", "missing = 0", "splats that no file holds"),
+        ("np.count_nonzero(seen == 0)", "np.count_nonzero(seen)", "unseen are seen"),
+    ],
     "levels/lod.py": [
+        ("        if not gone:\n            continue\n", "", "levels that are copies"),
         ("keep[first.keep] = second.keep", "keep[: len(second.keep)] = second.keep", "other rows"),
         (
             "first.changed[second.keep] | second.changed",
@@ -538,6 +548,7 @@ TESTS = {
     ],
     "glb": ["formats/glb_document.py"],
     "viewport_arrays": ["../viewport/arrays.py"],
+    "command_counts": ["report.py"],
     "levels": ["levels/lod.py", "levels/distance.py", "levels/files.py"],
 }
 """Modules whose tests are not in the file of their own name; those run first."""
