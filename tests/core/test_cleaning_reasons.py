@@ -72,13 +72,23 @@ def test_a_giant_may_lie_at_a_surface_by_half_if_it_is_a_veil(opacity, expected)
     assert reasons(square, made([[0.0, 0.0, 2.0]], 1.5, opacity, 0.1)) == expected
 
 
+def clump():
+    """Return 40 splats that hold together in the air, and support each other."""
+    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (40, 3))
+    return made(places, 0.06, 0.95, 0.1)
+
+
+def test_a_clump_is_isolated_and_nothing_else():
+    """It is in front of the wall as well, but has one reason."""
+    assert reasons(clump(), count=40) == {"isolated": 40}
+
+
 def test_fog_holds_no_cluster_together():
     """A clump in the air stays isolated where splats of opacity .05 lead from it to the wall."""
     depth = np.arange(2.0, 4.01, 0.1)
     fog = made(np.stack([0 * depth, 0 * depth, depth], axis=1), 0.06, 0.05, 0.1)
-    clump = made(np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (40, 3)), 0.06, 0.95, 0.1)
 
-    found = clean(joined(wall(), fog, clump), cameras()).found
+    found = clean(joined(wall(), fog, clump()), cameras()).found
 
     assert found["isolated"][-40:].all()
 
