@@ -11,7 +11,7 @@ Only the second step decides. A splat with nothing behind it, such as one of a s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -20,6 +20,7 @@ from ..errors import RefineError
 from ..scoring import projection
 from ..scoring.measuring import BLOCKS
 from ..scoring.sight_lines import SightLines
+from ..volumes import among_all, refuse_all
 from ..work import Progress, for_chunks, part, silent
 from . import sight
 from .clusters import cluster_sizes
@@ -143,6 +144,12 @@ class Cleaned:
         """Return how many splats go for each reason that is switched on."""
         return {name: int(np.count_nonzero(self.found[name])) for name in self.settings.reasons}
 
+    def for_all(self, rest: NDArray[np.bool_]) -> Cleaned:
+        """Return this of what was left of N splats, (N,) bool, for them all: the others go too."""
+        found = {name: among_all(mask, rest) for name, mask in self.found.items()}
+        keep, past = among_all(self.keep, rest), among_all(self.past, rest)
+        return replace(self, keep=keep, found=found, past=past)
+
     def facts(self) -> dict[str, Any]:
         """Return what a report says of it."""
         return {**self.counts(), "words": self.in_words()}
@@ -165,12 +172,13 @@ class Cleaned:
         return ", ".join(found) or "nothing to clean away"
 
 
-def clean(
+def clean(  # noqa: PLR0913 - as `pipeline.prune`
     splats: Splats,
     views: ViewSet,
     settings: Cleaning = Cleaning(),
     *,
     protected: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Cleaned:
@@ -184,6 +192,8 @@ def clean(
     settings : Cleaning
     protected : (N,) bool, optional
         Splats that stay, whatever they are. They are evidence all the same.
+    removed : (N,) bool, optional
+        Splats that go, unless they are protected, and are no evidence: as if they had gone before.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
     threads : int, optional
@@ -199,6 +209,15 @@ def clean(
     Cancelled
         If `progress` answers ``False``.
     """
+    if removed is not None and removed.any():
+        rest = ~removed if protected is None else ~removed | protected
+        refuse_all(~rest)
+        found = clean(
+            splats.take(rest), views, settings,
+            protected=None if protected is None else protected[rest],
+            progress=progress, threads=threads,
+        )  # fmt: skip
+        return found.for_all(rest)
     with np.errstate(under="ignore"):
         gaussians, scene, _ = projection.prepare(
             splats, views, progress=part(progress, 0.0, 0.05), threads=threads
@@ -206,20 +225,20 @@ def clean(
         run = _Run(gaussians, scene, splats, views.spread(settings.views), threads)
         reasons = run.reasons(part(progress, 0.05, 1.0))
     count = len(splats)
-    found = {name: np.zeros(count, np.bool_) for name in REASONS}
+    masks = {name: np.zeros(count, np.bool_) for name in REASONS}
     keep = np.ones(count, np.bool_)
     for name, rows in reasons.items():
-        found[name][gaussians.index[rows]] = True
+        masks[name][gaussians.index[rows]] = True
         if protected is not None:
-            found[name] &= ~protected
+            masks[name] &= ~protected
         if name in settings.reasons:
-            keep &= ~found[name]
+            keep &= ~masks[name]
     if count and not keep.any():
         msg = f"cleaning would remove all {count} splats; nothing was removed"
         raise RefineError(msg)
     past = np.zeros(count, np.int32)
     past[gaussians.index] = run.evidence.past
-    return Cleaned(keep, found, past, settings)
+    return Cleaned(keep, masks, past, settings)
 
 
 class _Run:

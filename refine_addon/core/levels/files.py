@@ -13,18 +13,20 @@ from ..quality import PSNR_CAP
 from ..report import Clock
 from ..survivors import survivor_columns
 from ..task import DEFAULTS
+from ..volumes import forced
 from ..whole_file import expanded, mode_of, refuse_existing, refuse_mapped, whole_file
 from ..work import Progress, silent
 from .lod import Levels, each_level, short
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
     from typing import Any
 
     from ..formats.ply import SplatFile
     from ..task import Settings
     from ..views import ViewSet
+    from ..volumes import Zone
     from .lod import Level
 
 MANIFEST = "lod.json"
@@ -69,6 +71,7 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
     levels: Levels,
     settings: Settings = DEFAULTS,
     *,
+    zones: Sequence[Zone] = (),
     suffix: str = ".ply",
     goal: float = GOAL,
     overwrite: bool = False,
@@ -85,6 +88,8 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
         Where the files go, named as by `level_paths`; made if it is not there.
     views, levels, settings, progress, threads
         See `lod`.
+    zones : sequence of Zone
+        Volumes that say which splats must stay and which must go.
     suffix : str
         Of the files, which names their format.
     goal : float
@@ -100,8 +105,8 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
     Raises
     ------
     RefineError, Cancelled
-        See `lod`, `read_splats` and `SplatFile.write`. Files that were new are removed again then,
-        and where files were to be replaced, no manifest is left.
+        See `lod`, `volumes.forced`, `read_splats` and `SplatFile.write`. Files that were new are
+        removed again then, and where files were to be replaced, no manifest is left.
     """
     clock = Clock()
     folder, source = expanded(folder), expanded(source)
@@ -113,8 +118,10 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
             refuse_mapped(path, source)
         clock.lap("read_s")
         entries, notes = [], [views.note] if views.note else []
+        splats = file.splats()
+        given = forced(zones, splats.means)
         made = each_level(
-            file.splats(), views, levels, settings,
+            splats, views, levels, settings, protected=given.protected, removed=given.removed,
             progress=progress, threads=threads,
         )  # fmt: skip
         for path, level in zip(paths, made, strict=True):
@@ -152,6 +159,7 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
         **facts,
         "files": {"input": str(source), "folder": str(folder), "manifest": MANIFEST},
         "settings": asdict(settings),
+        "volumes": list(given.facts),
         "timings": clock.timings,
         "notes": notes,
     }

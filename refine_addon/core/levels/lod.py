@@ -18,6 +18,7 @@ from ..pipeline import decide, score
 from ..quality import PSNR_CAP
 from ..selection import Budget
 from ..task import DEFAULTS, Origin, Task
+from ..volumes import among_all
 from ..work import Progress, part, silent
 from .distance import Lookout
 
@@ -135,6 +136,12 @@ class Level:
     reach: Reach
     absorbed: Absorbed | None = None
 
+    def for_all(self, rest: NDArray[np.bool_]) -> Level:
+        """Return a level of what was left of N splats, (N,) bool, as one of them all."""
+        keep = among_all(self.keep, rest)
+        absorbed = None if self.absorbed is None else replace(self.absorbed, keep=keep)
+        return replace(self, keep=keep, absorbed=absorbed)
+
     def facts(self, goal: float) -> dict[str, Any]:
         """Return what is to be known of it as plain JSON values.
 
@@ -168,6 +175,7 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     settings: Settings = DEFAULTS,
     *,
     protected: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> list[Level]:
@@ -183,6 +191,9 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
         How to score; with `Levels.absorb` only its number of views and settings of occlusion count.
     protected : (N,) bool, optional
         Splats that are in all levels, unchanged.
+    removed : (N,) bool, optional
+        Splats that are in no level, unless they are protected. They count as removed, and levels
+        are compared with the pictures of the others.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
     threads : int, optional
@@ -204,11 +215,11 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
         level = lod(file.splats(), views, Levels((0.5, 0.25)))[1]
         file.write("out.ply", level.keep, columns=survivor_columns(file.rows, level.absorbed))
     """
-    return list(
-        each_level(
-            splats, views, levels, settings, protected=protected, progress=progress, threads=threads
-        )
-    )
+    made = each_level(
+        splats, views, levels, settings, protected=protected, removed=removed,
+        progress=progress, threads=threads,
+    )  # fmt: skip
+    return list(made)
 
 
 def each_level(  # noqa: PLR0913 - as `lod`
@@ -218,13 +229,17 @@ def each_level(  # noqa: PLR0913 - as `lod`
     settings: Settings = DEFAULTS,
     *,
     protected: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Iterator[Level]:
     """Make the levels of `lod` one by one, when they are asked for."""
-    scene = Task(Budget(ratio=0.0), settings, splats, views, protected=protected)
-    lookout = Lookout(splats, views, progress=part(progress, 0.0, 0.05), threads=threads)
+    scene = Task(Budget(ratio=0.0), settings, splats, views, protected=protected, removed=removed)
     budgets, ahead = levels.budgets(len(splats)), part(progress, 0.05, 1.0)
+    forced = scene.forced()
+    scene = scene if forced is None else scene.without(forced)
+    splats = scene.scene()[0]
+    lookout = Lookout(splats, views, progress=part(progress, 0.0, 0.05), threads=threads)
     coarsest = 0.0
     made = (_absorbing if levels.absorb else _deleting)(scene, budgets, ahead, threads)
     for number, (keep, left, psnr, absorbed) in enumerate(made):
@@ -236,7 +251,8 @@ def each_level(  # noqa: PLR0913 - as `lod`
         coarsest = max(coarsest, reach.error)
         reach = replace(reach, error=coarsest)
         asked = (levels.shares or levels.psnr)[number]
-        yield Level(number + 1, asked, keep, left, psnr, reach, absorbed)
+        level = Level(number + 1, asked, keep, left, psnr, reach, absorbed)
+        yield level if forced is None else level.for_all(~forced)
 
 
 def _deleting(
