@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from ..core.levels.files import lod_file
 from ..core.quality import in_words
 from .options import levels, settings
+from .zones import of_files, words
 
 if TYPE_CHECKING:
     import argparse
@@ -31,6 +32,7 @@ def make_levels(
         views,
         levels(options),
         settings(options),
+        zones=of_files(options),
         suffix=options.format,
         goal=options.distance_psnr,
         overwrite=options.overwrite,
@@ -42,6 +44,8 @@ def make_levels(
         f"{source}: {len(done['levels'])} levels of {count:,} splats, {seconds:.2f} s "
         f"-> {options.output_dir}"
     )
+    if said := words(done):
+        terminal.say(f"  {said}")
     for entry in done["levels"]:
         terminal.say(f"  {_in_words(entry, done['goal_psnr'])}")
     terminal.notes(done["notes"])

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core import RefineError, as_written, clean, prune_file, read_splats, score
+from ..core import RefineError, as_written, clean, forced, prune_file, read_splats, score
 from ..core.errors import printable
 from ..core.quality import UNSEEN, in_words
 from ..core.report import scoring_notes
 from ..core.whole_file import refuse_existing, refuse_mapped
-from . import report
+from . import report, zones
 from .cameras import deciding
 from .checks import open_blend
 from .info import describe
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ..core import ViewSet
     from ..core.formats.ply import SplatFile
     from ..core.scores import Scores
+    from ..core.volumes import Forced
 
 
 def execute(options: argparse.Namespace) -> bool:
@@ -150,6 +151,7 @@ def _prune_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
         views,
         budget(options),
         settings(options),
+        zones=zones.of_files(options),
         absorb=options.absorb,
         cleaning=cleaning(options) if options.clean else None,
         overwrite=options.overwrite,
@@ -170,6 +172,7 @@ def _prune_object(run: _Run) -> dict[str, Any]:
         run.views(),
         budget(options),
         settings(options),
+        zones.of_object(options),
         absorb=options.absorb,
         output=options.output,
         save=options.save,
@@ -196,8 +199,10 @@ def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
     target = f" -> {files['output']}" if files["output"] else ""
     run.terminal.say(f"{run.named(label)}: {', '.join(parts)}{target}")
     run.say_cameras()
+    if demanded := zones.words(done):
+        run.terminal.say(f"  {demanded}")
     cleaned = sum(count for count in done.get("cleaned", {}).values() if isinstance(count, int))
-    _say_unseen(run, splats["unseen"], splats["before"] - cleaned)
+    _say_unseen(run, splats["unseen"], splats["before"] - cleaned - splats["forced"])
     if "cleaned" in done:
         run.terminal.say(f"  cleaned: {done['cleaned']['words']}")
     quality = _quality(done)
@@ -245,8 +250,12 @@ def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     options = run.options
     refuse_existing(options.output, overwrite=options.overwrite)
     file = read_splats(source)
-    scores = score(file.splats(), views, settings(options), progress=run.progress(source.name))
-    return _write_scores(run, str(source), file, scores)
+    splats = file.splats()
+    found = forced(zones.of_files(options), splats.means)
+    scores = score(
+        splats, views, settings(options), removed=found.removed, progress=run.progress(source.name)
+    )
+    return _write_scores(run, str(source), file, scores, found)
 
 
 def _score_object(run: _Run) -> dict[str, Any]:
@@ -254,16 +263,22 @@ def _score_object(run: _Run) -> dict[str, Any]:
 
     options = run.options
     refuse_existing(options.output, overwrite=options.overwrite)
-    file, scores, notes = splat_object.score_object(
-        options.object, run.views(), settings(options), progress=run.progress(options.object)
+    views, demanded = run.views(), zones.of_object(options)
+    file, scores, found, notes = splat_object.score_object(
+        options.object, views, settings(options), demanded, progress=run.progress(options.object)
     )
-    done = _write_scores(run, options.object, file, scores, notes)
+    done = _write_scores(run, options.object, file, scores, found, notes)
     done["files"]["input"] = f"{open_blend()}#{options.object}"
     return done
 
 
 def _write_scores(
-    run: _Run, label: str, file: SplatFile, scores: Scores, more_notes: Sequence[str] = ()
+    run: _Run,
+    label: str,
+    file: SplatFile,
+    scores: Scores,
+    found: Forced,
+    more_notes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Write a file with its scores and say what came of it; return the report."""
     options = run.options
@@ -274,13 +289,25 @@ def _write_scores(
         f"{label}: scored {len(file):,} splats by {scores.views_used} views -> {output}"
     )
     run.say_cameras()
-    unseen = int(np.count_nonzero(scores.seen == 0))
-    _say_unseen(run, unseen, len(file))
+    gone = found.counts()["forced"]
+    unseen = int(np.count_nonzero(scores.seen == 0)) - gone
+    done = {
+        "splats": {
+            "before": len(file),
+            "forced": gone,
+            "undrawable": scores.undrawable,
+            "unseen": unseen,
+        },
+        "volumes": list(found.facts),
+    }
+    if demanded := zones.words(done):
+        run.terminal.say(f"  {demanded}")
+    _say_unseen(run, unseen, len(file) - gone)
     notes = [*scoring_notes(scores), *more_notes]
     run.terminal.notes(notes)
     return {
         "files": {"input": label, "output": str(output)},
-        "splats": {"before": len(file), "undrawable": scores.undrawable, "unseen": unseen},
+        **done,
         "views": {"given": scores.views_given, "used": scores.views_used},
         "settings": asdict(settings(options)),
         "weights": scores.facts,
@@ -329,18 +356,30 @@ def _clean_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
         refuse_mapped(options.output, source)
     file = read_splats(source)
     progress = run.progress(source.name)
-    found = clean(file.splats(), views, cleaning(options), progress=progress)
+    splats = file.splats()
+    demanded = forced(zones.of_files(options), splats.means)
+    found = clean(
+        splats, views, cleaning(options), protected=demanded.protected, removed=demanded.removed,
+        progress=progress,
+    )  # fmt: skip
     made = as_written(file, options.output)
     if options.output:
         made.write(options.output, found.keep, overwrite=options.overwrite)
     run.terminal.clear()
     kept, to = int(found.keep.sum()), f" -> {options.output}" if options.output else ""
     run.terminal.say(f"{source}: {found.in_words()}; {kept:,} of {len(file):,} splats stay{to}")
+    splats_facts = {"before": len(file), "kept": kept, "removed": len(file) - kept}
+    done = {
+        "splats": splats_facts | demanded.counts(),
+        "volumes": list(demanded.facts),
+    }
+    if said := zones.words(done):
+        run.terminal.say(f"  {said}")
     notes = made.notes(found.keep)
     run.terminal.notes(notes)
     return {
         "files": {"input": str(source), "output": str(options.output) if to else None},
-        "splats": {"before": len(file), "kept": kept, "removed": len(file) - kept},
+        **done,
         "views": {"given": len(views)},
         "settings": asdict(found.settings),
         "cleaned": found.facts(),

@@ -209,12 +209,21 @@ class Forced:
     removed: NDArray[np.bool_] | None = None
     facts: tuple[dict[str, Any], ...] = ()
 
+    def counts(self) -> dict[str, int]:
+        """Return how many splats are ``protected`` and how many ``forced`` out."""
+        masks = (("protected", self.protected), ("forced", self.removed))
+        return {n: 0 if mask is None else int(np.count_nonzero(mask)) for n, mask in masks}
+
     def of(self, rows: NDArray[np.bool_]) -> Forced:
         """Return the same of some of the splats, (N,) bool."""
         protected, removed = (
             None if mask is None else mask[rows] for mask in (self.protected, self.removed)
         )
         return replace(self, protected=protected, removed=removed)
+
+
+FREE = Forced()
+"""Nothing must stay, and nothing must go."""
 
 
 def forced(

@@ -109,6 +109,18 @@ def score(addon):
     return score
 
 
+@pytest.fixture
+def kept_beside(addon):
+    """Return a function that says which splats a budget keeps where a name protects some."""
+
+    def kept(obj, budget, name):
+        checked = addon.mesh.layout.check(obj)
+        found = addon.demands.Demands((name,) if name else ()).forced(checked)
+        return addon.splat_object.keep_mask(checked, budget, found)
+
+    return kept
+
+
 def snapshot():
     """Return what an operator must leave alone where it fails, as plain values."""
     kinds = ("objects", "meshes", "pointclouds", "cameras", "collections", "node_groups")

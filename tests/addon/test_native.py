@@ -199,7 +199,7 @@ def test_apply_deletes_points_and_leaves_all_else(addon, cloud, room_cameras):  
     assert tuple(cloud.location) == (1.0, 2.0, 3.0)
 
 
-def test_a_protected_splat_of_a_point_cloud_stays(addon, core, cloud, room_cameras):  # noqa: ARG001
+def test_a_protected_splat_of_a_point_cloud_stays(addon, core, cloud, room_cameras, kept_beside):  # noqa: ARG001
     """By a boolean attribute, and by a float one where it is above 0; there are no groups."""
     bpy.ops.refine.score()
     ranks = addon.mesh.attributes.read_attribute(cloud.data, "refine_rank")
@@ -208,12 +208,12 @@ def test_a_protected_splat_of_a_point_cloud_stays(addon, core, cloud, room_camer
     store(cloud, "sure", "BOOLEAN", mark)
     store(cloud, "weight", "FLOAT", mark.astype(np.float32))
     store(cloud, "number", "INT", mark.astype(np.int32))
-    checked, budget = addon.mesh.layout.check(cloud), core.Budget(ratio=0.5)
-    keep = [addon.splat_object.keep_mask(checked, budget, name) for name in ("", "sure", "weight")]
+    budget = core.Budget(ratio=0.5)
+    keep = [kept_beside(cloud, budget, name) for name in ("", "sure", "weight")]
 
     assert [bool(mask[lowest]) for mask in keep] == [False, True, True]
     with pytest.raises(core.RefineError, match=r"'number' is INT on POINT.*has no vertex groups"):
-        addon.splat_object.keep_mask(checked, budget, "number")
+        kept_beside(cloud, budget, "number")
 
 
 def test_absorbing_changes_survivors_alone(addon, cloud, room_cameras):  # noqa: ARG001

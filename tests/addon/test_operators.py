@@ -181,7 +181,7 @@ def test_operators_that_change_the_scene_can_be_undone(name):
     assert {"REGISTER", "UNDO"} <= cls.bl_options
 
 
-def test_protected_splats_stay_by_group_or_attribute(addon, room, room_cameras):  # noqa: ARG001
+def test_protected_splats_stay_by_group_or_attribute(addon, room, room_cameras, kept_beside):  # noqa: ARG001
     """Keeping 500 of 39755 with 100 protected that would all go: the 100 are among the 500."""
     bpy.ops.refine.score()
     score = addon.mesh.attributes.read_attribute(room.data, "refine_score")
@@ -192,15 +192,15 @@ def test_protected_splats_stay_by_group_or_attribute(addon, room, room_cameras):
     mask[lowest] = True
     addon.mesh.attributes.write_attribute(room.data, "mask", "BOOLEAN", mask)
     budget = addon.core.Budget(keep=500)
-    by_group = addon.splat_object.keep_mask(addon.mesh.layout.check(room), budget, "group")
-    by_mask = addon.splat_object.keep_mask(addon.mesh.layout.check(room), budget, "mask")
+    by_group = kept_beside(room, budget, "group")
+    by_mask = kept_beside(room, budget, "mask")
 
     assert by_group[lowest].all()
     assert by_group.sum() == 500
     assert np.array_equal(by_group, by_mask)
     assert "REFINE read" not in bpy.data.objects
     with pytest.raises(addon.core.RefineError, match="named 'opacity' \\('opacity' is FLOAT"):
-        addon.splat_object.keep_mask(addon.mesh.layout.check(room), budget, "opacity")
+        kept_beside(room, budget, "opacity")
 
 
 def test_the_plan_says_before_apply_what_apply_does(addon, room, room_cameras):  # noqa: ARG001

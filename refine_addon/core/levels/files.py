@@ -159,6 +159,7 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
         **facts,
         "files": {"input": str(source), "folder": str(folder), "manifest": MANIFEST},
         "settings": asdict(settings),
+        "splats": {"before": len(file), **given.counts()},
         "volumes": list(given.facts),
         "timings": clock.timings,
         "notes": notes,
