@@ -9,7 +9,7 @@ import numpy as np
 from .cleaning.clean import clean
 from .formats.registry import Packed, as_written, read_splats, refuse_unknown_size
 from .pipeline import decide
-from .report import Clock, Files, complete_report
+from .report import Clock, Files, complete_report, held
 from .survivors import survivor_columns
 from .task import DEFAULTS, Result, Settings, Task
 from .volumes import forced
@@ -130,6 +130,7 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
         used = views.spread(settings.views)
         result.report.update(written_facts(written, result.scores, used, threads=threads))
     result.report["volumes"] = list(given.facts)
+    result.report["splats"] |= held(made, result.keep, written=written is not None)
     result.report["notes"] += made.notes(result.keep)
     names = (str(file.path), None if written is None else str(written))
     complete_report(result.report, clock, Files(*names, *sizes))

@@ -90,7 +90,7 @@ def _splats(context: bpy.types.Context) -> list[bpy.types.Object]:
 def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     """Hear of volumes that move, and of splats that move under them."""
     volumes = scene.refine.volumes
-    if depsgraph is None or not volumes:
+    if depsgraph is None or not volumes or bpy.app.background:
         return
     there = {item.object for item in volumes if item.object is not None}
     there |= {obj.data for obj in there if obj.data is not None}
