@@ -30,10 +30,10 @@ MOST = 1 << 24
 STAYS, GOES = 1, 2
 """What stays and what goes in any case, as `mesh.edit.FORCE` has it."""
 
-MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (1.0, 0.0, 0.6)}
+MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (1.0, 1.0, 1.0)}
 """Their tints. Neither is a colour of the heat map, nor that of what goes by the budget."""
 
-SHARES = {"SCENE": 0.3, "HEAT": 0.65, "STAYS": 0.3, "GOES": 0.65}
+SHARES = {"SCENE": 0.35, "HEAT": 0.55, "STAYS": 0.35, "GOES": 0.75}
 """How much of a colour that tint is, by mode of the view."""
 
 _KEYS = 65535.0
