@@ -8,7 +8,7 @@ from bpy.props import FloatProperty, PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
-from .ui import camera_list, kept, plans, price
+from .ui import camera_list, kept, plans, price, volumes
 from .ui.camera_list import REFINE_PT_camera_list, REFINE_UL_cameras, RefineCamera
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
@@ -33,16 +33,29 @@ from .ui.panel import (
 )
 from .ui.properties import RefineSettings
 from .ui.view_operators import REFINE_OT_view
+from .ui.volumes import (
+    REFINE_OT_add_volume,
+    REFINE_OT_crop,
+    REFINE_OT_drop_volume,
+    REFINE_OT_protect,
+    REFINE_PT_volumes,
+    RefineVolume,
+)
 from .viewport import draw
 from .webp import BlenderImages
 
 CLASSES = (
     RefineCamera,
+    RefineVolume,
     RefineSettings,
     REFINE_OT_import_ply,
     REFINE_OT_import_cameras,
     REFINE_OT_find_floaters,
     REFINE_OT_delete_floaters,
+    REFINE_OT_protect,
+    REFINE_OT_add_volume,
+    REFINE_OT_drop_volume,
+    REFINE_OT_crop,
     REFINE_OT_score,
     REFINE_OT_plan,
     REFINE_OT_apply,
@@ -57,6 +70,7 @@ CLASSES = (
     REFINE_UL_cameras,
     REFINE_PT_camera_list,
     REFINE_PT_floaters,
+    REFINE_PT_volumes,
     REFINE_PT_score,
     REFINE_PT_advanced,
     REFINE_PT_preview,
@@ -80,6 +94,7 @@ def register() -> None:
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
     camera_list.register()
     kept.register()
+    volumes.register()
     price.register()
     images.use(BlenderImages())
     _commands.append(bpy.utils.register_cli_command("refine", _run_command))
@@ -92,6 +107,7 @@ def unregister() -> None:
     images.use(None)
     plans.unregister()
     price.unregister()
+    volumes.unregister()
     kept.unregister()
     camera_list.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)

@@ -22,9 +22,11 @@ from .core.formats.registry import as_written, format_named, refuse_unknown_size
 from .core.report import Clock, Files, complete_report, held
 from .core.survivors import survivor_columns
 from .core.task import DEFAULTS, Result, Settings, Task
+from .core.volumes import FREE, Forced
 from .core.whole_file import expanded, refuse_existing
 from .core.work import Progress, part, silent
 from .core.written import written_facts
+from .demands import NONE
 from .mesh import attributes as mesh_attributes
 from .mesh import edit as mesh_edit
 from .mesh import floaters as mesh_floaters
@@ -45,6 +47,7 @@ if TYPE_CHECKING:
     from .core.selection import Budget
     from .core.splats import Splats
     from .core.views import ViewSet
+    from .demands import Demands
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,7 @@ def modifier_notes(obj: bpy.types.Object) -> list[str]:
 def stored_task(
     checked: SplatObject,
     budget: Budget,
-    protect: str = "",
+    found: Forced = FREE,
     *,
     settings: Settings = DEFAULTS,
     views: ViewSet | None = None,
@@ -132,8 +135,8 @@ def stored_task(
     ----------
     checked : SplatObject
     budget : Budget
-    protect : str
-        Name of a boolean point attribute or a vertex group: what is in it stays.
+    found : Forced
+        What must stay and what must go; see `Demands.forced`.
     settings : Settings, optional
         For absorbing.
     views : ViewSet, optional
@@ -147,7 +150,8 @@ def stored_task(
     Raises
     ------
     RefineError
-        If the object was not scored, or has nothing named `protect`; also see `gather`.
+        If the object was not scored, or some of it needs scores now that had to go then; also see
+        `gather`.
     """
     row_bytes, fixed_bytes = mesh_attributes.file_size(checked)
     return Task(
@@ -155,8 +159,9 @@ def stored_task(
         settings=settings,
         splats=None if views is None else gather(checked, whole=True),
         views=views,
-        scores=stored_scores(checked),
-        protected=mesh_edit.protected_mask(checked.obj, protect),
+        scores=stored_scores(checked, found.removed),
+        protected=found.protected,
+        removed=found.removed,
         absorb=views is not None,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
@@ -297,8 +302,13 @@ def export_object(
 
 
 def score_object(
-    name: str, views: ViewSet, settings: Settings, *, progress: Progress = silent
-) -> tuple[SplatFile, Scores, list[str]]:
+    name: str,
+    views: ViewSet,
+    settings: Settings,
+    demands: Demands = NONE,
+    *,
+    progress: Progress = silent,
+) -> tuple[SplatFile, Scores, Forced, list[str]]:
     """Score an object of the open scene; nothing in the scene changes.
 
     Parameters
@@ -307,6 +317,8 @@ def score_object(
         Of the object.
     views, settings, progress
         See `refine_addon.core.pipeline.score`.
+    demands : Demands
+        What must stay and what must go; the latter scores 0.
 
     Returns
     -------
@@ -314,17 +326,23 @@ def score_object(
         The file that the object would be.
     Scores
         Of its splats.
+    Forced
+        What must stay and what must go.
     list of str
         See `modifier_notes`.
 
     Raises
     ------
     RefineError
-        See `gather` and `refine_addon.core.pipeline.score`; also if there is no such object.
+        See `gather`, `Demands.forced` and `refine_addon.core.pipeline.score`; also if there is no
+        such object.
     """
     checked = check(find(name))
-    scores = pipeline.score(gather(checked), views, settings, progress=progress)
-    return mesh_attributes.file_from_object(checked), scores, modifier_notes(checked.obj)
+    found = demands.forced(checked)
+    scores = pipeline.score(
+        gather(checked), views, settings, removed=found.removed, progress=progress
+    )
+    return mesh_attributes.file_from_object(checked), scores, found, modifier_notes(checked.obj)
 
 
 def prune_object(  # noqa: PLR0913 - the command's options
@@ -332,6 +350,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     views: ViewSet,
     budget: Budget,
     settings: Settings,
+    demands: Demands = NONE,
     *,
     absorb: bool = False,
     output: Path | None = None,
@@ -348,6 +367,8 @@ def prune_object(  # noqa: PLR0913 - the command's options
         Of the object.
     views, budget, settings, absorb, progress
         See `refine_addon.core.pipeline.prune`.
+    demands : Demands
+        What must stay and what must go.
     output : Path, optional
         The file to make, in the format that its suffix names.
     save : bool
@@ -365,9 +386,9 @@ def prune_object(  # noqa: PLR0913 - the command's options
     Raises
     ------
     RefineError
-        See `gather`, `apply_object`, `export_object` and `refine_addon.core.pipeline.prune`; also
-        if there is no such object, or the .blend cannot be saved. What was exported by then stays;
-        the object is as it was.
+        See `gather`, `Demands.forced`, `apply_object`, `export_object` and
+        `refine_addon.core.pipeline.prune`; also if there is no such object, or the .blend cannot be
+        saved. What was exported by then stays; the object is as it was.
     """
     clock = Clock()
     checked = check(find(name))
@@ -379,11 +400,14 @@ def prune_object(  # noqa: PLR0913 - the command's options
     row_bytes, fixed_bytes = _file_size(checked, budget, output)
     estimates = settings.estimates or budget.psnr is not None
     matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
+    found = demands.forced(checked)
     task = Task(
         budget=budget,
         settings=settings,
         splats=gather(checked, whole=absorb or (None if estimates else False)),
         views=views,
+        protected=found.protected,
+        removed=found.removed,
         absorb=absorb,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
@@ -402,13 +426,14 @@ def prune_object(  # noqa: PLR0913 - the command's options
     result.report["notes"] += made.notes(result.keep)
     if save and not dry_run:
         with mesh_edit.all_or_nothing(checked.obj):
-            store(checked, result.scores, settings)
+            store(checked, result.scores, settings, forced=result.report["splats"]["forced"])
             _reduce(checked, result.keep, columns)
             _save(target)
     clock.lap("write_s")
     if target is not None:
         used = views.spread(settings.views)
         result.report.update(written_facts(target, result.scores, used, matrix=matrix))
+    result.report["volumes"] = list(found.facts)
     result.report["notes"] += modifier_notes(checked.obj)
     source, output_name = f"{bpy.data.filepath}#{name}", None if target is None else str(target)
     after = sizes.bytes_after if target is None else target.stat().st_size

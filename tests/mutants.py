@@ -36,6 +36,27 @@ MUTANTS = {
         ("            cancelled.set()\n", "", "what runs is not told"),
         ("time.monotonic() - told >= _REPORT_INTERVAL", "False", "one thread not asked"),
     ],
+    "solid.py": [
+        ("below = y[corners] <= py[:, None]", "below = y[corners] < py[:, None]", "ends twice"),
+        (
+            "first, last = np.minimum(one, other), np.maximum(one, other)",
+            "first, last = one, other",
+            "edges cut otherwise by each side",
+        ),
+        ("above = heights > points[rows, 2]", "above = heights >= points[rows, 2]", "upper face"),
+        ("turns != 0.0 if self.turned", "turns == 1.0 if self.turned", "overlaps left out"),
+        ("wide = (np.floor", "wide = False & (np.floor", "wide triangles touch few cells"),
+    ],
+    "volumes.py": [
+        ("removed = removed & ~protected", "pass", "force wins over protection"),
+        ("removed | ~masks", "removed & ~masks", "removed only where not kept"),
+        ("points < self.high", "points <= self.high", "boxes share their faces"),
+    ],
+    "task.py": [
+        ("removed = removed & ~self.protected", "pass", "force wins over protection"),
+        ("rows[rest] if isinstance", "rows if isinstance", "rows of all"),
+        ("self.budget.after(int(np.count_nonzero(forced)), len(forced))", "self.budget", "twice"),
+    ],
     "frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
         ("(near if np.ptp(near) > 0.0 else near[0, 0])", "0.0", "near plane ignored"),
@@ -492,7 +513,7 @@ MUTANTS = {
     ],
     "cleaning/clean.py": [
         ("(seen.views > 0) & ", "", "who sees nothing sees past"),
-        ("found[name] &= ~protected", "pass", "protected ones go"),
+        ("masks[name] &= ~protected", "pass", "protected ones go"),
         ("sizes < SMALL", "sizes > SMALL", "clusters of any size"),
         ("self._floats(most) & shows", "self._floats(most)", "giants that do not show"),
         ("visible & doubted & ~needle", "visible & ~needle", "two reasons for one splat"),
@@ -539,6 +560,8 @@ TESTS = {
     "cleaning": ["cleaning/clusters.py"],
     "cleaning_reasons": ["cleaning/sight.py", "cleaning/clean.py"],
     "invariance": ["scene.py"],
+    "volumes": ["solid.py"],
+    "forced": ["task.py"],
     "affine": ["spherical_harmonics.py"],
     "ply": ["formats/ply_columns.py", "formats/ply_write.py"],
     "formats": [

@@ -11,6 +11,7 @@ from ..core.formats.registry import SUFFIXES
 from ..core.levels.files import GOAL
 from ..core.whole_file import expanded
 from ..version import VERSION
+from . import zones
 from .terminal import shown
 
 DEFAULT_RATIO = 0.5
@@ -30,6 +31,8 @@ EXAMPLES = {
         "refine prune in.ply --cameras cameras.json --ratio 0.7 -o out.ply",
         "refine prune *.ply --cameras cameras.json --psnr 40 --output-dir pruned",
         "refine prune in.ply --cameras sparse/0 --max-mb 5 --absorb -o out.ply",
+        "refine prune in.ply --cameras sparse/0 --keep-inside box:-2,-2,-1,2,2,3 -o out.ply",
+        f"{BLENDER}refine prune --object Splats --protect Statue --remove-inside Sky -o out.ply",
         f"{BLENDER}refine prune --object Splats -o out.ply",
         f"{BLENDER}refine prune --object Splats --frames 1:250:10 --save",
         f"{BLENDER}refine prune --object Splats --source collection:Shot --dry-run",
@@ -141,6 +144,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         action="store_true",
         help="first remove floaters and outliers, as clean does; the budget counts the rest",
     )
+    zones.add(prune, names="a vertex group or boolean attribute of --object, ")
     prune.add_argument("--dry-run", action="store_true", help="decide and report, write nothing")
     _add_common(prune)
 
@@ -160,6 +164,7 @@ def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         help=f"which to remove, of {', '.join(REASONS)} (default {','.join(Cleaning.reasons)})",
     )
     _add_views(cleaning)
+    zones.add(cleaning)
     _add_common(cleaning)
 
 
@@ -171,6 +176,7 @@ def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "-o", "--output", type=_path, metavar="OUT.ply", required=True, help="the file to make"
     )
     _add_scoring(scoring)
+    zones.add(scoring, protects=False)
     _add_common(scoring)
 
 
@@ -224,6 +230,7 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
         f"{GOAL:g})",
     )
     _add_scoring(making)
+    zones.add(making)
     _add_common(making)
 
 

@@ -19,6 +19,7 @@ from .notes import parsed
 
 if TYPE_CHECKING:
     import bpy
+    from numpy.typing import NDArray
 
     from ..core.task import Settings
     from .layout import SplatObject
@@ -36,6 +37,7 @@ def store(
     settings: Settings,
     origin: dict[str, Any] | None = None,
     cameras: list[tuple[str, int]] | None = None,
+    forced: int = 0,
 ) -> None:
     """Write scores to the attributes of an object's mesh, and note how they came to be.
 
@@ -48,6 +50,8 @@ def store(
         See `staleness.origin`.
     cameras : list of (str, int), optional
         Name of each view given, and how many splats lie in it.
+    forced : int
+        How many splats had to go, and have the score 0.
 
     Raises
     ------
@@ -81,6 +85,7 @@ def store(
             "quality": scores.quality.facts() if scores.quality else None,
             "origin": origin,
             "cameras": cameras,
+            "forced": forced,
         }
     )
     mesh_attributes.updated(mesh)
@@ -96,8 +101,14 @@ def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
     return noted if complete else None
 
 
-def stored_scores(checked: SplatObject) -> Scores:
+def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None) -> Scores:
     """Return the scores that an object's mesh holds.
+
+    Parameters
+    ----------
+    checked : SplatObject
+    removed : (N,) bool, optional
+        Splats that have to go, and need no score.
 
     Raises
     ------
@@ -113,8 +124,11 @@ def stored_scores(checked: SplatObject) -> Scores:
             msg = f"{label}: has no scores; score it first"
             raise RefineError(msg)
     values = mesh_attributes.read_attribute(mesh, SCORE)
-    # Splats joined or added since hold a score of 0, as those do that no renderer can draw.
-    unscored = int(np.count_nonzero(values == 0.0)) - noted.get("undrawable", 0)
+    # Splats joined or added since hold a score of 0, as those do that no renderer can draw, and
+    # those that had to go.
+    zero = values == 0.0
+    zero = zero if removed is None else zero & ~removed
+    unscored = int(np.count_nonzero(zero)) - noted.get("undrawable", 0)
     if len(values) > noted["splats"] or unscored > 0:
         msg = (
             f"{label}: scored with {noted['splats']} splats, has {len(values)} now, "
@@ -122,7 +136,8 @@ def stored_scores(checked: SplatObject) -> Scores:
         )
         raise RefineError(msg)
     # The curve is that of all splats that were scored.
-    whole = len(values) == noted["splats"]
+    gone = 0 if removed is None else int(np.count_nonzero(removed))
+    whole = (len(values), gone) == (noted["splats"], noted.get("forced", 0))
     return Scores(
         values=values,
         seen=mesh_attributes.read_attribute(mesh, SEEN),

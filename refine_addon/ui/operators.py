@@ -24,6 +24,7 @@ from ..core.levels.lod import Level, Levels, lod
 from ..core.quality import in_words
 from ..core.report import scoring_notes, sizes_in_words
 from ..core.work import part
+from ..demands import Demands
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from ..core.splats import Splats
     from ..core.task import Result, Settings, Task
     from ..core.views import ViewSet
+    from ..core.volumes import Forced
     from ..core.work import Progress
     from ..mesh.layout import SplatObject
 
@@ -99,9 +101,13 @@ def _new_name(obj: bpy.types.Object) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Scoring:
-    """What is to be scored, by which views and how; where all of it stood (`staleness.origin`)."""
+    """What is to be scored, by which views and how; where all of it stood (`staleness.origin`).
+
+    What has to go, (N,) bool, is left out.
+    """
 
     splats: Splats
+    removed: NDArray[np.bool_] | None
     views: ViewSet
     settings: Settings
     quality: bool
@@ -123,17 +129,20 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         quality = settings.estimates or context.scene.refine.budget == "psnr"
         splats = splat_object.gather(checked, whole=None if quality else False)
         origin = staleness.origin(context, checked.obj)
-        return _Scoring(splats, views, settings, quality, origin)
+        removed = Demands.of_scene(context.scene).forced(checked).removed
+        return _Scoring(splats, removed, views, settings, quality, origin)
 
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
         """Score, and count how many splats lie in each view."""
         ahead = part(progress, 0.0, 0.97)
         scores = pipeline.score(
-            job.splats, job.views, job.settings, quality=job.quality, progress=ahead
-        )
+            job.splats, job.views, job.settings,
+            removed=job.removed, quality=job.quality, progress=ahead,
+        )  # fmt: skip
         ahead = part(progress, 0.97, 1.0)
-        return scores, frustum.census(job.splats.means, job.views, progress=ahead)
+        means = job.splats.means if job.removed is None else job.splats.means[~job.removed]
+        return scores, frustum.census(means, job.views, progress=ahead)
 
     def finish(
         self,
@@ -146,12 +155,13 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         scores, counts = found
         names = [view.name for view in job.views]
         cameras = list(zip(names, counts.tolist(), strict=True))
-        mesh_scores.store(checked, scores, job.settings, job.origin, cameras)
+        forced = 0 if job.removed is None else int(np.count_nonzero(job.removed))
+        mesh_scores.store(checked, scores, job.settings, job.origin, cameras, forced)
         plans.refresh(context)
-        unseen = int((scores.seen == 0).sum())
+        unseen = int((scores.seen == 0).sum()) - forced
         self.report(
             {"INFO"},
-            f"Scored {len(scores.values):,} splats by {scores.views_used} of "
+            f"Scored {len(scores.values) - forced:,} splats by {scores.views_used} of "
             f"{counted(scores.views_given, 'view')}; {unseen:,} lie in none",
         )
         for note in (*scoring_notes(scores), *splat_object.modifier_notes(checked.obj)):
@@ -193,7 +203,7 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
         return splat_object.stored_task(
             checked,
             settings.to_budget(),
-            settings.protect,
+            Demands.of_scene(context.scene).forced(checked),
             settings=settings.to_settings(),
             views=chosen_views(context) if settings.absorb else None,
         )
@@ -213,6 +223,7 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
             changed = []  # nothing went by the scores
         done = splat_object.apply_object(checked, result)
         plans.forget(checked.mesh)
+        plans.refresh(context)
         psnr = result.report["estimated_psnr"]
         if result.absorbed:
             self.report({"INFO"}, result.absorbed.note())
@@ -233,13 +244,13 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
 
 @dataclass(frozen=True, eq=False)
 class _Detail:
-    """What levels are to be made of, by which views and how; what is protected, (N,) bool."""
+    """What levels are to be made of, by which views and how; what must stay and go."""
 
     splats: Splats
     views: ViewSet
     levels: Levels
     settings: Settings
-    protected: NDArray[np.bool_] | None
+    forced: Forced
 
 
 class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
@@ -269,7 +280,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
             chosen_views(context),
             levels,
             settings.to_settings(),
-            mesh_edit.protected_mask(checked.obj, settings.protect),
+            Demands.of_scene(context.scene).forced(checked),
         )
 
     @staticmethod
@@ -277,7 +288,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         """Make the levels."""
         return lod(
             job.splats, job.views, job.levels, job.settings,
-            protected=job.protected, progress=progress,
+            protected=job.forced.protected, removed=job.forced.removed, progress=progress,
         )  # fmt: skip
 
     def finish(

@@ -205,7 +205,6 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         column.use_property_decorate = False
         column.prop(settings, "budget")
         column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
-        column.prop(settings, "protect")
         column.prop(settings, "absorb")
         obj = context.object
         record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None

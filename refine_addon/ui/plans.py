@@ -7,6 +7,7 @@ slider has come to rest (`refresh`): reading what is protected, marking what goe
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from .. import splat_object
+from .. import demands, splat_object
 from ..core.errors import RefineError
 from ..core.quality import in_words, out_of_reach
 from ..core.report import sizes_in_words
@@ -54,6 +55,8 @@ class _Known:
     kinds : Histogram
     unseen : int
         Splats whose centre lies in none of the views.
+    forced : int
+        Splats that go before all others, which all of the above leaves out.
     """
 
     holds: tuple[Any, ...]
@@ -62,6 +65,12 @@ class _Known:
     fixed_bytes: int
     kinds: Histogram
     unseen: int
+    forced: int
+
+    @property
+    def count(self) -> int:
+        """How many splats there are in all."""
+        return len(self.tally.scores.values) + self.forced
 
 
 _known: list[_Known] = []
@@ -84,7 +93,7 @@ def unregister() -> None:
 
 def key(settings: Any) -> str:  # noqa: ANN401 - RefineSettings, which imports this module
     """Return what a plan depends on, to tell whether a stored one still holds."""
-    budget = f"{settings.budget} {getattr(settings, settings.budget)!r} {settings.protect!r}"
+    budget = f"{settings.budget} {getattr(settings, settings.budget)!r} {_demanded(settings)!r}"
     return f"{budget} absorb" if settings.absorb else budget
 
 
@@ -111,8 +120,17 @@ def at_once(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
 def refresh(context: bpy.types.Context) -> None:
     """Work out the plan for the active object if it has scores, store it, and mark what goes."""
     obj = getattr(context, "object", None)
-    if obj is not None and _can_have(obj):
-        _refresh(context.scene, obj)
+    if obj is not None:
+        refresh_object(context.scene, obj)
+
+
+def refresh_object(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
+    """Do the same for any object; without scores, mark what must stay and what must go."""
+    if _can_have(obj):
+        _refresh(scene, obj)
+    elif _is_ours(obj):
+        with contextlib.suppress(RefineError):  # which the panel shows
+            demands.refresh(scene, mesh_layout.check(obj))
 
 
 def ask(context: bpy.types.Context, obj: bpy.types.Object) -> None:
@@ -218,17 +236,22 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
 
 def _can_have(obj: bpy.types.Object) -> bool:
     """Tell whether an object can have a plan: it is scored, and may be written to."""
-    if not mesh_layout.looks_like_splats(obj) or mesh_scores.record(obj.data) is None:
+    return _is_ours(obj) and mesh_scores.record(obj.data) is not None
+
+
+def _is_ours(obj: bpy.types.Object) -> bool:
+    """Tell whether an object holds splats that may be marked."""
+    if not mesh_layout.looks_like_splats(obj) or obj.mode == "EDIT":
         return False
-    return obj.mode != "EDIT" and not obj.data.library and not obj.library
+    return not obj.data.library and not obj.library
 
 
 def _rested() -> None:
     """Make the plan that is waited for; Blender's timer calls it once."""
     for scene_name, name in _waiting:
         scene, obj = bpy.data.scenes.get(scene_name), bpy.data.objects.get(name)
-        if scene is not None and obj is not None and _can_have(obj):
-            _refresh(scene, obj)
+        if scene is not None and obj is not None:
+            refresh_object(scene, obj)
     _waiting.clear()
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
@@ -242,10 +265,12 @@ def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     plan: dict[str, Any] = {"key": key(settings), "splats": mesh_layout.splat_count(mesh)}
     try:
         checked = mesh_layout.check(obj)
-        task = splat_object.stored_task(checked, settings.to_budget(), settings.protect)
+        found = demands.refresh(scene, checked)
+        task = splat_object.stored_task(checked, settings.to_budget(), found)
         known = _know(task, _state(mesh, settings))
         plan = _noted(known, settings)
         keep = splat_object.mark_removed(checked, task)
+        keep = keep if found.removed is None else keep[~found.removed]
         plan["unseen_gone"] = int(np.count_nonzero(~keep & (known.tally.scores.seen == 0)))
         price.show(mesh, known.tally.scores, known.kinds, _place(plan, settings), keep)
     except RefineError as error:
@@ -255,6 +280,9 @@ def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
 
 def _know(task: Task, state: tuple[Any, ...]) -> _Known:
     """Return what holds for any budget; what was known before, where it still does."""
+    forced = task.forced()
+    gone = 0 if forced is None else int(np.count_nonzero(forced))
+    task = task if forced is None else task.without(forced)
     scores = task.scores
     assert scores is not None  # noqa: S101 - a task of what is stored
     old = _known[0] if _known else None
@@ -262,7 +290,7 @@ def _know(task: Task, state: tuple[Any, ...]) -> _Known:
         return old
     kinds = price.histogram(scores)
     tally, unseen = Tally(scores, task.protected), int(np.count_nonzero(scores.seen == 0))
-    known = _Known(state, tally, int(task.row_bytes), task.fixed_bytes, kinds, unseen)
+    known = _Known(state, tally, int(task.row_bytes), task.fixed_bytes, kinds, unseen, gone)
     _known[:] = [known]
     return known
 
@@ -273,34 +301,41 @@ def _state(mesh: bpy.types.Mesh, settings: Any) -> tuple[Any, ...]:  # noqa: ANN
         mesh.session_uid,
         mesh_layout.splat_count(mesh),
         mesh.get(mesh_scores.RECORD),
-        settings.protect,
+        _demanded(settings),
     )
+
+
+def _demanded(settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
+    """Return what the settings name as to stay or to go; volumes that move are heard of."""
+    listed = [item for item in settings.volumes if item.object is not None]
+    return (settings.protect, *((item.role, item.object.session_uid) for item in listed))
 
 
 def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
     """Return the plan for a budget as plain values."""
-    scores = known.tally.scores
-    count, curve = len(scores.values), scores.quality
+    scores, count, forced = known.tally.scores, known.count, known.forced
+    rest, curve = count - forced, scores.quality
     noted: dict[str, Any] = {"key": key(settings), "splats": count, "unseen": known.unseen}
     try:
         budget = settings.to_budget()
         if budget.psnr is not None and settings.absorb:
-            gone = math.floor(quality_of(scores).share(budget.psnr, absorb=True) * count)
+            gone = math.floor(quality_of(scores).share(budget.psnr, absorb=True) * rest)
             noted["about"] = True
         else:
-            gone = known.tally.removed(budget, known.row_bytes, known.fixed_bytes)
+            left = budget.after(forced, count)
+            gone = known.tally.removed(left, known.row_bytes, known.fixed_bytes)
     except RefineError as error:
         return noted | {"error": str(error)}
-    sizes = splat_object.Plan.of(count, count - gone, known.row_bytes, known.fixed_bytes)
-    noted |= vars(sizes)
+    sizes = splat_object.Plan.of(count, rest - gone, known.row_bytes, known.fixed_bytes)
+    noted |= {**vars(sizes), "forced": forced}
     if curve is None:
         return noted
-    noted["psnr"] = curve.at(gone / count)
+    noted["psnr"] = curve.at(gone / rest)
     if curve.foretold:
-        noted["psnr_absorbed"] = curve.at(gone / count, absorb=True)
+        noted["psnr_absorbed"] = curve.at(gone / rest, absorb=True)
     if budget.psnr is not None:
-        psnr = curve.at(gone / count, absorb=settings.absorb)
-        remark = out_of_reach(budget.psnr, gone, count, psnr)
+        psnr = curve.at(gone / rest, absorb=settings.absorb)
+        remark = out_of_reach(budget.psnr, gone, rest, psnr)
         noted["remark"] = remark[:1].upper() + remark[1:]
     return noted
 
@@ -308,4 +343,5 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
 def _place(plan: dict[str, Any], settings: Any) -> Place | None:  # noqa: ANN401
     if "error" in plan:
         return None
-    return Place(plan["removed"] / plan["splats"], settings.absorb)
+    forced = plan["forced"]  # the chart is of the others
+    return Place((plan["removed"] - forced) / (plan["splats"] - forced), settings.absorb)

@@ -57,9 +57,10 @@ def core(addon):
 
 
 def keep_mask(addon, obj, budget, protect=""):
-    """Return which splats of a scored object stay, as *Apply* decides it."""
-    task = addon.splat_object.stored_task(addon.mesh.layout.check(obj), budget, protect)
-    return addon.core.pipeline.decide(task).keep
+    """Return which splats of a scored object stay, as *Apply* decides it; `protect` names some."""
+    checked = addon.mesh.layout.check(obj)
+    found = addon.demands.Demands((protect,) if protect else ()).forced(checked)
+    return addon.core.pipeline.decide(addon.splat_object.stored_task(checked, budget, found)).keep
 
 
 @pytest.fixture(autouse=True)

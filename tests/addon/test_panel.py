@@ -34,6 +34,12 @@ class Layout:
         self.drawn.append(name)
         return SimpleNamespace()
 
+    def operator_menu_enum(self, name, property, **_options):  # noqa: A002 - Blender's name
+        """Note a menu, and return something to set its properties on."""
+        assert property in bpy.ops.refine.__getattr__(name.split(".")[1]).get_rna_type().properties
+        self.drawn.append(name)
+        return SimpleNamespace()
+
     def prop(self, data, name, **_options):
         """Note a property; it must exist."""
         assert name in data.bl_rna.properties

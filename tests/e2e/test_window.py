@@ -90,6 +90,30 @@ def test_the_viewport_shows_splats_as_the_reference_renderer(
     assert found["handlers"] == [1, 0]
 
 
+def test_what_must_stay_and_go_is_shown_in_every_mode(binary: Binary, cloud: Path, cameras: Path):
+    """Before scoring *What Goes* shows what volumes force out; a volume that moves is followed.
+
+    All modes draw the same splats, and those that stay or go are parted between two of them.
+    """
+    try:
+        found = binary.window_step(
+            "volumes", cloud=cloud, cameras=cameras, picture=binary.work / "volumes-{}.png"
+        )
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+
+    unscored = found["unscored"]
+    assert 1000 < unscored["protected"] < 30_000
+    assert 0 < found["unscored GOES"] <= unscored["forced"] < 39_755
+    assert found["unscored SCENE"] == found["SCENE"] == found["HEAT"]
+    assert found["SCENE"] == found["STAYS"] + found["GOES"]
+    assert found["GOES"] > found["unscored GOES"]
+    assert found["moved"] != 0
+    assert found["failure"] == ""
+
+
 def _psnr(seen: dict, picture: Path, cloud: Path) -> float:
     """Return how close a view in a picture of the screen is to the reference renderer, dB."""
     view, window = np.array(seen["view"]), np.array(seen["window"])
