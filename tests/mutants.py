@@ -522,7 +522,6 @@ MUTANTS = {
         ("(seen.past >= AGREE * seen.views)", "True", "a minority of the views decides"),
         ("self.slender & (widest >= LONG) & ~giant", "self.slender & ~giant", "short needles"),
         ("(self.gaussians.largest >= HUGE) & (widest >= GIANT)", "widest >= GIANT", "near giants"),
-        (" & (self.gaussians.alphas >= SOLID)", "", "fog that holds together"),
         ("self.gaussians.alphas * contrast", "contrast", "opacity that does not count"),
         ("scales[:, 2] - scales[:, 1] >=", "scales[:, 2] - scales[:, 0] >=", "flakes as needles"),
         ("most | (some & (effect >= LOUD))", "most | some", "few views for what hardly shows"),
