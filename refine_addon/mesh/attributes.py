@@ -8,6 +8,7 @@ go in as those of a mesh.
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -216,6 +217,15 @@ def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDA
     attribute = attribute or mesh.attributes.new(name, data_type, "POINT")
     kind = KINDS[data_type]
     attribute.data.foreach_set(kind.field, np.ascontiguousarray(values, kind.dtype).ravel())
+
+
+def digest(checked: SplatObject) -> int:
+    """Return a number that tells an object's splats from others; harmonics are not looked at."""
+    columns = (column for column in checked.layout.columns if not column.name.startswith("f_rest_"))
+    found = 0
+    for name in dict.fromkeys(column.attribute for column in columns):
+        found = zlib.crc32(read_attribute(checked.mesh, name).data, found)
+    return found
 
 
 def remove_attribute(mesh: bpy.types.Mesh, name: str) -> None:

@@ -36,6 +36,8 @@ def store(
     settings: Settings,
     origin: dict[str, Any] | None = None,
     cameras: list[tuple[str, int]] | None = None,
+    *,
+    asked: Settings | None = None,
 ) -> None:
     """Write scores to the attributes of an object's mesh, and note how they came to be.
 
@@ -48,6 +50,8 @@ def store(
         See `staleness.origin`.
     cameras : list of (str, int), optional
         Name of each view given, and how many splats lie in it.
+    asked : Settings, optional
+        What the scores are to be refined by, if that is still to come.
 
     Raises
     ------
@@ -63,11 +67,7 @@ def store(
         )
         raise RefineError(msg)
     ranks = rank(scores.values)
-    mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
-    mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
-    mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
-    heat_map.write(mesh, ranks)
-    mesh[RECORD] = json.dumps(
+    note = json.dumps(
         {
             "splats": len(scores.values),
             "settings": asdict(settings),
@@ -81,8 +81,15 @@ def store(
             "quality": scores.quality.facts() if scores.quality else None,
             "origin": origin,
             "cameras": cameras,
+            "asked": asdict(asked) if asked else None,
         }
     )
+    # What can fail comes first: scores and note are to belong together.
+    heat_map.write(mesh, ranks)
+    mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
+    mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
+    mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
+    mesh[RECORD] = note
     mesh_attributes.updated(mesh)
 
 
@@ -94,6 +101,11 @@ def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
     return noted if complete else None
+
+
+def unrefined(record: dict[str, Any]) -> bool:
+    """Tell whether the scores of a note are a sketch of those that were asked for."""
+    return bool(record.get("asked"))
 
 
 def stored_scores(checked: SplatObject) -> Scores:

@@ -14,7 +14,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
 from ..viewport import draw as viewport_draw
-from . import kept, plans, preview, price, staleness, wrapped
+from . import kept, plans, preview, price, running, staleness, wrapped
 from .properties import FLOATERS
 from .view_operators import MODES
 from .wrapped import counted
@@ -40,7 +40,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the import and what the active object holds."""
         layout = self.layout
-        layout.operator("refine.import_ply", icon="IMPORT")
+        _operator(layout, context, "refine.import_ply", "IMPORT")
         obj = context.object
         if not mesh_layout.looks_like_splats(obj):
             lost = obj is not None and native.lost_base(obj)
@@ -88,9 +88,7 @@ class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
         """Draw the reasons, how many splats each takes, and the buttons."""
         layout = self.layout
         settings = context.scene.refine
-        if _draw_progress(layout, context):
-            return
-        layout.operator("refine.find_floaters", icon="VIEWZOOM")
+        _operator(layout, context, "refine.find_floaters", "VIEWZOOM")
         obj = context.object
         found = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
         column = layout.column(align=True)
@@ -120,14 +118,14 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         column.prop(settings, "method")
         if settings.method == "auto":
             column.prop(settings, "tolerance")
-        if _draw_progress(layout, context):
-            return
-        layout.operator("refine.score", icon="CAMERA_DATA")
+        _operator(layout, context, "refine.score", "CAMERA_DATA")
         obj = context.object
         record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
         if record:
             views = counted(record["views_given"], "view")
             layout.label(text=f"Scored by {record['views_used']} of {views}", icon="CHECKMARK")
+            if mesh_scores.unrefined(record):
+                wrapped.label(layout, context, "By the closed form, not yet refined", icon="INFO")
             question = ("changes", obj.data.get(mesh_scores.RECORD))
             changed = kept.answer(question, context, lambda: staleness.changes(context, obj))
             if changed:
@@ -210,9 +208,7 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
         if record:
             _draw_plan(layout, context, record)
-        if _draw_progress(layout, context):
-            return
-        layout.operator("refine.apply", icon="TRASH")
+        _operator(layout, context, "refine.apply", "TRASH")
 
 
 class REFINE_PT_export(_InSidebar, bpy.types.Panel):
@@ -223,21 +219,23 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the buttons."""
         layout, settings = self.layout, context.scene.refine
-        layout.operator("refine.export_ply", icon="EXPORT")
+        _operator(layout, context, "refine.export_ply", "EXPORT")
         column = layout.column()
         column.use_property_split = True
         column.use_property_decorate = False
         column.prop(settings, "levels")
         column.prop(settings, "nested")
-        column.operator("refine.levels", icon="MOD_DECIM")
+        _operator(column, context, "refine.levels", "MOD_DECIM")
 
 
-def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
-    """Draw how far an operator is that works on a thread; return whether one does."""
-    progress = context.window_manager.refine_progress
-    if progress >= 0.0:
-        layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
-    return bool(progress >= 0.0)
+def _operator(layout: bpy.types.UILayout, context: bpy.types.Context, name: str, icon: str) -> None:
+    """Draw an operator's button; while it works on a thread, how far it is instead."""
+    now = running.now()
+    if now is None or now.operator != name:
+        layout.operator(name, icon=icon)
+        return
+    layout.progress(factor=now.factor, text=now.share)
+    wrapped.label(layout, context, now.sentence)
 
 
 def _draw_frames(
@@ -292,7 +290,9 @@ def _draw_plan(
     if plan is None:
         layout.operator("refine.plan", icon="FILE_REFRESH")
     elif "error" in plan:
-        wrapped.label(layout, context, plan["error"], icon="ERROR")
+        waits = mesh_scores.unrefined(record) and settings.budget == "psnr"
+        text = plans.remark(plan, record) if waits else plan["error"]
+        wrapped.label(layout, context, text, icon="INFO" if waits else "ERROR")
     else:
         wrapped.label(layout, context, plans.sentence(plan, absorb=settings.absorb))
         if remark := plans.remark(plan, record):

@@ -205,7 +205,7 @@ class Context:
             event_timer_add=lambda _step, **_options: object(),
             event_timer_remove=lambda _timer: None,
             modal_handler_add=lambda _operator: None,
-            refine_progress=-1.0,
+            windows=[],
         )
 
     def __getattr__(self, name):
@@ -214,26 +214,33 @@ class Context:
 
 
 @pytest.fixture
-def started(addon, few):
+def started(addon, few):  # noqa: ARG001
     """Return a function that starts an operator as a click in a window does."""
 
     def started(name):
         cls = getattr(addon.ui.operators, f"REFINE_OT_{name}")
-        body = {key: cls.__dict__[key] for key in ("doing", "prepare", "work", "finish")}
+        names = ("bl_idname", "doing", "prepare", "sketch", "show", "work", "finish")
+        body = {key: cls.__dict__[key] for key in names if key in cls.__dict__}
         said = []
         body["report"] = lambda _self, _kind, text: said.append(text)
         operator, context = type(name, (addon.ui.on_thread.OnThread,), body)(), Context()
-        operator.start(context, operator.prepare(context, addon.mesh.layout.check(few)))
+        assert operator.launch(context) == {"RUNNING_MODAL"}
         return operator, context, said
 
     return started
 
 
+def event(kind, value="PRESS", **held):
+    """Return what Blender tells an operator of a key, the mouse or a timer."""
+    keys = {"ctrl": False, "shift": False, "alt": False, "oskey": False}
+    return SimpleNamespace(type=kind, value="NOTHING" if kind == "TIMER" else value, **keys | held)
+
+
 def until_over(operator, context):
     """Send the timer's events until the operator ends."""
     for _ in range(2000):
-        answer = operator.modal(context, SimpleNamespace(type="TIMER"))
-        if answer != {"RUNNING_MODAL"}:
+        answer = operator.modal(context, event("TIMER"))
+        if answer != {"PASS_THROUGH"}:
             return answer
         time.sleep(0.01)
     msg = "it never ended"
@@ -277,9 +284,9 @@ def test_an_operation_in_a_window_is_dropped_when_it_is_over(  # noqa: PLR0917
         monkeypatch.setattr(addon.mesh.scores, "store", refuse)
         monkeypatch.setattr(addon.splat_object, "apply_object", refuse)
     operator, context, said = started(name)
-    assert context.window_manager.refine_progress == 0.0
+    assert addon.ui.running.now().operator == f"refine.{name}"
     if how == "escape":
-        operator.modal(context, SimpleNamespace(type="ESC"))
+        operator.modal(context, event("ESC"))
     if how == "cancelled":
         operator.cancel(context)
         for thread in threading.enumerate():
@@ -291,7 +298,7 @@ def test_an_operation_in_a_window_is_dropped_when_it_is_over(  # noqa: PLR0917
 
     assert noted
     assert left(noted) == []
-    assert context.window_manager.refine_progress == -1.0
+    assert addon.ui.running.now() is None
     assert [text for text in said if "failed" in text] == ["failed"] * ("fail" in how)
     assert ("nothing was changed" in "".join(said)) == (how == "escape")
     assert len(few.data.vertices) == (
