@@ -7,11 +7,12 @@ import shutil
 import threading
 import time
 import weakref
-from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
+
+from tests.windows import event, started_in_a_window, until_over
 
 
 @pytest.fixture
@@ -195,56 +196,10 @@ def test_the_history_of_operators_holds_no_splats(few, noted, name):  # noqa: AR
     assert left(noted) == []
 
 
-class Context:
-    """Blender's context with a window that nobody sees."""
-
-    def __init__(self):
-        self.window = SimpleNamespace(screen=SimpleNamespace(areas=[]))
-        self.workspace = SimpleNamespace(status_text_set=lambda _text: None)
-        self.window_manager = SimpleNamespace(
-            event_timer_add=lambda _step, **_options: object(),
-            event_timer_remove=lambda _timer: None,
-            modal_handler_add=lambda _operator: None,
-            windows=[],
-        )
-
-    def __getattr__(self, name):
-        """Return what Blender has."""
-        return getattr(bpy.context, name)
-
-
 @pytest.fixture
 def started(addon, few):  # noqa: ARG001
     """Return a function that starts an operator as a click in a window does."""
-
-    def started(name):
-        cls = getattr(addon.ui.operators, f"REFINE_OT_{name}")
-        names = ("bl_idname", "doing", "prepare", "sketch", "show", "work", "finish")
-        body = {key: cls.__dict__[key] for key in names if key in cls.__dict__}
-        said = []
-        body["report"] = lambda _self, _kind, text: said.append(text)
-        operator, context = type(name, (addon.ui.on_thread.OnThread,), body)(), Context()
-        assert operator.launch(context) == {"RUNNING_MODAL"}
-        return operator, context, said
-
-    return started
-
-
-def event(kind, value="PRESS", **held):
-    """Return what Blender tells an operator of a key, the mouse or a timer."""
-    keys = {"ctrl": False, "shift": False, "alt": False, "oskey": False}
-    return SimpleNamespace(type=kind, value="NOTHING" if kind == "TIMER" else value, **keys | held)
-
-
-def until_over(operator, context):
-    """Send the timer's events until the operator ends."""
-    for _ in range(2000):
-        answer = operator.modal(context, event("TIMER"))
-        if answer != {"PASS_THROUGH"}:
-            return answer
-        time.sleep(0.01)
-    msg = "it never ended"
-    raise AssertionError(msg)
+    return lambda name: started_in_a_window(addon, getattr(addon.ui.operators, f"REFINE_OT_{name}"))
 
 
 @pytest.fixture
