@@ -117,6 +117,8 @@ class OnThread:
             running.worker.cancel()
         elif why := at_work.refused(event):
             self.report({"WARNING"}, why)
+            running.say(why)
+            running.tell(context)
         else:
             return {"PASS_THROUGH"}
         return {"RUNNING_MODAL"}

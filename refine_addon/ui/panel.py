@@ -39,21 +39,9 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the import and what the active object holds."""
-        layout = self.layout
-        _operator(layout, context, "refine.import_ply", "IMPORT")
-        obj = context.object
-        if not mesh_layout.looks_like_splats(obj):
-            lost = obj is not None and native.lost_base(obj)
-            text = "Colours were lost: open it in Blender 5.2" if lost else _NONE
-            wrapped.label(layout, context, text, icon="ERROR" if lost else "INFO")
-            return
-        count = mesh_layout.splat_count(obj.data)
-        layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
-        layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
-        size = kept.answer("bytes", context, lambda: mesh_layout.export_bytes(obj))
-        if size is not None:
-            layout.label(text=f"{size / 1e6:,.1f} MB")
-        layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
+        self.layout.operator("refine.import_ply", icon="IMPORT")
+        _draw_object(self.layout, context)
+        _draw_progress(self.layout, context, "refine.import_ply")
 
 
 class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
@@ -88,7 +76,7 @@ class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
         """Draw the reasons, how many splats each takes, and the buttons."""
         layout = self.layout
         settings = context.scene.refine
-        _operator(layout, context, "refine.find_floaters", "VIEWZOOM")
+        layout.operator("refine.find_floaters", icon="VIEWZOOM")
         obj = context.object
         found = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
         column = layout.column(align=True)
@@ -101,6 +89,7 @@ class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
                 text=f"Go: {total:,} of {mesh_layout.splat_count(obj.data):,}", icon="TRASH"
             )
             layout.operator("refine.delete_floaters", icon="TRASH")
+        _draw_progress(layout, context, "refine.find_floaters")
 
 
 class REFINE_PT_score(_InSidebar, bpy.types.Panel):
@@ -118,7 +107,7 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         column.prop(settings, "method")
         if settings.method == "auto":
             column.prop(settings, "tolerance")
-        _operator(layout, context, "refine.score", "CAMERA_DATA")
+        layout.operator("refine.score", icon="CAMERA_DATA")
         obj = context.object
         record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
         if record:
@@ -133,6 +122,7 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
                 wrapped.label(layout, context, text, icon="ERROR")
         elif mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes:
             wrapped.label(layout, context, "Applied: score again for more", icon="INFO")
+        _draw_progress(layout, context, "refine.score")
 
 
 class REFINE_PT_advanced(_InSidebar, bpy.types.Panel):
@@ -208,7 +198,8 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
         if record:
             _draw_plan(layout, context, record)
-        _operator(layout, context, "refine.apply", "TRASH")
+        layout.operator("refine.apply", icon="TRASH")
+        _draw_progress(layout, context, "refine.apply")
 
 
 class REFINE_PT_export(_InSidebar, bpy.types.Panel):
@@ -219,23 +210,42 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the buttons."""
         layout, settings = self.layout, context.scene.refine
-        _operator(layout, context, "refine.export_ply", "EXPORT")
+        layout.operator("refine.export_ply", icon="EXPORT")
         column = layout.column()
         column.use_property_split = True
         column.use_property_decorate = False
         column.prop(settings, "levels")
         column.prop(settings, "nested")
-        _operator(column, context, "refine.levels", "MOD_DECIM")
+        column.operator("refine.levels", icon="MOD_DECIM")
+        _draw_progress(layout, context, "refine.export_ply", "refine.levels")
 
 
-def _operator(layout: bpy.types.UILayout, context: bpy.types.Context, name: str, icon: str) -> None:
-    """Draw an operator's button; while it works on a thread, how far it is instead."""
-    now = running.now()
-    if now is None or now.operator != name:
-        layout.operator(name, icon=icon)
+def _draw_object(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw what the active object holds."""
+    obj = context.object
+    if not mesh_layout.looks_like_splats(obj):
+        lost = obj is not None and native.lost_base(obj)
+        text = "Colours were lost: open it in Blender 5.2" if lost else _NONE
+        wrapped.label(layout, context, text, icon="ERROR" if lost else "INFO")
         return
-    layout.progress(factor=now.factor, text=now.share)
-    wrapped.label(layout, context, now.sentence)
+    count = mesh_layout.splat_count(obj.data)
+    layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
+    layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
+    size = kept.answer("bytes", context, lambda: mesh_layout.export_bytes(obj))
+    if size is not None:
+        layout.label(text=f"{size / 1e6:,.1f} MB")
+    layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
+
+
+def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *names: str) -> None:
+    """Draw how far an operator is that works on a thread, if it is one of these.
+
+    To be called last: Blender 4.3 draws a label as a bar that takes the place of one in a panel.
+    """
+    now = running.now()
+    if now is not None and now.operator in names:
+        layout.progress(factor=now.factor, text=now.share)
+        wrapped.label(layout, context, now.sentence)
 
 
 def _draw_frames(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -54,6 +55,10 @@ class Sketch:
     left: str
 
 
+_LONG = 5.0
+"""Seconds for which a refusal stays in the status bar."""
+
+
 @dataclass
 class Running:
     """An operation while it runs: all that an operator holds of it, dropped when it is over.
@@ -92,6 +97,7 @@ class Running:
     sketch: Sketch | None = None
     stage: Literal["sketch", "work", "shown"] = "work"
     waits: str = ""
+    _said: tuple[str, float] = ("", 0.0)
     _pace: Pace = field(default_factory=_begun)
     _told: str = ""
 
@@ -125,9 +131,14 @@ class Running:
         what = f" ({self.worker.what})" if self.worker.what else ""
         return f"{self.doing}{what}; Esc {self.escape}"
 
+    def say(self, text: str) -> None:
+        """Say something in the status bar for `_LONG`."""
+        self._said = text, time.monotonic() + _LONG
+
     def tell(self, context: bpy.types.Context) -> None:
         """Say in status bar and panels how far it is, if there is news."""
-        text = f"{self.sentence}: {self.share}"
+        said, until = self._said
+        text = said if time.monotonic() < until else f"{self.sentence}: {self.share}"
         if text != self._told:
             self._told = text
             context.workspace.status_text_set(text)

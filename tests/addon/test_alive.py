@@ -110,6 +110,7 @@ def test_undo_redo_and_save_are_refused_with_a_sentence(start, gate, held, word)
     assert said == [
         f"{word} waits: Scoring splats: wait until it is over, or press Esc, which cancels"
     ]
+    assert context.said[-1] == said[0]
     for other in (event(kind, **held), event(kind, "RELEASE", ctrl=True, **held)):
         assert operator.modal(context, other) == {"PASS_THROUGH"}
 
