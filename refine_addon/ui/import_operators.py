@@ -81,7 +81,7 @@ class REFINE_OT_import_ply(AskedFirst, _InObjectMode, bpy.types.Operator, Import
     upright: BoolProperty(name="Upright", description=UPRIGHT_TEXT)
 
     doing = "Reading splats"
-    reads_object = changes_object = False
+    reads_object = False
 
     def ask(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
         """Ask for the files, or only for the options where files were dropped."""

@@ -57,13 +57,19 @@ class OnThread:
     """
 
     doing = ""
-    reads_object = changes_object = True
-    """Whether it needs the active object, and whether `finish` writes to it."""
+    reads_object = True
+    """Whether it needs the active object."""
     _running: Running | None = None
 
     def sketch(self, _job: Any) -> Sketch | None:  # noqa: ANN401 - its own kind
         """Return what is to be done and shown ahead of the work."""
         return None
+
+    def written(
+        self, _context: bpy.types.Context, checked: SplatObject | None
+    ) -> list[SplatObject]:
+        """Return the objects that `finish` writes to, the active one first."""
+        return [checked] if checked else []
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Do all of it at once."""
@@ -85,7 +91,7 @@ class OnThread:
         try:
             checked = self._checked(context)
             job = self.prepare(context, checked)
-            target = Target.of(checked) if self.changes_object and checked else None
+            targets = [Target.of(each) for each in self.written(context, checked)]
         except FAILURES as error:
             return fail(self, error)
         manager, sketch = context.window_manager, self.sketch(job)
@@ -94,7 +100,7 @@ class OnThread:
             doing=self.doing,
             escape="cancels",
             job=job,
-            target=target,
+            targets=targets,
             worker=Worker(sketch.work if sketch else partial(self.work, job)),
             timer=manager.event_timer_add(_STEP, window=context.window),
             sketch=sketch,
@@ -132,7 +138,8 @@ class OnThread:
     def _looked(self, context: bpy.types.Context, running: Running) -> Answer:
         """Look how far the thread is."""
         if not running.worker.running():
-            running.waits = running.target.waits() if running.target else ""
+            waits = (target.waits() for target in running.targets)
+            running.waits = next(filter(None, waits), "")
             if running.stage == "sketch":
                 return self._sketched(context, running)
             if running.worker.cancelled or not running.waits:
@@ -155,7 +162,7 @@ class OnThread:
         running.next(Worker(partial(self.work, running.job)))
         if found is not None and not running.waits:
             try:
-                self.show(context, running.target.found(), running.job, found)
+                self.show(context, running.found(), running.job, found)
             except FAILURES as error:
                 running.worker.cancel()
                 self._over(context, running)
@@ -174,8 +181,7 @@ class OnThread:
             return self._stopped(context, running, error)
         self._over(context, running)
         try:
-            checked = running.target.found() if running.target else None
-            return self.finish(context, checked, running.job, result)
+            return self.finish(context, running.found(), running.job, result)
         except FAILURES as error:
             return self._stopped(context, running, error)
 

@@ -441,7 +441,6 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
     bl_label = "Export Splats"
     bl_options = {"REGISTER"}
     doing = "Writing splats"
-    changes_object = False
 
     filename_ext = ".ply"
     filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
@@ -474,6 +473,12 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
         before = self.filepath
         self.filepath = without_suffix(before) + self.suffix
         return before != self.filepath
+
+    def written(
+        self, _context: bpy.types.Context, _checked: SplatObject | None
+    ) -> list[SplatObject]:
+        """Return none: the object is only read."""
+        return []
 
     def prepare(self, _context: bpy.types.Context, checked: SplatObject) -> _Export:
         """Refuse what cannot be written, and gather what is."""

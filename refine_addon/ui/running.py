@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ..core.work import Progress
+    from ..mesh.layout import SplatObject
     from .target import Target
     from .worker import Worker
 
@@ -75,8 +76,8 @@ class Running:
         What Esc does.
     job
         What was gathered from the scene.
-    target : Target or None
-        The object that is to be written to.
+    targets : list of Target
+        The objects that are to be written to.
     worker : Worker
     timer : bpy.types.Timer
     sketch : Sketch or None
@@ -91,7 +92,7 @@ class Running:
     doing: str
     escape: str
     job: Any
-    target: Target | None
+    targets: list[Target]
     worker: Worker[Any]
     timer: bpy.types.Timer
     sketch: Sketch | None = None
@@ -100,6 +101,16 @@ class Running:
     _said: tuple[str, float] = ("", 0.0)
     _pace: Pace = field(default_factory=_begun)
     _told: str = ""
+
+    def found(self) -> SplatObject | None:
+        """Return the first object that is to be written to, if all are as they were read.
+
+        Raises
+        ------
+        RefineError
+            See `Target.found`.
+        """
+        return next(iter([target.found() for target in self.targets]), None)
 
     def next(self, worker: Worker[Any]) -> None:
         """Go on with other work, at a pace of its own."""

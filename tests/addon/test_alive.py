@@ -196,6 +196,21 @@ def test_a_result_for_splats_that_changed_is_refused(start, gate, addon, few, ch
     assert addon.ui.running.now() is None
 
 
+def test_all_objects_that_are_written_to_have_to_be_as_they_were(start, gate, addon, few):
+    """Where an operator writes to several; the second is the one that changed."""
+    other = few.copy()
+    other.data = few.data.copy()
+    bpy.context.scene.collection.objects.link(other)
+    check = addon.mesh.layout.check
+    operator, context, said = start(written=lambda *_: [check(few), check(other)])
+    _move_a_vertex(other)
+    gate.open.set()
+
+    assert until_over(operator, context) == {"CANCELLED"}
+    assert said == ["object 'room.001': its splats were changed meanwhile; start again"]
+    assert noted(addon, few) is None
+
+
 def test_a_renamed_object_gets_its_result(start, gate, addon, few):
     """Another one has its name by then, and stays as it is."""
     operator, context, _ = start()
@@ -400,3 +415,32 @@ def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, 
 
     assert answer == {"CANCELLED"}
     assert list(tmp_path.iterdir()) == []
+
+
+def served(addon, function):
+    """Return what a thread gets that asks the main thread to call a function."""
+    worker = addon.ui.worker.Worker(lambda _progress: addon.main_thread.call(function))
+    while worker.running():
+        addon.main_thread.serve()
+    return worker.result()
+
+
+def test_the_main_thread_answers_the_thread(addon):
+    """With what the function returns or raises."""
+    assert served(addon, threading.current_thread) == threading.main_thread()
+    with pytest.raises(ZeroDivisionError):
+        served(addon, lambda: 1 // 0)
+
+
+def test_a_thread_that_is_cancelled_waits_for_no_answer(addon):
+    """And what it asked for is not done."""
+    main_thread, calls = addon.main_thread, []
+    worker = addon.ui.worker.Worker(lambda _progress: main_thread.call(lambda: calls.append(1)))
+    while not main_thread._asked.qsize():
+        time.sleep(0.01)
+    worker.end()
+    main_thread.serve()
+
+    assert calls == []
+    with pytest.raises(addon.core.Cancelled):
+        worker.result()

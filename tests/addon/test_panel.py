@@ -243,7 +243,7 @@ def at_work(addon):
 
     def at_work(operator, doing):
         worker = SimpleNamespace(fraction=0.43, what="looking")
-        running.begin(running.Running(operator, doing, "cancels", None, None, worker, None))
+        running.begin(running.Running(operator, doing, "cancels", None, [], worker, None))
 
     yield at_work
     running._now.clear()

@@ -83,9 +83,9 @@ def main(blend: str, cloud: str, pictures: str) -> Generator[float, None, dict[s
 def meanwhile(hand: window.Hand, gate: Gate, blend: str) -> Generator[float, None, dict[str, Any]]:
     """Do while splats are scored what the window is to allow, and what it is to refuse."""
     view, draws = hand.area.spaces.active.region_3d, Draws()
-    yield 1.0
+    yield from window.until(lambda: draws.counts["panel"] > 1, "the window is drawn")
     draws.clear()
-    yield 3.0
+    yield from window.until(lambda: draws.counts["panel"] > 2, "the bar is drawn")
     drawn = draws.stop()
     turned, far = view.view_rotation.copy(), view.view_distance
     yield from orbit(hand)
@@ -197,7 +197,7 @@ class Gate:
             step = 0
             while settings.method != "closed-form" and not self.opened.wait(0.05):
                 step += 1
-                work.report(progress, min(0.2 + 0.001 * step, 0.9), "looking")
+                work.report(progress, min(0.2 + 0.0005 * step, 0.9), "looking")
             return score(splats, views, settings, progress=progress, **options)
 
         pipeline.score = held
