@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from ..core.formats.ply import SplatFile
+from ..core.formats.ply import REQUIRED, SplatFile
 from ..core.splats import Splats, single_unit_quaternions
 from .layout import KINDS, Column, SplatObject, add_attributes, rest_count, splat_count
 
@@ -220,8 +220,11 @@ def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDA
 
 
 def digest(checked: SplatObject) -> int:
-    """Return a number that tells an object's splats from others; harmonics are not looked at."""
-    columns = (column for column in checked.layout.columns if not column.name.startswith("f_rest_"))
+    """Return a number that tells an object's splats from others.
+
+    Neither view-dependent colour is looked at, nor what does not draw, such as a painted mask.
+    """
+    columns = (column for column in checked.layout.columns if column.name in REQUIRED)
     found = 0
     for name in dict.fromkeys(column.attribute for column in columns):
         found = zlib.crc32(read_attribute(checked.mesh, name).data, found)

@@ -60,7 +60,7 @@ _LONG = 5.0
 """Seconds for which a refusal stays in the status bar."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Running:
     """An operation while it runs: all that an operator holds of it, dropped when it is over.
 
