@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 
 from ..cameras.sets import chosen_cameras
+from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
@@ -39,9 +40,23 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the import and what the active object holds."""
-        self.layout.operator("refine.import_ply", icon="IMPORT")
-        _draw_object(self.layout, context)
-        _draw_progress(self.layout, context, "refine.import_ply")
+        layout = self.layout
+        layout.operator("refine.import_ply", icon="IMPORT")
+        obj = context.object
+        if not mesh_layout.looks_like_splats(obj):
+            lost = obj is not None and native.lost_base(obj)
+            text = "Colours were lost: open it in Blender 5.2" if lost else _NONE
+            wrapped.label(layout, context, text, icon="ERROR" if lost else "INFO")
+            _draw_progress(layout, context, "refine.import_ply")
+            return
+        count = mesh_layout.splat_count(obj.data)
+        layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
+        layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
+        size = kept.answer("bytes", context, lambda: mesh_layout.export_bytes(obj))
+        if size is not None:
+            layout.label(text=size_in_words(size))
+        layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
+        _draw_progress(layout, context, "refine.import_ply")
 
 
 class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
@@ -218,23 +233,6 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
         column.prop(settings, "nested")
         column.operator("refine.levels", icon="MOD_DECIM")
         _draw_progress(layout, context, "refine.export_ply", "refine.levels")
-
-
-def _draw_object(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Draw what the active object holds."""
-    obj = context.object
-    if not mesh_layout.looks_like_splats(obj):
-        lost = obj is not None and native.lost_base(obj)
-        text = "Colours were lost: open it in Blender 5.2" if lost else _NONE
-        wrapped.label(layout, context, text, icon="ERROR" if lost else "INFO")
-        return
-    count = mesh_layout.splat_count(obj.data)
-    layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
-    layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
-    size = kept.answer("bytes", context, lambda: mesh_layout.export_bytes(obj))
-    if size is not None:
-        layout.label(text=f"{size / 1e6:,.1f} MB")
-    layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
 
 
 def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *names: str) -> None:
