@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import FloatProperty, PointerProperty
+from bpy.props import PointerProperty
 
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
-from .ui import camera_list, kept, plans, price, volumes
+from .ui import camera_list, kept, plans, price, running, volumes
 from .ui.camera_list import REFINE_PT_camera_list, REFINE_UL_cameras, RefineCamera
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
@@ -89,13 +89,13 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.refine = PointerProperty(type=RefineSettings)
-    bpy.types.WindowManager.refine_progress = FloatProperty(default=-1.0, options={"SKIP_SAVE"})
     bpy.types.TOPBAR_MT_file_import.append(_draw_import)
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
     camera_list.register()
     kept.register()
     volumes.register()
     price.register()
+    running.register()
     images.use(BlenderImages())
     _commands.append(bpy.utils.register_cli_command("refine", _run_command))
 
@@ -105,6 +105,7 @@ def unregister() -> None:
     draw.stop()
     bpy.utils.unregister_cli_command(_commands.pop())
     images.use(None)
+    running.unregister()
     plans.unregister()
     price.unregister()
     volumes.unregister()
@@ -112,7 +113,6 @@ def unregister() -> None:
     camera_list.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)
     bpy.types.TOPBAR_MT_file_import.remove(_draw_import)
-    del bpy.types.WindowManager.refine_progress
     del bpy.types.Scene.refine
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

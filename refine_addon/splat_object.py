@@ -291,11 +291,38 @@ def export_object(
         If the object's scale is uneven and is to be applied, or the file cannot be written; nothing
         is written then.
     """
+    target = export_target(path, overwrite=overwrite)
+    file = export_source(checked, columns=columns, apply_transform=apply_transform)
+    return write_export(file, target, keep=keep, overwrite=overwrite)
+
+
+def export_target(path: Path | str, *, overwrite: bool) -> Path:
+    """Return the file that `export_object` would write, or raise `RefineError` if it cannot."""
     target = expanded(path)
     refuse_existing(target, overwrite=overwrite)
-    file = mesh_attributes.file_from_object(
+    return target
+
+
+def export_source(
+    checked: SplatObject,
+    *,
+    columns: dict[str, NDArray[Any]] | None = None,
+    apply_transform: bool = False,
+) -> SplatFile:
+    """Return what `export_object` writes, in memory."""
+    return mesh_attributes.file_from_object(
         checked, _world_columns(checked) if apply_transform else columns
     )
+
+
+def write_export(
+    file: SplatFile,
+    target: Path,
+    *,
+    keep: NDArray[np.bool_] | None = None,
+    overwrite: bool = False,
+) -> SplatFile | Packed:
+    """Do what is left of `export_object`, which takes arrays alone; see there."""
     made = as_written(file, target)
     made.write(target, keep, overwrite=overwrite)
     return made

@@ -32,6 +32,13 @@ MUTANTS = {
             "turned the other way",
         ),
     ],
+    "whole_file.py": [
+        ("            checkpoint()  #", "            #", "cancelled, and there all the same"),
+    ],
+    "pace.py": [
+        ("passed * (total - done) / done", "passed * total / done", "time in all, not left"),
+        ("not 0.0 < done < total", "not 0.0 <= done < total", "a pace before anything is done"),
+    ],
     "work.py": [
         ("            cancelled.set()\n", "", "what runs is not told"),
         ("time.monotonic() - told >= _REPORT_INTERVAL", "False", "one thread not asked"),
@@ -558,6 +565,7 @@ TESTS = {
     "absorb": ["absorbing/merge_field.py", "absorbing/merging.py", "absorbing/merge_graph.py"],
     "cleaning": ["cleaning/clusters.py"],
     "cleaning_reasons": ["cleaning/sight.py", "cleaning/clean.py"],
+    "command_pace": ["pace.py"],
     "invariance": ["scene.py"],
     "volumes": ["solid.py"],
     "forced": ["task.py"],

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..core import RefineError, as_written, clean, forced, prune_file, read_splats, score
 from ..core.errors import printable
+from ..core.pace import Pace
 from ..core.quality import UNSEEN, in_words
 from ..core.report import held, kept_and_removed, scoring_notes, seen_by, what_was_seen
 from ..core.whole_file import refuse_existing, refuse_mapped
@@ -20,7 +21,6 @@ from .checks import open_blend
 from .info import describe
 from .lod import make_levels
 from .options import budget, cleaning, settings
-from .pace import Pace
 from .terminal import Terminal, complain, described
 from .words import by, left_unseen, sizes, written
 

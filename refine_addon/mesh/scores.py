@@ -31,13 +31,15 @@ RECORD = "refine_scores"
 """Custom property of the mesh: how its scores came to be, as JSON."""
 
 
-def store(
+def store(  # noqa: PLR0913 - all that a note holds
     checked: SplatObject,
     scores: Scores,
     settings: Settings,
     origin: dict[str, Any] | None = None,
     cameras: list[tuple[str, int]] | None = None,
+    *,
     forced: int = 0,
+    asked: Settings | None = None,
 ) -> None:
     """Write scores to the attributes of an object's mesh, and note how they came to be.
 
@@ -52,6 +54,8 @@ def store(
         Name of each view given, and how many splats lie in it.
     forced : int
         How many splats had to go, and have the score 0.
+    asked : Settings, optional
+        What the scores are to be refined by, if that is still to come.
 
     Raises
     ------
@@ -67,11 +71,7 @@ def store(
         )
         raise RefineError(msg)
     ranks = rank(scores.values)
-    mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
-    mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
-    mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
-    heat_map.write(mesh, ranks)
-    mesh[RECORD] = json.dumps(
+    note = json.dumps(
         {
             "splats": len(scores.values),
             "settings": asdict(settings),
@@ -86,8 +86,15 @@ def store(
             "origin": origin,
             "cameras": cameras,
             "forced": forced,
+            "asked": asdict(asked) if asked else None,
         }
     )
+    # What can fail comes first: scores and note are to belong together.
+    heat_map.write(mesh, ranks)
+    mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
+    mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
+    mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
+    mesh[RECORD] = note
     mesh_attributes.updated(mesh)
 
 
@@ -99,6 +106,11 @@ def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
     return noted if complete else None
+
+
+def unrefined(record: dict[str, Any]) -> bool:
+    """Tell whether the scores of a note are a sketch of those that were asked for."""
+    return bool(record.get("asked"))
 
 
 def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None) -> Scores:

@@ -7,7 +7,8 @@ Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,21 +24,23 @@ from ..core.formats.registry import FORMATS, Packed, without_suffix
 from ..core.levels.lod import Level, Levels, lod
 from ..core.quality import in_words
 from ..core.report import scoring_notes, sizes_in_words
-from ..core.work import part
+from ..core.work import part, report
 from ..demands import Demands
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
 from ..viewport import draw
-from . import plans, preview, staleness
+from . import plans, preview, running, staleness
 from .import_operators import FILE_NAMES
-from .on_thread import FAILURES, Answer, OnThread, fail
+from .on_thread import FAILURES, Answer, AskedFirst, OnThread, fail
+from .running import Sketch
 from .wrapped import counted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ..core.formats.ply import SplatFile
     from ..core.scores import Scores
     from ..core.splats import Splats
     from ..core.task import Result, Settings, Task
@@ -57,9 +60,15 @@ _FORMATS = (
 class OnSplats:
     """An operator on the active object, which must hold splats."""
 
+    waits = True
+    """Whether it waits until another one is over that works on a thread."""
+
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Tell whether the operator can run, and if not, why."""
+        if cls.waits and (why := running.refusal()):
+            cls.poll_message_set(why)
+            return False
         obj = context.object
         if not mesh_layout.looks_like_splats(obj):
             cls.poll_message_set("Select an object that holds splats: import a file of splats")
@@ -132,6 +141,25 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         removed = Demands.of_scene(context.scene).forced(checked).removed
         return _Scoring(splats, removed, views, settings, quality, origin)
 
+    def sketch(self, job: _Scoring) -> Sketch | None:
+        """Score by the closed form first, which takes a fraction of the time."""
+        if job.settings.method == "closed-form":
+            return None
+        work = partial(_sketched, job)
+        left = "the scores are the closed form's"
+        return Sketch(work, "Refining scores", "keeps the closed form's", left)
+
+    @staticmethod
+    def show(
+        context: bpy.types.Context, checked: SplatObject, job: _Scoring, scores: Scores
+    ) -> None:
+        """Store the closed form's scores, to be looked at until those asked for are there."""
+        forced = _forced(job)
+        mesh_scores.store(
+            checked, scores, _rough(job), job.origin, forced=forced, asked=job.settings
+        )
+        plans.refresh(context)
+
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
         """Score, and count how many splats lie in each view."""
@@ -155,8 +183,8 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         scores, counts = found
         names = [view.name for view in job.views]
         cameras = list(zip(names, counts.tolist(), strict=True))
-        forced = 0 if job.removed is None else int(np.count_nonzero(job.removed))
-        mesh_scores.store(checked, scores, job.settings, job.origin, cameras, forced)
+        forced = _forced(job)
+        mesh_scores.store(checked, scores, job.settings, job.origin, cameras, forced=forced)
         plans.refresh(context)
         unseen = int((scores.seen == 0).sum()) - forced
         self.report(
@@ -169,12 +197,28 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
+def _forced(job: _Scoring) -> int:
+    return 0 if job.removed is None else int(np.count_nonzero(job.removed))
+
+
+def _rough(job: _Scoring) -> Settings:
+    """Return the settings of a sketch of the scores that a job asks for."""
+    return replace(job.settings, method="closed-form")
+
+
+def _sketched(job: _Scoring, progress: Progress) -> Scores:
+    return pipeline.score(
+        job.splats, job.views, _rough(job), removed=job.removed, progress=progress
+    )
+
+
 class REFINE_OT_plan(_OnScored, bpy.types.Operator):
     """Work out again how many splats stay and go"""
 
     bl_idname = "refine.plan"
     bl_label = "Update"
     bl_options = {"INTERNAL"}
+    waits = False
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Work it out."""
@@ -316,6 +360,7 @@ class REFINE_OT_preview(OnSplats, bpy.types.Operator):
     bl_idname = "refine.preview"
     bl_label = "Preview"
     bl_options = {"REGISTER", "UNDO"}
+    waits = False
 
     mode: EnumProperty(
         name="Show",
@@ -402,12 +447,22 @@ class REFINE_OT_convert(OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
+@dataclass(frozen=True, eq=False)
+class _Export:
+    """What is to be written where."""
+
+    file: SplatFile
+    target: Path
+    overwrite: bool
+
+
+class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelper):
     """Write the active object's splats to a file, in the format that its suffix names"""
 
     bl_idname = "refine.export_ply"
     bl_label = "Export Splats"
     bl_options = {"REGISTER"}
+    doing = "Writing splats"
 
     filename_ext = ".ply"
     filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
@@ -428,12 +483,12 @@ class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
         options={"SKIP_SAVE"},
     )
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Ask for the file; whoever picks an existing one in the browser means to replace it."""
         if not self.filepath:
             self.filepath = _new_name(context.object)
         self.overwrite = True
-        return super().invoke(context, event)
+        return ExportHelper.invoke(self, context, event)
 
     def check(self, _context: bpy.types.Context) -> bool:
         """Give the file name the suffix of the format that is chosen; return whether it changed."""
@@ -441,17 +496,34 @@ class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
         self.filepath = without_suffix(before) + self.suffix
         return before != self.filepath
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def written(
+        self, _context: bpy.types.Context, _checked: SplatObject | None
+    ) -> list[SplatObject]:
+        """Return none: the object is only read."""
+        return []
+
+    def prepare(self, _context: bpy.types.Context, checked: SplatObject) -> _Export:
+        """Refuse what cannot be written, and gather what is."""
+        target = splat_object.export_target(
+            bpy.path.abspath(self.filepath), overwrite=self.overwrite
+        )
+        file = splat_object.export_source(checked, apply_transform=self.apply_transform)
+        return _Export(file, target, self.overwrite)
+
+    @staticmethod
+    def work(job: _Export, progress: Progress) -> SplatFile | Packed:
         """Write the file."""
-        try:
-            file = splat_object.export_object(
-                mesh_layout.check(context.object),
-                bpy.path.abspath(self.filepath),
-                apply_transform=self.apply_transform,
-                overwrite=self.overwrite,
-            )
-        except FAILURES as error:
-            return fail(self, error)
+        report(progress, 0.0, job.target.name)
+        return splat_object.write_export(job.file, job.target, overwrite=job.overwrite)
+
+    def finish(
+        self,
+        _context: bpy.types.Context,
+        _checked: SplatObject | None,
+        _job: _Export,
+        file: SplatFile | Packed,
+    ) -> Answer:
+        """Say what was written."""
         if isinstance(file, Packed):
             self.report({"INFO"}, "; ".join(file.notes(np.ones(len(file.file), np.bool_))))
         self.report({"INFO"}, f"Wrote the splats to {self.filepath}")

@@ -205,6 +205,8 @@ def remark(plan: dict[str, Any], record: dict[str, Any]) -> str:
     """Return what else there is to say of a plan and of the note of the scoring, or ""."""
     if "psnr" in plan:
         return str(plan.get("remark", ""))
+    if mesh_scores.unrefined(record):
+        return "Refined scores tell dB"
     if record.get("method") == "closed-form":
         return "Score with Auto, or with Quality as the budget, to see dB"
     return "The views see too little to tell dB"

@@ -47,7 +47,7 @@ def changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
     """
     record = mesh_scores.record(obj.data) or {}
     try:
-        then, settings = record["origin"], record["settings"]
+        then, settings = record["origin"], record.get("asked") or record["settings"]
         found = {
             "object moved": _moved(then, context.scene, obj),
             "cameras changed": _other_cameras(then, _cameras(context)),

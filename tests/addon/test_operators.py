@@ -557,7 +557,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
         ("core.pipeline", "decide", "apply", {}),
         ("ui.import_operators", "read_splats", "import_ply", {"filepath": "in.ply"}),
         ("ui.import_operators", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),
-        ("splat_object", "export_object", "export_ply", {"filepath": "out.ply"}),
+        ("splat_object", "write_export", "export_ply", {"filepath": "out.ply"}),
         ("ui.preview", "show", "preview", {}),
     ],
 )

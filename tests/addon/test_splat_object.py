@@ -204,7 +204,7 @@ def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, room,
     )
     scores = worker.result()
     cancelled = addon.ui.worker.Worker.__new__(addon.ui.worker.Worker)
-    cancelled._cancelled, cancelled._result, cancelled._error = True, None, None
+    cancelled._cancelled, cancelled._outcome, cancelled._error = 0.0, [], None
     cancelled._run(lambda progress: core.score(splats, room_views, progress=progress))
 
     assert np.array_equal(scores.values, core.score(splats, room_views).values)
