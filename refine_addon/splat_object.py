@@ -168,11 +168,6 @@ def stored_task(
     )
 
 
-def keep_mask(checked: SplatObject, budget: Budget, found: Forced = FREE) -> NDArray[np.bool_]:
-    """Return which splats of a scored object stay; see `stored_task`."""
-    return pipeline.decide(stored_task(checked, budget, found)).keep
-
-
 def mark_removed(checked: SplatObject, task: Task) -> NDArray[np.bool_]:
     """Mark the splats that a task (`stored_task`) removes; return which stay, (N,)."""
     keep = pipeline.decide(task).keep

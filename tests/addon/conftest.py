@@ -56,6 +56,14 @@ def core(addon):
     return addon.core
 
 
+def keep_mask(addon, obj, budget, protect=""):
+    """Return which splats of a scored object stay, as *Apply* decides it."""
+    checked = addon.mesh.layout.check(obj)
+    found = addon.demands.Demands((protect,) if protect else ()).forced(checked)
+    task = addon.splat_object.stored_task(checked, budget, found)
+    return addon.core.pipeline.decide(task).keep
+
+
 @pytest.fixture(autouse=True)
 def empty_scene():
     """Start from an empty file, with the extension enabled."""
@@ -107,18 +115,6 @@ def score(addon):
         addon.mesh.scores.store(addon.mesh.layout.check(obj), scores, settings)
 
     return score
-
-
-@pytest.fixture
-def kept_beside(addon):
-    """Return a function that says which splats a budget keeps where a name protects some."""
-
-    def kept(obj, budget, name):
-        checked = addon.mesh.layout.check(obj)
-        found = addon.demands.Demands((name,) if name else ()).forced(checked)
-        return addon.splat_object.keep_mask(checked, budget, found)
-
-    return kept
 
 
 def snapshot():

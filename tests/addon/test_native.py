@@ -11,6 +11,8 @@ import pytest
 
 from tests.strategies import ply_of
 
+from .conftest import keep_mask
+
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 TYPES = bpy.types.Attribute.bl_rna.properties["data_type"].enum_items.keys()
 FOUR = "FLOAT4" if "FLOAT4" in TYPES else "FLOAT_COLOR"
@@ -199,7 +201,7 @@ def test_apply_deletes_points_and_leaves_all_else(addon, cloud, room_cameras):  
     assert tuple(cloud.location) == (1.0, 2.0, 3.0)
 
 
-def test_a_protected_splat_of_a_point_cloud_stays(addon, core, cloud, room_cameras, kept_beside):  # noqa: ARG001
+def test_a_protected_splat_of_a_point_cloud_stays(addon, core, cloud, room_cameras):  # noqa: ARG001
     """By a boolean attribute, and by a float one where it is above 0; there are no groups."""
     bpy.ops.refine.score()
     ranks = addon.mesh.attributes.read_attribute(cloud.data, "refine_rank")
@@ -209,11 +211,11 @@ def test_a_protected_splat_of_a_point_cloud_stays(addon, core, cloud, room_camer
     store(cloud, "weight", "FLOAT", mark.astype(np.float32))
     store(cloud, "number", "INT", mark.astype(np.int32))
     budget = core.Budget(ratio=0.5)
-    keep = [kept_beside(cloud, budget, name) for name in ("", "sure", "weight")]
+    keep = [keep_mask(addon, cloud, budget, name) for name in ("", "sure", "weight")]
 
     assert [bool(mask[lowest]) for mask in keep] == [False, True, True]
     with pytest.raises(core.RefineError, match=r"'number' is INT on POINT.*has no vertex groups"):
-        kept_beside(cloud, budget, "number")
+        keep_mask(addon, cloud, budget, "number")
 
 
 def test_absorbing_changes_survivors_alone(addon, cloud, room_cameras):  # noqa: ARG001
