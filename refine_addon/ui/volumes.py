@@ -332,7 +332,10 @@ def _new_empty(
     obj = bpy.data.objects.new(f"{checked.obj.name} {role.lower()}", None)
     obj.empty_display_type = "CUBE" if shape == "BOX" else "SPHERE"
     obj.location = (low + high) / 2.0
-    obj.scale = half if shape == "BOX" else (float(half.max()),) * 3
+    obj.scale = half
+    if shape == "SPHERE":
+        away = np.linalg.norm(means - (low + high) / 2.0, axis=1)
+        obj.scale = (max(float(np.quantile(away, 1.0 - 2.0 * share)), 1e-3),) * 3
     obj.show_in_front = True
     context.collection.objects.link(obj)
     for other in context.selected_objects:
