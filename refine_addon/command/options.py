@@ -247,7 +247,8 @@ def _add_object(parser: argparse.ArgumentParser) -> None:
         type=_name,
         metavar="NAME",
         help="in place of INPUT: this splat object of the open .blend, by the cameras that are "
-        "chosen in the panel there; of the panel's other settings none counts",
+        "chosen in the panel there, with what it protects and crops; of the panel's other settings "
+        "none counts",
     )
     parser.add_argument(
         "--source",

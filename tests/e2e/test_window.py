@@ -93,7 +93,8 @@ def test_the_viewport_shows_splats_as_the_reference_renderer(
 def test_what_must_stay_and_go_is_shown_in_every_mode(binary: Binary, cloud: Path, cameras: Path):
     """Before scoring *What Goes* shows what volumes force out; a volume that moves is followed.
 
-    All modes draw the same splats, and those that stay or go are parted between two of them.
+    All modes draw the same splats, and those that stay or go are parted between two of them. What
+    is marked in edit mode is counted when that is left.
     """
     try:
         found = binary.window_step(
@@ -111,6 +112,7 @@ def test_what_must_stay_and_go_is_shown_in_every_mode(binary: Binary, cloud: Pat
     assert found["SCENE"] == found["STAYS"] + found["GOES"]
     assert found["GOES"] > found["unscored GOES"]
     assert found["moved"] != 0
+    assert found["edited"] == 39_755
     assert found["failure"] == ""
 
 
