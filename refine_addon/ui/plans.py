@@ -27,6 +27,7 @@ from .chart import Place
 
 if TYPE_CHECKING:
     from ..core.quality import Quality
+    from ..core.scores import Scores
     from ..core.task import Task
     from .chart import Histogram
 
@@ -106,6 +107,7 @@ def at_once(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     plan = _noted(_known[0], settings)
     mesh[PLAN] = json.dumps(plan | {"marked": False})
     price.move(mesh, _place(plan, settings))
+    _tell_cameras(_known[0].tally.scores, plan, settings)
 
 
 def refresh(context: bpy.types.Context) -> None:
@@ -246,6 +248,7 @@ def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
         keep = splat_object.mark_removed(checked, task)
         plan["unseen_gone"] = int(np.count_nonzero(~keep & (known.tally.scores.seen == 0)))
         price.show(mesh, known.tally.scores, known.kinds, _place(plan, settings), keep)
+        _tell_cameras(known.tally.scores, plan, settings)
     except RefineError as error:
         plan["error"] = str(error)
     mesh[PLAN] = json.dumps(plan)
@@ -311,6 +314,13 @@ def _reached(curve: Quality, goal: float, gone: int, *, absorb: bool) -> str:
         share = curve.shares[-1]
         return f"The estimate ends at {share:.0%} removed, {in_words(least)}: no more goes"
     return ""
+
+
+def _tell_cameras(scores: Scores, plan: dict[str, Any], settings: Any) -> None:  # noqa: ANN401
+    """Have the list of the cameras say how much of each picture a plan changes."""
+    curve = None if "error" in plan else scores.quality
+    share = 0.0 if curve is None else plan["removed"] / plan["splats"]
+    camera_list.tell(curve.of_views(share, absorb=settings.absorb) if curve else {})
 
 
 def _place(plan: dict[str, Any], settings: Any) -> Place | None:  # noqa: ANN401
