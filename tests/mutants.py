@@ -455,10 +455,13 @@ MUTANTS = {
     ],
     "levels/files.py": [
         (
-            "                (folder / MANIFEST).unlink(missing_ok=True)",
-            "                pass",
+            "    path.unlink(missing_ok=True)\n    return",
+            "    return",
             "old manifest",
         ),
+        ("_remove(set(before) - set(written), source)", "[]", "files of the run before"),
+        ("if _LEVEL.fullmatch(name)]", "]", "any file that a manifest names"),
+        ("            if path.samefile(source):", "            if False:", "the source itself"),
         ("                    path.unlink()\n", "                    pass\n", "levels left behind"),
     ],
     "scene.py": [

@@ -102,7 +102,7 @@ class REFINE_UL_cameras(bpy.types.UIList):
         row.label(text=item.name, icon=icon if item.seen else "ERROR")
         row = row.row()
         row.alignment = "RIGHT"
-        psnr = f"   {in_words(item.psnr)}" if item.psnr >= 0.0 else ""
+        psnr = f", {in_words(item.psnr).removeprefix('about ')}" if item.psnr >= 0.0 else ""
         row.label(text=f"{item.seen:,}{psnr}" if item.seen else "nothing")
 
 

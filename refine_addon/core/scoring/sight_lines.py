@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .. import spherical_harmonics
-from ..quality import PSNR_CAP, SHARES, TAKEN_OVER, Quality, absorbed_from
+from ..quality import FEWEST, PSNR_CAP, SHARES, TAKEN_OVER, Quality, absorbed_from
 from ..rendering import ALPHA_CUT, ALPHA_MAX
 from ..work import Progress, checkpoint, for_chunks, part, silent
 from . import projection
@@ -342,7 +342,9 @@ class SightLines:
         found = np.minimum.accumulate(self._mean(single, seen))
         names = [self.views[number][0].name for number in seen]
         views = dict(zip(names, np.minimum.accumulate(single, axis=1), strict=True))
-        return Quality(np.array(SHARES), found, absorbed_from(found, gains), views)
+        absorbed = absorbed_from(found, gains, len(values))
+        foretold = len(values) >= FEWEST
+        return Quality(np.array(SHARES), found, absorbed, foretold, views)
 
     def judged(
         self,
