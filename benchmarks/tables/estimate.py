@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from refine_addon.core.errors import RefineError
-from refine_addon.core.pipeline import Settings, prune
+from refine_addon.core.pipeline import Settings, prune, with_quality
 from refine_addon.core.selection import Budget
 
 from .evaluate import Evaluator, read_scene
@@ -107,7 +107,7 @@ def measure(
             if estimate is None:
                 raise RefineError(result.report["estimated_psnr_note"])
             renders, gone = evaluator.evaluate(left).renders, 1.0 - float(result.keep.mean())
-            truth, curve = renders.values["psnr"], result.scores.quality
+            truth, curve = renders.values["psnr"], with_quality(result.scores).quality
             assert curve is not None  # noqa: S101 - there is an estimate
             of_views = curve.of_views(gone, absorb=way == ABSORB)
             guess = np.array([of_views[name] for name in renders.names])  # (V,)

@@ -74,7 +74,7 @@ def size_in_words(count: int) -> str:
 
 def scoring_notes(scores: Scores) -> list[str]:
     """Return what the user should know about a scoring, in sentences."""
-    notes = list(scores.notes)
+    notes = [*scores.notes, *(scores.alignment.notes() if scores.alignment else ())]
     if scores.undrawable:
         notes.append(f"{scores.undrawable} splats cannot be drawn; they rank lowest")
     return notes

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .quality import Quality
+    from .scoring.alignment import Alignment
     from .scoring.sight_lines import SightLines
 
 _DISTINCT = 1 << 24
@@ -46,6 +47,8 @@ class Scores:
         What the views' lines of sight meet, from which any choice of splats can be judged.
     quality : Quality, optional
         How close the pictures stay with ever more splats removed in the order of these scores.
+    alignment : Alignment, optional
+        How the views stand to the splats.
     """
 
     values: NDArray[np.float32]
@@ -59,6 +62,7 @@ class Scores:
     views_given: int = 0
     sights: SightLines | None = None
     quality: Quality | None = None
+    alignment: Alignment | None = None
 
 
 def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:

@@ -79,6 +79,7 @@ def store(
             "weights": scores.facts,
             "notes": scores.notes,
             "quality": scores.quality.facts() if scores.quality else None,
+            "alignment": scores.alignment.facts() if scores.alignment else None,
             "origin": origin,
             "cameras": cameras,
         }

@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import bpy
-from bpy.props import CollectionProperty, FloatProperty, IntProperty, StringProperty
+from bpy.props import BoolProperty, CollectionProperty, FloatProperty, IntProperty, StringProperty
 
 from ..core.quality import in_words
 from ..mesh import layout as mesh_layout
@@ -29,6 +29,7 @@ class RefineCamera(bpy.types.PropertyGroup):
         description="How close its picture is estimated to stay; negative where nothing tells",
         default=-1.0,
     )
+    far: BoolProperty(name="Far Away", description="It sees the splats from far away")
 
 
 def register() -> None:
@@ -50,9 +51,10 @@ def fill(record: dict[str, Any]) -> None:
     """List the cameras of the note of a scoring, those that see least first."""
     listed = bpy.context.window_manager.refine_cameras
     listed.clear()
+    far = set((record.get("alignment") or {}).get("far", ()))
     for name, seen in sorted(record.get("cameras") or (), key=lambda camera: camera[1]):
         item = listed.add()
-        item.name, item.seen = name, seen
+        item.name, item.seen, item.far = name, seen, name in far
 
 
 def tell(psnr: Mapping[str, float]) -> None:
@@ -82,6 +84,12 @@ def warning(record: dict[str, Any]) -> str:
     return f"No splat lies in the view of {counted(none, 'camera')}" if none else ""
 
 
+def useless(record: dict[str, Any]) -> set[str]:
+    """Return the names of the cameras of a scoring that see nothing, or all from far away."""
+    none = {name for name, seen in record.get("cameras") or () if seen == 0}
+    return none | set((record.get("alignment") or {}).get("far", ()))
+
+
 class REFINE_UL_cameras(bpy.types.UIList):
     """Cameras that scored."""
 
@@ -97,13 +105,14 @@ class REFINE_UL_cameras(bpy.types.UIList):
     ) -> None:
         """Draw a camera; one that sees nothing is marked, and that whose picture changes most."""
         row = layout.row()
-        row.alert = item.seen == 0
+        row.alert = item.far or item.seen == 0
         icon = "SOLO_ON" if item.name == manager.refine_changes_most else "CAMERA_DATA"
-        row.label(text=item.name, icon=icon if item.seen else "ERROR")
-        row = row.row()
-        row.alignment = "RIGHT"
+        row.label(text=item.name, icon="ERROR" if row.alert else icon)
+        right = row.row()
+        right.alignment = "RIGHT"
         psnr = f", {in_words(item.psnr).removeprefix('about ')}" if item.psnr >= 0.0 else ""
-        row.label(text=f"{item.seen:,}{psnr}" if item.seen else "nothing")
+        seen = "far away" if item.far else f"{item.seen:,}{psnr}"
+        right.label(text=seen if item.seen else "nothing")
 
 
 class REFINE_PT_camera_list(bpy.types.Panel):
