@@ -61,6 +61,7 @@ class REFINE_OT_turn_cameras(OnSplats, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Turn them."""
+        context.view_layer.update()  # or what a script just made stands at the origin
         try:
             cameras = _deciding(context)
             roots = _roots(cameras, context.object)

@@ -53,6 +53,9 @@ FINE = 0.015
 BETTER = 1.4
 """By which factor turned cameras must see finer pictures."""
 
+LEAST = 0.01
+"""Pictures that are less fine than that show too little to tell anything."""
+
 ONE_WAY = 0.95
 """Length of the mean of the viewing directions from which on the views look one way: then turning
 them shows another part of the scene, and its fineness tells nothing."""
@@ -113,7 +116,7 @@ class Alignment:
             return ""
         count = "1 camera sees" if len(self.far) == 1 else f"{len(self.far):,} cameras see"
         return (
-            f"{count} the splats from so far away that they fill {SMALL:.0%} of a picture's width"
+            f"{count} the splats from so far away that they fill less than {SMALL:.0%} of a picture"
         )
 
     def facts(self) -> dict[str, Any]:
@@ -175,7 +178,7 @@ def alignment(
             return Alignment(far=far)
         fineness = _fineness(splats, rows, used.spread(VIEWS), progress, threads)
     best = list(_TURNS)[int(np.argmax(fineness))]
-    turn = best if max(fineness) > BETTER * fineness[0] else 0
+    turn = best if max(fineness) > max(BETTER * fineness[0], LEAST) else 0
     return Alignment(turn, fineness=fineness, far=far)
 
 
