@@ -23,7 +23,7 @@ import numpy as np
 
 from .. import frustum
 from ..affine import QUARTER
-from ..work import Progress, for_chunks, part, silent
+from ..work import Progress, for_chunks, part, report, silent
 from . import projection
 from .sight_lines import SightLines, meet
 
@@ -50,15 +50,19 @@ LINES = 1024
 FINE = 0.015
 """Standard deviation of a splat that is half as fine as one of no size, as a share of the image."""
 
-BETTER = 1.4
+BETTER = 1.5
 """By which factor turned cameras must see finer pictures."""
 
-LEAST = 0.01
+LEAST = 0.02
 """Pictures that are less fine than that show too little to tell anything."""
 
 ONE_WAY = 0.95
 """Length of the mean of the viewing directions from which on the views look one way: then turning
 them shows another part of the scene, and its fineness tells nothing."""
+
+WHOLE = 0.8
+"""Share of the splats that are in the picture, on average, from which on views are not judged: they
+look at all of it from outside, and turned they do so too."""
 
 FEW = 8
 """Of fewer splats of the sample in a picture it is not told how far away they are."""
@@ -169,31 +173,46 @@ def alignment(
         If `progress` answers ``False``.
     """
     rows = np.arange(0, len(splats), max(len(splats) // SAMPLE, 1))
+    means = splats.means[rows].astype(np.float64)  # (n, 3)
+    far, there, count = [], 0, 0
     with np.errstate(under="ignore"):
-        means = splats.means[rows]
-        far = tuple(view.name for view in views if view.weight and _is_far(means, view))
+        for view in views:
+            report(progress, 0.0, "checking")
+            if view.weight:
+                points = _in_picture(means, view)
+                there, count = there + points.shape[1], count + len(means)
+                far += [view.name] if _is_far(points, view) else []
+        found = Alignment(far=tuple(far))
         if views.turn is not None:
-            return Alignment(views.turn, known=True, far=far)
-        if used is None or np.linalg.norm(used.rotations[:, 2].mean(axis=0)) >= ONE_WAY:
-            return Alignment(far=far)
+            return replace(found, turn=views.turn, known=True)
+        one_way = np.linalg.norm(views.rotations[:, 2].mean(axis=0)) >= ONE_WAY
+        if used is None or one_way or there >= WHOLE * count:
+            return found
         fineness = _fineness(splats, rows, used.spread(VIEWS), progress, threads)
     best = list(_TURNS)[int(np.argmax(fineness))]
     turn = best if max(fineness) > max(BETTER * fineness[0], LEAST) else 0
-    return Alignment(turn, fineness=fineness, far=far)
+    return replace(found, turn=turn, fineness=fineness)
 
 
-def _is_far(means: NDArray[Any], view: View) -> bool:
-    """Tell whether all that a view sees of some points, (n, 3), lies in a small part of it."""
+def _in_picture(means: NDArray[np.float64], view: View) -> NDArray[np.float64]:
+    """Return where those of some points, (n, 3), that lie in a view are in its picture, (2, m).
+
+    In depths, from the middle of the lens.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
-        local = view.rotation @ (means.astype(np.float64) - view.center).T  # (3, n)
+        local = view.rotation @ (means - view.center).T  # (3, n)
         planes = frustum.clip_planes(view, float(np.finfo(np.float64).tiny))
         local = local[:, frustum.contains(view, local, planes)]
-        if local.shape[1] < FEW:
-            return False
-        across, down = local[:2] / local[2]
-    sides = ((across, view.fx / view.width), (down, view.fy / view.height))
-    spans = [np.ptp(np.percentile(values, [10.0, 90.0])) * scale for values, scale in sides]
-    return bool(max(spans) < SMALL)
+        return np.asarray(local[:2] / local[2])
+
+
+def _is_far(points: NDArray[np.float64], view: View) -> bool:
+    """Tell whether all that a view sees, (2, m), lies in a small part of its picture."""
+    if points.shape[1] < FEW:
+        return False
+    low, high = np.percentile(points, [10.0, 90.0], axis=1)  # (2,) each
+    spans = (high - low) * (view.fx / view.width, view.fy / view.height)
+    return bool(spans.max() < SMALL)
 
 
 def _fineness(
