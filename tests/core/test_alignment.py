@@ -126,6 +126,16 @@ def test_a_cloud_that_is_alike_from_all_sides_has_no_up_axis():
     assert min(found.fineness) > 0.8 * max(found.fineness) > 0.02
 
 
+def test_splats_that_fill_the_picture_are_not_fine():
+    """Opaque ones a unit wide, at most two away: 50 px of 69, weight 1 / (1 + (.7 / .015)^2)."""
+    means = np.random.default_rng(4).normal(size=(500, 3))
+
+    found = alignment(splats_of(means, alphas=0.9, scales=1.0), within(), within())
+
+    assert len(found.fineness) == 3
+    assert 0.0 < max(found.fineness) < 0.005
+
+
 def test_cameras_far_away_are_named():
     """Twenty splats 2 wide, at focal length 100 px in a picture of 80 x 60.
 
