@@ -121,6 +121,21 @@ def test_one_upright_import_beside_one_that_is_not_is_told_and_put_right(
     assert np.allclose(np.array(matrix), np.array(other), atol=1e-5)
 
 
+def test_the_command_notes_what_the_panel_warns_of(addon, imported):
+    """On an object of the scene, by the cameras that the panel chooses."""
+    obj = imported(splats=True, cameras=False)
+    views = addon.cameras.sets.Choice.of_scene(bpy.context.scene).views(bpy.context, obj)
+    report = addon.splat_object.prune_object(
+        obj.name,
+        views,
+        addon.core.Budget(ratio=0.5),
+        addon.core.Settings("closed-form"),
+        dry_run=True,
+    )
+
+    assert [note for note in report["notes"] if "do not share an up axis" in note]
+
+
 @pytest.mark.parametrize("upright", [False, True])
 def test_imports_that_are_alike_are_not_warned_of(imported, warned, upright):
     """Nor once both are moved together, nor by a shot that the cameras' file does not have."""
