@@ -53,7 +53,7 @@ FINE = 0.015
 BETTER = 1.5
 """By which factor turned cameras must see finer pictures."""
 
-LEAST = 0.02
+LEAST = 0.04
 """Pictures that are less fine than that show too little to tell anything."""
 
 ONE_WAY = 0.95
