@@ -163,11 +163,6 @@ def stored_task(
     )
 
 
-def keep_mask(checked: SplatObject, budget: Budget, protect: str = "") -> NDArray[np.bool_]:
-    """Return which splats of a scored object stay; see `stored_task`."""
-    return pipeline.decide(stored_task(checked, budget, protect)).keep
-
-
 def mark_removed(checked: SplatObject, task: Task) -> NDArray[np.bool_]:
     """Mark the splats that a task (`stored_task`) removes; return which stay, (N,)."""
     keep = pipeline.decide(task).keep

@@ -125,7 +125,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "--psnr",
         type=float,
         metavar="DB",
-        help="remove as much as leaves the cameras' pictures this close to the unpruned ones: 40 "
+        help="remove as much as leaves the views' pictures this close to the unpruned ones: 40 "
         "is hard to tell apart, 30 is seen",
     )
     _add_scoring(prune)

@@ -22,7 +22,7 @@ from ..core import frustum, pipeline
 from ..core.formats.registry import FORMATS, Packed, without_suffix
 from ..core.levels.lod import Level, Levels, lod
 from ..core.quality import in_words
-from ..core.report import scoring_notes
+from ..core.report import scoring_notes, sizes_in_words
 from ..core.work import part
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
@@ -219,7 +219,7 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
         self.report(
             {"INFO"},
             f"Kept {done.kept:,} splats, removed {done.removed:,}: "
-            f"{done.bytes_before / 1e6:,.1f} -> {done.bytes_after / 1e6:,.1f} MB"
+            + sizes_in_words(done.bytes_before, "->", done.bytes_after)
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
         if changed:

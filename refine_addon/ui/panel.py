@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 
 from ..cameras.sets import chosen_cameras
+from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
@@ -52,7 +53,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
         size = kept.answer("bytes", context, lambda: mesh_layout.export_bytes(obj))
         if size is not None:
-            layout.label(text=f"{size / 1e6:,.1f} MB")
+            layout.label(text=size_in_words(size))
         layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from .. import splat_object
 from ..core.errors import RefineError
 from ..core.quality import in_words, out_of_reach
+from ..core.report import sizes_in_words
 from ..core.scoring.alignment import Alignment
 from ..core.selection import Tally, quality_of
 from ..mesh import layout as mesh_layout
@@ -173,7 +174,7 @@ def sentence(plan: dict[str, Any], *, absorb: bool) -> str:
     """
     text = (
         f"Keeps {'about ' if plan.get('about') else ''}{plan['kept']:,} of {plan['splats']:,}, "
-        f"{plan['bytes_after'] / 1e6:,.1f} of {plan['bytes_before'] / 1e6:,.1f} MB"
+        + sizes_in_words(plan["bytes_after"], "of", plan["bytes_before"])
     )
     if "psnr" not in plan:
         return text

@@ -226,7 +226,7 @@ class RefineSettings(bpy.types.PropertyGroup):
     )
     psnr: FloatProperty(
         name="PSNR",
-        description="How close the pictures of the cameras stay to those of all splats, in dB: 40 "
+        description="How close the pictures of the views stay to those of all splats, in dB: 40 "
         "is hard to tell apart, 30 is seen",
         default=40.0,
         min=1.0,

@@ -56,6 +56,12 @@ def core(addon):
     return addon.core
 
 
+def keep_mask(addon, obj, budget, protect=""):
+    """Return which splats of a scored object stay, as *Apply* decides it."""
+    task = addon.splat_object.stored_task(addon.mesh.layout.check(obj), budget, protect)
+    return addon.core.pipeline.decide(task).keep
+
+
 @pytest.fixture(autouse=True)
 def empty_scene():
     """Start from an empty file, with the extension enabled."""

@@ -73,7 +73,7 @@ def draw(addon, monkeypatch):
     def draw():
         drawn = []
         with monkeypatch.context() as patch:
-            for name in ("mark_removed", "keep_mask", "stored_scores", "gather", "apply_object"):
+            for name in ("mark_removed", "stored_scores", "gather", "apply_object"):
                 patch.setattr(addon.splat_object, name, never)
             patch.setattr(addon.mesh.attributes, "read_attribute", never)
             patch.setattr(addon.mesh.attributes, "write_attribute", never)

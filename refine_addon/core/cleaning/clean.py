@@ -80,9 +80,15 @@ VIEWS = 3
 AGREE = 0.6
 """Share of the views that must see past it."""
 
-VISIBLE, GIANT_VISIBLE = 4 / 255, 1 / 255
-"""By how much a splat must change a pixel, as its opacity times its contrast to what lies behind. A
-giant changes all pixels."""
+LOUD, LOUD_VIEWS, LOUD_AGREE = 10 / 255, 6, 0.3
+"""Of a splat that changes a pixel by as much, so many views that see past it are enough, if they
+are this share: the others may see it against a surface just behind."""
+
+VISIBLE, WIDE = 4 / 255, 0.05
+"""By how much a splat must change a pixel, as its opacity times its contrast to what lies behind.
+One whose standard deviation reaches across more than this share of a picture's longer side changes
+more pixels, and must change each by so much less: the root mean square of the picture's change is
+the same."""
 
 
 @dataclass(frozen=True)
@@ -271,13 +277,14 @@ class _Run:
         small = self._clusters(~doubted & ~giant, part(progress, 0.5, 0.6))
         self._judge(doubted | giant | needle | small, part(progress, 0.6, 1.0))
         effect = self._effect()
-        floats = ~giant & self._floats(SUPPORT) & self._agreed()
+        floats = ~giant & self._floats(SUPPORT) & agreed(self.evidence, effect)
         most = np.where(self.gaussians.alphas < VEIL, VEIL_SUPPORT, GIANT_SUPPORT)
-        visible = floats & (effect >= VISIBLE)
+        shows = effect >= VISIBLE * (WIDE / np.maximum(widest, WIDE))
+        visible = floats & shows
         return {
             "front": visible & doubted & ~needle,
             "isolated": visible & small & ~needle,
-            "giant": giant & self._floats(most) & (effect >= GIANT_VISIBLE),
+            "giant": giant & self._floats(most) & shows,
             "needle": visible & needle,
             "transparent": floats & doubted & ~visible,
         }
@@ -367,13 +374,15 @@ class _Run:
         seen = self.evidence
         return (seen.views > 0) & (seen.near < most * (seen.near + seen.behind))
 
-    def _agreed(self) -> NDArray[np.bool_]:
-        """Return which suspects enough views see past, (M,)."""
-        seen = self.evidence
-        return (seen.past >= np.minimum(VIEWS, seen.views)) & (seen.past >= AGREE * seen.views)
-
     def _effect(self) -> NDArray[np.float64]:
         """Return by how much each suspect changes a pixel that it covers, (M,)."""
         behind = self.evidence.behind
         contrast = self.evidence.contrast / np.where(behind > 0.0, behind, 1.0)
         return np.asarray(self.gaussians.alphas * contrast, np.float64)
+
+
+def agreed(seen: sight.Evidence, effect: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which suspects, of some effects on a pixel, enough views see past, (M,)."""
+    most = (seen.past >= np.minimum(VIEWS, seen.views)) & (seen.past >= AGREE * seen.views)
+    some = (seen.past >= LOUD_VIEWS) & (seen.past >= LOUD_AGREE * seen.views)
+    return most | (some & (effect >= LOUD))

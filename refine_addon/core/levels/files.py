@@ -138,7 +138,7 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
         clock.lap("levels_s")
         facts = {
             "lod": 1,
-            "source": {"file": source.name, "splats": len(file), "bytes": file.stored_bytes},
+            "source": {"file": source.name, "bytes": file.stored_bytes},
             **seen,
             "distances": distances,
             "nested": not levels.absorb,

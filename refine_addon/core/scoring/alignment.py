@@ -41,6 +41,9 @@ if TYPE_CHECKING:
 SAMPLE = 4096
 """About so many splats stand for all, each as much larger as it stands for others."""
 
+POINTS = 512
+"""Of about so many splats it is told where in the pictures they lie."""
+
 VIEWS = 12
 """So many views at most are turned."""
 
@@ -172,8 +175,7 @@ def alignment(
     Cancelled
         If `progress` answers ``False``.
     """
-    rows = np.arange(0, len(splats), max(len(splats) // SAMPLE, 1))
-    means = splats.means[rows].astype(np.float64)  # (n, 3)
+    means = splats.means[_some(splats, POINTS)].astype(np.float64)  # (n, 3)
     far, there, count = [], 0, 0
     with np.errstate(under="ignore"):
         for view in views:
@@ -188,10 +190,16 @@ def alignment(
         one_way = np.linalg.norm(views.rotations[:, 2].mean(axis=0)) >= ONE_WAY
         if used is None or one_way or there >= WHOLE * count:
             return found
+        rows = _some(splats, SAMPLE)
         fineness = _fineness(splats, rows, used.spread(VIEWS), progress, threads)
     best = list(_TURNS)[int(np.argmax(fineness))]
     turn = best if max(fineness) > max(BETTER * fineness[0], LEAST) else 0
     return replace(found, turn=turn, fineness=fineness)
+
+
+def _some(splats: Splats, count: int) -> NDArray[np.int64]:
+    """Return the rows of at least `count` splats, if there are as many, evenly spread."""
+    return np.arange(0, len(splats), max(len(splats) // count, 1))
 
 
 def _in_picture(means: NDArray[np.float64], view: View) -> NDArray[np.float64]:
