@@ -218,8 +218,9 @@ def _is_far(points: NDArray[np.float64], view: View) -> bool:
     """Tell whether all that a view sees, (2, m), lies in a small part of its picture."""
     if points.shape[1] < FEW:
         return False
-    low, high = np.percentile(points, [10.0, 90.0], axis=1)  # (2,) each
-    spans = (high - low) * (view.fx / view.width, view.fy / view.height)
+    ordered, tenth = np.sort(points, axis=1), points.shape[1] // 10
+    widths = ordered[:, -1 - tenth] - ordered[:, tenth]  # (2,)
+    spans = widths * (view.fx / view.width, view.fy / view.height)
     return bool(spans.max() < SMALL)
 
 
