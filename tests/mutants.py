@@ -96,6 +96,13 @@ MUTANTS = {
         (" - 5.0 / math.log(10.0) * relative", "", "chance not mended"),
         ("np.where(back < on, before, after)", "after", "only those behind take over"),
         ('order[np.argsort(protected[order], kind="stable")]', "order", "protection forgotten"),
+        ("weights @ values / weights.sum()", "values.mean(axis=0)", "views count alike"),
+    ],
+    "scoring/alignment.py": [
+        (" or there >= WHOLE * count", "", "rings around all are judged"),
+        ("spans.max() < SMALL", "spans.min() < SMALL", "what is thin is far"),
+        ("            if view.weight:", "            if True:", "views of weight 0 are far"),
+        ("weight / (1.0 + square[lines.met[owner]])", "weight", "blobs are fine"),
     ],
     "selection.py": [
         ("ties[: count", "ties[-count :][: count", "ties from the end"),
@@ -132,6 +139,7 @@ MUTANTS = {
             "len(order) // 2",
             "median without weights",
         ),
+        ("rotation @ rotation.T, center=", "rotation @ rotation, center=", "turned back"),
     ],
     "formats/compressed_ply.py": [
         (

@@ -181,8 +181,8 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     ) -> Answer:
         """Store the scores on the mesh and say what came of it."""
         scores, counts = found
-        names = [view.name for view in job.views]
-        cameras = list(zip(names, counts.tolist(), strict=True))
+        pairs = zip(job.views, counts.tolist(), strict=True)
+        cameras = [(view.name, count) for view, count in pairs if view.weight]
         forced = _forced(job)
         mesh_scores.store(checked, scores, job.settings, job.origin, cameras, forced=forced)
         plans.refresh(context)
