@@ -15,7 +15,7 @@ from ..core.errors import RefineError
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
-from . import plans, wrapped
+from . import plans, running, wrapped
 from .on_thread import FAILURES, Answer, fail
 
 if TYPE_CHECKING:
@@ -372,6 +372,9 @@ class REFINE_OT_crop(_OnSplats):
     def poll(cls, context: bpy.types.Context) -> bool:
         """Tell whether the operator can run, and if not, why."""
         if not super().poll(context):
+            return False
+        if why := running.refusal():
+            cls.poll_message_set(why)
             return False
         if context.object.mode == "EDIT":
             cls.poll_message_set("Leave edit mode first")
