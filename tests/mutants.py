@@ -47,7 +47,13 @@ MUTANTS = {
         ("<= side.half * z", "<= side.half", "image of another depth"),
         ("(z >= planes[0]) &", "(z > planes[0]) &", "near plane excluded"),
     ],
-    "scoring/closed_form.py": [
+    "radix.py": [
+        ("(values + values.dtype.type(0.0))", "values", "-0 before 0"),
+        ("keys[undefined] = ~unsigned(0)", "keys[undefined] = unsigned(0)", "NaN is the lowest"),
+        ("ranks = [(total - 1) // 2,", "ranks = [total // 2,", "upper median"),
+        ('side="right"', 'side="left"', "off by one"),
+    ],
+    "scoring/closed_form_block.py": [
         ("total *= self.alpha[piece]", "total *= self.alpha[piece] ** 2", "opacity twice"),
         ("LUMA = (0.299, 0.587, 0.114)", "LUMA = (0.114, 0.587, 0.299)", "BGR"),
         ("largest + middle", "largest + smallest", "wrong two scales"),
@@ -55,8 +61,8 @@ MUTANTS = {
         ("depth.ravel()[index] + away", "depth.ravel()[index]", "depth beside the camera"),
         ("between > inside", "beyond > 0.0", "planes forgotten outside the image"),
         (
-            "weight * powers[cells[piece]]",
-            "powers[cells[piece]]",
+            "weight * powers[self.cells[piece]]",
+            "powers[self.cells[piece]]",
             "neighbours count from the first",
         ),
     ],
@@ -70,9 +76,10 @@ MUTANTS = {
         ('order[np.argsort(protected[order], kind="stable")]', "order", "protection forgotten"),
     ],
     "selection.py": [
-        ("ties[: count", "ties[-count :][: count", "ties from the end"),
-        ("count - 1)[count - 1]", "count)[count]", "off by one"),
-        ("free & (values < edge)", "(values < edge)", "protection forgotten"),
+        ("ties[: max(left, 0)]", "ties[-left:]", "ties from the end"),
+        ("[amount - 1])[0]", "[amount])[0]", "off by one"),
+        ("else free\n    keys", "else slice(None)\n    keys", "protection forgotten"),
+        ("np.cumsum(each) - each < left", "np.cumsum(each) < left", "a row of text too many"),
         ("Fraction(repr(float(self.ratio)))", "self.ratio", "binary ratio"),
         ("count = min(count or 0, len(self._values))", "count = count or 0", "protected counted"),
         ("self._seen = np.sort(scores.seen[free])", "self._seen = scores.seen", "not in order"),
@@ -500,7 +507,7 @@ MUTANTS = {
 """Module of core -> lines to change, what they become, and what is wrong then."""
 
 TESTS = {
-    "closed_form": ["frustum.py", "scoring/adaptive.py"],
+    "closed_form": ["frustum.py", "scoring/adaptive.py", "scoring/closed_form_block.py"],
     "occlusion": [
         "scoring/measuring.py",
         "scoring/froxels.py",

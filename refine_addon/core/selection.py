@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from fractions import Fraction
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from . import radix
 from .errors import RefineError
 from .quality import PSNR_CAP
 
@@ -202,9 +203,11 @@ def select(
     elif budget.min_seen is not None:
         keep[free & (scores.seen < _least_seen(budget.min_seen, scores.views_used))] = False
     elif removals:
-        _remove_lowest(keep, values, free, min(removals, int(np.count_nonzero(free))))
+        _remove_lowest(keep, values, free, removals)
     elif removals is None:
-        _remove_until_fitting(keep, values, free, budget, np.asarray(row_bytes), fixed_bytes)
+        lengths = np.asarray(row_bytes, np.int64)
+        excess = int(lengths.sum()) - budget.room(fixed_bytes)
+        _remove_lowest(keep, values, free, excess, lengths)
     _refuse_none_left(budget, len(values), int(np.count_nonzero(keep)))
     return keep
 
@@ -323,34 +326,58 @@ def quality_of(scores: Scores) -> Quality:
     return scores.quality
 
 
+def lowest(
+    keys: NDArray[np.unsignedinteger[Any]],
+    edge: int,
+    left: int,
+    weights: NDArray[np.int64] | None = None,
+) -> NDArray[np.bool_]:
+    """Return which splats go, (N,): those below an edge, and the first of those at it.
+
+    Parameters
+    ----------
+    keys : (N,) unsigned
+        `radix.keys_of` their scores.
+    edge : int
+        The key of the last one that goes.
+    left : int
+        Of the splats at the edge go as many of the first as have this weight together, or more.
+    weights : (N,) int64, optional
+        By default 1 each.
+    """
+    gone: NDArray[np.bool_] = keys < edge
+    ties = np.flatnonzero(keys == edge)
+    if weights is None:
+        gone[ties[: max(left, 0)]] = True
+    else:
+        each = weights[ties]
+        gone[ties[np.cumsum(each) - each < left]] = True
+    return gone
+
+
 def _remove_lowest(
-    keep: NDArray[np.bool_], values: NDArray[np.float32], free: NDArray[np.bool_], count: int
-) -> None:
-    """Set `keep` to False for the `count` lowest `free` values; of equal ones, for the first."""
-    if not count:
-        return
-    candidates = values if free.all() else values[free]
-    edge = np.partition(candidates, count - 1)[count - 1]
-    below = free & (values < edge)
-    keep[below] = False
-    ties = np.flatnonzero(free & (values == edge))
-    keep[ties[: count - int(np.count_nonzero(below))]] = False
-
-
-def _remove_until_fitting(
     keep: NDArray[np.bool_],
     values: NDArray[np.float32],
     free: NDArray[np.bool_],
-    budget: Budget,
-    lengths: NDArray[np.int64],
-    fixed_bytes: int,
+    amount: int,
+    weights: NDArray[np.int64] | None = None,
 ) -> None:
-    """Set `keep` to False for the lowest `free` values until the rows that stay fit."""
-    places = np.flatnonzero(free)
-    order = places[np.argsort(values[places], kind="stable")]
-    excess = int(lengths.sum()) - budget.room(fixed_bytes)
-    count = int(np.searchsorted(np.cumsum(lengths[order]), excess)) + 1
-    keep[order[:count]] = False
+    """Set `keep` to False for the lowest `free` values; of equal ones, for the first.
+
+    As many of them as have the weight `amount` together, or more; by default each weighs 1.
+    """
+    some: slice | NDArray[np.bool_] = slice(None) if free.all() else free
+    keys = radix.keys_of(values[some])
+    weights = None if weights is None else weights[some]
+    amount = min(amount, len(keys) if weights is None else int(weights.sum()))
+    if amount <= 0:
+        return
+
+    def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:
+        return radix.counts(keys, prefixes, shift, weights)
+
+    edge, below = radix.find(count, 8 * keys.dtype.itemsize, [amount - 1])[0]
+    keep[some] = ~lowest(keys, edge, amount - below, weights)
 
 
 def rank(values: NDArray[np.float32]) -> NDArray[np.float64]:
