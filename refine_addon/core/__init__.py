@@ -23,6 +23,7 @@ from .selection import Budget, rank, select
 from .splats import Splats
 from .survivors import survivor_columns
 from .task import METHODS, Result, Settings
+from .tiles.prune import prune_tiles
 from .views import View, ViewSet
 
 __all__ = [
@@ -50,6 +51,7 @@ __all__ = [
     "lod_file",
     "prune",
     "prune_file",
+    "prune_tiles",
     "rank",
     "read_cameras",
     "read_ply",

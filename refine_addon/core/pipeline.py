@@ -254,7 +254,7 @@ def decide(
     else:
         psnr = _estimated(scores, keep, threads)
     facts = make_report(scores, keep, task.budget, task.settings, clock)
-    facts |= _quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
+    facts |= quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
     if psnr is None and scores.sights is not None:
         facts["notes"].append(UNSEEN)
     if absorbed:
@@ -265,7 +265,7 @@ def decide(
     return Result(keep, scores, facts, absorbed)
 
 
-def _quality_facts(
+def quality_facts(
     scores: Scores, keep: NDArray[np.bool_], psnr: float | None, *, absorbed: bool
 ) -> dict[str, Any]:
     """Return what a report says about the quality of the pictures.

@@ -199,16 +199,16 @@ def select(
     free = np.ones(len(values), np.bool_) if protected is None else ~protected
     removals = _removals(scores, budget, row_bytes, fixed_bytes)
     if budget.threshold is not None:
-        keep[free & (values < _single(budget.threshold))] = False
+        keep[free & (values < single(budget.threshold))] = False
     elif budget.min_seen is not None:
-        keep[free & (scores.seen < _least_seen(budget.min_seen, scores.views_used))] = False
+        keep[free & (scores.seen < least_seen(budget.min_seen, scores.views_used))] = False
     elif removals:
         _remove_lowest(keep, values, free, removals)
     elif removals is None:
         lengths = np.asarray(row_bytes, np.int64)
         excess = int(lengths.sum()) - budget.room(fixed_bytes)
         _remove_lowest(keep, values, free, excess, lengths)
-    _refuse_none_left(budget, len(values), int(np.count_nonzero(keep)))
+    refuse_none_left(budget, len(values), int(np.count_nonzero(keep)))
     return keep
 
 
@@ -270,16 +270,16 @@ class Tally:
         budget.refuse_meaningless(scores.method, frustum=scores.frustum)
         count = _removals(scores, budget, row_bytes, fixed_bytes)
         if budget.threshold is not None:
-            count = int(np.searchsorted(self._values, _single(budget.threshold)))
+            count = int(np.searchsorted(self._values, single(budget.threshold)))
         elif budget.min_seen is not None:
-            least = _least_seen(budget.min_seen, scores.views_used)
+            least = least_seen(budget.min_seen, scores.views_used)
             count = int(np.searchsorted(self._seen, least))
         count = min(count or 0, len(self._values))
-        _refuse_none_left(budget, len(scores.values), len(scores.values) - count)
+        refuse_none_left(budget, len(scores.values), len(scores.values) - count)
         return count
 
 
-def _single(threshold: float) -> np.float32:
+def single(threshold: float) -> np.float32:
     """Return a threshold in the precision of scores; beyond its range all of them are below."""
     with np.errstate(over="ignore"):
         return np.float32(threshold)
@@ -295,7 +295,7 @@ def _removals(scores: Scores, budget: Budget, row_bytes: RowBytes, fixed_bytes: 
     return budget.removals(len(scores.values), row_bytes, fixed_bytes)
 
 
-def _least_seen(percentage: float, views: int) -> int:
+def least_seen(percentage: float, views: int) -> int:
     """Return in how many of the views a splat must lie to stay.
 
     In exact fractions: a splat that lies in 16 of 64 views lies in 25 % of them, and stays.
@@ -303,7 +303,8 @@ def _least_seen(percentage: float, views: int) -> int:
     return math.ceil(Fraction(repr(float(percentage))) * views / 100)
 
 
-def _refuse_none_left(budget: Budget, before: int, after: int) -> None:
+def refuse_none_left(budget: Budget, before: int, after: int) -> None:
+    """Raise `RefineError` if none of the splats would stay."""
     if not after:
         msg = f"{budget.kind} would remove all {before} splats; nothing was removed"
         raise RefineError(msg)

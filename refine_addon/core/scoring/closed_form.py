@@ -139,9 +139,9 @@ def score(
     Cancelled
         If `progress` answers ``False``.
     """
-    total = len(splats)
+    total, middle = len(splats), views.middle()
     blocks = [
-        Block(splats.take(slice(start, start + ROWS)), views, settings, threads=threads)
+        Block(splats.take(slice(start, start + ROWS)), views, settings, middle, threads=threads)
         for start in range(0, total, ROWS)
     ]
     done, whole = 0.0, progress
@@ -185,7 +185,14 @@ class Found:
     facts: dict[str, Any]
 
 
-def steps(each: Each, total: int, views: ViewSet, settings: ClosedForm) -> Found:
+def steps(
+    each: Each,
+    total: int,
+    views: ViewSet,
+    settings: ClosedForm,
+    *,
+    remember: Callable[[str, Callable[[], Any]], Any] = lambda _name, make: make(),
+) -> Found:
     """Score splats block by block; each `Block` has its scores afterwards.
 
     Parameters
@@ -198,6 +205,9 @@ def steps(each: Each, total: int, views: ViewSet, settings: ClosedForm) -> Found
         How many splats there are.
     views, settings
         See `score`.
+    remember : callable, optional
+        ``remember(name, make)`` returns what `make` returns, or returned when it was asked before:
+        blocks forget what the frame is made of.
 
     Raises
     ------
@@ -212,7 +222,10 @@ def steps(each: Each, total: int, views: ViewSet, settings: ClosedForm) -> Found
     if not good:
         msg = f"none of the {total} splats can be drawn: each is transparent or not finite"
         raise RefineError(msg)
-    frame = _frame(each, good, np.sum(moments, axis=0), settings)
+    axes, eta, near = remember(
+        "frame", lambda: _frame(each, good, np.sum(moments, axis=0), settings)
+    )
+    frame = Frame(axes, float(eta), float(near))
     sums = np.concatenate([*each("sum_views", frame)])
     if settings.frustum and not sums[:, 3].any():
         msg = (
@@ -271,8 +284,9 @@ def _powers(
     powers, count = np.zeros(CELLS**3), np.zeros(CELLS**3, np.int64)
     for crowd in crowds:
         assert crowd is not None  # noqa: S101 - as blocks are told
-        powers[crowd.cells] += crowd.sums
-        count[crowd.cells] += crowd.counts
+        cells, sums, counts = crowd
+        powers[cells] += sums
+        count[cells] += counts
     # Up to the last that occurs: zeros behind it would change how NumPy pairs what it sums.
     end = int(np.flatnonzero(count)[-1]) + 1
     powers, count = powers[:end], count[:end]

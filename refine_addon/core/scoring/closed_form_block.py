@@ -142,6 +142,8 @@ class Block:
         Needed for `read` alone.
     views : ViewSet
     settings : ClosedForm
+    middle : (3,) float64, float
+        Of the views, as `ViewSet.middle` returns it.
     threads : int, optional
     arrays : mapping of str to array, optional
         Those that the next step needs; see `STEPS`.
@@ -188,6 +190,7 @@ class Block:
         splats: Splats | None,
         views: ViewSet,
         settings: ClosedForm,
+        middle: tuple[NDArray[np.float64], float],
         *,
         threads: int | None = None,
         arrays: Mapping[str, NDArray[Any]] | None = None,
@@ -196,7 +199,7 @@ class Block:
         self.threads = threads
         self.progress: Progress = silent
         self.weights = views.weights
-        self.origin, self.view_variance = views.middle()
+        self.origin, self.view_variance = middle
         vars(self).update(arrays or {})
 
     def step(self, name: str, *arguments: Any) -> Any:  # noqa: ANN401 - of each step its own
