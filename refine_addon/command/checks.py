@@ -158,6 +158,10 @@ def _check_source(parser: argparse.ArgumentParser, given: argparse.Namespace) ->
 def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     if given.clean and given.object:
         parser.error("--clean goes with INPUT files, not with --object")
+    if given.together:
+        _check_together(parser, given)
+    elif given.workers is not None or given.scheduler:
+        parser.error("--workers and --scheduler go with --together")
     _check_source(parser, given)
     if given.object:
         if given.output_dir:
@@ -166,6 +170,21 @@ def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
             parser.error("--object needs -o OUT.ply, --save or --dry-run")
     else:
         _check_files(parser, given)
+
+
+def _check_together(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Refuse what needs all splats at once, or one output."""
+    alone = ("object", "output", "absorb", "clean", "psnr")
+    for name in alone:
+        if getattr(given, name):
+            option = "-o" if name == "output" else f"--{name}"
+            parser.error(f"{option} does not go with --together")
+    if given.method != "closed-form":
+        parser.error("--together scores by the closed form so far: add --method closed-form")
+    if given.workers is not None and given.scheduler:
+        parser.error("expected --workers or --scheduler, and not both")
+    if given.workers is not None and given.workers < 1:
+        parser.error(f"workers is {given.workers}, expected 1 or more")
 
 
 def _check_score(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:

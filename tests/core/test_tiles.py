@@ -20,6 +20,7 @@ from refine_addon.core import (
 from refine_addon.core.formats.ply_header import with_count
 from refine_addon.core.scoring import closed_form
 from refine_addon.core.selection import select
+from refine_addon.core.tiles import prune as together
 from refine_addon.core.tiles import steps, units
 from refine_addon.core.tiles.folder import Folder
 from tests.strategies import plain_ply
@@ -311,6 +312,26 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views,
     assert sorted(index for index in done if index < 5) == [0, 1, 2, 3, 4]
     # Rows that are copied: of each tile once, or once more of the tile under way.
     assert sum(index for index in done if index >= 5) <= COUNT + (1900 if stop > 0.82 else 0)
+
+
+def test_a_job_that_was_stopped_while_it_renamed_goes_on(tmp_path, tiles, views, monkeypatch):
+    """One of four files is in its place already; replacing it, the second run ends."""
+    publish, budget = together.publish, Budget(ratio=0.5)
+
+    def stop(made, path, **options):
+        if path.name == tiles[1].name:
+            raise KeyboardInterrupt
+        publish(made, path, **options)
+
+    monkeypatch.setattr(together, "publish", stop)
+    with pytest.raises(KeyboardInterrupt):
+        prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+    monkeypatch.undo()
+
+    with pytest.raises(RefineError, match="exists already"):
+        prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+    prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED, overwrite=True)
+    assert sum(len(read_ply(tmp_path / "out" / path.name)) for path in tiles) == COUNT // 2
 
 
 def test_another_job_does_not_take_over_what_is_left(tmp_path, tiles, views):

@@ -180,11 +180,12 @@ class Job:
         progress : callable, optional
         """
         name = f"{Path(tile.path).name}.written"
+        made = self.folder.tiles / Path(tile.path).name
         done, result = self.folder.noted(name)
-        if done:
+        if done and made.exists():  # it may have been renamed, just before a kill
             return int(result)
         file = reopened(tile)
-        with whole_file(self.folder.tiles / Path(tile.path).name, overwrite=True) as stream:
+        with whole_file(made, overwrite=True) as stream:
             stream.write(with_count(file.header, kept))
             stream.write(file.before.data)
             for unit in units:
@@ -207,7 +208,7 @@ class Job:
         return self.folder.noted(argument.name)[1]
 
 
-def refuse_unseen_files(job: Job, tiles: list[Tile]) -> str:
+def unseen_files(job: Job, tiles: list[Tile]) -> str:
     """Return what this process cannot see of a job's files, in a sentence; "" if all is there."""
     if not job.folder.noted("begun")[0]:
         return f"{job.folder.path} is not there"
