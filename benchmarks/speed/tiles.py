@@ -14,6 +14,7 @@ where no core waits for another, a run takes as long as its busiest process.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import resource
 import subprocess
@@ -111,11 +112,9 @@ def _family(process: int) -> list[int]:
     """Return a process and all that it started."""
     found = [process]
     for each in found:
-        try:
-            children = Path(f"/proc/{each}/task/{each}/children").read_text().split()
-        except OSError:  # it ended
-            continue
-        found += map(int, children)
+        for thread in Path(f"/proc/{each}/task").glob("*/children"):
+            with contextlib.suppress(OSError):  # it ended
+                found += map(int, thread.read_text().split())
     return found
 
 
@@ -158,9 +157,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
             more = ["--workers", str(workers)] if workers else []
             commands[f"{workers} workers"] = [*prune, "--output-dir", folder / f"w{workers}", *more]
         for name, command in commands.items():
-            seconds, busy, peak = run(command)
+            cost = run(command)
             print(
-                f"{name:10} {seconds:7.1f} s, processor {busy:7.1f} s, {peak:6.0f} MB", flush=True
+                f"{name:10} {cost.seconds:7.1f} s, processor {cost.busy:7.1f} s, busiest process "
+                f"{cost.busiest:7.1f} s, {cost.peak:6.0f} MB",
+                flush=True,
             )
 
 
