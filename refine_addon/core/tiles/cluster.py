@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import pickle
 import threading
+import uuid
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +33,13 @@ _AHEAD = 3
 
 _PATIENCE = 0.2
 """Seconds between two looks whether to go on."""
+
+_MEMORY = {
+    "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 28,
+    "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 25,
+}
+"""Dask lets glibc hand back memory at once, in bytes; arrays of a chunk would be page-faulted anew
+for each chunk, which takes longer than the work."""
 
 _CONNECT = 10
 """Seconds to find a scheduler."""
@@ -58,12 +67,14 @@ def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterato
         If Dask is not installed, or the scheduler not to be found.
     """
     try:
-        import distributed  # noqa: PLC0415 - an optional extra
+        import dask  # noqa: PLC0415 - an optional extra
+        import distributed  # noqa: PLC0415
     except ImportError as error:
         msg = "workers need Dask: pip install 'refine-addon[distributed]'"
         raise RefineError(msg) from error
     with contextlib.ExitStack() as held:
         if scheduler is None:
+            held.enter_context(dask.config.set(_MEMORY))
             scheduler = held.enter_context(
                 distributed.LocalCluster(
                     n_workers=workers, threads_per_worker=1, processes=True,
@@ -113,7 +124,9 @@ class Cluster:
                 msg = f"worker {worker}: {wrong}; workers need the same files under the same paths"
                 raise RefineError(msg)
 
-    def __call__(self, calls: Sequence[Call], progress: Progress, what: str) -> Iterator[Any]:
+    def __call__(
+        self, job: Job, calls: Sequence[Call], progress: Progress, what: str
+    ) -> Iterator[Any]:
         """Yield what each call returns, in their order.
 
         Raises
@@ -126,11 +139,12 @@ class Cluster:
 
         waiting: deque[Any] = deque()
         left, done = deque(calls), 0.0
+        packed = pickle.dumps(job)  # once: the arrays of all views take Dask some milliseconds
         ahead = _AHEAD * max(sum(self._client.nthreads().values()), 1)
         try:
             for call in calls:
                 while left and len(waiting) < ahead:
-                    waiting.append(self._submit(left.popleft()))
+                    waiting.append(self._submit(packed, left.popleft()))
                 yield self._result(waiting[0], progress, done, what)
                 waiting.popleft()
                 done += call.share
@@ -140,11 +154,11 @@ class Cluster:
         finally:
             self._client.cancel([*waiting])
 
-    def _submit(self, call: Call) -> Any:  # noqa: ANN401 - a future of Dask's
-        function = call.function
-        if call.chunked:
-            function = functools.partial(function, threads=1)
-        return self._client.submit(function, *call.arguments, pure=False)
+    def _submit(self, packed: bytes, call: Call) -> Any:  # noqa: ANN401 - a future of Dask's
+        options = dict(call.options) | ({"threads": 1} if call.chunked else {})
+        return self._client.submit(
+            _do, packed, call.step, call.arguments, options, key=f"{call.step}-{uuid.uuid4().hex}"
+        )
 
     def _result(self, future: Any, progress: Progress, done: float, what: str) -> Any:  # noqa: ANN401
         """Return the result of a future, and ask meanwhile whether to go on."""
@@ -154,6 +168,17 @@ class Cluster:
         while not ended.wait(_PATIENCE):
             report(progress, done, what)
         return future.result()
+
+
+def _do(packed: bytes, step: str, arguments: tuple[Any, ...], options: dict[str, Any]) -> Any:  # noqa: ANN401
+    """Do a step of a job, in a worker."""
+    return getattr(_unpacked(packed), step)(*arguments, **options)
+
+
+@functools.lru_cache(maxsize=2)
+def _unpacked(packed: bytes) -> Job:
+    job: Job = pickle.loads(packed)  # noqa: S301 - Dask itself sends pickles
+    return job
 
 
 def _answer(version: str, job: Job, tiles: list[Tile]) -> str:

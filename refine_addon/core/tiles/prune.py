@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import tempfile
 from dataclasses import fields
@@ -189,7 +188,7 @@ class _Run:
         clock.lap("score_s")
         rule = self._rule(budget)
         places = {tile: place for place, tile in enumerate(self.tiles)}
-        for unit, each in zip(self.units, self._map(job.choose, rule), strict=True):
+        for unit, each in zip(self.units, self._map("choose", rule), strict=True):
             for (tile, _, _), pair in zip(unit.parts, each, strict=True):
                 self.counts[places[tile]] += pair
         kept, unseen = self.counts.sum(axis=0).tolist()
@@ -213,13 +212,13 @@ class _Run:
         """Write each tile into the folder of the job; return their bytes."""
         calls = [
             Call(
-                self.job.write,
+                "write",
                 (tile, [u for u in self.units if any(tile == part.tile for part in u.parts)], kept),
                 tile.splats / self.total,
             )
             for tile, (kept, _) in zip(self.tiles, self.counts.tolist(), strict=True)
         ]
-        return [*self._workers(calls, part(self._progress, *SHARES["write"]), "writing")]
+        return [*self._workers(self.job, calls, part(self._progress, *SHARES["write"]), "writing")]
 
     def sizes(self) -> list[int]:
         """Return the bytes that `write` would write of each tile."""
@@ -234,14 +233,19 @@ class _Run:
         """Do a step of the closed form with each unit."""
         given = tuple(self._small(argument) for argument in arguments)
         calls = [
-            Call(self.job.score, (unit, step, given), len(unit) / self.total, chunked=True)
+            Call("score", (unit, step, given), len(unit) / self.total, chunked=True)
             for unit in self.units
         ]
-        return self._workers(calls, part(self._progress, *SHARES[step]), STEP_NAMES[step])
+        return self._workers(self.job, calls, part(self._progress, *SHARES[step]), STEP_NAMES[step])
 
-    def _map(self, function: Any, *arguments: Any) -> Iterator[Any]:  # noqa: ANN401 - methods of Job
-        calls = [Call(function, (unit, *arguments), len(unit) / self.total) for unit in self.units]
-        return self._workers(calls, part(self._progress, *SHARES["select"]), "selecting")
+    def _map(self, step: str, *arguments: Any, **options: Any) -> Iterator[Any]:  # noqa: ANN401 - of each its own
+        """Do a step of `Job` with each unit."""
+        calls = [
+            Call(step, (unit, *arguments), len(unit) / self.total, options=options)
+            for unit in self.units
+        ]
+        ahead = part(self._progress, *SHARES["select"])
+        return self._workers(self.job, calls, ahead, "selecting")
 
     def _small(self, argument: Any) -> Any:  # noqa: ANN401 - as given
         """Return an argument, or where it lies if it is large."""
@@ -271,11 +275,10 @@ class _Run:
             return Rule(left=(0,) * len(self.units))
 
         def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:
-            rank = functools.partial(self.job.rank, by_bytes=by_bytes)
-            return np.asarray(sum(self._map(rank, prefixes, shift)))
+            return np.asarray(sum(self._map("rank", prefixes, shift, by_bytes=by_bytes)))
 
         edge, below = radix.find(count, 32, [amount - 1])[0]
-        tied = [*self._map(functools.partial(self.job.tied, by_bytes=by_bytes), edge)]
+        tied = [*self._map("tied", edge, by_bytes=by_bytes)]
         before = np.cumsum([0, *tied[:-1]])
         return Rule(edge=edge, left=tuple((amount - below - before).tolist()), by_bytes=by_bytes)
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from ..errors import RefineError
 from ..work import Progress, part, report
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from .steps import Job
     from .units import Tile
@@ -24,7 +25,9 @@ class Workers(Protocol):
     def check(self, job: Job, tiles: list[Tile]) -> None:
         """Raise `RefineError` if a worker does not see the files."""
 
-    def __call__(self, calls: Sequence[Call], progress: Progress, what: str) -> Iterator[Any]:
+    def __call__(
+        self, job: Job, calls: Sequence[Call], progress: Progress, what: str
+    ) -> Iterator[Any]:
         """Yield what each call returns, in their order."""
 
 
@@ -33,19 +36,22 @@ class Call(NamedTuple):
 
     Attributes
     ----------
-    function : callable
-        A method of `Job`.
+    step : str
+        Name of a method of `Job`.
     arguments : tuple
     share : float
         How much of the work of all calls this is.
     chunked : bool
         Whether it takes ``progress`` and ``threads``.
+    options : dict
+        Arguments by name.
     """
 
-    function: Callable[..., Any]
+    step: str
     arguments: tuple[Any, ...]
     share: float
     chunked: bool = False
+    options: Mapping[str, Any] = MappingProxyType({})
 
 
 class Here:
@@ -63,12 +69,14 @@ class Here:
     def check(self, job: Job, tiles: list[Tile]) -> None:
         """Do nothing: this process sees what it sees."""
 
-    def __call__(self, calls: Sequence[Call], progress: Progress, what: str) -> Iterator[Any]:
+    def __call__(
+        self, job: Job, calls: Sequence[Call], progress: Progress, what: str
+    ) -> Iterator[Any]:
         """Yield what each call returns, in their order."""
         done = 0.0
         for call in calls:
             report(progress, done, what)
             ahead = part(progress, done, done + call.share)
             more = {"progress": ahead, "threads": self._threads} if call.chunked else {}
-            yield call.function(*call.arguments, **more)
+            yield getattr(job, call.step)(*call.arguments, **call.options, **more)
             done += call.share
