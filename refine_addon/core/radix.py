@@ -7,12 +7,12 @@ so the numbers can be read a part at a time, on several machines, in any order.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -93,6 +93,40 @@ def counts(
         each = None if weights is None else weights[chosen]
         found[index] = np.bincount(digits, each, minlength=1 << DIGIT)
     return found
+
+
+class Sparse(NamedTuple):
+    """Counts without those that are 0, which are most: what is sent from machine to machine.
+
+    Attributes
+    ----------
+    prefixes : int
+        How many rows of counts.
+    places : (n,) uint32
+        Where in all rows one after the other.
+    counts : (n,) int64
+    """
+
+    prefixes: int
+    places: NDArray[np.uint32]
+    counts: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, counts: NDArray[np.int64]) -> Sparse:
+        """Return `counts` without zeros."""
+        flat = counts.ravel()
+        places = np.flatnonzero(flat)
+        return cls(len(counts), places.astype(np.uint32), flat[places])
+
+
+def added(parts: Iterable[Sparse]) -> NDArray[np.int64]:
+    """Return the sum of counts of at least one part, (P, 65536)."""
+    total = np.zeros(0, np.int64)
+    for prefixes, places, each in parts:
+        if not len(total):
+            total = np.zeros(prefixes << DIGIT, np.int64)
+        total[places] += each
+    return total.reshape(-1, 1 << DIGIT)
 
 
 def find(count: Count, bits: int, ranks: Sequence[int]) -> list[tuple[int, int]]:

@@ -36,7 +36,9 @@ def test_the_kth_of_parts_is_that_of_the_whole(values, parts):
     keys = np.sort(np.concatenate(pieces))
 
     def count(prefixes, shift):
-        return sum(radix.counts(piece, prefixes, shift) for piece in pieces)
+        return radix.added(
+            radix.Sparse.of(radix.counts(piece, prefixes, shift)) for piece in pieces
+        )
 
     found = radix.find(count, 8 * values.dtype.itemsize, range(len(values)))
 

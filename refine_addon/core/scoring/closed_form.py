@@ -265,7 +265,7 @@ def _frame(each: Each, good: int, moments: NDArray[np.float64], settings: Closed
     """
 
     def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:
-        return np.asarray(sum(each("count", prefixes, shift)))
+        return radix.added(each("count", prefixes, shift))
 
     size = size_of(radix.median(count, np.dtype(np.float64), good))
     axes = principal_axes(moments[:3], moments[3]) / size  # (3, 3)

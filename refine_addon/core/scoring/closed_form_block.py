@@ -282,10 +282,10 @@ class Block:
             return area, ratio, longest
         return area, longest / (np.exp(smallest) + offset), longest
 
-    def count(self, prefixes: list[int], shift: int) -> NDArray[np.int64]:
+    def count(self, prefixes: list[int], shift: int) -> radix.Sparse:
         """Return `radix.counts` of the squared distances of what can be drawn."""
         squared = self.squared if self.good.all() else self.squared[self.good]
-        return radix.counts(radix.keys_of(squared), prefixes, shift)
+        return radix.Sparse.of(radix.counts(radix.keys_of(squared), prefixes, shift))
 
     def sum_views(self, frame: Frame) -> NDArray[np.float64]:
         """Compute H, and in how many views each splat lies.

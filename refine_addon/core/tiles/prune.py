@@ -275,7 +275,7 @@ class _Run:
             return Rule(left=(0,) * len(self.units))
 
         def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:
-            return np.asarray(sum(self._map("rank", prefixes, shift, by_bytes=by_bytes)))
+            return radix.added(self._map("rank", prefixes, shift, by_bytes=by_bytes))
 
         edge, below = radix.find(count, 32, [amount - 1])[0]
         tied = [*self._map("tied", edge, by_bytes=by_bytes)]

@@ -127,12 +127,10 @@ class Job:
         self.folder.drop(unit.index, over)
         return result
 
-    def rank(
-        self, unit: Unit, prefixes: list[int], shift: int, *, by_bytes: bool
-    ) -> NDArray[np.int64]:
+    def rank(self, unit: Unit, prefixes: list[int], shift: int, *, by_bytes: bool) -> radix.Sparse:
         """Return `radix.counts` of the scores of a unit."""
         keys, weights = self._keys(unit), _bytes(unit) if by_bytes else None
-        return radix.counts(keys, prefixes, shift, weights)
+        return radix.Sparse.of(radix.counts(keys, prefixes, shift, weights))
 
     def tied(self, unit: Unit, edge: int, *, by_bytes: bool) -> int:
         """Return how many splats of a unit score as much as the last that goes, or their bytes."""
