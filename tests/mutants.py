@@ -53,6 +53,36 @@ MUTANTS = {
         ("ranks = [(total - 1) // 2,", "ranks = [total // 2,", "upper median"),
         ('side="right"', 'side="left"', "off by one"),
     ],
+    "tiles/units.py": [
+        ("room -= stop - start", "room = room", "units beyond their rows"),
+        ("tile.begin + part.start", "tile.begin + 0 * part.start", "always the first rows"),
+        ("!= (tile.size, tile.changed)", "!= (tile.size, found.st_mtime_ns)", "time not compared"),
+    ],
+    "tiles/steps.py": [
+        (
+            'found["values"] < np.float32(rule.threshold)',
+            'found["values"] <= np.float32(rule.threshold)',
+            "threshold goes",
+        ),
+        ("rule.left[unit.index]", "rule.left[0]", "ties of the first unit"),
+        ("if part.tile == tile:", "if True:", "rows of other tiles"),
+        (
+            "        if noted:\n            self.folder.note(name, result)",
+            "        if False:\n            pass",
+            "nothing is done for good",
+        ),
+    ],
+    "tiles/folder.py": [
+        ("result or ()]", "()]", "results forgotten"),
+        ("fcntl.LOCK_EX | fcntl.LOCK_NB", "fcntl.LOCK_SH | fcntl.LOCK_NB", "two runs at once"),
+    ],
+    "tiles/prune.py": [
+        ("(amount - below - before)", "(amount - below - 0 * before)", "ties in each unit"),
+        ("except Exception:\n            job.folder.remove()", "except Exception:", "leavings"),
+        ("kept * tile.row_bytes)", "kept * tile.row_bytes + shorter)", "size of another header"),
+        ("if target.resolve() in read:", "if False:", "tiles replaced while read"),
+        ("if target in targets[:place]:", "if False:", "one output for two tiles"),
+    ],
     "scoring/closed_form_block.py": [
         ("total *= self.alpha[piece]", "total *= self.alpha[piece] ** 2", "opacity twice"),
         ("LUMA = (0.299, 0.587, 0.114)", "LUMA = (0.114, 0.587, 0.299)", "BGR"),
@@ -526,6 +556,7 @@ TESTS = {
     ],
     "glb": ["formats/glb_document.py"],
     "viewport_arrays": ["../viewport/arrays.py"],
+    "tiles": ["tiles/units.py", "tiles/steps.py", "tiles/folder.py", "tiles/prune.py"],
     "levels": ["levels/lod.py", "levels/distance.py", "levels/files.py"],
 }
 """Modules whose tests are not in the file of their own name; those run first."""

@@ -323,9 +323,10 @@ def test_a_job_that_was_stopped_while_it_renamed_goes_on(tmp_path, tiles, views,
             raise KeyboardInterrupt
         publish(made, path, **options)
 
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patched:
         patched.setattr(together, "publish", stop)
-        prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+        with pytest.raises(KeyboardInterrupt):
+            prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
 
     with pytest.raises(RefineError, match="exists already"):
         prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)

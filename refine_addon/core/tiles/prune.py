@@ -118,8 +118,8 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
             place = output.absolute() / f".refine-{_digest(tiles, used, budget, settings)}"
         job = Job(Folder(place), used, settings.closed_form, used.middle())
         held.enter_context(job.folder.opened())
-        run = _Run(job, tiles, workers or Here(threads), progress)
         try:
+            run = _Run(job, tiles, workers or Here(threads), progress)
             facts = run.prune(budget, settings, views, clock)
             sizes = run.write() if targets else run.sizes()
             for target in targets:
