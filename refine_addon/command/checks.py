@@ -40,6 +40,8 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
         parser.error(str(error))
     if given.command == "prune":
         _check_prune(parser, given)
+    elif given.command == "clean":
+        _check_files(parser, given)
     elif given.command == "score":
         _check_score(parser, given)
     if given.cameras is None and not (given.scene and open_blend()):
@@ -169,6 +171,10 @@ def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
         if not (given.output or given.save or given.dry_run):
             parser.error("--object needs -o OUT.ply, --save or --dry-run")
     else:
+        if given.save:
+            parser.error("--save goes with --object")
+        if not (given.output or given.output_dir or given.dry_run):
+            parser.error("expected -o OUT.ply, --output-dir DIR or --dry-run")
         _check_files(parser, given)
 
 
@@ -196,15 +202,18 @@ def _check_score(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
 
 
 def _check_files(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
-    if given.save:
-        parser.error("--save goes with --object")
     if given.output and given.output_dir:
         parser.error("expected -o or --output-dir, and not both")
-    if not (given.output or given.output_dir or given.dry_run):
-        parser.error("expected -o OUT.ply, --output-dir DIR or --dry-run")
     if given.output and len(given.inputs) > 1:
         parser.error(f"-o takes one input, got {len(given.inputs)}: use --output-dir")
-    names = [path.name for path in given.inputs]
-    double = next((name for name in names if names.count(name) > 1), None)
-    if given.output_dir and double:
-        parser.error(f"two inputs are called {double}: they would be one file in --output-dir")
+    if not given.output_dir:
+        return
+    first: dict[str, Path] = {}
+    for path in given.inputs:
+        other = first.setdefault(path.name, path)
+        if other is not path:
+            target = given.output_dir / path.name
+            advice = "call the command for each, with its own --output-dir or -o"
+            if given.together:
+                advice = "rename one of them"
+            parser.error(f"{other} and {path} would both be {target}: {advice}")

@@ -10,7 +10,7 @@ import numpy as np
 from .cleaning.clean import clean
 from .formats.registry import Packed, as_written, read_splats, refuse_unknown_size
 from .pipeline import decide
-from .report import Clock, Files, complete_report
+from .report import Clock, Files, complete_report, held, kept_and_removed
 from .survivors import survivor_columns
 from .task import DEFAULTS, Result, Settings, Task
 from .whole_file import expanded, refuse_existing, refuse_mapped
@@ -113,6 +113,7 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
     if written is not None:
         used = views.spread(settings.views)
         result.report.update(written_facts(written, result.scores, used, threads=threads))
+    result.report["splats"] |= held(made, result.keep, written=written is not None)
     result.report["notes"] += made.notes(result.keep)
     names = (str(file.path), None if written is None else str(written))
     complete_report(result.report, clock, Files(*names, *sizes))
@@ -129,7 +130,6 @@ def _of_all(result: Result, cleaned: Cleaned) -> Result:
     absorbed = result.absorbed
     if absorbed is not None:
         absorbed = replace(absorbed, keep=keep)
-    total, kept = len(keep), int(np.count_nonzero(keep))
-    result.report["splats"] |= {"before": total, "kept": kept, "removed": total - kept}
+    result.report["splats"] |= {"before": len(keep), **kept_and_removed(keep)}
     result.report["cleaned"] = cleaned.facts()
     return replace(result, keep=keep, absorbed=absorbed)

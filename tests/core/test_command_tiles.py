@@ -102,7 +102,8 @@ def test_two_tiles_of_one_name_are_wrong_usage(folder, capsys):
     tiles = ["a.ply", "b.ply", "more/a.ply"]
     options = ["--together", "--cameras", "cameras.json", *CLOSED, "--output-dir", "out"]
     assert main(["prune", *tiles, *options]) == 2
-    assert "two inputs are called a.ply" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "a.ply and more/a.ply would both be out/a.ply: rename one of them" in said
 
 
 def test_after_ctrl_c_it_says_how_to_go_on(folder, capsys, monkeypatch):

@@ -27,6 +27,7 @@ from ..errors import RefineError
 from ..rendering import NEAR_RELATIVE
 from ..scene import principal_axes, size_of
 from ..scores import Scores
+from ..splats import refuse_undrawable
 from ..work import Progress, part, silent
 from . import adaptive
 from .closed_form_block import CELLS, LUMA, ROWS, Block, Frame
@@ -219,9 +220,7 @@ def steps(
         raise RefineError(msg)
     tallies, moments = (np.concatenate(of) for of in zip(*each("read"), strict=True))
     good = int(tallies[:, 0].sum())
-    if not good:
-        msg = f"none of the {total} splats can be drawn: each is transparent or not finite"
-        raise RefineError(msg)
+    refuse_undrawable(good, total)
     axes, eta, near = remember(
         "frame", lambda: _frame(each, good, np.sum(moments, axis=0), settings)
     )

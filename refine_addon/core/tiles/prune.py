@@ -15,7 +15,7 @@ from ...version import VERSION
 from .. import radix
 from ..errors import RefineError
 from ..formats.ply_header import with_count
-from ..pipeline import quality_facts
+from ..pipeline import nothing_removed, quality_facts
 from ..report import Clock, Files, complete_report, make_report
 from ..scores import Scores
 from ..scoring import closed_form
@@ -131,6 +131,7 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
             raise
         job.folder.remove()
     clock.lap("write_s")
+    facts["splats"]["written"] = facts["splats"]["kept"] if targets else None
     before = sum(tile.size for tile in tiles)
     complete_report(facts, clock, Files(f"{len(tiles)} tiles", _shown(output), before, sum(sizes)))
     names: list[Path | None] = [*targets] or [None] * len(tiles)
@@ -205,7 +206,12 @@ class _Run:
             "kept": kept,
             "removed": self.total - kept,
             "unseen": unseen,
+            "left_out": 0,
         }
+        facts["budget_remark"] = ""
+        if budget.max_mb is not None and kept == self.total:
+            facts["budget_remark"] = nothing_removed(sum(tile.size for tile in self.tiles))
+            facts["notes"].append(facts["budget_remark"])
         return facts | quality_facts(nothing, np.empty(0, np.bool_), None, absorbed=False)
 
     def write(self) -> list[int]:
