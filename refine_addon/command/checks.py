@@ -214,6 +214,6 @@ def _check_files(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
         if other is not path:
             target = given.output_dir / path.name
             advice = "call the command for each, with its own --output-dir or -o"
-            if given.together:
+            if getattr(given, "together", False):
                 advice = "rename one of them"
             parser.error(f"{other} and {path} would both be {target}: {advice}")

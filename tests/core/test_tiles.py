@@ -74,7 +74,7 @@ def joined(paths):
 
 BUDGETS = [
     Budget(ratio=0.6),
-    Budget(ratio=0.17),  # among the equal ones
+    Budget(ratio=0.1),  # among the equal ones, which are those from the 253rd to the 653rd
     Budget(ratio=0.0),
     Budget(keep=1),
     Budget(max_mb=0.4),
@@ -102,6 +102,18 @@ def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budg
     assert report["splats"] == whole.report["splats"]
     assert report["weights"] == whole.report["weights"]
     assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in tiles}
+
+
+def test_splats_at_the_threshold_stay(tmp_path, tiles, views):
+    """401 splats are equal: those below them go, and none of them."""
+    splats = read_ply(tmp_path / "whole.ply").splats()
+    values = score(splats, views, CLOSED).values
+    threshold = float(values[900])
+
+    report = prune_tiles(tiles, None, views, Budget(threshold=threshold), CLOSED)
+
+    assert np.count_nonzero(values == values[900]) == 401
+    assert report["splats"]["removed"] == np.count_nonzero(values < values[900])
 
 
 def test_a_report_says_what_stays_of_each_tile(tmp_path, tiles, views):
