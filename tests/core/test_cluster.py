@@ -37,8 +37,8 @@ def workers():
 
 @pytest.fixture
 def tiles(tmp_path, monkeypatch):
-    """Write 5000 rows of the room as two tiles; a unit has 500."""
-    monkeypatch.setattr(units, "ROWS", 500)
+    """Write 5000 rows of the room as two tiles; a unit has 250, so two go in a group."""
+    monkeypatch.setattr(units, "ROWS", 250)
     file = read_ply(ROOM / "point_cloud.ply")
     paths = [tmp_path / "a.ply", tmp_path / "b.ply"]
     for path, rows in zip(paths, np.split(file.rows[:5000], [2300]), strict=True):

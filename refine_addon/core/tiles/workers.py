@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from ..errors import RefineError
@@ -51,7 +50,7 @@ class Call(NamedTuple):
     arguments: tuple[Any, ...]
     share: float
     chunked: bool = False
-    options: Mapping[str, Any] = MappingProxyType({})
+    options: Mapping[str, Any] = {}
 
 
 class Here:
