@@ -161,6 +161,10 @@ def _check_source(parser: argparse.ArgumentParser, given: argparse.Namespace) ->
 def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     if given.clean and given.object:
         parser.error("--clean goes with INPUT files, not with --object")
+    if given.together:
+        _check_together(parser, given)
+    elif given.workers is not None or given.scheduler:
+        parser.error("--workers and --scheduler go with --together")
     _check_source(parser, given)
     if given.object:
         if given.output_dir:
@@ -173,6 +177,21 @@ def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
         if not (given.output or given.output_dir or given.dry_run):
             parser.error("expected -o OUT.ply, --output-dir DIR or --dry-run")
         _check_files(parser, given)
+
+
+def _check_together(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Refuse what needs all splats at once, or one output."""
+    alone = ("object", "output", "absorb", "clean", "psnr")
+    for name in alone:
+        if getattr(given, name):
+            option = "-o" if name == "output" else f"--{name}"
+            parser.error(f"{option} does not go with --together")
+    if given.method != "closed-form":
+        parser.error("--together scores by the closed form so far: add --method closed-form")
+    if given.workers is not None and given.scheduler:
+        parser.error("expected --workers or --scheduler, and not both")
+    if given.workers is not None and given.workers < 1:
+        parser.error(f"workers is {given.workers}, expected 1 or more")
 
 
 def _check_score(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
@@ -195,7 +214,7 @@ def _check_files(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
         other = first.setdefault(path.name, path)
         if other is not path:
             target = given.output_dir / path.name
-            parser.error(
-                f"{other} and {path} would both be {target}: call the command for each, with its "
-                "own --output-dir or -o"
-            )
+            advice = "call the command for each, with its own --output-dir or -o"
+            if getattr(given, "together", False):
+                advice = "rename one of them"
+            parser.error(f"{other} and {path} would both be {target}: {advice}")

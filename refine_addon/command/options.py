@@ -33,6 +33,7 @@ EXAMPLES = {
         "refine prune in.ply --cameras sparse/0 --max-mb 5 --absorb -o out.ply",
         "refine prune in.ply --cameras sparse/0 --keep-inside box:-2,-2,-1,2,2,3 -o out.ply",
         f"{BLENDER}refine prune --object Splats --protect Statue --remove-inside Sky -o out.ply",
+        "refine prune *.ply --together --cameras sparse/0 --method closed-form --output-dir out",
         f"{BLENDER}refine prune --object Splats -o out.ply",
         f"{BLENDER}refine prune --object Splats --frames 1:250:10 --save",
         f"{BLENDER}refine prune --object Splats --source collection:Shot --dry-run",
@@ -145,6 +146,25 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         help="first remove floaters and outliers, as clean does; the budget counts the rest",
     )
     zones.add(prune, names="a vertex group or boolean attribute of --object, ")
+    prune.add_argument(
+        "--together",
+        action="store_true",
+        help="the inputs are tiles of one scene: one budget over all of them, with a few rows at a "
+        "time in memory; for plain PLY and --method closed-form; all are written or none",
+    )
+    prune.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="with --together: on N processes of a Dask cluster, started here (needs the extra "
+        "distributed)",
+    )
+    prune.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="with --together: on the workers of this Dask scheduler, which see the same files "
+        "under the same paths",
+    )
     prune.add_argument("--dry-run", action="store_true", help="decide and report, write nothing")
     _add_common(prune)
 

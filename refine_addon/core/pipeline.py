@@ -304,7 +304,7 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     else:
         psnr = _estimated(scores, keep, threads)
     facts = make_report(scores, keep, task.budget, task.settings, clock)
-    facts |= _quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
+    facts |= quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
     if psnr is None and scores.sights is not None:
         facts["notes"].append(UNSEEN)
     facts["budget_remark"] = _remark(task, keep, psnr)
@@ -325,11 +325,16 @@ def _remark(task: Task, keep: NDArray[np.bool_], psnr: float | None) -> str:
         return out_of_reach(budget.psnr, gone, len(keep), psnr)
     if budget.max_mb is not None and not gone:
         rows = np.broadcast_to(task.row_bytes, len(keep)).sum() + task.fixed_bytes
-        return f"already {size_in_words(int(rows))}: nothing was removed"
+        return nothing_removed(int(rows))
     return ""
 
 
-def _quality_facts(
+def nothing_removed(size: int) -> str:
+    """Return the remark on a file that is no larger than it may be; `size` is its bytes."""
+    return f"already {size_in_words(size)}: nothing was removed"
+
+
+def quality_facts(
     scores: Scores, keep: NDArray[np.bool_], psnr: float | None, *, absorbed: bool
 ) -> dict[str, Any]:
     """Return what a report says about the quality of the pictures.
