@@ -11,6 +11,7 @@ from ..core.formats.registry import format_named
 from ..core.levels.files import MANIFEST, check_goal, is_manifest, level_paths
 from . import options, zones
 from .report import is_report
+from .zones import ROLES
 
 if TYPE_CHECKING:
     import argparse
@@ -181,10 +182,10 @@ def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
 
 def _check_together(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     """Refuse what needs all splats at once, or one output."""
-    alone = ("object", "output", "absorb", "clean", "psnr")
+    alone = ("object", "output", "absorb", "clean", "psnr", *ROLES)
     for name in alone:
-        if getattr(given, name):
-            option = "-o" if name == "output" else f"--{name}"
+        if getattr(given, name, None):
+            option = "-o" if name == "output" else f"--{name.replace('_', '-')}"
             parser.error(f"{option} does not go with --together")
     if given.method != "closed-form":
         parser.error("--together scores by the closed form so far: add --method closed-form")

@@ -84,6 +84,10 @@ def test_a_tile_that_is_missing_stops_all(folder, capsys):
         ([*CLOSED, "--output-dir", "out", "--absorb"], "--absorb does not go with --together"),
         ([*CLOSED, "--output-dir", "out", "--clean"], "--clean does not go with --together"),
         ([*CLOSED, "--output-dir", "out", "--psnr", "40"], "--psnr does not go with --together"),
+        (
+            [*CLOSED, "--output-dir", "out", "--protect", "sphere:0,0,0,1"],
+            "--protect does not go with --together",
+        ),
         (CLOSED, "--output-dir DIR or --dry-run"),
     ],
 )

@@ -207,6 +207,8 @@ class _Run:
             "removed": self.total - kept,
             "unseen": unseen,
             "left_out": 0,
+            "protected": 0,
+            "forced": 0,
         }
         facts["budget_remark"] = ""
         if budget.max_mb is not None and kept == self.total:
