@@ -17,6 +17,7 @@ from .cameras.objects import world_matrix
 from .core import pipeline
 from .core.affine import is_uniform, transformed
 from .core.errors import RefineError
+from .core.file_to_file import picture_facts
 from .core.formats.ply import columns_from_splats
 from .core.formats.registry import as_written, format_named, refuse_unknown_size
 from .core.report import Clock, Files, complete_report
@@ -41,6 +42,7 @@ if TYPE_CHECKING:
     from .core.formats.ply import SplatFile
     from .core.formats.registry import Packed
     from .core.levels.lod import Level
+    from .core.picture_files import PictureFiles
     from .core.scores import Scores
     from .core.selection import Budget
     from .core.splats import Splats
@@ -340,6 +342,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     *,
     absorb: bool = False,
     output: Path | None = None,
+    pictures: PictureFiles | None = None,
     save: bool = False,
     dry_run: bool = False,
     overwrite: bool = False,
@@ -355,6 +358,8 @@ def prune_object(  # noqa: PLR0913 - the command's options
         See `refine_addon.core.pipeline.prune`.
     output : Path, optional
         The file to make, in the format that its suffix names.
+    pictures : PictureFiles, optional
+        Where pictures before and after go; none are drawn without it.
     save : bool
         Whether to delete the splats from the object and save the .blend.
     dry_run : bool
@@ -379,15 +384,18 @@ def prune_object(  # noqa: PLR0913 - the command's options
     target = None if output is None or dry_run else expanded(output)
     if target is not None:
         refuse_existing(target, overwrite=overwrite)
+    if pictures is not None:
+        pictures.refuse_existing(views)
     if save and not dry_run:
         _check_savable(checked.obj)
     row_bytes, fixed_bytes = _file_size(checked, budget, output)
-    estimates = settings.estimates or budget.psnr is not None
+    seen = settings.estimates or budget.psnr is not None or pictures is not None
     matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
+    splats = gather(checked, whole=absorb or (None if seen else False))
     task = Task(
         budget=budget,
         settings=settings,
-        splats=gather(checked, whole=absorb or (None if estimates else False)),
+        splats=splats,
         views=views,
         absorb=absorb,
         row_bytes=row_bytes,
@@ -408,6 +416,10 @@ def prune_object(  # noqa: PLR0913 - the command's options
     if target is not None:
         used = views.spread(settings.views)
         result.report.update(written_facts(target, result.scores, used, matrix=matrix))
+    ahead = part(progress, 0.85, 1.0)
+    drawn = picture_facts(pictures, splats, result, target, views, matrix=matrix, progress=ahead)
+    result.report.update(drawn)
+    clock.lap("pictures_s")
     result.report["notes"] += modifier_notes(checked.obj)
     source, made = f"{bpy.data.filepath}#{name}", None if target is None else str(target)
     after = sizes.bytes_after if target is None else target.stat().st_size

@@ -7,7 +7,7 @@ import stat
 from typing import TYPE_CHECKING
 
 from ..core import RefineError
-from ..core.formats.registry import format_named
+from ..core.formats.registry import format_named, without_suffix
 from ..core.levels.files import MANIFEST, check_goal, is_manifest, level_paths
 from . import options
 from .report import is_report
@@ -185,7 +185,13 @@ def _check_files(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
         parser.error("expected -o OUT.ply, --output-dir DIR or --dry-run")
     if given.output and len(given.inputs) > 1:
         parser.error(f"-o takes one input, got {len(given.inputs)}: use --output-dir")
-    names = [path.name for path in given.inputs]
-    double = next((name for name in names if names.count(name) > 1), None)
-    if given.output_dir and double:
-        parser.error(f"two inputs are called {double}: they would be one file in --output-dir")
+    if given.output_dir and (name := _double([path.name for path in given.inputs])):
+        parser.error(f"two inputs are called {name}: they would be one file in --output-dir")
+    names = [without_suffix(path.name) for path in given.inputs]
+    if given.pictures and (name := _double(names)):
+        parser.error(f"two inputs are called {name}: they would be one picture in --pictures")
+
+
+def _double(names: list[str]) -> str | None:
+    """Return the first of some names that is there twice."""
+    return next((name for name in names if names.count(name) > 1), None)

@@ -33,6 +33,7 @@ EXAMPLES = {
         f"{BLENDER}refine prune --object Splats -o out.ply",
         f"{BLENDER}refine prune --object Splats --frames 1:250:10 --save",
         f"{BLENDER}refine prune --object Splats --source collection:Shot --dry-run",
+        f"{BLENDER}refine prune --object Splats --dry-run --pictures before_and_after",
     ),
     "score": (
         "refine score in.ply --cameras cameras.json -o scored.ply",
@@ -149,7 +150,14 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         action="store_true",
         help="first remove floaters and outliers, as clean does; the budget counts the rest",
     )
-    prune.add_argument("--dry-run", action="store_true", help="decide and report, write nothing")
+    prune.add_argument(
+        "--pictures",
+        type=_path,
+        metavar="DIR",
+        help="draw up to 3 of the views before and after, and what differs, as "
+        "NAME-CAMERA-before.png and so on; made if it is not there; --dry-run draws them too",
+    )
+    prune.add_argument("--dry-run", action="store_true", help="decide and report, write no splats")
     _add_common(prune)
 
 

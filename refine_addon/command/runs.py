@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core import RefineError, as_written, clean, prune_file, read_splats, score
+from ..core import RefineError, as_written, clean, picture_files, prune_file, read_splats, score
 from ..core.errors import printable
+from ..core.formats.registry import without_suffix
+from ..core.picture_files import PictureFiles
 from ..core.quality import UNSEEN, in_words
 from ..core.report import scoring_notes
 from ..core.whole_file import refuse_existing, refuse_mapped
@@ -139,6 +141,14 @@ def _make_folder(folder: Path) -> None:
         raise RefineError(msg) from error
 
 
+def _pictures(options: argparse.Namespace, name: str) -> PictureFiles | None:
+    """Return where the pictures of an input go, if they are wanted; makes the folder."""
+    if options.pictures is None:
+        return None
+    _make_folder(options.pictures)
+    return PictureFiles(options.pictures, name, options.overwrite)
+
+
 def _prune_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     options = run.options
     output = options.output
@@ -152,6 +162,7 @@ def _prune_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
         settings(options),
         absorb=options.absorb,
         cleaning=cleaning(options) if options.clean else None,
+        pictures=_pictures(options, without_suffix(source.name)),
         overwrite=options.overwrite,
         dry_run=options.dry_run,
         progress=run.progress(source.name),
@@ -172,6 +183,7 @@ def _prune_object(run: _Run) -> dict[str, Any]:
         settings(options),
         absorb=options.absorb,
         output=options.output,
+        pictures=_pictures(options, options.object),
         save=options.save,
         dry_run=options.dry_run,
         overwrite=options.overwrite,
@@ -203,6 +215,9 @@ def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
     quality = _quality(done)
     if quality:
         run.terminal.say(f"  quality: {quality}")
+    if "pictures" in done:
+        measured = picture_files.in_words(done["pictures"])
+        run.terminal.say(f"  pictures: {measured} -> {run.options.pictures}")
     run.terminal.notes(done["notes"])
 
 

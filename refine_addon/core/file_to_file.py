@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .affine import is_uniform, transformed
 from .cleaning.clean import clean
-from .formats.registry import Packed, as_written, read_splats, refuse_unknown_size
+from .formats.registry import (
+    Packed,
+    as_written,
+    format_named,
+    read_splats,
+    refuse_unknown_size,
+)
 from .pipeline import decide
 from .report import Clock, Files, complete_report
 from .survivors import survivor_columns
@@ -20,8 +27,12 @@ from .written import written_facts
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
     from .cleaning.clean import Cleaned, Cleaning
+    from .picture_files import PictureFiles
     from .selection import Budget, RowBytes
+    from .splats import Splats
     from .views import ViewSet
 
 
@@ -34,6 +45,7 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
     *,
     absorb: bool = False,
     cleaning: Cleaning | None = None,
+    pictures: PictureFiles | None = None,
     overwrite: bool = False,
     dry_run: bool = False,
     progress: Progress = silent,
@@ -52,6 +64,8 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
         See `pipeline.prune`.
     cleaning : Cleaning, optional
         What to clean away first. The budget then counts what is left.
+    pictures : PictureFiles, optional
+        Where pictures before and after go; none are drawn without it.
     overwrite : bool
         Whether `output` may replace a file.
     dry_run : bool
@@ -68,6 +82,8 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
         See `pipeline.prune`, `read_splats` and `SplatFile.write`; also if a budget is a size, and
         the format of `output` compresses the file as a whole. Then nothing is written.
     """
+    if pictures is not None:
+        pictures.refuse_existing(views)
     clock = Clock()
     target = None if output is None else expanded(output)
     written = None if dry_run else target
@@ -113,10 +129,62 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
     if written is not None:
         used = views.spread(settings.views)
         result.report.update(written_facts(written, result.scores, used, threads=threads))
+    drawn = picture_facts(
+        pictures, file.splats(), result, written, views,
+        progress=part(progress, 0.85, 1.0), threads=threads,
+    )  # fmt: skip
+    result.report.update(drawn)
+    clock.lap("pictures_s")
     result.report["notes"] += made.notes(result.keep)
     names = (str(file.path), None if written is None else str(written))
     complete_report(result.report, clock, Files(*names, *sizes))
     return result
+
+
+def picture_facts(  # noqa: PLR0913 - what was pruned, and what to draw of it
+    pictures: PictureFiles | None,
+    splats: Splats,
+    result: Result,
+    written: Path | None,
+    views: ViewSet,
+    *,
+    matrix: NDArray[np.float64] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Write the pictures of a prune; return what the report says of them, nothing without any.
+
+    Parameters
+    ----------
+    pictures : PictureFiles or None
+    splats : Splats
+        All of them, in the frame of the views.
+    result : Result
+        What was decided of them.
+    written : Path or None
+        The file that holds what stays, if there is one: what a lossy format rounds is to be seen.
+    views : ViewSet
+        Those that decided.
+    matrix : (4, 4) float64, optional
+        From the frame of the file to that of the views; by default they are the same. Where it
+        scales directions differently, nothing that is rounded is seen.
+    progress, threads
+        See `PictureFiles.write`.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `PictureFiles.write`.
+    """
+    if pictures is None:
+        return {}
+    after = result.survivors(splats)
+    matrix = np.eye(4) if matrix is None else matrix
+    if written is not None and format_named(written) and is_uniform(matrix):
+        after = read_splats(written).splats()
+        if not np.array_equal(matrix, np.eye(4)):
+            after = transformed(after, matrix)
+    return {"pictures": pictures.write(splats, after, views, progress=progress, threads=threads)}
 
 
 def _of_all(result: Result, cleaned: Cleaned) -> Result:

@@ -176,3 +176,13 @@ class Result:
     scores: Scores
     report: dict[str, Any]
     absorbed: Absorbed | None = None
+
+    def survivors(self, splats: Splats) -> Splats:
+        """Return the splats that stay, as they became; in the frame of the views.
+
+        Parameters
+        ----------
+        splats : Splats
+            All of them, in that frame.
+        """
+        return self.absorbed.splats if self.absorbed else splats.take(self.keep)
