@@ -10,6 +10,7 @@ from .core.formats import images
 from .core.formats.registry import SUFFIXES
 from .ui import camera_list, kept, plans, price
 from .ui.camera_list import REFINE_PT_camera_list, REFINE_UL_cameras, RefineCamera
+from .ui.compare import REFINE_OT_compare
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
 from .ui.operators import (
@@ -46,6 +47,7 @@ CLASSES = (
     REFINE_OT_score,
     REFINE_OT_plan,
     REFINE_OT_apply,
+    REFINE_OT_compare,
     REFINE_OT_preview,
     REFINE_OT_view,
     REFINE_OT_convert,

@@ -7,6 +7,7 @@ leaves the scene as it was.
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -34,6 +35,7 @@ from .mesh.layout import SplatObject, check
 from .mesh.scores import RECORD, store, stored_scores
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -170,13 +172,6 @@ def keep_mask(checked: SplatObject, budget: Budget, protect: str = "") -> NDArra
     return pipeline.decide(stored_task(checked, budget, protect)).keep
 
 
-def mark_removed(checked: SplatObject, task: Task) -> NDArray[np.bool_]:
-    """Mark the splats that a task (`stored_task`) removes; return which stay, (N,)."""
-    keep = pipeline.decide(task).keep
-    mesh_edit.mark_removed(checked.obj, ~keep)
-    return keep
-
-
 def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
     """Delete the splats that do not stay, and set what the others became: all of it or nothing.
 
@@ -199,17 +194,28 @@ def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
     RefineError
         See `mesh_edit.check_deletable`; also if there are no longer as many splats.
     """
-    mesh_edit.check_deletable(checked.obj)
-    if len(result.keep) != len(checked):
-        msg = (
-            f"object '{checked.obj.name}': has {len(checked)} splats and had {len(result.keep)} "
-            "when it was decided which stay; apply again"
-        )
-        raise RefineError(msg)
-    done = _plan(checked, result.keep)
-    columns = absorbed_columns(checked, result.absorbed) if result.absorbed else {}
-    with mesh_edit.all_or_nothing(checked.obj):
-        _reduce(checked, result.keep, columns)
+    (done,) = apply_objects([(checked, result)])
+    return done
+
+
+def apply_objects(parts: Sequence[tuple[SplatObject, Result | Level]]) -> list[Plan]:
+    """Do what `apply_object` does to several objects: to all of them or to none."""
+    done, columns = [], []
+    for checked, result in parts:
+        mesh_edit.check_deletable(checked.obj)
+        if len(result.keep) != len(checked):
+            msg = (
+                f"object '{checked.obj.name}': has {len(checked)} splats and had "
+                f"{len(result.keep)} when it was decided which stay; apply again"
+            )
+            raise RefineError(msg)
+        done.append(_plan(checked, result.keep))
+        columns.append(absorbed_columns(checked, result.absorbed) if result.absorbed else {})
+    with ExitStack() as stack:
+        for checked, _ in parts:
+            stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
+        for (checked, result), changed in zip(parts, columns, strict=True):
+            _reduce(checked, result.keep, changed)
     return done
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from .notes import parsed
 
 if TYPE_CHECKING:
     import bpy
+    from numpy.typing import NDArray
 
     from ..core.task import Settings
     from .layout import SplatObject
@@ -30,12 +31,31 @@ RECORD = "refine_scores"
 """Custom property of the mesh: how its scores came to be, as JSON."""
 
 
+class Together(NamedTuple):
+    """What an object's scores have in common with those of others that were scored with it.
+
+    Attributes
+    ----------
+    id : str
+        Of the scoring.
+    splats : int
+        How many all objects have.
+    ranks : (N,) float64
+        Of this object's splats among all.
+    """
+
+    id: str
+    splats: int
+    ranks: NDArray[np.float64]
+
+
 def store(
     checked: SplatObject,
     scores: Scores,
     settings: Settings,
     origin: dict[str, Any] | None = None,
     cameras: list[tuple[str, int]] | None = None,
+    together: Together | None = None,
 ) -> None:
     """Write scores to the attributes of an object's mesh, and note how they came to be.
 
@@ -48,6 +68,8 @@ def store(
         See `staleness.origin`.
     cameras : list of (str, int), optional
         Name of each view given, and how many splats lie in it.
+    together : Together, optional
+        Where other objects were scored with them; the curve of `scores` is that of all then.
 
     Raises
     ------
@@ -62,7 +84,7 @@ def store(
             f"{len(scores.values)}; score it again"
         )
         raise RefineError(msg)
-    ranks = rank(scores.values)
+    ranks = together.ranks if together else rank(scores.values)
     mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
     mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
     mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
@@ -81,6 +103,7 @@ def store(
             "quality": scores.quality.facts() if scores.quality else None,
             "origin": origin,
             "cameras": cameras,
+            "together": together and {"id": together.id, "splats": together.splats},
         }
     )
     mesh_attributes.updated(mesh)
@@ -122,7 +145,7 @@ def stored_scores(checked: SplatObject) -> Scores:
         )
         raise RefineError(msg)
     # The curve is that of all splats that were scored.
-    whole = len(values) == noted["splats"]
+    whole = len(values) == (noted.get("together") or noted)["splats"]
     return Scores(
         values=values,
         seen=mesh_attributes.read_attribute(mesh, SEEN),

@@ -16,7 +16,7 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from .. import level_objects, splat_object
+from .. import level_objects, splat_group, splat_object
 from ..cameras.sets import Choice
 from ..core import frustum, pipeline
 from ..core.formats.registry import FORMATS, Packed, without_suffix
@@ -68,7 +68,7 @@ class OnSplats:
         return True
 
 
-class _OnScored(OnSplats):
+class OnScored(OnSplats):
     """An operator on the active object, which must be scored."""
 
     @classmethod
@@ -85,6 +85,23 @@ class _OnScored(OnSplats):
 def chosen_views(context: bpy.types.Context) -> ViewSet:
     """Return the views of the cameras that the panel names."""
     return Choice.of_scene(context.scene).views(context, context.object)
+
+
+def apply_task(context: bpy.types.Context, group: splat_group.Members) -> Task:
+    """Return what *Apply* has to decide of the selected objects by the settings of the panel."""
+    settings = context.scene.refine
+    return splat_group.stored_task(
+        group,
+        settings.to_budget(),
+        settings.protect,
+        settings=settings.to_settings(),
+        views=chosen_views(context) if settings.absorb else None,
+    )
+
+
+def _of_objects(group: splat_group.Members) -> str:
+    """Return how many objects were worked on, if more than one."""
+    return f" of {len(group)} objects" if len(group) > 1 else ""
 
 
 def _new_name(obj: bpy.types.Object) -> str:
@@ -105,7 +122,8 @@ class _Scoring:
     views: ViewSet
     settings: Settings
     quality: bool
-    origin: dict[str, Any]
+    names: tuple[str, ...]
+    origins: list[dict[str, Any]]
 
 
 class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
@@ -119,11 +137,14 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Scoring:
         """Gather splats, views and settings."""
         settings, views = context.scene.refine.to_settings(), chosen_views(context)
-        mesh_edit.check_writable(checked.obj)
+        group = splat_group.members(context.view_layer, checked.obj)
+        for member in group:
+            mesh_edit.check_writable(member.obj)
         quality = settings.estimates or context.scene.refine.budget == "psnr"
-        splats = splat_object.gather(checked, whole=None if quality else False)
-        origin = staleness.origin(context, checked.obj)
-        return _Scoring(splats, views, settings, quality, origin)
+        splats = splat_group.gather(group, whole=None if quality else False)
+        origins = [staleness.origin(context, member.obj) for member in group]
+        names = splat_group.names_of(group)
+        return _Scoring(splats, views, settings, quality, names, origins)
 
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
@@ -138,28 +159,30 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     def finish(
         self,
         context: bpy.types.Context,
-        checked: SplatObject,
+        _checked: SplatObject,
         job: _Scoring,
         found: tuple[Scores, NDArray[np.int64]],
     ) -> Answer:
-        """Store the scores on the mesh and say what came of it."""
+        """Store the scores on the meshes and say what came of it."""
         scores, counts = found
         names = [view.name for view in job.views]
         cameras = list(zip(names, counts.tolist(), strict=True))
-        mesh_scores.store(checked, scores, job.settings, job.origin, cameras)
+        group = splat_group.by_names(job.names)
+        splat_group.store(group, scores, job.settings, job.origins, cameras)
         plans.refresh(context)
         unseen = int((scores.seen == 0).sum())
         self.report(
             {"INFO"},
-            f"Scored {len(scores.values):,} splats by {scores.views_used} of "
+            f"Scored {len(scores.values):,} splats{_of_objects(group)} by {scores.views_used} of "
             f"{counted(scores.views_given, 'view')}; {unseen:,} lie in none",
         )
-        for note in (*scoring_notes(scores), *splat_object.modifier_notes(checked.obj)):
+        modified = [note for m in group for note in splat_object.modifier_notes(m.obj)]
+        for note in (*scoring_notes(scores), *modified):
             self.report({"WARNING"}, note)
         return {"FINISHED"}
 
 
-class REFINE_OT_plan(_OnScored, bpy.types.Operator):
+class REFINE_OT_plan(OnScored, bpy.types.Operator):
     """Work out again how many splats stay and go"""
 
     bl_idname = "refine.plan"
@@ -172,7 +195,15 @@ class REFINE_OT_plan(_OnScored, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
+@dataclass(frozen=True, eq=False)
+class _Applying:
+    """What is to be decided, and of which objects."""
+
+    task: Task
+    names: tuple[str, ...]
+
+
+class REFINE_OT_apply(OnThread, OnScored, bpy.types.Operator):
     """Delete the splats that the budget does not keep; with Absorb, survivors take them over"""
 
     bl_idname = "refine.apply"
@@ -186,39 +217,36 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
             return self.execute(context)
         return super().invoke(context, event)
 
-    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> Task:
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Applying:
         """Gather the scores that decide; to absorb, splats and views besides."""
-        settings = context.scene.refine
-        mesh_edit.check_deletable(checked.obj)
-        return splat_object.stored_task(
-            checked,
-            settings.to_budget(),
-            settings.protect,
-            settings=settings.to_settings(),
-            views=chosen_views(context) if settings.absorb else None,
-        )
+        group = splat_group.members(context.view_layer, checked.obj)
+        for member in group:
+            mesh_edit.check_deletable(member.obj)
+        return _Applying(apply_task(context, group), splat_group.names_of(group))
 
     @staticmethod
-    def work(task: Task, progress: Progress) -> Result:
+    def work(job: _Applying, progress: Progress) -> Result:
         """Decide which splats stay, and what they absorb."""
-        return pipeline.decide(task, progress=progress)
+        return pipeline.decide(job.task, progress=progress)
 
     def finish(
-        self, context: bpy.types.Context, checked: SplatObject, task: Task, result: Result
+        self, context: bpy.types.Context, _checked: SplatObject, job: _Applying, result: Result
     ) -> Answer:
         """Delete what does not stay, and change what absorbed it."""
         context.view_layer.update()
-        changed = staleness.changes(context, checked.obj)
-        if result.absorbed and not task.budget.needs_scores:
+        group = splat_group.by_names(job.names)
+        changed = staleness.changes_of(context, [member.obj for member in group])
+        if result.absorbed and not job.task.budget.needs_scores:
             changed = []  # nothing went by the scores
-        done = splat_object.apply_object(checked, result)
-        plans.forget(checked.mesh)
+        done = splat_group.apply(group, result)
+        for member in group:
+            plans.forget(member.mesh)
         psnr = result.report["estimated_psnr"]
         if result.absorbed:
             self.report({"INFO"}, result.absorbed.note())
         self.report(
             {"INFO"},
-            f"Kept {done.kept:,} splats, removed {done.removed:,}: "
+            f"Kept {done.kept:,} splats{_of_objects(group)}, removed {done.removed:,}: "
             f"{done.bytes_before / 1e6:,.1f} -> {done.bytes_after / 1e6:,.1f} MB"
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
+from .. import splat_group
 from ..cameras.sets import chosen_cameras
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
@@ -47,9 +48,16 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
             text = "Colours were lost: open it in Blender 5.2" if lost else _NONE
             wrapped.label(layout, context, text, icon="ERROR" if lost else "INFO")
             return
-        count = mesh_layout.splat_count(obj.data)
-        layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
-        layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
+        objects = splat_group.chosen(context.view_layer, obj)
+        count = sum(mesh_layout.splat_count(each.data) for each in objects)
+        several = len(objects) > 1
+        name = counted(len(objects), "object") if several else obj.name
+        layout.label(text=name, icon="OUTLINER_OB_POINTCLOUD")
+        degree = max(mesh_layout.sh_degree(each.data) for each in objects)
+        layout.label(text=f"{count:,} splats, SH degree {degree}")
+        if several:
+            wrapped.label(layout, context, "Scored and pruned as one scene", icon="INFO")
+            return
         size = kept.answer("bytes", context, lambda: mesh_layout.export_bytes(obj))
         if size is not None:
             layout.label(text=f"{size / 1e6:,.1f} MB")
@@ -128,8 +136,10 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         if record:
             views = counted(record["views_given"], "view")
             layout.label(text=f"Scored by {record['views_used']} of {views}", icon="CHECKMARK")
-            question = ("changes", obj.data.get(mesh_scores.RECORD))
-            changed = kept.answer(question, context, lambda: staleness.changes(context, obj))
+            objects = splat_group.chosen(context.view_layer, obj)
+            records = tuple(each.data.get(mesh_scores.RECORD) for each in objects)
+            question = ("changes", records)
+            changed = kept.answer(question, context, lambda: staleness.changes_of(context, objects))
             if changed:
                 text = f"Score again: {', '.join(changed)}"
                 wrapped.label(layout, context, text, icon="ERROR")
@@ -212,6 +222,8 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
             _draw_plan(layout, context, record)
         if _draw_progress(layout, context):
             return
+        if record:
+            layout.operator("refine.compare", icon="IMAGE_DATA")
         layout.operator("refine.apply", icon="TRASH")
 
 

@@ -90,6 +90,31 @@ def test_the_viewport_shows_splats_as_the_reference_renderer(
     assert found["handlers"] == [1, 0]
 
 
+def test_compare_shows_before_after_and_difference_in_a_window_of_their_own(
+    binary: Binary, blend: Path
+):
+    """One click: three thirds of a window; the next click, at 90 % removed, changes them in place.
+
+    The images are 240 x 160, the render size. Nothing asks to be saved on leaving.
+    """
+    try:
+        found = binary.window_step("compare", blend, pictures=binary.work)
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+
+    names = ["Compare: before", "Compare: after", "Compare: difference"]
+    for shown in (found["first"], found["again"]):
+        assert shown["areas"] == names
+        assert shown["images"] == sorted(names)
+        assert shown["windows"] == 2
+        assert shown["size"] == [240, 160]
+        assert shown["unsaved"] == []
+        assert max(shown["widths"]) - min(shown["widths"]) <= 8
+    assert found["larger"]
+
+
 def _psnr(seen: dict, picture: Path, cloud: Path) -> float:
     """Return how close a view in a picture of the screen is to the reference renderer, dB."""
     view, window = np.array(seen["view"]), np.array(seen["window"])
