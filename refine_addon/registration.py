@@ -8,7 +8,7 @@ from bpy.props import FloatProperty, PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
-from .ui import camera_list, kept, plans, price
+from .ui import camera_list, kept, plans, price, translations
 from .ui.camera_list import REFINE_PT_camera_list, REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
@@ -32,6 +32,7 @@ from .ui.panel import (
     REFINE_PT_score,
     REFINE_PT_splats,
 )
+from .ui.preferences import RefinePreferences
 from .ui.properties import RefineSettings
 from .ui.view_operators import REFINE_OT_view
 from .viewport import draw
@@ -40,6 +41,7 @@ from .webp import BlenderImages
 CLASSES = (
     RefineCamera,
     RefineSettings,
+    RefinePreferences,
     REFINE_OT_import_ply,
     REFINE_OT_import_cameras,
     REFINE_OT_find_floaters,
@@ -80,6 +82,7 @@ def register() -> None:
     bpy.types.WindowManager.refine_progress = FloatProperty(default=-1.0, options={"SKIP_SAVE"})
     bpy.types.TOPBAR_MT_file_import.append(_draw_import)
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
+    translations.register()
     camera_list.register()
     kept.register()
     price.register()
@@ -96,6 +99,7 @@ def unregister() -> None:
     price.unregister()
     kept.unregister()
     camera_list.unregister()
+    translations.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)
     bpy.types.TOPBAR_MT_file_import.remove(_draw_import)
     del bpy.types.WindowManager.refine_progress

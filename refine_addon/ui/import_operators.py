@@ -3,6 +3,7 @@
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import bpy
@@ -19,16 +20,21 @@ from ..core.formats.registry import SUFFIXES, read_splats
 from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
 from ..viewport import draw
+from . import preferences
 from .on_thread import FAILURES, Answer, described, fail
+from .properties import UPRIGHT_TEXT
 from .wrapped import counted
 
 FILE_NAMES = ";".join(f"*{suffix}" for suffix in SUFFIXES)
 """What a file browser shows."""
 
-UPRIGHT_TEXT = (
-    "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "
-    "z-up world of Blender"
-)
+FOLDER = "refine_folder"
+"""Custom property of an imported object: the folder of its file."""
+
+_CAMERAS = ("cameras.json", "transforms.json", "sparse", "cameras.bin", "cameras.txt")
+"""What lies where the cameras of a capture are."""
+
+_ABOVE = 3  # folders above the splats in which their cameras are looked for
 
 
 class _InObjectMode:
@@ -48,7 +54,7 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
 
     bl_idname = "refine.import_ply"
     bl_label = "Import Splats"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options = {"REGISTER", "UNDO", "PRESET"}
 
     filename_ext = ".ply"
     filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
@@ -60,6 +66,7 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
         """Ask for the files, or only for the options where files were dropped."""
+        preferences.suggest(self, context, "upright")
         return self.invoke_popup(context)
 
     def execute(self, context: bpy.types.Context) -> Answer:
@@ -80,6 +87,7 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
         for obj in imported:
             obj.select_set(True)
         context.view_layer.objects.active = imported[-1]
+        preferences.give_defaults(context)
         if not bpy.app.background:
             draw.show("SCENE")
         count = sum(len(obj.data.vertices) for obj in imported)
@@ -99,6 +107,7 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
             raise RefineError(msg)
         mesh = mesh_attributes.mesh_from_file(file)
         obj = bpy.data.objects.new(mesh.name, mesh)
+        obj[FOLDER] = str(path.parent.absolute())
         if self.upright:
             obj.matrix_world = mathutils.Matrix(UPRIGHT.tolist())
         _target(context).objects.link(obj)
@@ -112,7 +121,7 @@ class REFINE_OT_import_cameras(_InObjectMode, bpy.types.Operator, ImportHelper):
 
     bl_idname = "refine.import_cameras"
     bl_label = "Import Cameras"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options = {"REGISTER", "UNDO", "PRESET"}
 
     filename_ext = ".json"
     filter_glob: StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})
@@ -131,7 +140,12 @@ class REFINE_OT_import_cameras(_InObjectMode, bpy.types.Operator, ImportHelper):
         obj = context.object
         if mesh_layout.looks_like_splats(obj) and not self.properties.is_property_set("upright"):
             self.upright = np.allclose(np.array(obj.matrix_world)[:3, :3], UPRIGHT[:3, :3])
-        return self.invoke_popup(context)
+        folder = None if self.properties.is_property_set("filepath") else _capture_folder(obj)
+        if folder is None:
+            return self.invoke_popup(context)
+        self.filepath = os.path.join(folder, "")  # noqa: PTH118 - ends in a separator
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Import the cameras into a collection of their own."""
@@ -169,6 +183,22 @@ class REFINE_FH_ply(bpy.types.FileHandler):
     def poll_drop(cls, context: bpy.types.Context) -> bool:
         """Tell whether files can be dropped here."""
         return context.area is not None and context.area.type == "VIEW_3D"
+
+
+def _capture_folder(obj: bpy.types.Object | None) -> Path | None:
+    """Return where the cameras of a splat object may lie: where its file came from, or above it.
+
+    Trained scenes have their splats some folders below their cameras, in
+    ``point_cloud/iteration_30000``.
+    """
+    noted = obj.get(FOLDER) if obj is not None else None
+    if not isinstance(noted, str) or not noted or not os.path.isdir(noted):  # noqa: PTH112
+        return None
+    folder = Path(noted)
+    for place in (folder, *folder.parents[:_ABOVE]):
+        if any((place / name).exists() for name in _CAMERAS):
+            return place
+    return folder
 
 
 def _target(context: bpy.types.Context) -> bpy.types.Collection:

@@ -30,6 +30,7 @@ from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
 from ..viewport import draw
 from . import plans, preview, staleness
+from .adjust import Adjustable
 from .import_operators import FILE_NAMES
 from .on_thread import FAILURES, Answer, OnThread, fail
 from .wrapped import counted
@@ -203,7 +204,7 @@ class _Applying:
     names: tuple[str, ...]
 
 
-class REFINE_OT_apply(OnThread, OnScored, bpy.types.Operator):
+class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
     """Delete the splats that the budget does not keep; with Absorb, survivors take them over"""
 
     bl_idname = "refine.apply"
@@ -211,8 +212,28 @@ class REFINE_OT_apply(OnThread, OnScored, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
     doing = "Absorbing splats"
 
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run, and if not, why.
+
+        Also where it has run: to adjust it, Blender asks before it undoes it.
+        """
+        if not super().poll(context):
+            return False
+        mesh = context.object.data
+        if mesh_scores.record(mesh) is None and mesh_scores.RANK not in mesh.attributes:
+            cls.poll_message_set("Score the splats first")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Do all of it at once; adjusted, by another budget than that of the panel."""
+        self.adjust(context)
+        return super().execute(context)
+
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Delete at once; absorb on a thread."""
+        self.adjust(context)
         if not context.scene.refine.absorb:
             return self.execute(context)
         return super().invoke(context, event)
@@ -422,7 +443,7 @@ class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
 
     bl_idname = "refine.export_ply"
     bl_label = "Export Splats"
-    bl_options = {"REGISTER"}
+    bl_options = {"REGISTER", "PRESET"}
 
     filename_ext = ".ply"
     filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})

@@ -224,7 +224,9 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
             return
         if record:
             layout.operator("refine.compare", icon="IMAGE_DATA")
-        layout.operator("refine.apply", icon="TRASH")
+        row = layout.row()
+        row.enabled = record is not None
+        row.operator("refine.apply", icon="TRASH")
 
 
 class REFINE_PT_export(_InSidebar, bpy.types.Panel):
