@@ -21,7 +21,7 @@ from .core.errors import RefineError
 from .core.file_to_file import picture_facts
 from .core.formats.ply import columns_from_splats
 from .core.formats.registry import as_written, format_named, refuse_unknown_size
-from .core.report import Clock, Files, complete_report
+from .core.report import Clock, Files, complete_report, held
 from .core.survivors import survivor_columns
 from .core.task import DEFAULTS, Result, Settings, Task
 from .core.whole_file import expanded, refuse_existing
@@ -411,8 +411,14 @@ def prune_object(  # noqa: PLR0913 - the command's options
     result = pipeline.decide(task, clock=clock, progress=part(progress, 0.0, 0.8))
     sizes = _plan(checked, result.keep)
     columns = absorbed_columns(checked, result.absorbed) if result.absorbed and not dry_run else {}
-    if target is not None:
-        export_object(checked, target, keep=result.keep, columns=columns, overwrite=overwrite)
+    if target is None:
+        made = as_written(mesh_attributes.file_from_object(checked), output)
+    else:
+        made = export_object(
+            checked, target, keep=result.keep, columns=columns, overwrite=overwrite
+        )
+    result.report["splats"] |= held(made, result.keep, written=target is not None)
+    result.report["notes"] += made.notes(result.keep)
     if save and not dry_run:
         with mesh_edit.all_or_nothing(checked.obj):
             store(checked, result.scores, settings)
@@ -422,14 +428,15 @@ def prune_object(  # noqa: PLR0913 - the command's options
     if target is not None:
         used = views.spread(settings.views)
         result.report.update(written_facts(target, result.scores, used, matrix=matrix))
-    ahead = part(progress, 0.85, 1.0)
-    drawn = picture_facts(pictures, splats, result, target, views, matrix=matrix, progress=ahead)
+    drawn = picture_facts(
+        pictures, splats, result, target, views,
+        clock=clock, matrix=matrix, progress=part(progress, 0.85, 1.0),
+    )  # fmt: skip
     result.report.update(drawn)
-    clock.lap("pictures_s")
     result.report["notes"] += modifier_notes(checked.obj)
-    source, made = f"{bpy.data.filepath}#{name}", None if target is None else str(target)
+    source, output_name = f"{bpy.data.filepath}#{name}", None if target is None else str(target)
     after = sizes.bytes_after if target is None else target.stat().st_size
-    files = Files(source, made, sizes.bytes_before, after)
+    files = Files(source, output_name, sizes.bytes_before, after)
     complete_report(result.report, clock, files)
     return result.report
 

@@ -473,10 +473,13 @@ MUTANTS = {
     ],
     "levels/files.py": [
         (
-            "                (folder / MANIFEST).unlink(missing_ok=True)",
-            "                pass",
+            "    path.unlink(missing_ok=True)\n    return",
+            "    return",
             "old manifest",
         ),
+        ("_remove(set(before) - set(written), source)", "[]", "files of the run before"),
+        ("if _LEVEL.fullmatch(name)]", "]", "any file that a manifest names"),
+        ("            if path.samefile(source):", "            if False:", "the source itself"),
         ("                    path.unlink()\n", "                    pass\n", "levels left behind"),
     ],
     "scene.py": [
@@ -496,6 +499,8 @@ MUTANTS = {
         ("(seen.views > 0) & ", "", "who sees nothing sees past"),
         ("found[name] &= ~protected", "pass", "protected ones go"),
         ("sizes < SMALL", "sizes > SMALL", "clusters of any size"),
+        ("most | (some & (effect >= LOUD))", "most | some", "few views for what hardly shows"),
+        ("(WIDE / np.maximum(widest, WIDE))", "1.0", "haze over the picture stays"),
     ],
     "cleaning/clusters.py": [
         ("labels = jumped", "break", "parts that are not joined"),

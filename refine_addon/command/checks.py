@@ -14,6 +14,7 @@ from .report import is_report
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
 
@@ -40,6 +41,8 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
         parser.error(str(error))
     if given.command == "prune":
         _check_prune(parser, given)
+    elif given.command == "clean":
+        _check_files(parser, given)
     elif given.command == "score":
         _check_score(parser, given)
     if given.cameras is None and not (given.scene and open_blend()):
@@ -165,6 +168,10 @@ def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
         if not (given.output or given.save or given.dry_run):
             parser.error("--object needs -o OUT.ply, --save or --dry-run")
     else:
+        if given.save:
+            parser.error("--save goes with --object")
+        if not (given.output or given.output_dir or given.dry_run):
+            parser.error("expected -o OUT.ply, --output-dir DIR or --dry-run")
         _check_files(parser, given)
 
 
@@ -177,21 +184,33 @@ def _check_score(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
 
 
 def _check_files(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
-    if given.save:
-        parser.error("--save goes with --object")
     if given.output and given.output_dir:
         parser.error("expected -o or --output-dir, and not both")
-    if not (given.output or given.output_dir or given.dry_run):
-        parser.error("expected -o OUT.ply, --output-dir DIR or --dry-run")
     if given.output and len(given.inputs) > 1:
         parser.error(f"-o takes one input, got {len(given.inputs)}: use --output-dir")
-    if given.output_dir and (name := _double([path.name for path in given.inputs])):
-        parser.error(f"two inputs are called {name}: they would be one file in --output-dir")
-    names = [without_suffix(path.name) for path in given.inputs]
-    if given.pictures and (name := _double(names)):
-        parser.error(f"two inputs are called {name}: they would be one picture in --pictures")
+    if given.output_dir:
+        _refuse_doubles(parser, given.inputs, lambda path: given.output_dir / path.name)
+    if given.pictures:
+        _refuse_doubles(
+            parser,
+            given.inputs,
+            lambda path: given.pictures / f"{without_suffix(path.name)}-CAMERA-after.png",
+            "--pictures",
+        )
 
 
-def _double(names: list[str]) -> str | None:
-    """Return the first of some names that is there twice."""
-    return next((name for name in names if names.count(name) > 1), None)
+def _refuse_doubles(
+    parser: argparse.ArgumentParser,
+    inputs: Sequence[Path],
+    made: Callable[[Path], Path],
+    option: str = "--output-dir or -o",
+) -> None:
+    """Refuse two inputs of which the same file would be made."""
+    first: dict[Path, Path] = {}
+    for path in inputs:
+        other = first.setdefault(made(path), path)
+        if other is not path:
+            parser.error(
+                f"{other} and {path} would both be {made(path)}: call the command for each, with "
+                f"its own {option}"
+            )

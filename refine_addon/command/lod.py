@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 from ..core.levels.files import lod_file
 from ..core.quality import in_words
+from ..core.report import size_in_words
 from .options import levels, settings
+from .words import by, left_unseen
 
 if TYPE_CHECKING:
     import argparse
@@ -37,11 +39,13 @@ def make_levels(
         progress=progress,
     )
     terminal.clear()
-    count, seconds = done["source"]["splats"], done["timings"]["total_s"]
+    count, made = done["splats"]["before"], len(done["levels"])
     terminal.say(
-        f"{source}: {len(done['levels'])} levels of {count:,} splats, {seconds:.2f} s "
-        f"-> {options.output_dir}"
+        f"{source}: {made} level{'s' if made > 1 else ''} of {count:,} splats, "
+        f"{by(done['views'])}, {done['timings']['total_s']:.2f} s -> {options.output_dir}"
     )
+    if done["splats"]["unseen"]:
+        terminal.say(f"  {left_unseen(done['splats']['unseen'], count)}")
     for entry in done["levels"]:
         terminal.say(f"  {_in_words(entry, done['goal_psnr'])}")
     terminal.notes(done["notes"])
@@ -50,7 +54,7 @@ def make_levels(
 
 def _in_words(entry: dict[str, Any], goal: float) -> str:
     """Return what there is to know of a level, on one line."""
-    parts = [f"{entry['splats']:,} splats", f"{entry['bytes'] / 1e6:,.1f} MB"]
+    parts = [f"{entry['splats']:,} splats", size_in_words(entry["bytes"])]
     if entry["psnr"] is not None:
         parts.append(in_words(entry["psnr"]))
     far = entry["distance_psnr"]

@@ -41,7 +41,8 @@ EXAMPLES = {
     ),
     "clean": (
         "refine clean in.ply --cameras cameras.json",
-        "refine clean in.ply --cameras cameras.json --reasons front isolated -o out.ply",
+        "refine clean *.ply --cameras cameras.json --output-dir cleaned",
+        "refine clean in.ply --cameras cameras.json --reasons front,isolated -o out.ply",
     ),
     "lod": (
         "refine lod in.ply --cameras cameras.json -o levels",
@@ -105,16 +106,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     prune.add_argument(
         "--save", action="store_true", help="with --object: delete the splats there and save"
     )
-    prune.add_argument(
-        "-o",
-        "--output",
-        type=_path,
-        metavar="OUT.ply",
-        help="for a single input; written in the format of its suffix",
-    )
-    prune.add_argument(
-        "--output-dir", type=_path, metavar="DIR", help="for many inputs; made if it is not there"
-    )
+    _add_outputs(prune)
     amount = prune.add_mutually_exclusive_group()
     amount.add_argument(
         "--ratio",
@@ -163,18 +155,17 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
 
 def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     cleaning = _add(commands, "clean", "remove what the cameras see to float in the air")
-    cleaning.add_argument("inputs", nargs=1, type=_given, metavar="INPUT", help="a file of splats")
     cleaning.add_argument(
-        "-o", "--output", type=_path, metavar="OUT.ply", help="without it, only say what would go"
+        "inputs", nargs="+", type=_given, metavar="INPUT", help=f"files: {FORMATS}"
     )
+    _add_outputs(cleaning, "; without it, only say what would go")
     _add_cameras(cleaning)
     cleaning.add_argument(
         "--reasons",
-        nargs="+",
-        choices=REASONS,
+        type=_words,
         default=Cleaning.reasons,
-        metavar="REASON",
-        help=f"which to remove, of {', '.join(REASONS)} (default: {' '.join(Cleaning.reasons)})",
+        metavar="R,R,...",
+        help=f"which to remove, of {', '.join(REASONS)} (default {','.join(Cleaning.reasons)})",
     )
     _add_views(cleaning)
     _add_common(cleaning)
@@ -226,6 +217,7 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
     )
     making.add_argument(
         "--format",
+        type=str.lower,
         choices=SUFFIXES,
         default=SUFFIXES[0],
         metavar="SUFFIX",
@@ -270,6 +262,19 @@ def _add_object(parser: argparse.ArgumentParser) -> None:
         metavar="A:B:STEP",
         help="with --object: the active camera decides, at frame A and every STEP-th after it to B "
         "(every one without STEP); --source frames alone takes the panel's range",
+    )
+
+
+def _add_outputs(parser: argparse.ArgumentParser, more: str = "") -> None:
+    parser.add_argument(
+        "-o",
+        "--output",
+        type=_path,
+        metavar="OUT.ply",
+        help=f"for a single input; written in the format of its suffix{more}",
+    )
+    parser.add_argument(
+        "--output-dir", type=_path, metavar="DIR", help="for many inputs; made if it is not there"
     )
 
 
@@ -340,6 +345,11 @@ def _numbers(text: str) -> tuple[float, ...]:
     except ValueError as error:
         msg = f"expected numbers with commas between them, got {text!r}"
         raise argparse.ArgumentTypeError(msg) from error
+
+
+def _words(text: str) -> tuple[str, ...]:
+    """Return words between commas."""
+    return tuple(word.strip() for word in text.split(","))
 
 
 def _name(text: str) -> str:

@@ -14,7 +14,7 @@ from ..core.errors import printable
 from ..core.formats.registry import without_suffix
 from ..core.picture_files import PictureFiles
 from ..core.quality import UNSEEN, in_words
-from ..core.report import scoring_notes
+from ..core.report import held, kept_and_removed, scoring_notes, seen_by, what_was_seen
 from ..core.whole_file import refuse_existing, refuse_mapped
 from . import report
 from .cameras import deciding
@@ -24,6 +24,7 @@ from .lod import make_levels
 from .options import budget, cleaning, settings
 from .pace import Pace
 from .terminal import Terminal, complain, described
+from .words import by, left_unseen, sizes, written
 
 if TYPE_CHECKING:
     import argparse
@@ -49,7 +50,7 @@ def execute(options: argparse.Namespace) -> bool:
     works = {
         "prune": _prune,
         "score": _score,
-        "clean": _clean,
+        "clean": lambda run: _each(run, _clean_one),
         "lod": _lod,
         "convert": _convert,
         "info": _info,
@@ -90,6 +91,11 @@ class _Run:
         if words := self._cameras["cameras"].get("words"):
             self.terminal.say(f"  cameras: {words}")
 
+    def say_unseen(self, unseen: int, scored: int) -> None:
+        """Say how many of the splats that were scored no view holds, if any."""
+        if unseen:
+            self.terminal.say(f"  {left_unseen(unseen, scored)}")
+
     def attempt(self, label: str, work: Callable[[], dict[str, Any]]) -> None:
         """Do one input's work; note its error, so that the others go on."""
         self._pace.next()
@@ -111,7 +117,8 @@ class _Run:
         if options.report is None:
             return
         writes = options.command != "info" and not getattr(options, "dry_run", False)
-        writes = writes and (options.command != "clean" or options.output is not None)
+        if options.command == "clean":
+            writes = bool(options.output or options.output_dir)
         report.write(
             options.report,
             self.entries,
@@ -126,11 +133,19 @@ def _prune(run: _Run) -> None:
     if options.object:
         run.attempt(options.object, lambda: _prune_object(run))
         return
-    views = run.views()
-    if options.output_dir and not options.dry_run:
+    _each(run, _prune_one)
+
+
+def _each(run: _Run, work: Callable[[_Run, Path, Path | None, ViewSet], dict[str, Any]]) -> None:
+    """Do the work of every input: with its output, if there is to be one, and the views."""
+    options, views = run.options, run.views()
+    if options.output_dir and not getattr(options, "dry_run", False):
         _make_folder(options.output_dir)
     for source in options.inputs:
-        run.attempt(str(source), lambda source=source: _prune_one(run, source, views))
+        output = options.output_dir / source.name if options.output_dir else options.output
+        run.attempt(
+            str(source), lambda source=source, output=output: work(run, source, output, views)
+        )
 
 
 def _make_folder(folder: Path) -> None:
@@ -149,11 +164,8 @@ def _pictures(options: argparse.Namespace, name: str) -> PictureFiles | None:
     return PictureFiles(options.pictures, name, options.overwrite)
 
 
-def _prune_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
+def _prune_one(run: _Run, source: Path, output: Path | None, views: ViewSet) -> dict[str, Any]:
     options = run.options
-    output = options.output
-    if options.output_dir:
-        output = options.output_dir / source.name
     result = prune_file(
         source,
         output,
@@ -197,19 +209,19 @@ def _prune_object(run: _Run) -> dict[str, Any]:
 def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
     splats, views, files = done["splats"], done["views"], done["files"]
     verb = "would keep" if run.options.dry_run else "kept"
-    sizes = _megabytes(files["input_bytes"], files["output_bytes"])
     share = splats["removed"] / splats["before"]
     parts = [
-        f"{verb} {splats['kept']:,} of {splats['before']:,} splats ({share:.1%} removed)",
-        sizes,
-        f"by {views['used']} of {views['given']} views",
+        f"{verb} {splats['kept']:,} of {splats['before']:,} splats ({share:.1%} removed)"
+        + written(splats),
+        sizes(files["input_bytes"], files["output_bytes"]),
+        by(views),
         f"{done['timings']['total_s']:.2f} s",
     ]
     target = f" -> {files['output']}" if files["output"] else ""
     run.terminal.say(f"{run.named(label)}: {', '.join(parts)}{target}")
     run.say_cameras()
     cleaned = sum(count for count in done.get("cleaned", {}).values() if isinstance(count, int))
-    _say_unseen(run, splats["unseen"], splats["before"] - cleaned)
+    run.say_unseen(splats["unseen"], splats["before"] - cleaned)
     if "cleaned" in done:
         run.terminal.say(f"  cleaned: {done['cleaned']['words']}")
     quality = _quality(done)
@@ -221,18 +233,6 @@ def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
     run.terminal.notes(done["notes"])
 
 
-def _say_unseen(run: _Run, unseen: int, scored: int) -> None:
-    """Say how many of the splats that were scored no view holds, if any."""
-    if unseen:
-        run.terminal.say(f"  {unseen:,} of {scored:,} splats lie in no view")
-
-
-def _megabytes(before: int, after: int | None) -> str:
-    if after is None:  # only writing tells
-        return f"of {before / 1e6:,.1f} MB"
-    return f"{before / 1e6:,.1f} -> {after / 1e6:,.1f} MB"
-
-
 def _quality(done: dict[str, Any]) -> str:
     """Return what is estimated of the pictures, in words; "" where nothing is."""
     psnr, absorbed = done["estimated_psnr"], done["estimated_psnr_absorbed"]
@@ -241,8 +241,10 @@ def _quality(done: dict[str, Any]) -> str:
     words = f"{in_words(psnr)} in these views"
     if done.get("written_psnr") is not None:
         words += f", {in_words(done['written_psnr'])} as written"
-    if absorbed is None or "absorbed" in done or psnr > UNSEEN:
+    if "absorbed" in done or psnr > UNSEEN:
         return words
+    if absorbed is None:
+        return f"{words}; {done['estimated_psnr_absorbed_note']}"
     return f"{words}; with --absorb {in_words(absorbed)}"
 
 
@@ -289,14 +291,13 @@ def _write_scores(
         f"{label}: scored {len(file):,} splats by {scores.views_used} views -> {output}"
     )
     run.say_cameras()
-    unseen = int(np.count_nonzero(scores.seen == 0))
-    _say_unseen(run, unseen, len(file))
+    seen = seen_by(scores)
+    run.say_unseen(seen["splats"]["unseen"], len(file))
     notes = [*scoring_notes(scores), *more_notes]
     run.terminal.notes(notes)
     return {
         "files": {"input": label, "output": str(output)},
-        "splats": {"before": len(file), "undrawable": scores.undrawable, "unseen": unseen},
-        "views": {"given": scores.views_given, "used": scores.views_used},
+        **seen,
         "settings": asdict(settings(options)),
         "weights": scores.facts,
         "notes": notes,
@@ -315,9 +316,12 @@ def _convert_one(run: _Run, source: Path) -> dict[str, Any]:
     file = read_splats(source)
     made = as_written(file, output)
     made.write(output, overwrite=overwrite)
-    size, notes = output.stat().st_size, made.notes(np.ones(len(file), np.bool_))
+    everything = np.ones(len(file), np.bool_)
+    size, notes = output.stat().st_size, made.notes(everything)
+    splats = {"before": len(file), **held(made, everything)}
     run.terminal.say(
-        f"{source}: {len(file):,} splats, {_megabytes(file.stored_bytes, size)} -> {output}"
+        f"{source}: {len(file):,} splats{written(splats)}, {sizes(file.stored_bytes, size)} "
+        f"-> {output}"
     )
     run.terminal.notes(notes)
     return {
@@ -327,36 +331,42 @@ def _convert_one(run: _Run, source: Path) -> dict[str, Any]:
             "input_bytes": file.stored_bytes,
             "output_bytes": size,
         },
-        "splats": {"before": len(file)},
+        "splats": splats,
         "notes": notes,
     }
 
 
-def _clean(run: _Run) -> None:
-    views, source = run.views(), run.options.inputs[0]
-    run.attempt(str(source), lambda: _clean_one(run, source, views))
-
-
-def _clean_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
+def _clean_one(run: _Run, source: Path, output: Path | None, views: ViewSet) -> dict[str, Any]:
     options = run.options
-    if options.output:
-        refuse_existing(options.output, overwrite=options.overwrite)
-        refuse_mapped(options.output, source)
+    if output:
+        refuse_existing(output, overwrite=options.overwrite)
+        refuse_mapped(output, source)
     file = read_splats(source)
     progress = run.progress(source.name)
     found = clean(file.splats(), views, cleaning(options), progress=progress)
-    made = as_written(file, options.output)
-    if options.output:
-        made.write(options.output, found.keep, overwrite=options.overwrite)
+    made = as_written(file, output)
+    if output:
+        made.write(output, found.keep, overwrite=options.overwrite)
     run.terminal.clear()
-    kept, to = int(found.keep.sum()), f" -> {options.output}" if options.output else ""
-    run.terminal.say(f"{source}: {found.in_words()}; {kept:,} of {len(file):,} splats stay{to}")
-    notes = made.notes(found.keep)
+    facts = what_was_seen(found.seen, found.undrawable, found.views_given, found.views_used)
+    splats: dict[str, Any] = {
+        **facts["splats"],
+        **kept_and_removed(found.keep),
+        **held(made, found.keep, written=output is not None),
+    }
+    to = f" -> {output}" if output else ""
+    run.terminal.say(
+        f"{run.named(str(source))}: {found.in_words()}; {splats['kept']:,} of {len(file):,} splats "
+        f"stay{written(splats)}, {by(facts['views'])}{to}"
+    )
+    run.say_cameras()
+    run.say_unseen(splats["unseen"], len(file))
+    notes = [*found.notes(), *made.notes(found.keep)]
     run.terminal.notes(notes)
     return {
-        "files": {"input": str(source), "output": str(options.output) if to else None},
-        "splats": {"before": len(file), "kept": kept, "removed": len(file) - kept},
-        "views": {"given": len(views)},
+        "files": {"input": str(source), "output": str(output) if output else None},
+        "splats": splats,
+        "views": facts["views"],
         "settings": asdict(found.settings),
         "cleaned": found.facts(),
         "notes": notes,

@@ -17,7 +17,7 @@ from .formats.registry import (
     refuse_unknown_size,
 )
 from .pipeline import decide
-from .report import Clock, Files, complete_report
+from .report import Clock, Files, complete_report, held, kept_and_removed
 from .survivors import survivor_columns
 from .task import DEFAULTS, Result, Settings, Task
 from .whole_file import expanded, refuse_existing, refuse_mapped
@@ -131,10 +131,10 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
         result.report.update(written_facts(written, result.scores, used, threads=threads))
     drawn = picture_facts(
         pictures, file.splats(), result, written, views,
-        progress=part(progress, 0.85, 1.0), threads=threads,
+        clock=clock, progress=part(progress, 0.85, 1.0), threads=threads,
     )  # fmt: skip
     result.report.update(drawn)
-    clock.lap("pictures_s")
+    result.report["splats"] |= held(made, result.keep, written=written is not None)
     result.report["notes"] += made.notes(result.keep)
     names = (str(file.path), None if written is None else str(written))
     complete_report(result.report, clock, Files(*names, *sizes))
@@ -148,6 +148,7 @@ def picture_facts(  # noqa: PLR0913 - what was pruned, and what to draw of it
     written: Path | None,
     views: ViewSet,
     *,
+    clock: Clock,
     matrix: NDArray[np.float64] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
@@ -165,6 +166,8 @@ def picture_facts(  # noqa: PLR0913 - what was pruned, and what to draw of it
         The file that holds what stays, if there is one: what a lossy format rounds is to be seen.
     views : ViewSet
         Those that decided.
+    clock : Clock
+        Gets the time that it took.
     matrix : (4, 4) float64, optional
         From the frame of the file to that of the views; by default they are the same. Where it
         scales directions differently, nothing that is rounded is seen.
@@ -184,7 +187,9 @@ def picture_facts(  # noqa: PLR0913 - what was pruned, and what to draw of it
         after = read_splats(written).splats()
         if not np.array_equal(matrix, np.eye(4)):
             after = transformed(after, matrix)
-    return {"pictures": pictures.write(splats, after, views, progress=progress, threads=threads)}
+    facts = pictures.write(splats, after, views, progress=progress, threads=threads)
+    clock.lap("pictures_s")
+    return {"pictures": facts}
 
 
 def _of_all(result: Result, cleaned: Cleaned) -> Result:
@@ -197,7 +202,6 @@ def _of_all(result: Result, cleaned: Cleaned) -> Result:
     absorbed = result.absorbed
     if absorbed is not None:
         absorbed = replace(absorbed, keep=keep)
-    total, kept = len(keep), int(np.count_nonzero(keep))
-    result.report["splats"] |= {"before": total, "kept": kept, "removed": total - kept}
+    result.report["splats"] |= {"before": len(keep), **kept_and_removed(keep)}
     result.report["cleaned"] = cleaned.facts()
     return replace(result, keep=keep, absorbed=absorbed)

@@ -13,7 +13,10 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _POINTER = b"version https://git-lfs.github.com/spec/"
-_GZIP, _ZIP, _SPZ = b"\x1f\x8b", b"PK\x03\x04", b"NGSP"
+GZIP = b"\x1f\x8b"
+"""The first bytes of a gzip file."""
+
+_ZIP, _SPZ = b"PK\x03\x04", b"NGSP"
 _CONVERT = "convert it to a plain 3DGS PLY first (SuperSplat and splat-transform do)"
 _READ = "'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
 
@@ -74,12 +77,13 @@ def foreign_kind(path: Path, head: bytes) -> str:
         return f"a {suffix} file: {_UNSIGNED[suffix]}"
     if head.startswith(_SPZ) or unpacked_beginning(head).startswith(_SPZ):
         return f"an SPZ file: {_READ}"
-    if head.startswith(_GZIP):
+    if head.startswith(GZIP):
         return "compressed with gzip: unpack it first"
-    if head.startswith(_ZIP) and (suffix == ".sog" or _lists_sog(path)):
-        return f"a SOG file: {_READ}"
     if head.startswith(_ZIP):
-        return "a ZIP archive: unpack it first"
+        sog = suffix == ".sog" or _lists_sog(path)
+        return f"a SOG file: {_READ}" if sog else "a ZIP archive: unpack it first"
+    if suffix == ".spz" and head and not head.startswith(b"ply"):
+        return f"a damaged SPZ file: begins with {head[:4]!r}, expected {_SPZ!r} or {GZIP!r}"
     return ""
 
 

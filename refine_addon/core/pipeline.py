@@ -17,8 +17,8 @@ import numpy as np
 from . import selection
 from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
-from .quality import left_to_lose
-from .report import Clock, make_report
+from .quality import FEWEST, left_to_lose, out_of_reach
+from .report import Clock, make_report, size_in_words
 from .scoring import auto, closed_form, occlusion, sight_lines
 from .selection import Budget
 from .task import DEFAULTS, Result, Settings, Task
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 UNSEEN = "the views see too little for an estimate of the pictures' quality"
 UNESTIMATED = "the closed form estimates the pictures' quality only if a PSNR is the budget"
+UNFORETOLD = f"what absorbing reaches is not foretold for fewer than {FEWEST:,} splats"
 """Why there is no estimate: notes of the report."""
 
 TRIES = 3
@@ -257,12 +258,26 @@ def decide(
     facts |= _quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
     if psnr is None and scores.sights is not None:
         facts["notes"].append(UNSEEN)
+    facts["budget_remark"] = _remark(task, keep, psnr)
+    if facts["budget_remark"]:
+        facts["notes"].append(facts["budget_remark"])
     if absorbed:
         facts["absorbed"] = absorbed.facts()
         facts["notes"].append(absorbed.note())
         if known and task.settings.method == "closed-form":
             facts["notes"].append("absorbing measures by occlusion: closed-form was not used")
     return Result(keep, scores, facts, absorbed)
+
+
+def _remark(task: Task, keep: NDArray[np.bool_], psnr: float | None) -> str:
+    """Return why a budget is out of reach or removes nothing, or ""."""
+    budget, gone = task.budget, len(keep) - int(np.count_nonzero(keep))
+    if budget.psnr is not None:
+        return out_of_reach(budget.psnr, gone, len(keep), psnr)
+    if budget.max_mb is not None and not gone:
+        rows = np.broadcast_to(task.row_bytes, len(keep)).sum() + task.fixed_bytes
+        return f"already {size_in_words(int(rows))}: nothing was removed"
+    return ""
 
 
 def _quality_facts(
@@ -280,15 +295,18 @@ def _quality_facts(
         Whether survivors absorbed the others.
     """
     curve, other = scores.quality, psnr if absorbed else None
-    if curve is not None and not absorbed:
+    if curve is not None and curve.foretold and not absorbed:
         other = curve.at(1.0 - float(np.mean(keep)), absorb=True)
-    why = None
+    why = why_other = None
     if psnr is None:
         why = UNESTIMATED if scores.sights is None else UNSEEN
+    if other is None:
+        why_other = UNFORETOLD if psnr is not None else why
     return {
         "estimated_psnr": None if psnr is None else round(psnr, 2),
         "estimated_psnr_absorbed": None if other is None else round(other, 2),
         "estimated_psnr_note": why,
+        "estimated_psnr_absorbed_note": why_other,
         "quality": curve.facts() if curve is not None else None,
     }
 

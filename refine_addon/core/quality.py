@@ -30,6 +30,16 @@ GAIN = (3.0, 4.5, 4.5, 4.3), (0.5, 0.55, 0.7, 0.85)
 """What absorbing gains over deleting at those shares, dB: a constant, and a part of what it gains
 on lines of sight."""
 
+ENOUGH = 40_000
+"""So many splats have, and more, gain that much."""
+
+FEWER = 0.2, 0.4, 0.8, 1.3
+"""By how much less fewer splats gain at those shares, dB for each halving: they have fewer
+neighbours of their kind to merge with."""
+
+FEWEST = 20_000
+"""Of fewer splats it is not foretold: scenes differ by up to 7 dB."""
+
 PLAIN = 0.1
 """Share removed up to which absorbing is plain deletion."""
 
@@ -51,6 +61,8 @@ class Quality:
         With these shares deleted, lowest scores first; dB, never rising.
     absorbed : (L,) float64
         About what absorbing reaches with as many survivors; dB, never rising.
+    foretold : bool
+        Whether that is near enough to be told to anybody.
 
     Examples
     --------
@@ -62,6 +74,7 @@ class Quality:
     shares: NDArray[np.float64]
     psnr: NDArray[np.float64]
     absorbed: NDArray[np.float64]
+    foretold: bool = True
 
     def at(self, share: float, *, absorb: bool = False) -> float:
         """Return the PSNR with a share of the splats removed, dB; with `absorb`, about.
@@ -92,12 +105,13 @@ class Quality:
         odds = np.concatenate([[_log_odds(0.0)], [_log_odds(float(s)) for s in self.shares]])
         return odds, np.concatenate([[PSNR_CAP], values])
 
-    def facts(self) -> dict[str, list[float]]:
+    def facts(self) -> dict[str, Any]:
         """Return the curve as plain JSON values."""
         return {
             "shares": self.shares.tolist(),
             "psnr": self.psnr.tolist(),
             "absorbed": self.absorbed.tolist(),
+            "foretold": self.foretold,
         }
 
     @classmethod
@@ -109,10 +123,13 @@ class Quality:
         except (KeyError, TypeError, ValueError):
             return None
         whole = len(shares) and shares.shape == psnr.shape == absorbed.shape == (len(shares),)
-        return cls(shares, psnr, absorbed) if whole else None
+        foretold = bool((facts or {}).get("foretold", True))
+        return cls(shares, psnr, absorbed, foretold) if whole else None
 
 
-def absorbed_from(psnr: NDArray[np.float64], gains: NDArray[np.float64]) -> NDArray[np.float64]:
+def absorbed_from(
+    psnr: NDArray[np.float64], gains: NDArray[np.float64], count: int
+) -> NDArray[np.float64]:
     """Return about what absorbing reaches at `SHARES`, (L,), without absorbing; dB.
 
     On lines of sight it is known what the pictures would be if what goes stayed as opaque as it is
@@ -125,9 +142,12 @@ def absorbed_from(psnr: NDArray[np.float64], gains: NDArray[np.float64]) -> NDAr
         With the splats deleted, at `SHARES`.
     gains : (4,) float64
         By how much it is higher with them taken over in that way, at `TAKEN_OVER`.
+    count : int
+        How many splats there are.
     """
     constant, part = np.array(GAIN)
-    found = (constant + part * gains).clip(0.0)
+    halvings = max(math.log2(ENOUGH / max(count, 1)), 0.0)
+    found = (constant + part * gains - halvings * np.array(FEWER)).clip(0.0)
     gain = np.interp(SHARES, (PLAIN, *TAKEN_OVER), np.concatenate([[0.0], found]))
     return np.minimum.accumulate(np.minimum(psnr + gain, PSNR_CAP))
 
@@ -152,6 +172,36 @@ def left_to_lose(goal: float, psnr: float | None) -> float:
         return goal
     left = 10.0 ** (-goal / 10.0) - 10.0 ** (-psnr / 10.0)
     return -10.0 * math.log10(left) if left > 0.0 else math.inf
+
+
+def out_of_reach(goal: float, gone: int, count: int, psnr: float | None) -> str:
+    """Return what to say where a PSNR as budget cannot be had, or "".
+
+    Parameters
+    ----------
+    goal : float
+        The PSNR, dB.
+    gone, count : int
+        How many splats go, of how many.
+    psnr : float or None
+        The estimate with these removed, dB.
+
+    Examples
+    --------
+    >>> out_of_reach(99.0, 0, 100, 100.0)
+    'by the estimate nothing can go at 99 dB'
+    >>> out_of_reach(10.0, 95, 100, 16.2)
+    'the estimate ends at 95% removed, about 16 dB: for 10 dB no more goes'
+    """
+    if not gone:
+        return f"by the estimate nothing can go at {goal:g} dB"
+    at_end = gone >= math.floor(SHARES[-1] * count)
+    if at_end and psnr is not None and psnr > goal:
+        share = f"{SHARES[-1]:.0%}"
+        return (
+            f"the estimate ends at {share} removed, {in_words(psnr)}: for {goal:g} dB no more goes"
+        )
+    return ""
 
 
 def in_words(psnr: float) -> str:

@@ -12,6 +12,8 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from .formats.ply import SplatFile
+    from .formats.registry import Packed
     from .scores import Scores
     from .selection import Budget
     from .task import Settings
@@ -61,12 +63,71 @@ class Files:
     output_bytes: int | None
 
 
+def size_in_words(count: int) -> str:
+    """Return a number of bytes, in kB below .1 MB.
+
+    >>> size_in_words(4_940_000), size_in_words(32_000)
+    ('4.9 MB', '32.0 kB')
+    """
+    return f"{count / 1e3:,.1f} kB" if count < 1e5 else f"{count / 1e6:,.1f} MB"  # noqa: PLR2004
+
+
 def scoring_notes(scores: Scores) -> list[str]:
     """Return what the user should know about a scoring, in sentences."""
     notes = list(scores.notes)
     if scores.undrawable:
         notes.append(f"{scores.undrawable} splats cannot be drawn; they rank lowest")
     return notes
+
+
+def what_was_seen(
+    seen: NDArray[np.int32], undrawable: int, given: int, used: int
+) -> dict[str, dict[str, int]]:
+    """Return what every report says of the splats and the views, as plain JSON values.
+
+    Parameters
+    ----------
+    seen : (N,) int32
+        In how many of the views used each splat's centre lies.
+    undrawable : int
+        How many splats cannot be drawn.
+    given, used : int
+        How many views there were, and how many of them were used.
+    """
+    unseen = int(np.count_nonzero(seen == 0))
+    return {
+        "splats": {"before": len(seen), "undrawable": undrawable, "unseen": unseen},
+        "views": {"given": given, "used": used},
+    }
+
+
+def seen_by(scores: Scores) -> dict[str, dict[str, int]]:
+    """Return `what_was_seen` of a scoring."""
+    return what_was_seen(scores.seen, scores.undrawable, scores.views_given, scores.views_used)
+
+
+def kept_and_removed(keep: NDArray[np.bool_]) -> dict[str, int]:
+    """Return how many splats stay and go."""
+    kept = int(np.count_nonzero(keep))
+    return {"kept": kept, "removed": len(keep) - kept}
+
+
+def held(
+    made: SplatFile | Packed, keep: NDArray[np.bool_], *, written: bool = True
+) -> dict[str, int | None]:
+    """Return how many splats a file of the kept rows holds, and how many its format leaves out.
+
+    Parameters
+    ----------
+    made : SplatFile or Packed
+        What writes the file.
+    keep : (N,) bool
+    written : bool
+        Whether there is a file; without one, ``written`` is None.
+    """
+    missing = made.left_out(keep)
+    count = int(np.count_nonzero(keep)) - missing
+    return {"written": count if written else None, "left_out": missing}
 
 
 def make_report(
@@ -85,16 +146,10 @@ def make_report(
     clock : Clock
         The report shares its timings, so it also gets those of later laps.
     """
-    kept = int(np.count_nonzero(keep))
+    facts = seen_by(scores)
+    facts["splats"] |= kept_and_removed(keep)
     return {
-        "splats": {
-            "before": len(keep),
-            "kept": kept,
-            "removed": len(keep) - kept,
-            "undrawable": scores.undrawable,
-            "unseen": int(np.count_nonzero(scores.seen == 0)),
-        },
-        "views": {"given": scores.views_given, "used": scores.views_used},
+        **facts,
         "budget": {budget.kind: getattr(budget, budget.kind)},
         "settings": asdict(settings),
         "weights": scores.facts,

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .errors import RefineError
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -277,6 +279,19 @@ def drawable(splats: Splats) -> NDArray[np.bool_]:
         if not finite.all():  # rare; testing each row costs ten times as much
             good &= finite.reshape(len(splats), -1).all(axis=1)
     return good
+
+
+def refuse_undrawable(good: NDArray[np.bool_]) -> None:
+    """Raise `RefineError` if no splat can be drawn.
+
+    Parameters
+    ----------
+    good : (N,) bool
+        Which splats can be drawn.
+    """
+    if not good.any():
+        msg = f"none of the {len(good)} splats can be drawn: each is transparent or not finite"
+        raise RefineError(msg)
 
 
 _UNIT_TOLERANCE = 5e-7  # of the squared length: four squares, each rounded to float32

@@ -135,6 +135,11 @@ def by_views(seen: NDArray[np.int32], views: int) -> Histogram:
     return Histogram(bins, np.bincount(bins, minlength=count + 1), ticks, "views")
 
 
+def _ways(quality: Quality) -> list[tuple[str, bool]]:
+    """Return the curves that are drawn, and whether each is that of absorbing."""
+    return [("delete", False), ("absorb", True)][: 2 if quality.foretold else 1]
+
+
 class Chart:
     """The picture for one scoring; what does not change with the budget is drawn once.
 
@@ -206,10 +211,10 @@ class Chart:
             columns[shares <= quality.shares[-1]],
             shares[shares <= quality.shares[-1]],
         )
-        for name, absorb in (("absorb", True), ("delete", False)):
+        for name, absorb in reversed(_ways(quality)):
             heights = [self.at(share, quality.at(share, absorb=absorb))[1] for share in shares]
             canvas.curve(columns, np.array(heights), 2.0 * self._scale, colors[name])
-        self._legend(("delete", "absorb"), 0, "dB")
+        self._legend((name for name, _ in _ways(quality)), 0, "dB")
 
     def _draw_axis(self, ticks: Iterable[tuple[float, str]], y: float) -> None:
         self._rule(self._still, _LEFT, y, _RIGHT, 0.5)
@@ -250,7 +255,7 @@ class Chart:
     def _draw_place(self, strip: _Canvas, x: float, quality: Quality, place: Place) -> None:
         half, (top, bottom) = 0.5 * self._scale, (_TOP * self._scale, _MIDDLE * self._scale)
         strip.box((x - half, top, x + half, bottom), self.look.ink, 0.8)
-        for name, absorb in (("delete", False), ("absorb", True)):
+        for name, absorb in _ways(quality):
             y = self.at(place.share, quality.at(place.share, absorb=absorb))[1]
             chosen = absorb == place.absorb
             if chosen:

@@ -333,7 +333,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         self,
         _context: bpy.types.Context,
         checked: SplatObject,
-        _job: _Detail,
+        job: _Detail,
         levels: list[Level],
     ) -> Answer:
         """Make the objects and say what each level costs."""
@@ -343,6 +343,8 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
             for level in levels
         ]
         self.report({"INFO"}, f"'{collection.name}': {', '.join(told)} splats")
+        for note in job.levels.notes({level.asked: level.remark for level in levels}):
+            self.report({"WARNING"}, note)
         return {"FINISHED"}
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from .. import splat_group, splat_object
 from ..core import pipeline
 from ..core.errors import RefineError
-from ..core.quality import in_words
+from ..core.quality import in_words, out_of_reach
 from ..core.selection import Tally, quality_of
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
@@ -27,7 +27,6 @@ from . import camera_list, price
 from .chart import Place
 
 if TYPE_CHECKING:
-    from ..core.quality import Quality
     from ..core.task import Task
     from .chart import Histogram
 
@@ -183,6 +182,8 @@ def sentence(plan: dict[str, Any], *, absorb: bool) -> str:
     )
     if "psnr" not in plan:
         return text
+    if "psnr_absorbed" not in plan:  # not foretold
+        return f"{text}, {in_words(plan['psnr'])} in these views{' without Absorb' * absorb}"
     ways = [in_words(plan[name]) for name in ("psnr", "psnr_absorbed")]
     here, other = ways[::-1] if absorb else ways
     named = "without Absorb" if absorb else "Absorb"
@@ -318,24 +319,14 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
     noted |= vars(sizes)
     if curve is None:
         return noted
-    noted |= {
-        "psnr": curve.at(gone / count),
-        "psnr_absorbed": curve.at(gone / count, absorb=True),
-    }
+    noted["psnr"] = curve.at(gone / count)
+    if curve.foretold:
+        noted["psnr_absorbed"] = curve.at(gone / count, absorb=True)
     if budget.psnr is not None:
-        noted["remark"] = _reached(curve, budget.psnr, gone, absorb=settings.absorb)
+        psnr = curve.at(gone / count, absorb=settings.absorb)
+        remark = out_of_reach(budget.psnr, gone, count, psnr)
+        noted["remark"] = remark[:1].upper() + remark[1:]
     return noted
-
-
-def _reached(curve: Quality, goal: float, gone: int, *, absorb: bool) -> str:
-    """Return what to say where a PSNR as budget is out of reach, or ""."""
-    if not gone:
-        return f"By the estimate nothing can go at {goal:g} dB"
-    least = (curve.absorbed if absorb else curve.psnr)[-1]
-    if goal < least:
-        share = curve.shares[-1]
-        return f"The estimate ends at {share:.0%} removed, {in_words(least)}: no more goes"
-    return ""
 
 
 def _place(plan: dict[str, Any], settings: Any) -> Place | None:  # noqa: ANN401

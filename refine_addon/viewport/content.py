@@ -15,7 +15,7 @@ from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import check, sh_degree
 from . import background, shader
-from .arrays import MOST, Packed, as_texture, first_of_each, most_important_first, pack
+from .arrays import MOST, Packed, as_texture, first_of_each, most_important_first, pack, same
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -41,7 +41,9 @@ class Held:
     packed : Packed or None
         Once they are.
     ranks : (N,) floating or None
-        Of their scores, of all vertices.
+        Of their scores, of all vertices there were when they were packed.
+    scored : int
+        Rises where these have changed.
     important : (M,) int32 or None
         Those packed, the ones that matter most first.
     going : (M,) bool or None
@@ -55,7 +57,9 @@ class Held:
     important: NDArray[np.int32] | None = None
     going: NDArray[np.bool_] | None = None
     degree: int = 0
+    scored: int = 0
     remove: NDArray[np.bool_] | None = field(default=None, repr=False)
+    rank: NDArray[Any] | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,9 +171,7 @@ class Content:
         mesh = checked.mesh
         held = self._held.setdefault(mesh.session_uid, Held())
         held.degree = sh_degree(mesh)
-        before, held.ranks = held.ranks, _attribute(mesh, mesh_scores.RANK, "FLOAT")
-        if before is None or held.ranks is None or not np.array_equal(before, held.ranks):
-            held.important = None
+        held.rank = _attribute(mesh, mesh_scores.RANK, "FLOAT")
         held.remove = _attribute(mesh, mesh_edit.REMOVE, "BOOLEAN")
         columns = mesh_attributes.stored_columns(checked)
         checksum = 1
@@ -179,7 +181,7 @@ class Content:
         if signature != held.signature:
             held.signature = signature
             held.future = background.start(pack, mesh_attributes.splats_from_object(checked))
-        elif held.packed is not None:
+        elif held.future is None:
             self._mark(held)
 
     def _mark(self, held: Held) -> None:
@@ -188,6 +190,9 @@ class Content:
         if packed is None:
             return
         held.going = None if held.remove is None else held.remove[packed.vertices]
+        if not same(held.ranks, held.rank):
+            held.ranks, held.important = held.rank, None
+            held.scored += 1
         if held.important is None:
             held.important = most_important_first(packed, held.ranks)
         self.changes += 1

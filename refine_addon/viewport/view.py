@@ -23,6 +23,7 @@ from .arrays import (
     first_of_each,
     heat,
     in_front,
+    same,
     tinted,
 )
 
@@ -222,7 +223,9 @@ class View:
         """
         parts = _parts(shown, camera)
         colors_key: tuple[Any, ...] = (key[0], mode, [p.slot.number for p in parts])
-        if mode != "HEAT":
+        if mode == "HEAT":
+            colors_key += tuple(p.slot.held.scored for p in parts)
+        else:
             colors_key += tuple(p.eye.place.tobytes() for p in parts if p.slot.held.degree)
         rows = None if colors_key == self._colors_key else key[0].rows
         if self._colors is None and key[0].rows > few:
@@ -248,7 +251,7 @@ class View:
         depths = _depths(camera.size) if solid else None
         size = tuple(max(1, length // pixels) for length in camera.size)
         wanted = (self._order.key, self._colors_key, self._camera_key, size)
-        if self._picture and wanted == self._drawn and _same(depths, self._depths):
+        if self._picture and wanted == self._drawn and same(depths, self._depths):
             return
         self._drawn, self._depths = wanted, depths
         if not self._picture or (self._picture.width, self._picture.height) != size:
@@ -356,12 +359,6 @@ def _depths(size: tuple[int, int]) -> NDArray[np.float32]:
     buffer = gpu.types.Buffer("FLOAT", width * height)
     gpu.state.active_framebuffer_get().read_depth(0, 0, width, height, data=buffer)
     return np.frombuffer(memoryview(buffer), np.float32).reshape(height, width)
-
-
-def _same(one: NDArray[Any] | None, other: NDArray[Any] | None) -> bool:
-    if one is None or other is None:
-        return one is other
-    return np.array_equal(one, other)
 
 
 def _put(picture: gpu.types.GPUTexture) -> None:

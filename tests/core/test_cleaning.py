@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from refine_addon.core import Cleaning, RefineError, Splats, View, ViewSet, clean
+from refine_addon.core.cleaning.clean import agreed
 from refine_addon.core.cleaning.clusters import connected
+from refine_addon.core.cleaning.sight import Evidence
 
 SIDE = 24
 """Splats along each side of the wall."""
@@ -203,3 +205,33 @@ def test_cameras_that_see_nothing_are_refused():
 
     with pytest.raises(RefineError, match="no camera sees the splats"):
         clean(wall(), away)
+
+
+def test_a_faint_splat_that_covers_much_must_show_less():
+    """At .225 of the picture's side .9 of 255 is enough where .05 and less must change it by 4."""
+    wide = made([[0.0, 0.0, 2.0]], 0.6, 0.01, 0.1)
+    small = made([[0.0, 0.0, 2.0]], 0.06, 0.01, 0.1)
+
+    assert not clean(joined(wall(), wide), cameras()).keep[-1]
+    assert clean(joined(wall(), small), cameras()).keep[-1]
+
+
+@pytest.mark.parametrize(
+    ("views", "past", "effect", "expected"),
+    [
+        (2, 2, 4, True),
+        (2, 1, 200, False),
+        (10, 6, 4, True),
+        (10, 5, 4, False),
+        (20, 6, 9, False),
+        (20, 6, 10.1, True),
+        (21, 6, 200, False),
+        (12, 5, 200, False),
+    ],
+)
+def test_three_in_five_views_decide_and_fewer_of_what_shows_much(views, past, effect, expected):
+    """All of one or two, else three; what changes a pixel by 10 of 255: six and 30 %."""
+    seen = Evidence.zero(1)
+    seen.views[0], seen.past[0] = views, past
+
+    assert agreed(seen, np.array([effect / 255])).tolist() == [expected]

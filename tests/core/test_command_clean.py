@@ -37,9 +37,9 @@ def files(tmp_path):
     return tmp_path
 
 
-def call(files, command, *options):
-    """Run a subcommand on the scene, and return its exit code."""
-    return main([command, str(files / "scene.ply"), "--cameras", str(files), *options])
+def call(files, command, *options, more=()):
+    """Run a subcommand on the scene, and more inputs, and return its exit code."""
+    return main([command, str(files / "scene.ply"), *more, "--cameras", str(files), *options])
 
 
 def test_clean_says_why_and_writes_the_rest(files, capsys):
@@ -111,3 +111,62 @@ def test_clean_says_what_a_lossy_format_does_to_what_stays(files, capsys):
     """As `prune` and `convert` do: `.splat` has a note of its own."""
     assert call(files, "clean", "-o", str(files / "out.splat")) == 0
     assert "  note: .splat " in capsys.readouterr().out
+
+
+def test_reasons_are_named_with_commas_before_or_behind_the_input(files):
+    """With blanks between them the file behind them was taken for a reason."""
+    scene, out = str(files / "scene.ply"), files / "out.ply"
+    options = ["--cameras", str(files), "-o", str(out), "--overwrite"]
+
+    assert main(["clean", "--reasons", "front,isolated", scene, *options]) == 0
+    assert len(read_ply(out)) == SIDE**2
+    assert main(["clean", scene, *options, "--reasons", "isolated, giant"]) == 0
+    assert len(read_ply(out)) == SIDE**2 + 1
+
+
+def test_clean_takes_many_files_and_one_that_fails_does_not_stop_the_others(files, capsys):
+    """As `prune` does: the second is no PLY."""
+    (files / "broken.ply").write_bytes(b"no")
+    (files / "again.ply").write_bytes((files / "scene.ply").read_bytes())
+    names = [str(files / f"{name}.ply") for name in ("broken", "again")]
+
+    code = call(files, "clean", "--output-dir", str(files / "out"), more=names)
+
+    assert code == 1
+    assert "broken.ply" in capsys.readouterr().err
+    assert sorted(path.name for path in (files / "out").iterdir()) == ["again.ply", "scene.ply"]
+    assert len(read_ply(files / "out/again.ply")) == SIDE**2
+
+
+@pytest.mark.parametrize(
+    ("more", "options", "word"),
+    [
+        ([], ["-o", "x.ply", "--output-dir", "y"], "and not both"),
+        (["a.ply"], ["-o", "x.ply"], "-o takes one input"),
+    ],
+)
+def test_outputs_that_cannot_be_are_wrong_usage(files, capsys, more, options, word):
+    """The same as of `prune`."""
+    assert call(files, "clean", *options, more=more) == 2
+    assert word in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["clean", "prune"])
+def test_two_inputs_of_one_name_are_both_named(files, capsys, command):
+    """They would be one file in --output-dir."""
+    other = files / "other/scene.ply"
+
+    assert call(files, command, "--output-dir", str(files / "out"), more=[str(other)]) == 2
+    said = capsys.readouterr().err
+    assert f"{files / 'scene.ply'} and {other} would both be {files / 'out/scene.ply'}" in said
+
+
+def test_a_file_of_splats_that_cannot_be_drawn_is_not_called_clean(files, capsys):
+    """All positions are NaN: it said that there was nothing to clean away."""
+    data = bytearray((files / "scene.ply").read_bytes())
+    start = data.index(b"end_header\n") + len(b"end_header\n")
+    np.frombuffer(data, "<f4", offset=start).reshape(-1, len(NAMES))[:, 0] = np.nan
+    (files / "scene.ply").write_bytes(data)
+
+    assert call(files, "clean") == 1
+    assert f"none of the {SIDE**2 + 1} splats can be drawn" in capsys.readouterr().err

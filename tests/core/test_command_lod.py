@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
+from pathlib import Path
 
 import pytest
 
@@ -118,3 +121,111 @@ def test_without_cameras_there_are_no_levels(files, capsys):  # noqa: F811
     """They decide what goes."""
     assert main(["lod", str(files / "scene.ply"), "-o", str(files / "out")]) == 2
     assert "no cameras" in capsys.readouterr().err
+
+
+def test_one_level_is_one(files, capsys):  # noqa: F811
+    """It was "1 levels"."""
+    assert call(files, "lod", "--levels", ".5", "-o", str(files / "out"), *QUICK) == 0
+    assert ": 1 level of 577 splats, by 2 of 6 views, " in capsys.readouterr().out
+
+
+def test_levels_that_would_be_equal_are_made_once(files, capsys):  # noqa: F811
+    """Of 577, .999 are all (576.4); .002 and .0019 are both 2 (1.2 and 1.1)."""
+    options = ["--levels", ".999,.5,.002,.0019", "-o", str(files / "out"), *QUICK]
+
+    assert call(files, "lod", *options) == 0
+    said = capsys.readouterr().out
+    assert "2 levels of 577" in said
+    assert "note: no level for 0.999: it would be a copy of the input" in said
+    assert "note: no level for 0.0019: it would be a copy of level 2" in said
+    told = json.loads((files / "out/lod.json").read_text())["levels"]
+    assert [(entry["level"], entry["asked"], entry["splats"]) for entry in told] == [
+        (1, 0.5, 289),
+        (2, 0.002, 2),
+    ]
+    assert len(list((files / "out").iterdir())) == 3
+
+
+def test_a_psnr_that_lets_nothing_go_makes_no_level(files, capsys):  # noqa: F811
+    """Alone it is an error; beside another the note says so. 1 dB is out of reach."""
+    run = ["lod", "-o", str(files / "out"), "--nested", "--views", "2"]
+
+    assert call(files, *run, "--psnr", "99.9") == 1
+    assert "no level has fewer splats than the input, which has 577" in capsys.readouterr().err
+    assert not (files / "out").exists()
+    assert call(files, *run, "--psnr", "99.9,1") == 0
+    said = capsys.readouterr().out
+    assert "note: no level for 99.9 dB: it would be a copy of the input" in said
+    assert "note: level 1: the estimate ends at 95% removed" in said
+
+
+def test_files_that_the_new_manifest_does_not_name_go(files, capsys):  # noqa: F811
+    """Those of the run before alone; neither the source nor what is no level."""
+    out = files / "out"
+    run = ["lod", "-o", str(out), "--overwrite", *QUICK]
+    assert call(files, *run, "--levels", ".5,.3,.1") == 0
+    (out / "scene.lod9.ply").write_text("mine")
+    (files / "outside.lod3.ply").write_text("mine")
+    (out / "notes.txt").write_text("mine")
+    told = json.loads((out / "lod.json").read_text())
+    names = ["scene.lod3.ply", "../outside.lod3.ply", "notes.txt", "gone.lod1.ply"]
+    told["levels"] = [{"file": name} for name in names]
+    (out / "lod.json").write_text(json.dumps(told))
+    capsys.readouterr()
+
+    assert call(files, *run, "--levels", ".5,.3") == 0
+
+    assert "note: scene.lod3.ply of the run before is removed" in capsys.readouterr().out
+    left = ["lod.json", "notes.txt", "scene.lod1.ply", "scene.lod2.ply", "scene.lod9.ply"]
+    assert sorted(path.name for path in out.iterdir()) == left
+    assert (files / "outside.lod3.ply").exists()
+
+
+def test_a_level_can_be_the_source_of_a_new_run(files):  # noqa: F811
+    """It is in the folder, and the manifest before names it: it stays."""
+    out = files / "out"
+    assert call(files, "lod", "-o", str(out), "--levels", ".5", *QUICK) == 0
+    source, cameras = str(out / "scene.lod1.ply"), ["--cameras", str(files)]
+
+    assert main(["lod", source, *cameras, "-o", str(out), "--overwrite", *QUICK]) == 0
+
+    assert (out / "scene.lod1.ply").exists()
+    assert (out / "scene.lod1.lod1.ply").exists()
+
+
+def test_a_run_that_stops_before_its_first_level_leaves_the_run_before(files, monkeypatch):  # noqa: F811
+    """Nothing is taken away until there is something to replace it."""
+    out = files / "out"
+    assert call(files, "lod", "-o", str(out), *QUICK) == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+
+    def interrupted(*_given, **_named):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(levels_files, "each_level", interrupted)
+
+    assert call(files, "lod", "-o", str(out), "--overwrite", *QUICK) == 130
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+@pytest.mark.parametrize("stop", ["scene.lod1.ply", "scene.lod2.ply", "lod.json"])
+def test_no_manifest_names_a_file_that_is_not_there(files, monkeypatch, stop):  # noqa: F811
+    """Killed at any file: what the manifest names, if there is one, is there."""
+    out = files / "out"
+    assert call(files, "lod", "-o", str(out), "--levels", ".5,.3,.1", *QUICK) == 0
+    replace = Path.replace
+
+    def killed(self, target):
+        if Path(target).name == stop:
+            os._exit(9)  # without any clean-up
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", killed)
+    process = multiprocessing.get_context("fork").Process(
+        target=call, args=(files, "lod", "-o", str(out), "--overwrite", "--levels", ".5,.3", *QUICK)
+    )
+    process.start()
+    process.join()
+
+    assert process.exitcode == 9
+    assert not (out / "lod.json").exists()

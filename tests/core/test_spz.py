@@ -90,7 +90,10 @@ def test_version_4_says_what_is_missing(tmp_path, monkeypatch):
         (gzip.compress(header(3, 2**32 - 1) + bytes(99)), "truncated: 4294967295 splats need "),
         (gzip.compress(header(3, 1000) + bytes(99)), "truncated: 1000 splats (unpacked) need 29"),
         (gzip.compress(header(3) + bytes(29))[:-2], "truncated: the gzip stream has no end"),
-        (gzip.compress(header(3) + bytes(29))[:-8] + bytes(8), "the gzip stream is damaged ("),
+        (
+            gzip.compress(header(3) + bytes(29))[:-8] + bytes(8),
+            "a damaged SPZ file: its gzip stream breaks at ",
+        ),
         (gzip.compress(header(4) + bytes(99)), "SPZ version 4 inside of gzip"),
         (header(4, 2**32 - 1, streams=6) + struct.pack("<I12x", 32) + bytes(96), "stream 'mean'"),
         (header(4, streams=2) + struct.pack("<I12x", 32) + bytes(96), "byte 15: 2 streams, expect"),
@@ -113,6 +116,39 @@ def test_a_file_that_lies_is_refused(tmp_path, data, expected):
 
     assert tracemalloc.get_traced_memory()[1] < 3_000_000
     tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        (b"\x1f\x8b\x08\0" + bytes(6) + b"\x06" + bytes(99), "a damaged SPZ file: its gzip strea"),
+        (gzip.compress(b"NGSX" + bytes(99)), "no SPZ file: its gzip stream begins with b'NGSX', e"),
+        (b"NGXP" + bytes(99), "a damaged SPZ file: begins with b'NGXP', expected b'NGSP' or "),
+    ],
+    ids=["stream", "inside", "open"],
+)  # fmt: skip
+def test_a_file_whose_beginning_is_damaged_is_still_called_spz(tmp_path, data, expected):
+    """It was told to be unpacked. A gzip header has 10 bytes; a block of type 3 does not exist."""
+    path = tmp_path / "a.SPZ"
+    path.write_bytes(data)
+
+    with pytest.raises(RefineError, match=re.escape(f"{path}: {expected}")):
+        read_splats(path)
+
+
+@pytest.mark.parametrize("at", [5000, 9000])
+def test_the_byte_at_which_a_stream_breaks_is_named(tmp_path, at):
+    """A stream of stored blocks, cut within one and followed by a block of type 3."""
+    stored = gzip.compress(header(3, 1000) + bytes(29_000), compresslevel=0)
+    path = tmp_path / "a.spz"
+    first = 10 + 5 + 65535  # header, head of a block, its content
+    assert len(stored) < first
+    length = at - 15
+    block = struct.pack("<BHH", 0, length, 0xFFFF ^ length) + stored[15 : 15 + length]
+    path.write_bytes(stored[:10] + block + b"\x06" + bytes(20_000))
+
+    with pytest.raises(RefineError, match=f"breaks at byte {at} "):
+        read_splats(path)
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ from ..errors import RefineError
 from ..scoring import projection
 from ..scoring.measuring import BLOCKS
 from ..scoring.sight_lines import SightLines
+from ..splats import refuse_undrawable
 from ..work import Progress, for_chunks, part, silent
 from . import sight
 from .clusters import cluster_sizes
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..scene import Scene
-    from ..scoring.projection import Gaussians
+    from ..scoring.projection import Footprints, Gaussians
     from ..splats import Splats
     from ..views import ViewSet
 
@@ -79,9 +80,15 @@ VIEWS = 3
 AGREE = 0.6
 """Share of the views that must see past it."""
 
-VISIBLE, GIANT_VISIBLE = 4 / 255, 1 / 255
-"""By how much a splat must change a pixel, as its opacity times its contrast to what lies behind. A
-giant changes all pixels."""
+LOUD, LOUD_VIEWS, LOUD_AGREE = 10 / 255, 6, 0.3
+"""Of a splat that changes a pixel by as much, so many views that see past it are enough, if they
+are this share: the others may see it against a surface just behind."""
+
+VISIBLE, WIDE = 4 / 255, 0.05
+"""By how much a splat must change a pixel, as its opacity times its contrast to what lies behind.
+One whose standard deviation reaches across more than this share of a picture's longer side changes
+more pixels, and must change each by so much less: the root mean square of the picture's change is
+the same."""
 
 
 @dataclass(frozen=True)
@@ -131,12 +138,22 @@ class Cleaned:
         reason. Protected splats have none.
     past : (N,) int32
         How many views see past each splat.
+    seen : (N,) int32
+        In how many of the views used each splat's centre lies.
+    undrawable : int
+        How many splats cannot be drawn. They stay.
+    views_given, views_used : int
+        How many views there were, and how many of them were used.
     settings : Cleaning
     """
 
     keep: NDArray[np.bool_]
     found: dict[str, NDArray[np.bool_]]
     past: NDArray[np.int32]
+    seen: NDArray[np.int32]
+    undrawable: int
+    views_given: int
+    views_used: int
     settings: Cleaning
 
     def counts(self) -> dict[str, int]:
@@ -163,6 +180,12 @@ class Cleaned:
             words.append((few, f"{text} in all of the 1 or 2 views that see them"))
         found = [f"{count:,} {text}" for count, text in words if count]
         return ", ".join(found) or "nothing to clean away"
+
+    def notes(self) -> list[str]:
+        """Return what else the user should know, in sentences."""
+        if not self.undrawable:
+            return []
+        return [f"{self.undrawable} splats cannot be drawn: no camera judges them, and they stay"]
 
 
 def clean(
@@ -195,14 +218,17 @@ def clean(
     Raises
     ------
     RefineError
-        If nothing would be left, or no view sees any splat.
+        If there are splats and none of them can be drawn, if no view sees any, or if nothing would
+        be left.
     Cancelled
         If `progress` answers ``False``.
     """
     with np.errstate(under="ignore"):
-        gaussians, scene, _ = projection.prepare(
+        gaussians, scene, good = projection.prepare(
             splats, views, progress=part(progress, 0.0, 0.05), threads=threads
         )
+        if len(splats):
+            refuse_undrawable(good)
         run = _Run(gaussians, scene, splats, views.spread(settings.views), threads)
         reasons = run.reasons(part(progress, 0.05, 1.0))
     count = len(splats)
@@ -217,9 +243,10 @@ def clean(
     if count and not keep.any():
         msg = f"cleaning would remove all {count} splats; nothing was removed"
         raise RefineError(msg)
-    past = np.zeros(count, np.int32)
-    past[gaussians.index] = run.evidence.past
-    return Cleaned(keep, found, past, settings)
+    past, seen = np.zeros((2, count), np.int32)
+    past[gaussians.index], seen[gaussians.index] = run.evidence.past, run.seen
+    undrawable = count - int(np.count_nonzero(good))
+    return Cleaned(keep, found, past, seen, undrawable, len(views), len(run.sights.views), settings)
 
 
 class _Run:
@@ -236,6 +263,7 @@ class _Run:
         self.gaussians, self.scene, self.threads = gaussians, scene, threads
         self.sights = SightLines(views.by_distance(), gaussians, splats)
         self.evidence = sight.Evidence.zero(len(gaussians))
+        self.seen = np.zeros(len(gaussians), np.int32)
         with np.errstate(invalid="ignore"):
             scales = np.sort(splats.log_scales[gaussians.index].astype(np.float64), axis=1)
         self.slender = scales[:, 2] - scales[:, 1] >= np.log(SLENDER)
@@ -249,13 +277,14 @@ class _Run:
         small = self._clusters(~doubted & ~giant, part(progress, 0.5, 0.6))
         self._judge(doubted | giant | needle | small, part(progress, 0.6, 1.0))
         effect = self._effect()
-        floats = ~giant & self._floats(SUPPORT) & self._agreed()
+        floats = ~giant & self._floats(SUPPORT) & agreed(self.evidence, effect)
         most = np.where(self.gaussians.alphas < VEIL, VEIL_SUPPORT, GIANT_SUPPORT)
-        visible = floats & (effect >= VISIBLE)
+        shows = effect >= VISIBLE * (WIDE / np.maximum(widest, WIDE))
+        visible = floats & shows
         return {
             "front": visible & doubted & ~needle,
             "isolated": visible & small & ~needle,
-            "giant": giant & self._floats(most) & (effect >= GIANT_VISIBLE),
+            "giant": giant & self._floats(most) & shows,
             "needle": visible & needle,
             "transparent": floats & doubted & ~visible,
         }
@@ -270,24 +299,28 @@ class _Run:
         none = np.zeros(count, np.bool_)
 
         def block(numbers: range) -> tuple[NDArray[np.float64], ...]:
-            light, supported, widest = np.zeros(count), np.zeros(count), np.zeros(count)
+            light, supported, widest, inside = np.zeros((4, count))
             for number in numbers:
-                seen = sight.look(self.gaussians, self.scene, self.sights, number, none)
-                if seen is not None:
-                    hits, wide = seen
+                footprints, looked = self._look(number, none)
+                inside[footprints.index[footprints.inside]] += 1.0
+                if looked is not None:
+                    hits, wide = looked
                     taken, held = sight.own_support(hits)
                     light[hits.met] += taken
                     supported[hits.met] += held
                     widest[hits.met] = np.maximum(widest[hits.met], wide)
-            return light, supported, widest
+            return light, supported, widest, inside
 
         blocks = self._blocks(block, progress, "looking")
-        lights, supports, widths = (np.array(arrays) for arrays in zip(*blocks, strict=True))
+        lights, supports, widths, insides = (
+            np.array(arrays) for arrays in zip(*blocks, strict=True)
+        )
+        self.seen = insides.sum(axis=0).astype(np.int32)
         light = lights.sum(axis=0)
         lit = light > 0.0
-        if count and not lit.any():
+        if len(self.sights.splats) and not lit.any():
             msg = (
-                f"no camera sees the splats: none of {count} that can be drawn is met from any of "
+                f"no camera sees the splats: none of {count} that show is met from any of "
                 f"{len(self.sights.views)} views; check that cameras and splats share their frame "
                 "and unit"
             )
@@ -309,13 +342,22 @@ class _Run:
         def block(numbers: range) -> sight.Evidence:
             total = sight.Evidence.zero(len(suspects))
             for number in numbers:
-                seen = sight.look(self.gaussians, self.scene, self.sights, number, suspects)
-                if seen is not None:
-                    total.add(seen[0], suspects, self.gaussians.colors)
+                _, looked = self._look(number, suspects)
+                if looked is not None:
+                    total.add(looked[0], suspects, self.gaussians.colors)
             return total
 
         for found in self._blocks(block, progress, "judging"):
             self.evidence.merge(found)
+
+    def _look(
+        self, number: int, absent: NDArray[np.bool_]
+    ) -> tuple[Footprints, tuple[sight.Hits, NDArray[np.float32]] | None]:
+        """Return the footprints of all Gaussians in a view, and `sight.look`."""
+        view = self.sights.views[number][0]
+        footprints = projection.project(self.gaussians, self.scene, view)
+        looked = sight.look(self.gaussians, footprints, self.scene, self.sights, number, absent)
+        return footprints, looked
 
     def _blocks(
         self, work: Callable[[range], Result], progress: Progress, what: str
@@ -332,13 +374,15 @@ class _Run:
         seen = self.evidence
         return (seen.views > 0) & (seen.near < most * (seen.near + seen.behind))
 
-    def _agreed(self) -> NDArray[np.bool_]:
-        """Return which suspects enough views see past, (M,)."""
-        seen = self.evidence
-        return (seen.past >= np.minimum(VIEWS, seen.views)) & (seen.past >= AGREE * seen.views)
-
     def _effect(self) -> NDArray[np.float64]:
         """Return by how much each suspect changes a pixel that it covers, (M,)."""
         behind = self.evidence.behind
         contrast = self.evidence.contrast / np.where(behind > 0.0, behind, 1.0)
         return np.asarray(self.gaussians.alphas * contrast, np.float64)
+
+
+def agreed(seen: sight.Evidence, effect: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which suspects, of some effects on a pixel, enough views see past, (M,)."""
+    most = (seen.past >= np.minimum(VIEWS, seen.views)) & (seen.past >= AGREE * seen.views)
+    some = (seen.past >= LOUD_VIEWS) & (seen.past >= LOUD_AGREE * seen.views)
+    return most | (some & (effect >= LOUD))

@@ -104,6 +104,7 @@ class Hits:
 
 def look(
     gaussians: Gaussians,
+    footprints: Footprints,
     scene: Scene,
     sights: SightLines,
     number: int,
@@ -114,6 +115,8 @@ def look(
     Parameters
     ----------
     gaussians : Gaussians
+    footprints : Footprints
+        Of these in the view.
     scene : Scene
     sights : SightLines
         Has the views, and tells where their lines lie.
@@ -129,7 +132,6 @@ def look(
         The longer standard deviation of the footprints met, as a share of the longer side.
     """
     view = sights.views[number][0]
-    footprints = projection.project(gaussians, scene, view)
     count = min(LINES, MOST_MET / max(sight_lines.crowding(gaussians, footprints, view), 1.0))
     lines = sight_lines.meet(gaussians, footprints, *sights.pixels(number, count))
     if not len(lines.line):

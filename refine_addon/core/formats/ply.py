@@ -155,6 +155,10 @@ class SplatFile:
             for name in ([] if keep.all() else self.indexing)
         ]
 
+    def left_out(self, _keep: NDArray[np.bool_]) -> int:
+        """Return how many of the kept rows a file does not hold: none."""
+        return 0
+
     def splats(self) -> Splats:
         """Return the rows as splats; the arrays are views of the file if its layout permits."""
         return splats_from_columns(self.rows)

@@ -209,13 +209,17 @@ class Packed:
         extra = [n for n in names if n not in known and not n.startswith("f_rest_")]
         if extra:
             notes.append(f"{self.form.suffix} does not hold {', '.join(extra)}: left out")
-        lost = int(np.count_nonzero(keep & ~drawable(self.file.splats())))
+        lost = self.left_out(keep)
         if lost:
             notes.append(
                 f"{lost} of the kept splats cannot be drawn and {self.form.suffix} cannot hold "
                 "them: left out"
             )
         return notes
+
+    def left_out(self, keep: NDArray[np.bool_]) -> int:
+        """Return how many of the kept rows cannot be drawn: no file of the format holds them."""
+        return int(np.count_nonzero(keep & ~drawable(self.file.splats())))
 
     def write(
         self,

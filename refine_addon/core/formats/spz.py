@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RefineError
-from ..foreign_files import unpacked_beginning
+from ..foreign_files import GZIP, unpacked_beginning
 from ..splats import above_constant, opacity, opacity_logits, unit_quaternions
 from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
 from .ply import Origin, SplatFile
@@ -58,6 +58,9 @@ _INFLATION = 1032
 
 _PIECE = 1 << 20
 
+_STEP = 1 << 12
+"""Bytes of a damaged stream that are tried at a time."""
+
 
 @dataclass(frozen=True)
 class _Header:
@@ -77,9 +80,14 @@ class _Header:
         return {name: width * self.count for name, width in widths.items()}
 
 
-def matches(_path: Path, head: bytes) -> bool:
-    """Return whether a file is one: its signature stands in the open or in a gzip stream."""
-    return head.startswith(MAGIC) or unpacked_beginning(head).startswith(MAGIC)
+def matches(path: Path, head: bytes) -> bool:
+    """Return whether a file is one: its signature stands in the open or in a gzip stream.
+
+    A gzip stream of its name is one that may be damaged at its beginning.
+    """
+    if head.startswith(MAGIC) or unpacked_beginning(head).startswith(MAGIC):
+        return True
+    return path.suffix.lower() == FORMAT.suffix and head.startswith(GZIP)
 
 
 def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
@@ -118,7 +126,10 @@ def _parsed(path: Path, head: bytes) -> _Header:
     """Return what the first bytes say, or refuse them."""
     refuse_short(path, _HEADER.size, len(head), "the first bytes of an SPZ file")
     magic, version, count, degree, fraction, _, streams = _HEADER.unpack(head)
-    if magic != MAGIC or version not in _VERSIONS:
+    if magic != MAGIC:
+        msg = f"{path}: no SPZ file: its gzip stream begins with {magic!r}, expected {MAGIC!r}"
+        raise RefineError(msg)
+    if version not in _VERSIONS:
         msg = f"{path}: SPZ version {version}, expected {', '.join(map(str, _VERSIONS))}"
         raise RefineError(msg)
     if degree >= _DEGREES:
@@ -146,13 +157,29 @@ def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict[str, N
             while not engine.eof and engine.decompress(engine.unconsumed_tail, _PIECE):
                 pass
     except zlib.error as error:
-        msg = f"{path}: the gzip stream is damaged ({error})"
+        at = _damaged_at(data)
+        msg = f"{path}: a damaged SPZ file: its gzip stream breaks at byte {at} ({error})"
         raise RefineError(msg) from error
     blocks = _split(path, header, np.frombuffer(body, np.uint8))
     if not engine.eof:
         msg = f"{path}: truncated: the gzip stream has no end"
         raise RefineError(msg)
     return header, blocks
+
+
+def _damaged_at(data: NDArray[np.uint8]) -> int:
+    """Return which byte of a gzip stream zlib cannot go on from."""
+    engine = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    at = 0
+    for size in (_STEP, 1):  # the step with the damage, then the byte
+        try:
+            while at < len(data):
+                before = engine.copy()
+                engine.decompress(data[at : at + size].data)
+                at += size
+        except zlib.error:
+            engine = before
+    return at
 
 
 def _split(path: Path, header: _Header, body: NDArray[np.uint8]) -> dict[str, NDArray[np.uint8]]:

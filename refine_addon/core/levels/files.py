@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from ..errors import RefineError
-from ..formats.registry import as_written, read_splats, without_suffix
+from ..formats.registry import SUFFIXES, as_written, read_splats, without_suffix
 from ..quality import PSNR_CAP
-from ..report import Clock
+from ..report import Clock, held, scoring_notes, seen_by
+from ..selection import Budget
 from ..survivors import survivor_columns
-from ..task import DEFAULTS
+from ..task import DEFAULTS, Task
 from ..whole_file import expanded, mode_of, refuse_existing, refuse_mapped, whole_file
 from ..work import Progress, silent
 from .lod import Levels, each_level, short
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
     from typing import Any
 
@@ -33,6 +35,9 @@ GOAL = 40.0
 """The PSNR from which on a level is hard to tell from the original, dB."""
 
 _BEGINNING = b'{"lod":'
+
+_LEVEL = re.compile(r"[^/\\]*\.lod\d+(?:" + "|".join(map(re.escape, SUFFIXES)) + ")")
+"""Names of files of levels."""
 
 
 def level_paths(source: Path, folder: Path, count: int, suffix: str = ".ply") -> list[Path]:
@@ -95,13 +100,13 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
     Returns
     -------
     dict
-        The report: what the manifest says, sizes, settings, timings, notes.
+        The report: what the manifest says, settings, timings, notes.
 
     Raises
     ------
     RefineError, Cancelled
         See `lod`, `read_splats` and `SplatFile.write`. Files that were new are removed again then,
-        and where files were to be replaced, no manifest is left.
+        and where one was to be replaced, no manifest is left.
     """
     clock = Clock()
     folder, source = expanded(folder), expanded(source)
@@ -112,34 +117,29 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
         for path in paths:
             refuse_mapped(path, source)
         clock.lap("read_s")
-        entries, notes = [], [views.note] if views.note else []
-        made = each_level(
-            file.splats(), views, levels, settings,
-            progress=progress, threads=threads,
-        )  # fmt: skip
-        for path, level in zip(paths, made, strict=True):
-            if overwrite:
-                (folder / MANIFEST).unlink(missing_ok=True)
-            distances = [short(far) for far, _ in level.reach.psnr]
-            found = _write(file, level, path, overwrite=overwrite)
+        entries: list[dict[str, Any]] = []
+        notes: list[str] = []
+        remarks: dict[float, str] = {}
+        scene = Task(Budget(ratio=0.0), settings, file.splats(), views)
+        for level in each_level(scene, levels, progress=progress, threads=threads):
+            if level.number == 1:
+                # From here on files of an earlier run are replaced, so its manifest goes first.
+                before = _unlisted(folder) if overwrite else []
+                distances = [short(far) for far, _ in level.reach.psnr]
+                seen, notes = seen_by(level.scores), scoring_notes(level.scores)
+            path = paths[level.number - 1]
+            facts, found = _write(file, level, path, overwrite=overwrite)
             written.append(path)
+            remarks[level.asked] = level.remark
             notes += [note for note in found if note not in notes]
-            entries.append(
-                {
-                    **level.facts(goal),
-                    "file": path.name,
-                    "bytes": path.stat().st_size,
-                }
-            )
+            entries.append({**level.facts(goal), **facts})
+        notes += levels.notes(remarks)
+        notes += _remove(set(before) - set(written), source)
         clock.lap("levels_s")
         facts = {
             "lod": 1,
-            "source": {
-                "file": source.name,
-                "splats": len(file),
-                "bytes": file.stored_bytes,
-            },
-            "views": len(views),
+            "source": {"file": source.name, "splats": len(file), "bytes": file.stored_bytes},
+            **seen,
             "distances": distances,
             "nested": not levels.absorb,
             "goal_psnr": goal,
@@ -157,12 +157,52 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
     }
 
 
-def _write(file: SplatFile, level: Level, path: Path, *, overwrite: bool) -> list[str]:
-    """Write the file of a level; return what there is to say of it, in sentences."""
+def _write(
+    file: SplatFile, level: Level, path: Path, *, overwrite: bool
+) -> tuple[dict[str, Any], list[str]]:
+    """Write the file of a level; return what the manifest says of it, and sentences."""
     made = as_written(file, path)
     columns = survivor_columns(file.rows, level.absorbed) if level.absorbed else {}
     made.write(path, level.keep, columns=columns, overwrite=overwrite)
-    return made.notes(level.keep)
+    counts = held(made, level.keep)
+    facts = {
+        "splats": counts["written"],
+        "left_out": counts["left_out"],
+        "file": path.name,
+        "bytes": path.stat().st_size,
+    }
+    return facts, made.notes(level.keep)
+
+
+def _unlisted(folder: Path) -> list[Path]:
+    """Remove the manifest of an earlier run; return the files of levels that it lists.
+
+    Names that no level has, or of other folders, do not count.
+    """
+    path = folder / MANIFEST
+    try:
+        told = json.loads(path.read_bytes())
+        names = [str(entry["file"]) for entry in told["levels"]]
+    except (OSError, ValueError, LookupError, TypeError):
+        names = []
+    path.unlink(missing_ok=True)
+    return [folder / name for name in names if _LEVEL.fullmatch(name)]
+
+
+def _remove(paths: Iterable[Path], source: Path) -> list[str]:
+    """Remove files that are there, but not the source; return what there is to say."""
+    notes = []
+    for path in sorted(paths):
+        try:
+            if path.samefile(source):
+                continue
+            path.unlink()
+            notes.append(f"{path.name} of the run before is removed")
+        except FileNotFoundError:
+            continue
+        except OSError as error:
+            notes.append(f"{path.name} of the run before is not removed ({error.strerror})")
+    return notes
 
 
 @contextlib.contextmanager

@@ -22,19 +22,20 @@ from ..work import Progress, part, silent
 from .distance import Lookout
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
     from typing import Any
 
     import numpy as np
     from numpy.typing import NDArray
 
     from ..absorbing.absorb import Absorbed
+    from ..scores import Scores
     from ..splats import Splats
-    from ..task import Settings
+    from ..task import Result, Settings
     from ..views import ViewSet
     from .distance import Reach
 
-    _Made = tuple[NDArray[np.bool_], Splats, float | None, Absorbed | None]
+    _Made = tuple[NDArray[np.bool_], Splats, Result, Absorbed | None]
 
 MANY = 16
 """No more levels than this: the last of so many halvings would hold .0015 % of the splats."""
@@ -94,7 +95,36 @@ class Levels:
 
     def __len__(self) -> int:
         """Return the number of levels."""
-        return len(self.shares or self.psnr)
+        return len(self.asked)
+
+    @property
+    def asked(self) -> tuple[float, ...]:
+        """The shares, or the PSNR."""
+        return self.shares or self.psnr
+
+    def notes(self, remarks: Mapping[float, str]) -> list[str]:
+        """Return, in sentences, which levels were not made, and what is remarked of the others.
+
+        Parameters
+        ----------
+        remarks : mapping of float to str
+            `Level.remark` of those that were made, by `Level.asked`.
+
+        Examples
+        --------
+        >>> Levels(psnr=(99.0, 40.0)).notes({40.0: ""})
+        ['no level for 99 dB: it would be a copy of the input']
+        """
+        notes, number, unit = [], 0, "" if self.shares else " dB"
+        for asked in self.asked:
+            if asked not in remarks:
+                copied = f"level {number}" if number else "the input"
+                notes.append(f"no level for {asked:g}{unit}: it would be a copy of {copied}")
+                continue
+            number += 1
+            if remarks[asked]:
+                notes.append(f"level {number}: {remarks[asked]}")
+        return notes
 
     def budgets(self, count: int) -> list[Budget]:
         """Return the budgets of the levels for so many splats; at least one splat stays."""
@@ -123,8 +153,12 @@ class Level:
         The estimated PSNR of the views against all splats, dB; None where the views see too little.
     reach : Reach
         From how far away it will do.
+    scores : Scores
+        What the views saw of all splats, the same for all levels.
     absorbed : Absorbed or None
         What absorbing made of all splats.
+    remark : str
+        Why the PSNR that was asked for is out of reach; "" if it is not.
     """
 
     number: int
@@ -133,7 +167,9 @@ class Level:
     splats: Splats
     psnr: float | None
     reach: Reach
+    scores: Scores
     absorbed: Absorbed | None = None
+    remark: str = ""
 
     def facts(self, goal: float) -> dict[str, Any]:
         """Return what is to be known of it as plain JSON values.
@@ -190,12 +226,13 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     Returns
     -------
     list of Level
-        The finest first.
+        The finest first. One that would have as many splats as the one before, or as the original,
+        is not among them; see `Levels.notes`.
 
     Raises
     ------
     RefineError, Cancelled
-        See `pipeline.score`.
+        See `pipeline.score`; also if no level would have fewer splats than the original.
 
     Examples
     --------
@@ -204,39 +241,49 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
         level = lod(file.splats(), views, Levels((0.5, 0.25)))[1]
         file.write("out.ply", level.keep, columns=survivor_columns(file.rows, level.absorbed))
     """
-    return list(
-        each_level(
-            splats, views, levels, settings, protected=protected, progress=progress, threads=threads
-        )
-    )
-
-
-def each_level(  # noqa: PLR0913 - as `lod`
-    splats: Splats,
-    views: ViewSet,
-    levels: Levels,
-    settings: Settings = DEFAULTS,
-    *,
-    protected: NDArray[np.bool_] | None = None,
-    progress: Progress = silent,
-    threads: int | None = None,
-) -> Iterator[Level]:
-    """Make the levels of `lod` one by one, when they are asked for."""
     scene = Task(Budget(ratio=0.0), settings, splats, views, protected=protected)
+    return list(each_level(scene, levels, progress=progress, threads=threads))
+
+
+def each_level(
+    scene: Task, levels: Levels, *, progress: Progress = silent, threads: int | None = None
+) -> Iterator[Level]:
+    """Make the levels of `lod` one by one, when they are asked for.
+
+    Parameters
+    ----------
+    scene : Task
+        Splats, views, settings and what is protected; its budget does not matter.
+    levels, progress, threads
+        See `lod`.
+    """
+    splats, views = scene.scene()
     lookout = Lookout(splats, views, progress=part(progress, 0.0, 0.05), threads=threads)
     budgets, ahead = levels.budgets(len(splats)), part(progress, 0.05, 1.0)
-    coarsest = 0.0
+    coarsest, left_before, number = 0.0, len(splats), 0
     made = (_absorbing if levels.absorb else _deleting)(scene, budgets, ahead, threads)
-    for number, (keep, left, psnr, absorbed) in enumerate(made):
-        end = 0.05 + 0.95 * (number + 1) / len(levels) if levels.absorb else 1.0
+    for place, (keep, left, result, absorbed) in enumerate(made, start=1):
+        gone, left_before = left_before - len(left), len(left)
+        if not gone:
+            continue
+        number += 1
+        end = 0.05 + 0.95 * place / len(levels) if levels.absorb else 1.0
         reach = lookout.reach(
             left, keep, absorbed.changed if absorbed else None, progress=part(progress, end, end)
         )
         # What a level has changed is changed in all after it, though they may measure as less.
         coarsest = max(coarsest, reach.error)
         reach = replace(reach, error=coarsest)
-        asked = (levels.shares or levels.psnr)[number]
-        yield Level(number + 1, asked, keep, left, psnr, reach, absorbed)
+        if number == 1:
+            scores = result.scores
+        report = result.report
+        yield Level(
+            number, levels.asked[place - 1], keep, left, report["estimated_psnr"], reach, scores,
+            absorbed, report["budget_remark"],
+        )  # fmt: skip
+    if not number:
+        msg = f"no level has fewer splats than the input, which has {len(splats)}"
+        raise RefineError(msg)
 
 
 def _deleting(
@@ -248,8 +295,7 @@ def _deleting(
     for budget in budgets:
         task = replace(scene, budget=budget, scores=scores)
         result = decide(task, threads=threads)
-        psnr = result.report["estimated_psnr"]
-        yield result.keep, splats.take(result.keep), psnr, None
+        yield result.keep, splats.take(result.keep), result, None
 
 
 def _absorbing(
@@ -264,7 +310,7 @@ def _absorbing(
         assert result.absorbed is not None  # noqa: S101 - the task says so
         psnr = result.report["estimated_psnr"]
         whole = result.absorbed if whole is None else _both(whole, result.absorbed)
-        yield whole.keep, whole.splats, psnr, whole
+        yield whole.keep, whole.splats, result, whole
         if number == 0:
             sights = result.scores.sights
         task = replace(

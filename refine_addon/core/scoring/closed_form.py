@@ -28,7 +28,7 @@ from ..frustum import Frustums
 from ..rendering import NEAR_RELATIVE
 from ..scene import median_size, principal_axes
 from ..scores import Scores
-from ..splats import base_color, drawable, opacity
+from ..splats import base_color, drawable, opacity, refuse_undrawable
 from ..work import Progress, for_chunks, part, silent
 from . import adaptive
 
@@ -159,9 +159,7 @@ def score(
         scene.read, len(splats), 4 * _CHUNK,
         progress=part(progress, 0.0, 0.2), what="reading", threads=threads,
     )  # fmt: skip
-    if not scene.good.any():
-        msg = f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
-        raise RefineError(msg)
+    refuse_undrawable(scene.good)
     scene.set_frame(np.sum([moments for _, moments in read], axis=0))
     sums = for_chunks(
         scene.sum_views, len(splats), _CHUNK,

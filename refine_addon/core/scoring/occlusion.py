@@ -24,6 +24,7 @@ import numpy as np
 
 from ..errors import RefineError
 from ..scores import Scores, shares_gone
+from ..splats import refuse_undrawable
 from ..work import Progress, part, report, silent
 from . import closed_form, coverage, projection
 from .measuring import Measured, Measuring, Sampling
@@ -277,11 +278,7 @@ class Run:
             splats, views, progress=part(progress, 0.0, 0.5), threads=threads
         )
         self.undrawable = ~good  # (N,) bool
-        if not good.any():
-            msg = (
-                f"none of the {len(splats)} splats can be drawn: each is transparent or not finite"
-            )
-            raise RefineError(msg)
+        refuse_undrawable(good)
         self.measuring = Measuring(scene, views, settings, threads, members)
         self.sights = SightLines(self.measuring.views, self.gaussians, splats)
         self.rounds = settings.rounds

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .. import spherical_harmonics
-from ..quality import PSNR_CAP, SHARES, TAKEN_OVER, Quality, absorbed_from
+from ..quality import FEWEST, PSNR_CAP, SHARES, TAKEN_OVER, Quality, absorbed_from
 from ..rendering import ALPHA_CUT, ALPHA_MAX
 from ..work import Progress, checkpoint, for_chunks, part, silent
 from . import projection
@@ -341,7 +341,8 @@ class SightLines:
         )
         assert gains is not None  # noqa: S101 - the same lines tell it
         found = np.minimum.accumulate(found)
-        return Quality(np.array(SHARES), found, absorbed_from(found, gains))
+        absorbed = absorbed_from(found, gains, len(values))
+        return Quality(np.array(SHARES), found, absorbed, foretold=len(values) >= FEWEST)
 
     def judged(
         self,

@@ -64,7 +64,8 @@ def adjust(hand: Hand, values: dict[str, Any]) -> Generator[float, None, None]:
     for key, value in values.items():
         setattr(operator.properties, key, value)
     with bpy.context.temp_override(window=hand.window, area=hand.area, region=hand.sidebar):
-        bpy.ops.ed.undo_redo()
+        # As by hand, with an undo step of its own.
+        bpy.ops.ed.undo_redo("EXEC_DEFAULT", True)  # noqa: FBT003
     yield 0.5
 
 
