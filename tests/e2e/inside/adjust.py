@@ -65,7 +65,7 @@ def adjust(hand: Hand, values: dict[str, Any]) -> Generator[float, None, None]:
         setattr(operator.properties, key, value)
     with bpy.context.temp_override(window=hand.window, area=hand.area, region=hand.sidebar):
         # As by hand, with an undo step of its own.
-        bpy.ops.ed.undo_redo("EXEC_DEFAULT", True)  # noqa: FBT003
+        bpy.ops.ed.undo_redo("EXEC_DEFAULT", True)
     yield 0.5
 
 
