@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import bpy
-from bpy.props import FloatProperty, PointerProperty
+from bpy.props import PointerProperty
 
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
-from .ui import camera_list, kept, plans, price, translations
+from .ui import camera_list, kept, plans, price, running, translations, volumes
 from .ui.camera_list import REFINE_PT_camera_list, REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
@@ -35,17 +35,30 @@ from .ui.panel import (
 from .ui.preferences import RefinePreferences
 from .ui.properties import RefineSettings
 from .ui.view_operators import REFINE_OT_view
+from .ui.volumes import (
+    REFINE_OT_add_volume,
+    REFINE_OT_crop,
+    REFINE_OT_drop_volume,
+    REFINE_OT_protect,
+    REFINE_PT_volumes,
+    RefineVolume,
+)
 from .viewport import draw
 from .webp import BlenderImages
 
 CLASSES = (
     RefineCamera,
+    RefineVolume,
     RefineSettings,
     RefinePreferences,
     REFINE_OT_import_ply,
     REFINE_OT_import_cameras,
     REFINE_OT_find_floaters,
     REFINE_OT_delete_floaters,
+    REFINE_OT_protect,
+    REFINE_OT_add_volume,
+    REFINE_OT_drop_volume,
+    REFINE_OT_crop,
     REFINE_OT_score,
     REFINE_OT_plan,
     REFINE_OT_apply,
@@ -61,6 +74,7 @@ CLASSES = (
     REFINE_UL_cameras,
     REFINE_PT_camera_list,
     REFINE_PT_floaters,
+    REFINE_PT_volumes,
     REFINE_PT_score,
     REFINE_PT_advanced,
     REFINE_PT_preview,
@@ -79,13 +93,14 @@ def register() -> None:
     for cls in CLASSES:
         bpy.utils.register_class(cls)
     bpy.types.Scene.refine = PointerProperty(type=RefineSettings)
-    bpy.types.WindowManager.refine_progress = FloatProperty(default=-1.0, options={"SKIP_SAVE"})
     bpy.types.TOPBAR_MT_file_import.append(_draw_import)
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
     translations.register()
     camera_list.register()
     kept.register()
+    volumes.register()
     price.register()
+    running.register()
     images.use(BlenderImages())
     _commands.append(bpy.utils.register_cli_command("refine", _run_command))
 
@@ -95,14 +110,15 @@ def unregister() -> None:
     draw.stop()
     bpy.utils.unregister_cli_command(_commands.pop())
     images.use(None)
+    running.unregister()
     plans.unregister()
     price.unregister()
+    volumes.unregister()
     kept.unregister()
     camera_list.unregister()
     translations.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)
     bpy.types.TOPBAR_MT_file_import.remove(_draw_import)
-    del bpy.types.WindowManager.refine_progress
     del bpy.types.Scene.refine
     for cls in reversed(CLASSES):
         bpy.utils.unregister_class(cls)

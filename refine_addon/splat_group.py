@@ -7,25 +7,26 @@ What panel operators do to the selection goes through here. A single object is h
 from __future__ import annotations
 
 import uuid
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
+import bpy
 import numpy as np
 
-from . import splat_object
+from . import demands, splat_object
 from .core.errors import RefineError
 from .core.quality import Quality
 from .core.selection import rank
 from .core.splats import Splats, above_constant
 from .core.task import DEFAULTS, Task
+from .demands import Demands
 from .mesh import edit as mesh_edit
 from .mesh import layout as mesh_layout
 from .mesh import scores as mesh_scores
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
 
-    import bpy
     from numpy.typing import NDArray
 
     from .core.absorbing.absorb import Absorbed
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from .core.selection import Budget
     from .core.task import Result, Settings
     from .core.views import ViewSet
+    from .core.volumes import Forced
     from .mesh.layout import SplatObject
     from .splat_object import Plan
 
@@ -73,14 +75,60 @@ def members(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> Members:
     return found
 
 
-def by_names(names: Iterable[str]) -> Members:
-    """Return the objects of these names; see `splat_object.find` and `mesh.layout.check`."""
-    return [mesh_layout.check(splat_object.find(name)) for name in names]
+def active_first(layer: bpy.types.ViewLayer, active: SplatObject | None) -> Members:
+    """Return the objects of `members`, the active one first; none without it."""
+    if active is None:
+        return []
+    return sorted(members(layer, active.obj), key=lambda member: member.obj != active.obj)
 
 
-def names_of(group: Members) -> tuple[str, ...]:
-    """Return the names of the objects."""
-    return tuple(member.obj.name for member in group)
+def uids_of(group: Members) -> tuple[int, ...]:
+    """Return what Blender knows the objects by in this session, whatever they are called."""
+    return tuple(member.obj.session_uid for member in group)
+
+
+def by_uids(uids: tuple[int, ...]) -> Members:
+    """Return the objects again, in that order; see `mesh.layout.check`."""
+    there = {obj.session_uid: obj for obj in bpy.data.objects}
+    return [mesh_layout.check(there.get(uid)) for uid in uids]
+
+
+def forced(scene: bpy.types.Scene, group: Members) -> list[Forced]:
+    """Return what must stay and what must go of each object, as a scene says it.
+
+    A name protects in the objects that have it.
+
+    Raises
+    ------
+    RefineError
+        See `Demands`; also if no object has a name that protects.
+    """
+    wanted = Demands.of_scene(scene)
+    if len(group) == 1:
+        return [wanted.forced(group[0])]
+    owners = [(name, _protecting(group, name)) for name in wanted.names]
+    return [
+        replace(wanted, names=tuple(n for n, has in owners if has[place])).forced(member)
+        for place, member in enumerate(group)
+    ]
+
+
+def refresh(scene: bpy.types.Scene, group: Members) -> list[Forced]:
+    """Mark what a scene demands of each object, and return it; see `demands.refresh`."""
+    if len(group) == 1:
+        return [demands.refresh(scene, group[0])]
+    found = forced(scene, group)
+    for member, own in zip(group, found, strict=True):
+        demands.mark(member, own)
+    return found
+
+
+def removed_of(found: Sequence[Forced], group: Members) -> NDArray[np.bool_] | None:
+    """Return which splats of all objects must go, (N,); None where there are none."""
+    masks = [own.removed for own in found]
+    if all(mask is None for mask in masks):
+        return None
+    return _joined_masks(masks, [len(member) for member in group])
 
 
 def gather(group: Members, *, whole: bool | None = False) -> Splats:
@@ -88,13 +136,28 @@ def gather(group: Members, *, whole: bool | None = False) -> Splats:
     return _joined([splat_object.gather(member, whole=whole) for member in group])
 
 
-def store(
-    group: Members,
-    scores: Scores,
-    settings: Settings,
-    origins: Sequence[dict[str, Any]],
-    cameras: list[tuple[str, int]],
-) -> None:
+@dataclass(frozen=True, eq=False)
+class Noted:
+    """How scores came to be; see `mesh.scores.store`.
+
+    Attributes
+    ----------
+    settings, cameras, asked
+        See there.
+    origins : sequence of dict
+        Of each object.
+    removed : (N,) bool or None
+        Splats of all objects that had to go.
+    """
+
+    settings: Settings
+    origins: Sequence[dict[str, Any]]
+    cameras: list[tuple[str, int]] | None = None
+    removed: NDArray[np.bool_] | None = None
+    asked: Settings | None = None
+
+
+def store(group: Members, scores: Scores, noted: Noted) -> None:
     """Write scores of all objects' splats to their meshes; see `mesh.scores.store`.
 
     Parameters
@@ -102,63 +165,63 @@ def store(
     group : list of SplatObject
     scores : Scores
         Of the splats of `gather`.
-    settings, cameras
-        See `mesh.scores.store`.
-    origins : sequence of dict
-        Of each object.
+    noted : Noted
     """
-    if len(group) == 1:
-        mesh_scores.store(group[0], scores, settings, origins[0], cameras)
-        return
     _check_counts(group, len(scores.values))
-    ranks = rank(scores.values)
-    scoring = uuid.uuid4().hex
-    for member, rows, origin in zip(group, _rows(group), origins, strict=True):
-        values = scores.values[rows]
-        own = replace(
-            scores,
-            values=values,
-            seen=scores.seen[rows],
-            undrawable=int(np.count_nonzero(values == 0.0)),
-        )
-        together = mesh_scores.Together(scoring, len(scores.values), ranks[rows])
-        mesh_scores.store(member, own, settings, origin, cameras, together)
+    ranks, scoring = rank(scores.values), uuid.uuid4().hex
+    for member, rows, origin in zip(group, _rows(group), noted.origins, strict=True):
+        values, own, together = scores.values[rows], scores, None
+        gone = 0 if noted.removed is None else int(np.count_nonzero(noted.removed[rows]))
+        if len(group) > 1:
+            undrawable = int(np.count_nonzero(values == 0.0)) - gone
+            own = replace(scores, values=values, seen=scores.seen[rows], undrawable=undrawable)
+            together = mesh_scores.Together(scoring, len(scores.values), ranks[rows])
+        mesh_scores.store(
+            member, own, noted.settings, origin, noted.cameras,
+            forced=gone, asked=noted.asked, together=together,
+        )  # fmt: skip
 
 
 def stored_task(
     group: Members,
     budget: Budget,
-    protect: str = "",
+    found: Sequence[Forced],
     *,
     settings: Settings = DEFAULTS,
     views: ViewSet | None = None,
 ) -> Task:
     """Return what Apply has to decide of all objects; see `splat_object.stored_task`.
 
+    Parameters
+    ----------
+    group, budget, settings, views
+        See there.
+    found : sequence of Forced
+        What must stay and what must go of each object.
+
     Raises
     ------
     RefineError
-        Also if the objects were not scored together; and if what is protected is named by none.
+        Also if the objects were not scored together.
     """
-    if len(group) == 1:
-        (member,) = group
-        return splat_object.stored_task(member, budget, protect, settings=settings, views=views)
-    _check_scored_together(group)
-    names = _protecting(group, protect)
+    if len(group) > 1:
+        _check_scored_together(group)
     tasks = [
-        splat_object.stored_task(member, budget, name, settings=settings, views=views)
-        for member, name in zip(group, names, strict=True)
+        splat_object.stored_task(member, budget, own, settings=settings, views=views)
+        for member, own in zip(group, found, strict=True)
     ]
+    if len(tasks) == 1:
+        return tasks[0]
     counts = [len(member) for member in group]
     masks: dict[str, Any] = {
-        field.name: _joined_masks([getattr(task, field.name) for task in tasks], counts)
-        for field in fields(Task)
-        if any(isinstance(getattr(task, field.name), np.ndarray) for task in tasks)
+        name: _joined_masks([getattr(task, name) for task in tasks], counts)
+        for name in ("protected", "removed")
+        if any(getattr(task, name) is not None for task in tasks)
     }
     return replace(
         tasks[0],
         splats=None if views is None else _joined([task.splats for task in tasks if task.splats]),
-        scores=_scores(group, [task.scores for task in tasks if task.scores]),
+        scores=_scores(group, [task.scores for task in tasks if task.scores], masks),
         # Of rows of several lengths the longest counts: a size is never exceeded.
         row_bytes=max(float(task.row_bytes) for task in tasks),
         fixed_bytes=sum(task.fixed_bytes for task in tasks),
@@ -208,9 +271,10 @@ def _rows(group: Members) -> list[slice]:
 def _check_counts(group: Members, count: int) -> None:
     found = sum(len(member) for member in group)
     if found != count:
+        names = ", ".join(repr(member.obj.name) for member in group)
         msg = (
-            f"objects {', '.join(names_of(group))}: have {found} splats together and had {count} "
-            "when the work began; do it again"
+            f"objects {names}: have {found} splats together and had {count} when the work began; "
+            "do it again"
         )
         raise RefineError(msg)
 
@@ -229,10 +293,13 @@ def _check_scored_together(group: Members) -> None:
         raise RefineError(msg)
 
 
-def _scores(group: Members, parts: list[Scores]) -> Scores:
+def _scores(group: Members, parts: list[Scores], masks: dict[str, Any]) -> Scores:
     """Return the scores of all objects as one; their curve, if all that were scored are there."""
-    noted = mesh_scores.record(group[0].mesh) or {}
+    records = [mesh_scores.record(member.mesh) or {} for member in group]
+    noted, removed = records[0], masks.get("removed")
     whole = noted["together"]["splats"] == sum(len(part.values) for part in parts)
+    gone = 0 if removed is None else int(np.count_nonzero(removed))
+    whole = whole and gone == sum(record.get("forced", 0) for record in records)
     return replace(
         parts[0],
         values=np.concatenate([part.values for part in parts]),
@@ -242,25 +309,25 @@ def _scores(group: Members, parts: list[Scores]) -> Scores:
     )
 
 
-def _protecting(group: Members, protect: str) -> list[str]:
-    """Return what protects in each object: the name, or nothing where it has none of that name.
+def _protecting(group: Members, name: str) -> list[bool]:
+    """Return which objects have something of that name that protects.
 
     Raises
     ------
     RefineError
-        If none has one.
+        If none has.
     """
-    names, errors = [], []
+    found, errors = [], []
     for member in group:
         try:
-            mesh_edit.protected_mask(member.obj, protect)
-            names.append(protect)
+            mesh_edit.protected_mask(member.obj, name)
+            found.append(True)
         except RefineError as error:
-            names.append("")
+            found.append(False)
             errors.append(error)
-    if len(errors) == len(group):
+    if not any(found):
         raise errors[0]
-    return names
+    return found
 
 
 def _joined_masks(parts: list[Any], counts: list[int]) -> NDArray[np.bool_]:

@@ -24,9 +24,11 @@ from .core.formats.registry import as_written, format_named, refuse_unknown_size
 from .core.report import Clock, Files, complete_report, held
 from .core.survivors import survivor_columns
 from .core.task import DEFAULTS, Result, Settings, Task
+from .core.volumes import FREE, Forced
 from .core.whole_file import expanded, refuse_existing
 from .core.work import Progress, part, silent
 from .core.written import written_facts
+from .demands import NONE
 from .mesh import attributes as mesh_attributes
 from .mesh import edit as mesh_edit
 from .mesh import floaters as mesh_floaters
@@ -49,6 +51,7 @@ if TYPE_CHECKING:
     from .core.selection import Budget
     from .core.splats import Splats
     from .core.views import ViewSet
+    from .demands import Demands
 
 
 @dataclass(frozen=True)
@@ -125,7 +128,7 @@ def modifier_notes(obj: bpy.types.Object) -> list[str]:
 def stored_task(
     checked: SplatObject,
     budget: Budget,
-    protect: str = "",
+    found: Forced = FREE,
     *,
     settings: Settings = DEFAULTS,
     views: ViewSet | None = None,
@@ -136,8 +139,8 @@ def stored_task(
     ----------
     checked : SplatObject
     budget : Budget
-    protect : str
-        Name of a boolean point attribute or a vertex group: what is in it stays.
+    found : Forced
+        What must stay and what must go; see `Demands.forced`.
     settings : Settings, optional
         For absorbing.
     views : ViewSet, optional
@@ -151,7 +154,8 @@ def stored_task(
     Raises
     ------
     RefineError
-        If the object was not scored, or has nothing named `protect`; also see `gather`.
+        If the object was not scored, or some of it needs scores now that had to go then; also see
+        `gather`.
     """
     row_bytes, fixed_bytes = mesh_attributes.file_size(checked)
     return Task(
@@ -159,17 +163,13 @@ def stored_task(
         settings=settings,
         splats=None if views is None else gather(checked, whole=True),
         views=views,
-        scores=stored_scores(checked),
-        protected=mesh_edit.protected_mask(checked.obj, protect),
+        scores=stored_scores(checked, found.removed),
+        protected=found.protected,
+        removed=found.removed,
         absorb=views is not None,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
     )
-
-
-def keep_mask(checked: SplatObject, budget: Budget, protect: str = "") -> NDArray[np.bool_]:
-    """Return which splats of a scored object stay; see `stored_task`."""
-    return pipeline.decide(stored_task(checked, budget, protect)).keep
 
 
 def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
@@ -299,19 +299,51 @@ def export_object(
         If the object's scale is uneven and is to be applied, or the file cannot be written; nothing
         is written then.
     """
+    target = export_target(path, overwrite=overwrite)
+    file = export_source(checked, columns=columns, apply_transform=apply_transform)
+    return write_export(file, target, keep=keep, overwrite=overwrite)
+
+
+def export_target(path: Path | str, *, overwrite: bool) -> Path:
+    """Return the file that `export_object` would write, or raise `RefineError` if it cannot."""
     target = expanded(path)
     refuse_existing(target, overwrite=overwrite)
-    file = mesh_attributes.file_from_object(
+    return target
+
+
+def export_source(
+    checked: SplatObject,
+    *,
+    columns: dict[str, NDArray[Any]] | None = None,
+    apply_transform: bool = False,
+) -> SplatFile:
+    """Return what `export_object` writes, in memory."""
+    return mesh_attributes.file_from_object(
         checked, _world_columns(checked) if apply_transform else columns
     )
+
+
+def write_export(
+    file: SplatFile,
+    target: Path,
+    *,
+    keep: NDArray[np.bool_] | None = None,
+    overwrite: bool = False,
+) -> SplatFile | Packed:
+    """Do what is left of `export_object`, which takes arrays alone; see there."""
     made = as_written(file, target)
     made.write(target, keep, overwrite=overwrite)
     return made
 
 
 def score_object(
-    name: str, views: ViewSet, settings: Settings, *, progress: Progress = silent
-) -> tuple[SplatFile, Scores, list[str]]:
+    name: str,
+    views: ViewSet,
+    settings: Settings,
+    demands: Demands = NONE,
+    *,
+    progress: Progress = silent,
+) -> tuple[SplatFile, Scores, Forced, list[str]]:
     """Score an object of the open scene; nothing in the scene changes.
 
     Parameters
@@ -320,6 +352,8 @@ def score_object(
         Of the object.
     views, settings, progress
         See `refine_addon.core.pipeline.score`.
+    demands : Demands
+        What must stay and what must go; the latter scores 0.
 
     Returns
     -------
@@ -327,17 +361,23 @@ def score_object(
         The file that the object would be.
     Scores
         Of its splats.
+    Forced
+        What must stay and what must go.
     list of str
         See `modifier_notes`.
 
     Raises
     ------
     RefineError
-        See `gather` and `refine_addon.core.pipeline.score`; also if there is no such object.
+        See `gather`, `Demands.forced` and `refine_addon.core.pipeline.score`; also if there is no
+        such object.
     """
     checked = check(find(name))
-    scores = pipeline.score(gather(checked), views, settings, progress=progress)
-    return mesh_attributes.file_from_object(checked), scores, modifier_notes(checked.obj)
+    found = demands.forced(checked)
+    scores = pipeline.score(
+        gather(checked), views, settings, removed=found.removed, progress=progress
+    )
+    return mesh_attributes.file_from_object(checked), scores, found, modifier_notes(checked.obj)
 
 
 def prune_object(  # noqa: PLR0913 - the command's options
@@ -345,6 +385,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     views: ViewSet,
     budget: Budget,
     settings: Settings,
+    demands: Demands = NONE,
     *,
     absorb: bool = False,
     output: Path | None = None,
@@ -362,6 +403,8 @@ def prune_object(  # noqa: PLR0913 - the command's options
         Of the object.
     views, budget, settings, absorb, progress
         See `refine_addon.core.pipeline.prune`.
+    demands : Demands
+        What must stay and what must go.
     output : Path, optional
         The file to make, in the format that its suffix names.
     pictures : PictureFiles, optional
@@ -381,9 +424,9 @@ def prune_object(  # noqa: PLR0913 - the command's options
     Raises
     ------
     RefineError
-        See `gather`, `apply_object`, `export_object` and `refine_addon.core.pipeline.prune`; also
-        if there is no such object, or the .blend cannot be saved. What was exported by then stays;
-        the object is as it was.
+        See `gather`, `Demands.forced`, `apply_object`, `export_object` and
+        `refine_addon.core.pipeline.prune`; also if there is no such object, or the .blend cannot be
+        saved. What was exported by then stays; the object is as it was.
     """
     clock = Clock()
     checked = check(find(name))
@@ -398,11 +441,14 @@ def prune_object(  # noqa: PLR0913 - the command's options
     seen = settings.estimates or budget.psnr is not None or pictures is not None
     matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
     splats = gather(checked, whole=absorb or (None if seen else False))
+    found = demands.forced(checked)
     task = Task(
         budget=budget,
         settings=settings,
         splats=splats,
         views=views,
+        protected=found.protected,
+        removed=found.removed,
         absorb=absorb,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
@@ -421,7 +467,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     result.report["notes"] += made.notes(result.keep)
     if save and not dry_run:
         with mesh_edit.all_or_nothing(checked.obj):
-            store(checked, result.scores, settings)
+            store(checked, result.scores, settings, forced=result.report["splats"]["forced"])
             _reduce(checked, result.keep, columns)
             _save(target)
     clock.lap("write_s")
@@ -433,6 +479,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
         clock=clock, matrix=matrix, progress=part(progress, 0.85, 1.0),
     )  # fmt: skip
     result.report.update(drawn)
+    result.report["volumes"] = list(found.facts)
     result.report["notes"] += modifier_notes(checked.obj)
     source, output_name = f"{bpy.data.filepath}#{name}", None if target is None else str(target)
     after = sizes.bytes_after if target is None else target.stat().st_size

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import tempfile
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
+
+from . import main_thread
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -20,7 +23,7 @@ _LOSSLESS = 100
 
 
 class BlenderImages:
-    """A codec, see `refine_addon.core.formats.images.Codec`; for Blender's main thread."""
+    """A codec, see `refine_addon.core.formats.images.Codec`; works on Blender's main thread."""
 
     def size(self, data: bytes) -> tuple[int, int]:
         """Return width and height, read from the first bytes of the file.
@@ -47,6 +50,13 @@ class BlenderImages:
 
     def decode(self, data: bytes) -> NDArray[np.uint8]:
         """Return the pixels, (height, width, 4), the top row first."""
+        return main_thread.call(partial(self._decode, data))
+
+    def encode(self, pixels: NDArray[np.uint8]) -> bytes:
+        """Return a WebP image of pixels (height, width, 4); colours of alpha 0 may be lost."""
+        return main_thread.call(partial(self._encode, pixels))
+
+    def _decode(self, data: bytes) -> NDArray[np.uint8]:
         with _file() as path:
             path.write_bytes(data)
             try:
@@ -67,8 +77,7 @@ class BlenderImages:
         pixels = np.rint(values * 255.0).astype(np.uint8)
         return pixels.reshape(height, width, 4)[::-1]  # Blender's first row is the lowest
 
-    def encode(self, pixels: NDArray[np.uint8]) -> bytes:
-        """Return a WebP image of pixels (height, width, 4); colours of alpha 0 may be lost."""
+    def _encode(self, pixels: NDArray[np.uint8]) -> bytes:
         height, width = pixels.shape[:2]
         image = bpy.data.images.new("refine", width, height, alpha=True, is_data=True)
         try:

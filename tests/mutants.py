@@ -32,9 +32,37 @@ MUTANTS = {
             "turned the other way",
         ),
     ],
+    "whole_file.py": [
+        ("            checkpoint()  #", "            #", "cancelled, and there all the same"),
+    ],
+    "pace.py": [
+        ("passed * (total - done) / done", "passed * total / done", "time in all, not left"),
+        ("not 0.0 < done < total", "not 0.0 <= done < total", "a pace before anything is done"),
+    ],
     "work.py": [
         ("            cancelled.set()\n", "", "what runs is not told"),
         ("time.monotonic() - told >= _REPORT_INTERVAL", "False", "one thread not asked"),
+    ],
+    "solid.py": [
+        ("below = y[corners] <= py[:, None]", "below = y[corners] < py[:, None]", "ends twice"),
+        (
+            "first, last = np.minimum(one, other), np.maximum(one, other)",
+            "first, last = one, other",
+            "edges cut otherwise by each side",
+        ),
+        ("above = heights > points[rows, 2]", "above = heights >= points[rows, 2]", "upper face"),
+        ("turns != 0.0 if self.turned", "turns == 1.0 if self.turned", "overlaps left out"),
+        ("wide = (np.floor", "wide = False & (np.floor", "wide triangles touch few cells"),
+    ],
+    "volumes.py": [
+        ("removed = removed & ~protected", "pass", "force wins over protection"),
+        ("removed | ~masks", "removed & ~masks", "removed only where not kept"),
+        ("points < self.high", "points <= self.high", "boxes share their faces"),
+    ],
+    "task.py": [
+        ("removed = removed & ~self.protected", "pass", "force wins over protection"),
+        ("rows[rest] if isinstance", "rows if isinstance", "rows of all"),
+        ("self.budget.after(int(np.count_nonzero(forced)), len(forced))", "self.budget", "twice"),
     ],
     "frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
@@ -155,6 +183,8 @@ MUTANTS = {
         ("wider = spread > widest", "wider = spread < widest", "halved along the narrowest"),
     ],
     "formats/spz.py": [
+        ("for size in (_STEP, 1):", "for size in (_STEP,):", "damage to a step alone"),
+        (" and head.startswith(GZIP)", "", "any file by its name"),
         ("(whole << 8) >> 8", "whole", "positions without sign"),
         ("[:, _WXYZ]", "", "rotations x y z w"),
         (
@@ -451,7 +481,15 @@ MUTANTS = {
         ),
         ("if format_named(path) is None:", "if False:", "a plain PLY compared"),
     ],
+    "quality.py": [
+        (" - halvings * np.array(FEWER)", "", "few splats that gain as much"),
+    ],
+    "report.py": [
+        ("missing = made.left_out(keep)", "missing = 0", "splats that no file holds"),
+        ("np.count_nonzero(seen == 0)", "np.count_nonzero(seen)", "unseen are seen"),
+    ],
     "levels/lod.py": [
+        ("        if not gone:\n            continue\n", "", "levels that are copies"),
         ("keep[first.keep] = second.keep", "keep[: len(second.keep)] = second.keep", "other rows"),
         (
             "first.changed[second.keep] | second.changed",
@@ -494,16 +532,28 @@ MUTANTS = {
             "no slope",
         ),
         ("lines.dark * present", "lines.dark + 0.0 * present", "suspects hide what lies behind"),
+        ("more = 1.0 / (1.0 - hits.alpha)", "more = 1.0", "a splat that dims its own support"),
+        ("(stops + passes > SEEN * mass)", "(mass >= 0.0)", "views that see nothing"),
+        ("stops < PAST * (stops + passes)", "stops < passes", "past by half"),
     ],
     "cleaning/clean.py": [
         ("(seen.views > 0) & ", "", "who sees nothing sees past"),
-        ("found[name] &= ~protected", "pass", "protected ones go"),
+        ("masks[name] &= ~protected", "pass", "protected ones go"),
         ("sizes < SMALL", "sizes > SMALL", "clusters of any size"),
+        ("self._floats(most) & shows", "self._floats(most)", "giants that do not show"),
+        ("visible & doubted & ~needle", "visible & ~needle", "two reasons for one splat"),
+        ("self.gaussians.alphas < VEIL, ", "False, ", "veils like other giants"),
+        (" & agreed(self.evidence, effect)", "", "one view decides"),
+        ("(seen.past >= AGREE * seen.views)", "True", "a minority of the views decides"),
+        ("self.slender & (widest >= LONG) & ~giant", "self.slender & ~giant", "short needles"),
+        ("(self.gaussians.largest >= HUGE) & (widest >= GIANT)", "widest >= GIANT", "near giants"),
+        ("self.gaussians.alphas * contrast", "contrast", "opacity that does not count"),
+        ("scales[:, 2] - scales[:, 1] >=", "scales[:, 2] - scales[:, 0] >=", "flakes as needles"),
         ("most | (some & (effect >= LOUD))", "most | some", "few views for what hardly shows"),
         ("(WIDE / np.maximum(widest, WIDE))", "1.0", "haze over the picture stays"),
     ],
     "cleaning/clusters.py": [
-        ("labels = jumped", "break", "parts that are not joined"),
+        ("* REACH", "* 0.0", "splats that never touch"),
     ],
     "absorbing/neighbours.py": [
         (
@@ -531,8 +581,12 @@ TESTS = {
         "scoring/coverage.py",
     ],
     "absorb": ["absorbing/merge_field.py", "absorbing/merging.py", "absorbing/merge_graph.py"],
-    "cleaning": ["cleaning/sight.py", "cleaning/clean.py", "cleaning/clusters.py"],
+    "cleaning": ["cleaning/clusters.py"],
+    "cleaning_reasons": ["cleaning/sight.py", "cleaning/clean.py"],
+    "command_pace": ["pace.py"],
     "invariance": ["scene.py"],
+    "volumes": ["solid.py"],
+    "forced": ["task.py"],
     "affine": ["spherical_harmonics.py"],
     "ply": ["formats/ply_columns.py", "formats/ply_write.py"],
     "formats": [
@@ -542,6 +596,7 @@ TESTS = {
     ],
     "glb": ["formats/glb_document.py"],
     "viewport_arrays": ["../viewport/arrays.py"],
+    "command_counts": ["report.py"],
     "levels": ["levels/lod.py", "levels/distance.py", "levels/files.py"],
     "pictures": ["png.py", "picture_files.py"],
 }

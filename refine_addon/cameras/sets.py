@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import bpy
 import numpy as np
 
 from ..core.errors import RefineError
@@ -13,6 +12,7 @@ from ..core.views import View, ViewSet
 from .objects import SHEAR, camera_from_view, turned, view_from_camera, world_matrix
 
 if TYPE_CHECKING:
+    import bpy
     from numpy.typing import NDArray
 
 
@@ -71,12 +71,6 @@ def create_cameras(
         camera.data.display_size = min(max(0.1 * spread, 1e-3), 1.0) if len(views) > 1 else 0.25
         collection.objects.link(camera)
     return cameras
-
-
-def visible_views(scene: bpy.types.Scene) -> ViewSet:
-    """Return the views of all visible cameras of a scene: the background command's default."""
-    with bpy.context.temp_override(scene=scene):
-        return views_from_scene(bpy.context, "VISIBLE")
 
 
 def views_from_frames(

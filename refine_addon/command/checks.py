@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from ..core import RefineError
 from ..core.formats.registry import format_named, without_suffix
 from ..core.levels.files import MANIFEST, check_goal, is_manifest, level_paths
-from . import options
+from . import options, zones
 from .report import is_report
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
         _check_settings(parser, given)
     except RefineError as error:
         parser.error(str(error))
+    zones.check(parser, given)
     if given.command == "prune":
         _check_prune(parser, given)
     elif given.command == "clean":

@@ -9,6 +9,7 @@ from ..core.quality import in_words
 from ..core.report import size_in_words
 from .options import levels, settings
 from .words import by, left_unseen
+from .zones import of_files, words
 
 if TYPE_CHECKING:
     import argparse
@@ -33,6 +34,7 @@ def make_levels(
         views,
         levels(options),
         settings(options),
+        zones=of_files(options),
         suffix=options.format,
         goal=options.distance_psnr,
         overwrite=options.overwrite,
@@ -44,8 +46,11 @@ def make_levels(
         f"{source}: {made} level{'s' if made > 1 else ''} of {count:,} splats, "
         f"{by(done['views'])}, {done['timings']['total_s']:.2f} s -> {options.output_dir}"
     )
+    if said := words(done):
+        terminal.say(f"  {said}")
     if done["splats"]["unseen"]:
-        terminal.say(f"  {left_unseen(done['splats']['unseen'], count)}")
+        scored = count - done["splats"]["forced"]
+        terminal.say(f"  {left_unseen(done['splats']['unseen'], scored)}")
     for entry in done["levels"]:
         terminal.say(f"  {_in_words(entry, done['goal_psnr'])}")
     terminal.notes(done["notes"])
@@ -59,6 +64,6 @@ def _in_words(entry: dict[str, Any], goal: float) -> str:
         parts.append(in_words(entry["psnr"]))
     far = entry["distance_psnr"]
     if far is not None:
-        parts.append(f"{goal:g} dB from {far:.3g} away")
-    parts.append(f"under a pixel from {entry['distance_pixel']:.3g}")
+        parts.append(f"{goal:g} dB at a distance of {far:.3g} or more")
+    parts.append(f"no change wider than a pixel at {entry['distance_pixel']:.3g} or more")
     return f"{entry['file']}: {', '.join(parts)}"

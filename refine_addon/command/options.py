@@ -11,6 +11,7 @@ from ..core.formats.registry import SUFFIXES
 from ..core.levels.files import GOAL
 from ..core.whole_file import expanded
 from ..version import VERSION
+from . import zones
 from .terminal import shown
 
 DEFAULT_RATIO = 0.5
@@ -30,6 +31,8 @@ EXAMPLES = {
         "refine prune in.ply --cameras cameras.json --ratio 0.7 -o out.ply",
         "refine prune *.ply --cameras cameras.json --psnr 40 --output-dir pruned",
         "refine prune in.ply --cameras sparse/0 --max-mb 5 --absorb -o out.ply",
+        "refine prune in.ply --cameras sparse/0 --keep-inside box:-2,-2,-1,2,2,3 -o out.ply",
+        f"{BLENDER}refine prune --object Splats --protect Statue --remove-inside Sky -o out.ply",
         f"{BLENDER}refine prune --object Splats -o out.ply",
         f"{BLENDER}refine prune --object Splats --frames 1:250:10 --save",
         f"{BLENDER}refine prune --object Splats --source collection:Shot --dry-run",
@@ -126,7 +129,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "--psnr",
         type=float,
         metavar="DB",
-        help="remove as much as leaves the cameras' pictures this close to the unpruned ones: 40 "
+        help="remove as much as leaves the views' pictures this close to the unpruned ones: 40 "
         "is hard to tell apart, 30 is seen",
     )
     _add_scoring(prune)
@@ -142,6 +145,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         action="store_true",
         help="first remove floaters and outliers, as clean does; the budget counts the rest",
     )
+    zones.add(prune, names="a vertex group or boolean attribute of --object, ")
     prune.add_argument(
         "--pictures",
         type=_path,
@@ -168,6 +172,7 @@ def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         help=f"which to remove, of {', '.join(REASONS)} (default {','.join(Cleaning.reasons)})",
     )
     _add_views(cleaning)
+    zones.add(cleaning)
     _add_common(cleaning)
 
 
@@ -179,6 +184,7 @@ def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "-o", "--output", type=_path, metavar="OUT.ply", required=True, help="the file to make"
     )
     _add_scoring(scoring)
+    zones.add(scoring, protects=False)
     _add_common(scoring)
 
 
@@ -232,6 +238,7 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
         f"{GOAL:g})",
     )
     _add_scoring(making)
+    zones.add(making)
     _add_common(making)
 
 

@@ -9,20 +9,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..core import RefineError, as_written, clean, picture_files, prune_file, read_splats, score
+from ..core import (
+    RefineError,
+    as_written,
+    clean,
+    forced,
+    picture_files,
+    prune_file,
+    read_splats,
+    score,
+)
 from ..core.errors import printable
 from ..core.formats.registry import without_suffix
+from ..core.pace import Pace
 from ..core.picture_files import PictureFiles
 from ..core.quality import UNSEEN, in_words
 from ..core.report import held, kept_and_removed, scoring_notes, seen_by, what_was_seen
 from ..core.whole_file import refuse_existing, refuse_mapped
-from . import report
+from . import report, zones
 from .cameras import deciding
 from .checks import open_blend
 from .info import describe
 from .lod import make_levels
 from .options import budget, cleaning, settings
-from .pace import Pace
 from .terminal import Terminal, complain, described
 from .words import by, left_unseen, sizes, written
 
@@ -33,6 +42,7 @@ if TYPE_CHECKING:
     from ..core import ViewSet
     from ..core.formats.ply import SplatFile
     from ..core.scores import Scores
+    from ..core.volumes import Forced
 
 
 def execute(options: argparse.Namespace) -> bool:
@@ -172,6 +182,7 @@ def _prune_one(run: _Run, source: Path, output: Path | None, views: ViewSet) -> 
         views,
         budget(options),
         settings(options),
+        zones=zones.of_files(options),
         absorb=options.absorb,
         cleaning=cleaning(options) if options.clean else None,
         pictures=_pictures(options, without_suffix(source.name)),
@@ -193,6 +204,7 @@ def _prune_object(run: _Run) -> dict[str, Any]:
         run.views(),
         budget(options),
         settings(options),
+        zones.of_object(options),
         absorb=options.absorb,
         output=options.output,
         pictures=_pictures(options, options.object),
@@ -220,8 +232,10 @@ def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
     target = f" -> {files['output']}" if files["output"] else ""
     run.terminal.say(f"{run.named(label)}: {', '.join(parts)}{target}")
     run.say_cameras()
+    if demanded := zones.words(done):
+        run.terminal.say(f"  {demanded}")
     cleaned = sum(count for count in done.get("cleaned", {}).values() if isinstance(count, int))
-    run.say_unseen(splats["unseen"], splats["before"] - cleaned)
+    run.say_unseen(splats["unseen"], splats["before"] - cleaned - splats["forced"])
     if "cleaned" in done:
         run.terminal.say(f"  cleaned: {done['cleaned']['words']}")
     quality = _quality(done)
@@ -262,8 +276,12 @@ def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     options = run.options
     refuse_existing(options.output, overwrite=options.overwrite)
     file = read_splats(source)
-    scores = score(file.splats(), views, settings(options), progress=run.progress(source.name))
-    return _write_scores(run, str(source), file, scores)
+    splats = file.splats()
+    found = forced(zones.of_files(options), splats.means)
+    scores = score(
+        splats, views, settings(options), removed=found.removed, progress=run.progress(source.name)
+    )
+    return _write_scores(run, str(source), file, scores, found)
 
 
 def _score_object(run: _Run) -> dict[str, Any]:
@@ -271,16 +289,22 @@ def _score_object(run: _Run) -> dict[str, Any]:
 
     options = run.options
     refuse_existing(options.output, overwrite=options.overwrite)
-    file, scores, notes = splat_object.score_object(
-        options.object, run.views(), settings(options), progress=run.progress(options.object)
+    views, demanded = run.views(), zones.of_object(options)
+    file, scores, found, notes = splat_object.score_object(
+        options.object, views, settings(options), demanded, progress=run.progress(options.object)
     )
-    done = _write_scores(run, options.object, file, scores, notes)
+    done = _write_scores(run, options.object, file, scores, found, notes)
     done["files"]["input"] = f"{open_blend()}#{options.object}"
     return done
 
 
 def _write_scores(
-    run: _Run, label: str, file: SplatFile, scores: Scores, more_notes: Sequence[str] = ()
+    run: _Run,
+    label: str,
+    file: SplatFile,
+    scores: Scores,
+    found: Forced,
+    more_notes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Write a file with its scores and say what came of it; return the report."""
     options = run.options
@@ -291,13 +315,21 @@ def _write_scores(
         f"{label}: scored {len(file):,} splats by {scores.views_used} views -> {output}"
     )
     run.say_cameras()
-    seen = seen_by(scores)
-    run.say_unseen(seen["splats"]["unseen"], len(file))
+    seen, gone = seen_by(scores), found.counts()["forced"]
+    seen["splats"]["unseen"] -= gone
+    done = {
+        **seen,
+        "splats": seen["splats"] | {"forced": gone},
+        "volumes": list(found.facts),
+    }
+    if said := zones.words(done):
+        run.terminal.say(f"  {said}")
+    run.say_unseen(seen["splats"]["unseen"], len(file) - gone)
     notes = [*scoring_notes(scores), *more_notes]
     run.terminal.notes(notes)
     return {
         "files": {"input": label, "output": str(output)},
-        **seen,
+        **done,
         "settings": asdict(settings(options)),
         "weights": scores.facts,
         "notes": notes,
@@ -343,29 +375,39 @@ def _clean_one(run: _Run, source: Path, output: Path | None, views: ViewSet) -> 
         refuse_mapped(output, source)
     file = read_splats(source)
     progress = run.progress(source.name)
-    found = clean(file.splats(), views, cleaning(options), progress=progress)
+    splats = file.splats()
+    demanded = forced(zones.of_files(options), splats.means)
+    found = clean(
+        splats, views, cleaning(options), protected=demanded.protected, removed=demanded.removed,
+        progress=progress,
+    )  # fmt: skip
     made = as_written(file, output)
     if output:
         made.write(output, found.keep, overwrite=options.overwrite)
     run.terminal.clear()
     facts = what_was_seen(found.seen, found.undrawable, found.views_given, found.views_used)
-    splats: dict[str, Any] = {
+    counts: dict[str, Any] = {
         **facts["splats"],
         **kept_and_removed(found.keep),
+        **demanded.counts(),
         **held(made, found.keep, written=output is not None),
     }
+    counts["unseen"] -= counts["forced"]
+    done = {"splats": counts, "volumes": list(demanded.facts)}
     to = f" -> {output}" if output else ""
     run.terminal.say(
-        f"{run.named(str(source))}: {found.in_words()}; {splats['kept']:,} of {len(file):,} splats "
-        f"stay{written(splats)}, {by(facts['views'])}{to}"
+        f"{run.named(str(source))}: {found.in_words()}; {counts['kept']:,} of {len(file):,} splats "
+        f"stay{written(counts)}, {by(facts['views'])}{to}"
     )
     run.say_cameras()
-    run.say_unseen(splats["unseen"], len(file))
+    if said := zones.words(done):
+        run.terminal.say(f"  {said}")
+    run.say_unseen(counts["unseen"], len(file) - counts["forced"])
     notes = [*found.notes(), *made.notes(found.keep)]
     run.terminal.notes(notes)
     return {
         "files": {"input": str(source), "output": str(output) if output else None},
-        "splats": splats,
+        **done,
         "views": facts["views"],
         "settings": asdict(found.settings),
         "cleaned": found.facts(),

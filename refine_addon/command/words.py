@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ..core.report import size_in_words
+from ..core.report import size_in_words, sizes_in_words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -39,5 +39,6 @@ def sizes(before: int, after: int | None) -> str:
     >>> sizes(4_940_000, 32_000), sizes(4_940_000, None)
     ('4.9 MB -> 32.0 kB', 'of 4.9 MB')
     """
-    old = size_in_words(before)
-    return f"of {old}" if after is None else f"{old} -> {size_in_words(after)}"
+    if after is None:
+        return f"of {size_in_words(before)}"
+    return sizes_in_words(before, "->", after)

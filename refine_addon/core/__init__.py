@@ -20,14 +20,17 @@ from .scores import Scores
 from .scoring.closed_form import ClosedForm
 from .scoring.occlusion import Occlusion
 from .selection import Budget, rank, select
+from .solid import Solid
 from .splats import Splats
 from .survivors import survivor_columns
 from .task import METHODS, Result, Settings
 from .views import View, ViewSet
+from .volumes import Box, Placed, Sphere, Zone, forced
 
 __all__ = [
     "METHODS",
     "REASONS",
+    "Box",
     "Budget",
     "Cancelled",
     "Cleaned",
@@ -36,16 +39,21 @@ __all__ = [
     "Level",
     "Levels",
     "Occlusion",
+    "Placed",
     "RefineError",
     "Result",
     "Scores",
     "Settings",
+    "Solid",
+    "Sphere",
     "SplatFile",
     "Splats",
     "View",
     "ViewSet",
+    "Zone",
     "as_written",
     "clean",
+    "forced",
     "lod",
     "lod_file",
     "prune",

@@ -24,6 +24,12 @@ def is_uniform(matrix: NDArray[Any]) -> bool:
     return bool(scales[0] - scales[2] <= UNIFORM_TOLERANCE * scales[0])
 
 
+def moved(means: NDArray[Any], matrix: NDArray[Any]) -> NDArray[np.float64]:
+    """Return places, (N, 3), where an affine (4, 4) matrix moves them."""
+    with np.errstate(invalid="ignore", over="ignore"):  # of what is not finite
+        return np.asarray(means @ matrix[:3, :3].T.astype(np.float64) + matrix[:3, 3])
+
+
 def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True) -> Splats:
     """Return the splats transformed by an affine matrix.
 
@@ -60,7 +66,7 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
             f"the transform is flat or not affine (scales {scales.tolist()}): it cannot be applied"
         )
         raise RefineError(msg)
-    means = splats.means @ linear.T.astype(np.float64) + matrix[:3, 3]
+    means = moved(splats.means, matrix)
     if not is_uniform(matrix):
         if rotate_sh:
             msg = (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,23 +16,26 @@ from .formats.registry import (
     refuse_unknown_size,
 )
 from .pipeline import decide
-from .report import Clock, Files, complete_report, held, kept_and_removed
+from .report import Clock, Files, complete_report, held
 from .survivors import survivor_columns
 from .task import DEFAULTS, Result, Settings, Task
+from .volumes import forced
 from .whole_file import expanded, refuse_existing, refuse_mapped
 from .work import Progress, part, report, silent
 from .written import written_facts
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from .cleaning.clean import Cleaned, Cleaning
+    from .cleaning.clean import Cleaning
     from .picture_files import PictureFiles
     from .selection import Budget, RowBytes
     from .splats import Splats
     from .views import ViewSet
+    from .volumes import Zone
 
 
 def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
@@ -43,6 +45,7 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
     budget: Budget,
     settings: Settings = DEFAULTS,
     *,
+    zones: Sequence[Zone] = (),
     absorb: bool = False,
     cleaning: Cleaning | None = None,
     pictures: PictureFiles | None = None,
@@ -62,6 +65,8 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
         a plain PLY.
     views, budget, settings, absorb, progress, threads
         See `pipeline.prune`.
+    zones : sequence of Zone
+        Volumes that say which splats must stay and which must go.
     cleaning : Cleaning, optional
         What to clean away first. The budget then counts what is left.
     pictures : PictureFiles, optional
@@ -79,8 +84,9 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
     Raises
     ------
     RefineError, Cancelled
-        See `pipeline.prune`, `read_splats` and `SplatFile.write`; also if a budget is a size, and
-        the format of `output` compresses the file as a whole. Then nothing is written.
+        See `pipeline.prune`, `volumes.forced`, `read_splats` and `SplatFile.write`; also if a
+        budget is a size, and the format of `output` compresses the file as a whole. Then nothing is
+        written.
     """
     if pictures is not None:
         pictures.refuse_existing(views)
@@ -95,22 +101,31 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
     row_bytes: RowBytes = made.row_bytes
     if budget.max_mb is not None and isinstance(made, Packed):
         refuse_unknown_size(made.form)
-    if absorb and budget.removals(len(file), row_bytes, made.fixed_bytes) != 0:
-        row_bytes = made.changed_row_bytes  # how long each becomes is not known before
     splats, cleaned = file.splats(), None
+    given = forced(zones, splats.means)
+    rest = np.ones(len(file), np.bool_) if given.removed is None else ~given.removed
+    stay = row_bytes[rest] if isinstance(row_bytes, np.ndarray) else row_bytes
+    if absorb and budget.removals(int(rest.sum()), stay, made.fixed_bytes) != 0:
+        row_bytes = made.changed_row_bytes  # how long each becomes is not known before
     clock.lap("read_s")
     if cleaning is not None:
         ahead = part(progress, 0.0, 0.4)
-        cleaned = clean(splats, views, cleaning, progress=ahead, threads=threads)
-        splats = splats.take(cleaned.keep)
+        cleaned = clean(
+            splats, views, cleaning, protected=given.protected, removed=given.removed,
+            progress=ahead, threads=threads,
+        )  # fmt: skip
+        left = cleaned.keep | ~rest  # what is forced out is the budget's
+        splats, given = splats.take(left), given.of(left)
         if isinstance(row_bytes, np.ndarray):
-            row_bytes = row_bytes[cleaned.keep]
+            row_bytes = row_bytes[left]
         clock.lap("clean_s")
     task = Task(
         budget=budget,
         settings=settings,
         splats=splats,
         views=views,
+        protected=given.protected,
+        removed=given.removed,
         absorb=absorb,
         row_bytes=row_bytes,
         fixed_bytes=made.fixed_bytes,
@@ -118,7 +133,8 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
     ahead = part(progress, 0.0 if cleaned is None else 0.4, 0.8)
     result = decide(task, clock=clock, progress=ahead, threads=threads)
     if cleaned is not None:
-        result = _of_all(result, cleaned)
+        result = result.for_all(left)
+        result.report["cleaned"] = cleaned.facts()
     report(progress, 0.8, "writing")
     columns = survivor_columns(file.rows, result.absorbed) if result.absorbed else {}
     sizes = (file.stored_bytes, made.size(result.keep, columns))
@@ -129,15 +145,20 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
     if written is not None:
         used = views.spread(settings.views)
         result.report.update(written_facts(written, result.scores, used, threads=threads))
-    drawn = picture_facts(
-        pictures, file.splats(), result, written, views,
-        clock=clock, progress=part(progress, 0.85, 1.0), threads=threads,
+    ahead = part(progress, 0.85, 1.0)
+    result.report.update(
+        picture_facts(
+            pictures, file.splats(), result, written, views,
+            clock=clock, progress=ahead, threads=threads,
+        ),
+        volumes=list(given.facts),
     )  # fmt: skip
-    result.report.update(drawn)
     result.report["splats"] |= held(made, result.keep, written=written is not None)
     result.report["notes"] += made.notes(result.keep)
-    names = (str(file.path), None if written is None else str(written))
-    complete_report(result.report, clock, Files(*names, *sizes))
+
+    complete_report(
+        result.report, clock, Files(str(file.path), str(written) if written else None, *sizes)
+    )
     return result
 
 
@@ -190,18 +211,3 @@ def picture_facts(  # noqa: PLR0913 - what was pruned, and what to draw of it
     facts = pictures.write(splats, after, views, progress=progress, threads=threads)
     clock.lap("pictures_s")
     return {"pictures": facts}
-
-
-def _of_all(result: Result, cleaned: Cleaned) -> Result:
-    """Return a result for what cleaning left as one for all splats.
-
-    Its scores stay those of what cleaning left.
-    """
-    keep = cleaned.keep.copy()
-    keep[cleaned.keep] = result.keep
-    absorbed = result.absorbed
-    if absorbed is not None:
-        absorbed = replace(absorbed, keep=keep)
-    result.report["splats"] |= {"before": len(keep), **kept_and_removed(keep)}
-    result.report["cleaned"] = cleaned.facts()
-    return replace(result, keep=keep, absorbed=absorbed)

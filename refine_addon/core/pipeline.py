@@ -22,6 +22,7 @@ from .report import Clock, make_report, size_in_words
 from .scoring import auto, closed_form, occlusion, sight_lines
 from .selection import Budget
 from .task import DEFAULTS, Result, Settings, Task
+from .volumes import refuse_all
 from .work import Progress, part, report, silent
 
 if TYPE_CHECKING:
@@ -56,11 +57,12 @@ PARTS = 2
 turns; what the other views see is carried over."""
 
 
-def score(
+def score(  # noqa: PLR0913 - as `prune`
     splats: Splats,
     views: ViewSet,
     settings: Settings = DEFAULTS,
     *,
+    removed: NDArray[np.bool_] | None = None,
     quality: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
@@ -73,6 +75,9 @@ def score(
         In the frame of the views.
     views : ViewSet
     settings : Settings
+    removed : (N,) bool, optional
+        Splats that are to go in any case: the others are scored as if they had gone, and they
+        score 0; see `Task`.
     quality : bool
         Whether the scores get an estimate of the pictures' quality even if that takes longer than
         scoring by the closed form; scores by occlusion always have one.
@@ -91,6 +96,13 @@ def score(
     Cancelled
         If `progress` answers ``False``.
     """
+    if removed is not None and removed.any():
+        refuse_all(removed)
+        rest = ~removed
+        found = score(
+            splats.take(rest), views, settings, quality=quality, progress=progress, threads=threads
+        )
+        return found.for_all(rest)
     whole, estimates = progress, quality or settings.estimates
     progress = part(progress, 0.0, 0.9 if estimates else 1.0)
     # Numbers that underflow to 0 are negligible in all sums.
@@ -111,8 +123,8 @@ def score(
             )
         if quality and scores.sights is None:
             ahead = part(whole, 0.9, 0.95)
-            found = sight_lines.sights(splats, used, progress=ahead, threads=threads)
-            scores = replace(scores, sights=found)
+            sights = sight_lines.sights(splats, used, progress=ahead, threads=threads)
+            scores = replace(scores, sights=sights)
     scores = _with_views(scores, views)
     return with_quality(scores, progress=part(whole, 0.95, 1.0), threads=threads)
 
@@ -155,6 +167,7 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
     settings: Settings = DEFAULTS,
     *,
     protected: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
     absorb: bool = False,
     row_bytes: RowBytes = 0.0,
     fixed_bytes: int = 0,
@@ -171,6 +184,8 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
         How much to remove.
     protected : (N,) bool, optional
         Splats that are neither removed nor changed.
+    removed : (N,) bool, optional
+        Splats that go in any case, unless they are protected; see `Task`.
     absorb : bool
         See `Task`.
     row_bytes, fixed_bytes
@@ -191,6 +206,7 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
         splats=splats,
         views=views,
         protected=protected,
+        removed=removed,
         absorb=absorb,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
@@ -225,9 +241,21 @@ def decide(
     Raises
     ------
     RefineError, Cancelled
-        See `score` and `selection.select`.
+        See `score` and `selection.select`; also if all splats have to go.
     """
-    clock = clock or Clock()
+    clock, forced = clock or Clock(), task.forced()
+    if forced is None:
+        result = _decide(task, clock, progress, threads)
+    else:
+        result = _decide(task.without(forced), clock, progress, threads).for_all(~forced)
+        result.report["budget"] = {task.budget.kind: getattr(task.budget, task.budget.kind)}
+    for name, mask in (("protected", task.protected), ("forced", forced)):
+        result.report["splats"][name] = 0 if mask is None else int(np.count_nonzero(mask))
+    return result
+
+
+def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -> Result:
+    """Decide on a task from which nothing has to go in any case."""
     scored = 0.2 if task.absorb else 0.95
     scores, known = _scores_of(task, part(progress, 0.0, scored), threads)
     if task.budget.psnr is not None and task.protected is not None:

@@ -72,6 +72,16 @@ def size_in_words(count: int) -> str:
     return f"{count / 1e3:,.1f} kB" if count < 1e5 else f"{count / 1e6:,.1f} MB"  # noqa: PLR2004
 
 
+def sizes_in_words(first: int, between: str, second: int) -> str:
+    """Return two numbers of bytes, with one unit where they have the same.
+
+    >>> sizes_in_words(9_860_000, "->", 4_940_000), sizes_in_words(9_860_000, "->", 32_000)
+    ('9.9 -> 4.9 MB', '9.9 MB -> 32.0 kB')
+    """
+    one, other = size_in_words(first), size_in_words(second)
+    return f"{one[:-3] if one[-3:] == other[-3:] else one} {between} {other}"
+
+
 def scoring_notes(scores: Scores) -> list[str]:
     """Return what the user should know about a scoring, in sentences."""
     notes = list(scores.notes)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from .errors import RefineError
+from .volumes import among_all
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -24,7 +27,8 @@ class Scores:
     Attributes
     ----------
     values : (N,) float32
-        Finite, >= 0; 0 only for undrawable splats. Each method has its own scale.
+        Finite, >= 0; 0 only for undrawable splats and those that had gone before (`for_all`). Each
+        method has its own scale.
     seen : (N,) int32
         In how many of the views used the splat's centre lies.
     views_used : int
@@ -43,9 +47,10 @@ class Scores:
     views_given : int
         How many views were given; those used were chosen from them.
     sights : SightLines, optional
-        What the views' lines of sight meet, from which any choice of splats can be judged.
+        What the views' lines of sight meet, from which any choice of the splats that were scored
+        can be judged.
     quality : Quality, optional
-        How close the pictures stay with ever more splats removed in the order of these scores.
+        How close the pictures stay with ever more of these removed in the order of the scores.
     """
 
     values: NDArray[np.float32]
@@ -59,6 +64,42 @@ class Scores:
     views_given: int = 0
     sights: SightLines | None = None
     quality: Quality | None = None
+
+    def for_all(self, rest: NDArray[np.bool_]) -> Scores:
+        """Return scores of what was left of N splats as scores of them all.
+
+        Parameters
+        ----------
+        rest : (N,) bool
+            Which were left. The others, which the scene has without them, get the score 0.
+        """
+        values, seen = among_all(self.values, rest), among_all(self.seen, rest)
+        return replace(self, values=values, seen=seen)
+
+    def of(self, rest: NDArray[np.bool_]) -> Scores:
+        """Return the scores of some splats; the reverse of `for_all` where those had been left.
+
+        Parameters
+        ----------
+        rest : (N,) bool
+
+        Raises
+        ------
+        RefineError
+            If some of them were not scored.
+        """
+        values, count = self.values[rest], int(np.count_nonzero(rest))
+        unscored = int(np.count_nonzero(values == 0.0)) - self.undrawable
+        if unscored > 0:
+            msg = (
+                f"{unscored} splats had to go when the others were scored, and need not go now; "
+                "score again"
+            )
+            raise RefineError(msg)
+        sights = self.sights
+        if sights is not None and len(sights.splats) != count:
+            sights = None  # of a scene with other splats
+        return replace(self, values=values, seen=self.seen[rest], sights=sights)
 
 
 def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:

@@ -112,6 +112,20 @@ class Budget:
             msg = "without the frustum test every view sees every splat: min_seen would remove none"
             raise RefineError(msg)
 
+    def after(self, gone: int, count: int) -> Budget:
+        """Return the budget for what is left of `count` splats when `gone` went before.
+
+        Those count as removed; where the budget removes no more than these, nothing else goes.
+
+        Examples
+        --------
+        >>> Budget(ratio=0.5).after(20, 100), Budget(ratio=0.5).after(70, 100).removals(30)
+        (Budget(ratio=None, keep=50, max_mb=None, threshold=None, min_seen=None, psnr=None), 0)
+        """
+        if self.ratio is None:
+            return self
+        return Budget(keep=count - max(self.removals(count) or 0, gone))
+
     def removals(self, count: int, row_bytes: RowBytes = 0.0, fixed_bytes: int = 0) -> int | None:
         """Return how many of `count` splats are removed, or None if that depends on the scores.
 

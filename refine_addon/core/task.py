@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
 
 from .errors import RefineError
 from .scoring.closed_form import ClosedForm
 from .scoring.occlusion import Occlusion
+from .volumes import among_all, refuse_all
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from .absorbing.absorb import Absorbed
@@ -121,6 +123,10 @@ class Task:
         Known scores of the splats; None computes them.
     protected : (N,) bool or None
         Splats that are neither removed nor changed.
+    removed : (N,) bool or None
+        Splats that go before all others, whatever they are worth, and count as removed; those that
+        are protected stay. The rest is scored without them, and is what the pictures of a PSNR are
+        compared with; nothing absorbs them.
     absorb : bool
         Whether survivors absorb the splats that are removed. Then the budget only decides how many
         survive; which ones, and their new values, come from merging, whatever the method.
@@ -136,6 +142,7 @@ class Task:
     views: ViewSet | None = None
     scores: Scores | None = None
     protected: NDArray[np.bool_] | None = None
+    removed: NDArray[np.bool_] | None = None
     absorb: bool = False
     row_bytes: RowBytes = 0.0
     fixed_bytes: int = 0
@@ -153,6 +160,33 @@ class Task:
             msg = "splats without scores need views to be scored, and absorbing needs both"
             raise RefineError(msg)
         return self.splats, self.views
+
+    def forced(self) -> NDArray[np.bool_] | None:
+        """Return which splats go before all others, (N,); None where there are none."""
+        removed = self.removed
+        if removed is not None and self.protected is not None:
+            removed = removed & ~self.protected
+        return None if removed is None or not removed.any() else removed
+
+    def without(self, forced: NDArray[np.bool_]) -> Task:
+        """Return the task for what is left when some splats, (N,), have gone.
+
+        Raises
+        ------
+        RefineError
+            If nothing is, or some of it was not scored.
+        """
+        refuse_all(forced)
+        rest, rows = ~forced, self.row_bytes
+        return replace(
+            self,
+            budget=self.budget.after(int(np.count_nonzero(forced)), len(forced)),
+            splats=None if self.splats is None else self.splats.take(rest),
+            scores=None if self.scores is None else self.scores.of(rest),
+            protected=None if self.protected is None else self.protected[rest],
+            removed=None,
+            row_bytes=rows[rest] if isinstance(rows, np.ndarray) else rows,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,3 +220,11 @@ class Result:
             All of them, in that frame.
         """
         return self.absorbed.splats if self.absorbed else splats.take(self.keep)
+
+    def for_all(self, rest: NDArray[np.bool_]) -> Result:
+        """Return a result for what was left of N splats, (N,) bool, as one for them all."""
+        keep = among_all(self.keep, rest)
+        total, kept = len(keep), int(np.count_nonzero(keep))
+        self.report["splats"] |= {"before": total, "kept": kept, "removed": total - kept}
+        absorbed = None if self.absorbed is None else replace(self.absorbed, keep=keep)
+        return replace(self, keep=keep, scores=self.scores.for_all(rest), absorbed=absorbed)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from .errors import RefineError
+from .work import checkpoint
 
 try:
     import fcntl
@@ -115,6 +116,8 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
     ------
     RefineError
         If the file exists and may not be replaced, or the system cannot write it.
+    Cancelled
+        See `work.checkpoint`; the file stays as it was.
     """
     refuse_existing(path, overwrite=overwrite)
     try:
@@ -133,6 +136,7 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
                     # By descriptor: whoever owns the folder may have put a link of that name.
                     named = stream.fileno() if os.chmod in os.supports_fd else temporary
                     os.chmod(named, mode)  # noqa: PTH101 - pathlib takes no descriptor
+            checkpoint()  # whoever cancels while the file is written wants none
             if overwrite:
                 temporary.replace(target)
             else:

@@ -40,9 +40,9 @@ def part(progress: Progress, start: float, end: float) -> Progress:
 
 
 def checkpoint() -> None:
-    """Let the work of `for_chunks` be cancelled here; outside of such work, do nothing.
+    """Let work be cancelled here: that of `for_chunks`, or else what `checked_by` encloses.
 
-    Work with long chunks calls this several times a second.
+    Work with long chunks calls this several times a second. Outside of such work it does nothing.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def checkpoint() -> None:
 
 
 @contextmanager
-def _checked_by(check: Callable[[], None]) -> Iterator[None]:
+def checked_by(check: Callable[[], None]) -> Iterator[None]:
     """Make `checkpoint` call `check` in this thread, within the block."""
     before = getattr(_own, "check", None)
     _own.check = check
@@ -134,7 +134,7 @@ def _in_turn(
         if time.monotonic() - told >= _REPORT_INTERVAL:
             tell()
 
-    with _checked_by(check):
+    with checked_by(check):
         for index, piece in enumerate(slices):
             if index % step == 0:
                 tell()
@@ -158,7 +158,7 @@ def _side_by_side(
             raise Cancelled
 
     def checked(piece: slice) -> Result:
-        with _checked_by(check):
+        with checked_by(check):
             return work(piece)
 
     results: list[Result] = []

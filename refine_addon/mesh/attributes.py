@@ -8,13 +8,14 @@ go in as those of a mesh.
 
 from __future__ import annotations
 
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
 
-from ..core.formats.ply import SplatFile
+from ..core.formats.ply import REQUIRED, SplatFile
 from ..core.splats import Splats, single_unit_quaternions
 from .layout import KINDS, Column, SplatObject, add_attributes, rest_count, splat_count
 
@@ -216,6 +217,18 @@ def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDA
     attribute = attribute or mesh.attributes.new(name, data_type, "POINT")
     kind = KINDS[data_type]
     attribute.data.foreach_set(kind.field, np.ascontiguousarray(values, kind.dtype).ravel())
+
+
+def digest(checked: SplatObject) -> int:
+    """Return a number that tells an object's splats from others.
+
+    Neither view-dependent colour is looked at, nor what does not draw, such as a painted mask.
+    """
+    columns = (column for column in checked.layout.columns if column.name in REQUIRED)
+    found = 0
+    for name in dict.fromkeys(column.attribute for column in columns):
+        found = zlib.crc32(read_attribute(checked.mesh, name).data, found)
+    return found
 
 
 def remove_attribute(mesh: bpy.types.Mesh, name: str) -> None:

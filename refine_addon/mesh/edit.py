@@ -21,6 +21,12 @@ if TYPE_CHECKING:
 REMOVE = "refine_remove"
 """Boolean point attribute: the splats that the budget removes."""
 
+PROTECT = "refine_protect"
+"""Boolean point attribute: splats that stay, whatever else is said; set by hand."""
+
+FORCE = "refine_force"
+"""Integer point attribute, for display: 1 what stays in any case, 2 what goes, 0 the rest."""
+
 _GROUP_VALUES = "refine_group_values"
 
 
@@ -144,8 +150,34 @@ def mark_removed(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
     mesh_attributes.updated(obj.data)
 
 
+def mark_forced(
+    obj: bpy.types.Object,
+    protected: NDArray[np.bool_] | None,
+    removed: NDArray[np.bool_] | None,
+) -> None:
+    """Mark, for the views, what stays and what goes in any case: (N,) each, or None.
+
+    Raises
+    ------
+    RefineError
+        See `check_writable`.
+    """
+    check_writable(obj)
+    force = np.zeros(splat_count(obj.data), np.int32)
+    for number, mask in ((2, removed), (1, protected)):
+        if mask is not None:
+            force[mask] = number
+    if force.any():
+        mesh_attributes.write_attribute(obj.data, FORCE, "INT", force)
+    elif FORCE in obj.data.attributes:
+        mesh_attributes.remove_attribute(obj.data, FORCE)
+    else:
+        return
+    mesh_attributes.updated(obj.data)
+
+
 def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
-    """Return which splats a boolean point attribute or a vertex group marks.
+    """Return which splats are marked by `PROTECT`, and by an attribute or a vertex group.
 
     A point cloud has no vertex groups; a float attribute marks there, which is what `convert` makes
     of one.
@@ -159,15 +191,26 @@ def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None
     Returns
     -------
     (N,) bool or None
-        For a vertex group or a float attribute, where the weight is above 0; None without a name.
+        For a vertex group or a float attribute, where the weight is above 0; None without a name
+        where nothing is marked.
 
     Raises
     ------
     RefineError
         If the object has neither of that name.
     """
+    marked = None
+    attribute = obj.data.attributes.get(PROTECT)
+    if attribute and (attribute.data_type, attribute.domain) == ("BOOLEAN", "POINT"):
+        marked = mesh_attributes.read_attribute(obj.data, PROTECT)
     if not name:
-        return None
+        return marked
+    named = _named_mask(obj, name)
+    return named if marked is None else named | marked
+
+
+def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
+    """Return which splats an attribute or a vertex group marks, (N,)."""
     attribute = obj.data.attributes.get(name)
     if attribute and attribute.data_type in marking(obj) and attribute.domain == "POINT":
         return mesh_attributes.read_attribute(obj.data, name) > 0

@@ -49,12 +49,15 @@ class Together(NamedTuple):
     ranks: NDArray[np.float64]
 
 
-def store(
+def store(  # noqa: PLR0913 - all that a note holds
     checked: SplatObject,
     scores: Scores,
     settings: Settings,
     origin: dict[str, Any] | None = None,
     cameras: list[tuple[str, int]] | None = None,
+    *,
+    forced: int = 0,
+    asked: Settings | None = None,
     together: Together | None = None,
 ) -> None:
     """Write scores to the attributes of an object's mesh, and note how they came to be.
@@ -68,6 +71,10 @@ def store(
         See `staleness.origin`.
     cameras : list of (str, int), optional
         Name of each view given, and how many splats lie in it.
+    forced : int
+        How many splats had to go, and have the score 0.
+    asked : Settings, optional
+        What the scores are to be refined by, if that is still to come.
     together : Together, optional
         Where other objects were scored with them; the curve of `scores` is that of all then.
 
@@ -85,11 +92,7 @@ def store(
         )
         raise RefineError(msg)
     ranks = together.ranks if together else rank(scores.values)
-    mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
-    mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
-    mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
-    heat_map.write(mesh, ranks)
-    mesh[RECORD] = json.dumps(
+    note = json.dumps(
         {
             "splats": len(scores.values),
             "settings": asdict(settings),
@@ -103,9 +106,17 @@ def store(
             "quality": scores.quality.facts() if scores.quality else None,
             "origin": origin,
             "cameras": cameras,
+            "forced": forced,
+            "asked": asdict(asked) if asked else None,
             "together": together and {"id": together.id, "splats": together.splats},
         }
     )
+    # What can fail comes first: scores and note are to belong together.
+    heat_map.write(mesh, ranks)
+    mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
+    mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
+    mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
+    mesh[RECORD] = note
     mesh_attributes.updated(mesh)
 
 
@@ -119,8 +130,19 @@ def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
     return noted if complete else None
 
 
-def stored_scores(checked: SplatObject) -> Scores:
+def unrefined(record: dict[str, Any]) -> bool:
+    """Tell whether the scores of a note are a sketch of those that were asked for."""
+    return bool(record.get("asked"))
+
+
+def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None) -> Scores:
     """Return the scores that an object's mesh holds.
+
+    Parameters
+    ----------
+    checked : SplatObject
+    removed : (N,) bool, optional
+        Splats that have to go, and need no score.
 
     Raises
     ------
@@ -136,8 +158,11 @@ def stored_scores(checked: SplatObject) -> Scores:
             msg = f"{label}: has no scores; score it first"
             raise RefineError(msg)
     values = mesh_attributes.read_attribute(mesh, SCORE)
-    # Splats joined or added since hold a score of 0, as those do that no renderer can draw.
-    unscored = int(np.count_nonzero(values == 0.0)) - noted.get("undrawable", 0)
+    # Splats joined or added since hold a score of 0, as those do that no renderer can draw, and
+    # those that had to go.
+    zero = values == 0.0
+    zero = zero if removed is None else zero & ~removed
+    unscored = int(np.count_nonzero(zero)) - noted.get("undrawable", 0)
     if len(values) > noted["splats"] or unscored > 0:
         msg = (
             f"{label}: scored with {noted['splats']} splats, has {len(values)} now, "
@@ -145,7 +170,9 @@ def stored_scores(checked: SplatObject) -> Scores:
         )
         raise RefineError(msg)
     # The curve is that of all splats that were scored.
-    whole = len(values) == (noted.get("together") or noted)["splats"]
+    gone = 0 if removed is None else int(np.count_nonzero(removed))
+    whole = (len(values), gone) == (noted["splats"], noted.get("forced", 0))
+    whole = whole and not noted.get("together")  # then it is that of several objects
     return Scores(
         values=values,
         seen=mesh_attributes.read_attribute(mesh, SEEN),

@@ -50,6 +50,12 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
     bl_options = {"REGISTER"}
     doing = "Comparing"
 
+    def written(
+        self, _context: bpy.types.Context, _checked: SplatObject | None
+    ) -> list[SplatObject]:
+        """Return nothing: the splats are not changed."""
+        return []
+
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Look:
         """Gather what Apply would decide by, the splats and the view of the active camera."""
         view = Choice("ACTIVE").views(context, checked.obj)[0]

@@ -1,16 +1,16 @@
 """Operators that find splats which float, by what the cameras see, and delete them."""
 
-# ruff: noqa: D400, N801, TC002 - Blender's names and tooltips; annotations are run
+# ruff: noqa: D400, N801 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import bpy
-import numpy as np
 
 from .. import splat_object
 from ..core.cleaning.clean import Cleaned, Cleaning, clean
+from ..demands import Demands
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters
 from ..mesh import layout as mesh_layout
@@ -19,10 +19,9 @@ from .on_thread import FAILURES, Answer, OnThread, fail
 from .operators import OnSplats, chosen_views
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from ..core.splats import Splats
     from ..core.views import ViewSet
+    from ..core.volumes import Forced
     from ..core.work import Progress
     from ..mesh.layout import SplatObject
 
@@ -34,7 +33,7 @@ class _Looking:
     splats: Splats
     views: ViewSet
     settings: Cleaning
-    protected: NDArray[np.bool_] | None
+    forced: Forced
 
 
 class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
@@ -53,15 +52,16 @@ class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
             splat_object.gather(checked),
             chosen_views(context),
             Cleaning(tuple(settings.reasons), settings.views),
-            mesh_edit.protected_mask(checked.obj, settings.protect),
+            Demands.of_scene(context.scene).forced(checked),
         )
 
     @staticmethod
     def work(job: _Looking, progress: Progress) -> Cleaned:
         """Look."""
         return clean(
-            job.splats, job.views, job.settings, protected=job.protected, progress=progress
-        )
+            job.splats, job.views, job.settings,
+            protected=job.forced.protected, removed=job.forced.removed, progress=progress,
+        )  # fmt: skip
 
     def finish(
         self, context: bpy.types.Context, checked: SplatObject, _job: _Looking, cleaned: Cleaned
@@ -99,5 +99,6 @@ class REFINE_OT_delete_floaters(OnSplats, bpy.types.Operator):
         except FAILURES as error:
             return fail(self, error)
         plans.forget(checked.mesh)
+        plans.refresh(context)
         self.report({"INFO"}, f"Deleted {done.removed:,} floaters, {done.kept:,} splats stay")
         return {"FINISHED"}

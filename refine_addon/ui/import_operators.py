@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 import mathutils
@@ -17,13 +19,21 @@ from ..cameras.sets import create_cameras
 from ..core.cameras.read import read_cameras
 from ..core.errors import RefineError
 from ..core.formats.registry import SUFFIXES, read_splats
+from ..core.work import part, report
 from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
 from ..viewport import draw
-from . import preferences
-from .on_thread import FAILURES, Answer, described, fail
+from . import preferences, running
+from .on_thread import FAILURES, Answer, AskedFirst, described, fail
 from .properties import UPRIGHT_TEXT
 from .wrapped import counted
+
+if TYPE_CHECKING:
+    from ..core.formats.ply import SplatFile
+    from ..core.work import Progress
+
+_ROWS = 1 << 16
+"""Rows that are read between two looks at whether to go on."""
 
 FILE_NAMES = ";".join(f"*{suffix}" for suffix in SUFFIXES)
 """What a file browser shows."""
@@ -43,13 +53,24 @@ class _InObjectMode:
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Tell whether the operator can run, and if not, why."""
+        if why := running.refusal():
+            cls.poll_message_set(why)
+            return False
         if context.mode != "OBJECT":
             cls.poll_message_set("Go to object mode first")
             return False
         return True
 
 
-class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
+@dataclass(frozen=True)
+class _Read:
+    """What files hold, and what is wrong with those that cannot be read."""
+
+    files: list[SplatFile]
+    errors: list[Exception]
+
+
+class REFINE_OT_import_ply(AskedFirst, _InObjectMode, bpy.types.Operator, ImportHelper):
     """Import files of splats, of any format: a vertex a splat, a point attribute a property"""
 
     bl_idname = "refine.import_ply"
@@ -64,18 +85,38 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
     directory: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
     upright: BoolProperty(name="Upright", description=UPRIGHT_TEXT)
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
+    doing = "Reading splats"
+    reads_object = False
+
+    def ask(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
         """Ask for the files, or only for the options where files were dropped."""
         preferences.suggest(self, context, "upright")
         return self.invoke_popup(context)
 
-    def execute(self, context: bpy.types.Context) -> Answer:
-        """Import the files; one that cannot be read does not stop the others."""
-        errors: list[Exception] = []
-        imported = []
-        for path in self._paths():
+    def prepare(self, _context: bpy.types.Context, _checked: None) -> list[Path]:
+        """Note which files to read."""
+        return self._paths()
+
+    @staticmethod
+    def work(paths: list[Path], progress: Progress) -> _Read:
+        """Read the files; one that cannot be read does not stop the others."""
+        read = _Read([], [])
+        for index, path in enumerate(paths):
+            ahead = part(progress, index / len(paths), (index + 1) / len(paths))
             try:
-                imported.append(self._import(context, path))
+                read.files.append(_read(path, ahead))
+            except FAILURES as error:
+                read.errors.append(error)
+        return read
+
+    def finish(
+        self, context: bpy.types.Context, _checked: None, _paths: list[Path], read: _Read
+    ) -> Answer:
+        """Make an object of each file."""
+        errors, imported = read.errors, []
+        for file in read.files:
+            try:
+                imported.append(self._import(context, file))
             except FAILURES as error:
                 errors.append(error)
         if not imported:
@@ -100,14 +141,10 @@ class REFINE_OT_import_ply(_InObjectMode, bpy.types.Operator, ImportHelper):
             return [Path(bpy.path.abspath(self.directory)) / name for name in names]
         return [Path(bpy.path.abspath(self.filepath))]
 
-    def _import(self, context: bpy.types.Context, path: Path) -> bpy.types.Object:
-        file = read_splats(path)
-        if not len(file):
-            msg = f"{path}: holds no splats"
-            raise RefineError(msg)
+    def _import(self, context: bpy.types.Context, file: SplatFile) -> bpy.types.Object:
         mesh = mesh_attributes.mesh_from_file(file)
         obj = bpy.data.objects.new(mesh.name, mesh)
-        obj[FOLDER] = str(path.parent.absolute())
+        obj[FOLDER] = str(Path(file.path).parent.absolute())
         if self.upright:
             obj.matrix_world = mathutils.Matrix(UPRIGHT.tolist())
         _target(context).objects.link(obj)
@@ -199,6 +236,19 @@ def _capture_folder(obj: bpy.types.Object | None) -> Path | None:
         if any((place / name).exists() for name in _CAMERAS):
             return place
     return folder
+
+
+def _read(path: Path, progress: Progress) -> SplatFile:
+    """Return what a file holds, with all its bytes in memory."""
+    report(progress, 0.0, "")
+    file = read_splats(path)
+    if not len(file):
+        msg = f"{path}: holds no splats"
+        raise RefineError(msg)
+    for start in range(0, len(file), _ROWS):
+        report(progress, start / len(file), "")
+        file.rows[start : start + _ROWS].tobytes()  # a mapped file is read when it is looked at
+    return file
 
 
 def _target(context: bpy.types.Context) -> bpy.types.Collection:

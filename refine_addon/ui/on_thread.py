@@ -1,23 +1,32 @@
-"""Operators whose work runs on a thread, while a bar shows how far it is and Esc cancels."""
+"""Operators whose work runs on a thread, while the window stays alive and Esc cancels."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from .. import splat_object
+from .. import main_thread
 from ..core.errors import Cancelled, RefineError
 from ..core.work import silent
 from ..mesh import layout as mesh_layout
+from . import running as at_work
+from .running import Running
+from .target import Target
 from .worker import Worker
+
+if TYPE_CHECKING:
+    from ..mesh.layout import SplatObject
+    from .running import Sketch
 
 Answer = set[str]
 
 FAILURES = (RefineError, MemoryError)
 """What an operator reports as an error; all else is a fault of the program."""
+
+_STEP = 0.05
+"""Seconds between two looks at the thread."""
 
 
 def fail(operator: bpy.types.Operator, error: Exception) -> Answer:
@@ -33,43 +42,39 @@ def described(error: Exception) -> str:
     return str(error)
 
 
-@dataclass
-class _Running:
-    """An operation while it runs: all that an operator holds of it, dropped when it is over.
-
-    Blender keeps an operator in its history long after; splats and results are not to stay there.
-
-    Attributes
-    ----------
-    job
-        What `prepare` gathered.
-    name : str
-        Of the object: the object itself may not be the same one after an undo.
-    worker : Worker
-    timer : bpy.types.Timer
-    """
-
-    job: Any
-    name: str
-    worker: Worker[Any]
-    timer: bpy.types.Timer
-
-
 class OnThread:
     """An operator that waits for a thread in a window, with a bar to watch and a key to cancel.
 
     It says what to do in three steps. `prepare` reads the scene and returns a job: all that is
     needed of it. `work` runs on the thread and touches the job's arrays alone. `finish` writes what
     came of it. The operator itself keeps neither.
+
+    Where `sketch` names other work, that is done first; `show` writes what came of it while `work`
+    goes on, and it stays if that is cancelled or fails.
+
+    Meanwhile events go on to the rest of the window, but for undo and save. What was done to the
+    object is looked for before anything is written to it (`Target`).
     """
 
     doing = ""
-    _running: _Running | None = None
+    reads_object = True
+    """Whether it needs the active object."""
+    _running: Running | None = None
+
+    def sketch(self, _job: Any) -> Sketch | None:  # noqa: ANN401 - its own kind
+        """Return what is to be done and shown ahead of the work."""
+        return None
+
+    def written(
+        self, _context: bpy.types.Context, checked: SplatObject | None
+    ) -> list[SplatObject]:
+        """Return the objects that `finish` writes to, the active one first."""
+        return [checked] if checked else []
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Do all of it at once."""
         try:
-            checked = mesh_layout.check(context.object)
+            checked = self._checked(context)
             job = self.prepare(context, checked)
             return self.finish(context, checked, job, self.work(job, silent))
         except FAILURES as error:
@@ -79,67 +84,143 @@ class OnThread:
         """Start the thread, unless there is nobody to watch."""
         if bpy.app.background or context.window is None:
             return self.execute(context)
+        return self.launch(context)
+
+    def launch(self, context: bpy.types.Context) -> Answer:
+        """Read the scene, start the thread, and have Blender call `modal` from now on."""
         try:
-            job = self.prepare(context, mesh_layout.check(context.object))
+            checked = self._checked(context)
+            job = self.prepare(context, checked)
+            targets = [Target.of(each) for each in self.written(context, checked)]
         except FAILURES as error:
             return fail(self, error)
-        self.start(context, job)
-        return {"RUNNING_MODAL"}
-
-    def start(self, context: bpy.types.Context, job: Any) -> None:  # noqa: ANN401 - its own kind
-        """Start the thread, and have Blender call `modal` from now on."""
-        manager = context.window_manager
-        self._running = _Running(
+        manager, sketch = context.window_manager, self.sketch(job)
+        self._running = Running(
+            operator=type(self).bl_idname,
+            doing=self.doing,
+            escape="cancels",
             job=job,
-            name=context.object.name,
-            worker=Worker(partial(self.work, job)),
-            timer=manager.event_timer_add(0.05, window=context.window),
+            targets=targets,
+            worker=Worker(sketch.work if sketch else partial(self.work, job)),
+            timer=manager.event_timer_add(_STEP, window=context.window),
+            sketch=sketch,
+            stage="sketch" if sketch else "work",
         )
         manager.modal_handler_add(self)
-        _show_progress(context, self.doing, 0.0)
+        at_work.begin(self._running)
+        self._running.tell(context)
+        return {"RUNNING_MODAL"}
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Wait for the thread, and write what it found."""
         running = self._running
         if running is None:
             return {"CANCELLED"}
-        worker = running.worker
-        if event.type == "ESC":
-            worker.cancel()
-        if event.type != "TIMER":
-            return {"RUNNING_MODAL"}
-        if worker.running():
-            _show_progress(context, self.doing, worker.fraction)
-            return {"RUNNING_MODAL"}
-        self._over(context, running)
-        try:
-            result = worker.result()
-            checked = mesh_layout.check(splat_object.find(running.name))
-            return self.finish(context, checked, running.job, result)
-        except Cancelled:
-            self.report({"INFO"}, f"{self.doing} cancelled; nothing was changed")
-            return {"CANCELLED"}
-        except FAILURES as error:
-            return fail(self, error)
+        if event.type == "TIMER":
+            main_thread.serve()
+            return self._looked(context, running)
+        if event.type == "ESC" and event.value == "PRESS":
+            running.worker.cancel()
+        elif why := at_work.refused(event):
+            self.report({"WARNING"}, why)
+            running.say(why)
+            running.tell(context)
+        else:
+            return {"PASS_THROUGH"}
+        return {"RUNNING_MODAL"}
 
     def cancel(self, context: bpy.types.Context) -> None:
-        """Stop the thread where Blender ends the operator."""
+        """End the thread where Blender ends the operator: its window is closed, or its file."""
         if (running := self._running) is not None:
             self._over(context, running)
-            running.worker.cancel()
+            running.worker.end()
 
-    def _over(self, context: bpy.types.Context, running: _Running) -> None:
+    def _looked(self, context: bpy.types.Context, running: Running) -> Answer:
+        """Look how far the thread is."""
+        if not running.worker.running():
+            waits = (target.waits() for target in running.targets)
+            running.waits = next(filter(None, waits), "")
+            if running.stage == "sketch":
+                return self._sketched(context, running)
+            if running.worker.cancelled or not running.waits:
+                return self._done(context, running)
+        running.tell(context)
+        return {"PASS_THROUGH"}
+
+    def _checked(self, context: bpy.types.Context) -> SplatObject | None:
+        return mesh_layout.check(context.object) if self.reads_object else None
+
+    def _sketched(self, context: bpy.types.Context, running: Running) -> Answer:
+        """Go on to the main work, and show what the sketch came to."""
+        try:
+            found = running.worker.result()
+        except Cancelled:
+            return self._stopped(context, running)
+        except FAILURES:
+            found = None  # the main work says what is wrong, in the words that fit it
+        running.stage = "work"
+        running.next(Worker(partial(self.work, running.job)))
+        if found is not None and not running.waits:
+            try:
+                self.show(context, running.found(), running.job, found)
+            except FAILURES as error:
+                running.worker.cancel()
+                self._over(context, running)
+                return fail(self, error)
+            running.shows()
+        running.tell(context)
+        return {"PASS_THROUGH"}
+
+    def _done(self, context: bpy.types.Context, running: Running) -> Answer:
+        """Write what the main work came to."""
+        try:
+            result = running.worker.result()
+        except Cancelled:
+            return self._stopped(context, running)
+        except FAILURES as error:
+            return self._stopped(context, running, error)
+        self._over(context, running)
+        try:
+            return self.finish(context, running.found(), running.job, result)
+        except FAILURES as error:
+            return self._stopped(context, running, error)
+
+    def _stopped(
+        self, context: bpy.types.Context, running: Running, error: Exception | None = None
+    ) -> Answer:
+        """Say why nothing more comes; a sketch that was shown is a step that can be undone."""
+        self._over(context, running)
+        if error is not None:
+            fail(self, error)
+        if running.sketch and running.stage == "shown":
+            self.report({"INFO"}, f"{running.doing} stopped; {running.sketch.left}")
+            return {"FINISHED"}
+        if error is None:
+            self.report({"INFO"}, f"{self.doing} cancelled; nothing was changed")
+        return {"CANCELLED"}
+
+    def _over(self, context: bpy.types.Context, running: Running) -> None:
         """Clear the bar and let go of what ran."""
-        self._running = None
-        context.window_manager.event_timer_remove(running.timer)
-        _show_progress(context, self.doing, None)
+        if self._running is not None:
+            self._running = None
+            at_work.over(context, running)
 
 
-def _show_progress(context: bpy.types.Context, doing: str, fraction: float | None) -> None:
-    """Draw how much is done in panel and status bar; None clears both."""
-    context.window_manager.refine_progress = -1.0 if fraction is None else fraction
-    text = None if fraction is None else f"{doing}: {fraction:.0%} (Esc cancels)"
-    context.workspace.status_text_set(text)
-    for area in context.window.screen.areas:
-        if area.type == "VIEW_3D":
-            area.tag_redraw()
+class AskedFirst(OnThread):
+    """Such an operator that asks something before it starts: for a file."""
+
+    _asked = False
+
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+        """Ask; Blender calls `execute` when that is answered."""
+        raise NotImplementedError
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+        """Ask, and start the thread then."""
+        self._asked = True
+        return self.ask(context, event)
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Start the thread after asking; a script, or an operation adjusted, does all at once."""
+        asked, self._asked = self._asked, False
+        return OnThread.invoke(self, context, None) if asked else super().execute(context)

@@ -7,7 +7,8 @@ Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* 
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,26 +23,30 @@ from ..core import frustum, pipeline
 from ..core.formats.registry import FORMATS, Packed, without_suffix
 from ..core.levels.lod import Level, Levels, lod
 from ..core.quality import in_words
-from ..core.report import scoring_notes
-from ..core.work import part
+from ..core.report import scoring_notes, sizes_in_words
+from ..core.work import part, report
+from ..demands import Demands
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
 from ..viewport import draw
-from . import plans, preview, staleness
+from . import plans, preview, running, staleness
 from .adjust import Adjustable
 from .import_operators import FILE_NAMES
-from .on_thread import FAILURES, Answer, OnThread, fail
+from .on_thread import FAILURES, Answer, AskedFirst, OnThread, fail
+from .running import Sketch
 from .wrapped import counted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ..core.formats.ply import SplatFile
     from ..core.scores import Scores
     from ..core.splats import Splats
     from ..core.task import Result, Settings, Task
     from ..core.views import ViewSet
+    from ..core.volumes import Forced
     from ..core.work import Progress
     from ..mesh.layout import SplatObject
 
@@ -56,9 +61,15 @@ _FORMATS = (
 class OnSplats:
     """An operator on the active object, which must hold splats."""
 
+    waits = True
+    """Whether it waits until another one is over that works on a thread."""
+
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Tell whether the operator can run, and if not, why."""
+        if cls.waits and (why := running.refusal()):
+            cls.poll_message_set(why)
+            return False
         obj = context.object
         if not mesh_layout.looks_like_splats(obj):
             cls.poll_message_set("Select an object that holds splats: import a file of splats")
@@ -94,7 +105,7 @@ def apply_task(context: bpy.types.Context, group: splat_group.Members) -> Task:
     return splat_group.stored_task(
         group,
         settings.to_budget(),
-        settings.protect,
+        splat_group.forced(context.scene, group),
         settings=settings.to_settings(),
         views=chosen_views(context) if settings.absorb else None,
     )
@@ -117,13 +128,17 @@ def _new_name(obj: bpy.types.Object) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Scoring:
-    """What is to be scored, by which views and how; where all of it stood (`staleness.origin`)."""
+    """What is to be scored, by which views and how; where all of it stood (`staleness.origin`).
+
+    What has to go, (N,) bool, is left out.
+    """
 
     splats: Splats
+    removed: NDArray[np.bool_] | None
     views: ViewSet
     settings: Settings
     quality: bool
-    names: tuple[str, ...]
+    uids: tuple[int, ...]
     origins: list[dict[str, Any]]
 
 
@@ -144,18 +159,43 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         quality = settings.estimates or context.scene.refine.budget == "psnr"
         splats = splat_group.gather(group, whole=None if quality else False)
         origins = [staleness.origin(context, member.obj) for member in group]
-        names = splat_group.names_of(group)
-        return _Scoring(splats, views, settings, quality, names, origins)
+        removed = splat_group.removed_of(splat_group.forced(context.scene, group), group)
+        uids = splat_group.uids_of(group)
+        return _Scoring(splats, removed, views, settings, quality, uids, origins)
+
+    def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
+        """Return the objects that are scored, the active one first."""
+        return splat_group.active_first(context.view_layer, checked)
+
+    def sketch(self, job: _Scoring) -> Sketch | None:
+        """Score by the closed form first, which takes a fraction of the time."""
+        if job.settings.method == "closed-form":
+            return None
+        work = partial(_sketched, job)
+        left = "the scores are the closed form's"
+        return Sketch(work, "Refining scores", "keeps the closed form's", left)
+
+    @staticmethod
+    def show(
+        context: bpy.types.Context, _checked: SplatObject, job: _Scoring, scores: Scores
+    ) -> None:
+        """Store the closed form's scores, to be looked at until those asked for are there."""
+        group = splat_group.by_uids(job.uids)
+        noted = splat_group.Noted(_rough(job), job.origins, removed=job.removed, asked=job.settings)
+        splat_group.store(group, scores, noted)
+        plans.refresh(context)
 
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
         """Score, and count how many splats lie in each view."""
         ahead = part(progress, 0.0, 0.97)
         scores = pipeline.score(
-            job.splats, job.views, job.settings, quality=job.quality, progress=ahead
-        )
+            job.splats, job.views, job.settings,
+            removed=job.removed, quality=job.quality, progress=ahead,
+        )  # fmt: skip
         ahead = part(progress, 0.97, 1.0)
-        return scores, frustum.census(job.splats.means, job.views, progress=ahead)
+        means = job.splats.means if job.removed is None else job.splats.means[~job.removed]
+        return scores, frustum.census(means, job.views, progress=ahead)
 
     def finish(
         self,
@@ -168,13 +208,15 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         scores, counts = found
         names = [view.name for view in job.views]
         cameras = list(zip(names, counts.tolist(), strict=True))
-        group = splat_group.by_names(job.names)
-        splat_group.store(group, scores, job.settings, job.origins, cameras)
+        group, forced = splat_group.by_uids(job.uids), _forced(job)
+        noted = splat_group.Noted(job.settings, job.origins, cameras, job.removed)
+        splat_group.store(group, scores, noted)
         plans.refresh(context)
-        unseen = int((scores.seen == 0).sum())
+        unseen = int((scores.seen == 0).sum()) - forced
         self.report(
             {"INFO"},
-            f"Scored {len(scores.values):,} splats{_of_objects(group)} by {scores.views_used} of "
+            f"Scored {len(scores.values) - forced:,} splats{_of_objects(group)} by "
+            f"{scores.views_used} of "
             f"{counted(scores.views_given, 'view')}; {unseen:,} lie in none",
         )
         modified = [note for m in group for note in splat_object.modifier_notes(m.obj)]
@@ -183,12 +225,28 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
+def _forced(job: _Scoring) -> int:
+    return 0 if job.removed is None else int(np.count_nonzero(job.removed))
+
+
+def _rough(job: _Scoring) -> Settings:
+    """Return the settings of a sketch of the scores that a job asks for."""
+    return replace(job.settings, method="closed-form")
+
+
+def _sketched(job: _Scoring, progress: Progress) -> Scores:
+    return pipeline.score(
+        job.splats, job.views, _rough(job), removed=job.removed, progress=progress
+    )
+
+
 class REFINE_OT_plan(OnScored, bpy.types.Operator):
     """Work out again how many splats stay and go"""
 
     bl_idname = "refine.plan"
     bl_label = "Update"
     bl_options = {"INTERNAL"}
+    waits = False
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Work it out."""
@@ -201,7 +259,7 @@ class _Applying:
     """What is to be decided, and of which objects."""
 
     task: Task
-    names: tuple[str, ...]
+    uids: tuple[int, ...]
 
 
 class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
@@ -243,7 +301,11 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         group = splat_group.members(context.view_layer, checked.obj)
         for member in group:
             mesh_edit.check_deletable(member.obj)
-        return _Applying(apply_task(context, group), splat_group.names_of(group))
+        return _Applying(apply_task(context, group), splat_group.uids_of(group))
+
+    def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
+        """Return the objects that lose splats, the active one first."""
+        return splat_group.active_first(context.view_layer, checked)
 
     @staticmethod
     def work(job: _Applying, progress: Progress) -> Result:
@@ -255,20 +317,21 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
     ) -> Answer:
         """Delete what does not stay, and change what absorbed it."""
         context.view_layer.update()
-        group = splat_group.by_names(job.names)
+        group = splat_group.by_uids(job.uids)
         changed = staleness.changes_of(context, [member.obj for member in group])
         if result.absorbed and not job.task.budget.needs_scores:
             changed = []  # nothing went by the scores
         done = splat_group.apply(group, result)
         for member in group:
             plans.forget(member.mesh)
+        plans.refresh(context)
         psnr = result.report["estimated_psnr"]
         if result.absorbed:
             self.report({"INFO"}, result.absorbed.note())
         self.report(
             {"INFO"},
             f"Kept {done.kept:,} splats{_of_objects(group)}, removed {done.removed:,}: "
-            f"{done.bytes_before / 1e6:,.1f} -> {done.bytes_after / 1e6:,.1f} MB"
+            + sizes_in_words(done.bytes_before, "->", done.bytes_after)
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
         if changed:
@@ -282,13 +345,13 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
 
 @dataclass(frozen=True, eq=False)
 class _Detail:
-    """What levels are to be made of, by which views and how; what is protected, (N,) bool."""
+    """What levels are to be made of, by which views and how; what must stay and go."""
 
     splats: Splats
     views: ViewSet
     levels: Levels
     settings: Settings
-    protected: NDArray[np.bool_] | None
+    forced: Forced
 
 
 class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
@@ -318,7 +381,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
             chosen_views(context),
             levels,
             settings.to_settings(),
-            mesh_edit.protected_mask(checked.obj, settings.protect),
+            Demands.of_scene(context.scene).forced(checked),
         )
 
     @staticmethod
@@ -326,7 +389,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         """Make the levels."""
         return lod(
             job.splats, job.views, job.levels, job.settings,
-            protected=job.protected, progress=progress,
+            protected=job.forced.protected, removed=job.forced.removed, progress=progress,
         )  # fmt: skip
 
     def finish(
@@ -354,6 +417,7 @@ class REFINE_OT_preview(OnSplats, bpy.types.Operator):
     bl_idname = "refine.preview"
     bl_label = "Preview"
     bl_options = {"REGISTER", "UNDO"}
+    waits = False
 
     mode: EnumProperty(
         name="Show",
@@ -440,12 +504,22 @@ class REFINE_OT_convert(OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
+@dataclass(frozen=True, eq=False)
+class _Export:
+    """What is to be written where."""
+
+    file: SplatFile
+    target: Path
+    overwrite: bool
+
+
+class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelper):
     """Write the active object's splats to a file, in the format that its suffix names"""
 
     bl_idname = "refine.export_ply"
     bl_label = "Export Splats"
     bl_options = {"REGISTER", "PRESET"}
+    doing = "Writing splats"
 
     filename_ext = ".ply"
     filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
@@ -466,12 +540,12 @@ class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
         options={"SKIP_SAVE"},
     )
 
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Ask for the file; whoever picks an existing one in the browser means to replace it."""
         if not self.filepath:
             self.filepath = _new_name(context.object)
         self.overwrite = True
-        return super().invoke(context, event)
+        return ExportHelper.invoke(self, context, event)
 
     def check(self, _context: bpy.types.Context) -> bool:
         """Give the file name the suffix of the format that is chosen; return whether it changed."""
@@ -479,17 +553,34 @@ class REFINE_OT_export_ply(OnSplats, bpy.types.Operator, ExportHelper):
         self.filepath = without_suffix(before) + self.suffix
         return before != self.filepath
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def written(
+        self, _context: bpy.types.Context, _checked: SplatObject | None
+    ) -> list[SplatObject]:
+        """Return none: the object is only read."""
+        return []
+
+    def prepare(self, _context: bpy.types.Context, checked: SplatObject) -> _Export:
+        """Refuse what cannot be written, and gather what is."""
+        target = splat_object.export_target(
+            bpy.path.abspath(self.filepath), overwrite=self.overwrite
+        )
+        file = splat_object.export_source(checked, apply_transform=self.apply_transform)
+        return _Export(file, target, self.overwrite)
+
+    @staticmethod
+    def work(job: _Export, progress: Progress) -> SplatFile | Packed:
         """Write the file."""
-        try:
-            file = splat_object.export_object(
-                mesh_layout.check(context.object),
-                bpy.path.abspath(self.filepath),
-                apply_transform=self.apply_transform,
-                overwrite=self.overwrite,
-            )
-        except FAILURES as error:
-            return fail(self, error)
+        report(progress, 0.0, job.target.name)
+        return splat_object.write_export(job.file, job.target, overwrite=job.overwrite)
+
+    def finish(
+        self,
+        _context: bpy.types.Context,
+        _checked: SplatObject | None,
+        _job: _Export,
+        file: SplatFile | Packed,
+    ) -> Answer:
+        """Say what was written."""
         if isinstance(file, Packed):
             self.report({"INFO"}, "; ".join(file.notes(np.ones(len(file.file), np.bool_))))
         self.report({"INFO"}, f"Wrote the splats to {self.filepath}")

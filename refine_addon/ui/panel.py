@@ -9,13 +9,14 @@ import bpy
 
 from .. import splat_group
 from ..cameras.sets import chosen_cameras
+from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
 from ..viewport import draw as viewport_draw
-from . import kept, plans, preview, price, staleness, wrapped
+from . import kept, plans, preview, price, running, staleness, wrapped
 from .properties import FLOATERS
 from .view_operators import MODES
 from .wrapped import counted
@@ -47,6 +48,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
             lost = obj is not None and native.lost_base(obj)
             text = "Colours were lost: open it in Blender 5.2" if lost else _NONE
             wrapped.label(layout, context, text, icon="ERROR" if lost else "INFO")
+            _draw_progress(layout, context, "refine.import_ply")
             return
         objects = splat_group.chosen(context.view_layer, obj)
         count = sum(mesh_layout.splat_count(each.data) for each in objects)
@@ -60,8 +62,9 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
             return
         size = kept.answer("bytes", context, lambda: mesh_layout.export_bytes(obj))
         if size is not None:
-            layout.label(text=f"{size / 1e6:,.1f} MB")
+            layout.label(text=size_in_words(size))
         layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
+        _draw_progress(layout, context, "refine.import_ply")
 
 
 class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
@@ -96,8 +99,6 @@ class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
         """Draw the reasons, how many splats each takes, and the buttons."""
         layout = self.layout
         settings = context.scene.refine
-        if _draw_progress(layout, context):
-            return
         layout.operator("refine.find_floaters", icon="VIEWZOOM")
         obj = context.object
         found = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
@@ -111,6 +112,7 @@ class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
                 text=f"Go: {total:,} of {mesh_layout.splat_count(obj.data):,}", icon="TRASH"
             )
             layout.operator("refine.delete_floaters", icon="TRASH")
+        _draw_progress(layout, context, "refine.find_floaters")
 
 
 class REFINE_PT_score(_InSidebar, bpy.types.Panel):
@@ -128,14 +130,14 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         column.prop(settings, "method")
         if settings.method == "auto":
             column.prop(settings, "tolerance")
-        if _draw_progress(layout, context):
-            return
         layout.operator("refine.score", icon="CAMERA_DATA")
         obj = context.object
         record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
         if record:
             views = counted(record["views_given"], "view")
             layout.label(text=f"Scored by {record['views_used']} of {views}", icon="CHECKMARK")
+            if mesh_scores.unrefined(record):
+                wrapped.label(layout, context, "By the closed form, not yet refined", icon="INFO")
             objects = splat_group.chosen(context.view_layer, obj)
             records = tuple(each.data.get(mesh_scores.RECORD) for each in objects)
             question = ("changes", records)
@@ -145,6 +147,7 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
                 wrapped.label(layout, context, text, icon="ERROR")
         elif mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes:
             wrapped.label(layout, context, "Applied: score again for more", icon="INFO")
+        _draw_progress(layout, context, "refine.score")
 
 
 class REFINE_PT_advanced(_InSidebar, bpy.types.Panel):
@@ -214,19 +217,18 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         column.use_property_decorate = False
         column.prop(settings, "budget")
         column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
-        column.prop(settings, "protect")
         column.prop(settings, "absorb")
         obj = context.object
         record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
         if record:
             _draw_plan(layout, context, record)
-        if _draw_progress(layout, context):
-            return
         if record:
             layout.operator("refine.compare", icon="IMAGE_DATA")
+            _draw_progress(layout, context, "refine.compare")
         row = layout.row()
         row.enabled = record is not None
         row.operator("refine.apply", icon="TRASH")
+        _draw_progress(layout, context, "refine.apply")
 
 
 class REFINE_PT_export(_InSidebar, bpy.types.Panel):
@@ -244,14 +246,18 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
         column.prop(settings, "levels")
         column.prop(settings, "nested")
         column.operator("refine.levels", icon="MOD_DECIM")
+        _draw_progress(layout, context, "refine.export_ply", "refine.levels")
 
 
-def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context) -> bool:
-    """Draw how far an operator is that works on a thread; return whether one does."""
-    progress = context.window_manager.refine_progress
-    if progress >= 0.0:
-        layout.progress(factor=progress, text=f"{progress:.0%} (Esc cancels)")
-    return bool(progress >= 0.0)
+def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *names: str) -> None:
+    """Draw how far an operator is that works on a thread, if it is one of these.
+
+    To be called last: Blender 4.3 draws a label as a bar that takes the place of one in a panel.
+    """
+    now = running.now()
+    if now is not None and now.operator in names:
+        layout.progress(factor=now.factor, text=now.share)
+        wrapped.label(layout, context, now.sentence)
 
 
 def _draw_frames(
@@ -306,7 +312,9 @@ def _draw_plan(
     if plan is None:
         layout.operator("refine.plan", icon="FILE_REFRESH")
     elif "error" in plan:
-        wrapped.label(layout, context, plan["error"], icon="ERROR")
+        waits = mesh_scores.unrefined(record) and settings.budget == "psnr"
+        text = plans.remark(plan, record) if waits else plan["error"]
+        wrapped.label(layout, context, text, icon="INFO" if waits else "ERROR")
     else:
         wrapped.label(layout, context, plans.sentence(plan, absorb=settings.absorb))
         if remark := plans.remark(plan, record):

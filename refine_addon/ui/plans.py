@@ -7,6 +7,7 @@ slider has come to rest (`refresh`): reading what is protected, marking what goe
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 from dataclasses import dataclass
@@ -15,10 +16,11 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from .. import splat_group, splat_object
+from .. import demands, splat_group, splat_object
 from ..core import pipeline
 from ..core.errors import RefineError
 from ..core.quality import in_words, out_of_reach
+from ..core.report import sizes_in_words
 from ..core.selection import Tally, quality_of
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
@@ -54,6 +56,8 @@ class _Known:
     kinds : Histogram
     unseen : int
         Splats whose centre lies in none of the views.
+    forced : int
+        Splats that go before all others, which all of the above leaves out.
     """
 
     holds: tuple[Any, ...]
@@ -62,6 +66,12 @@ class _Known:
     fixed_bytes: int
     kinds: Histogram
     unseen: int
+    forced: int
+
+    @property
+    def count(self) -> int:
+        """How many splats there are in all."""
+        return len(self.tally.scores.values) + self.forced
 
 
 _known: list[_Known] = []
@@ -84,7 +94,7 @@ def unregister() -> None:
 
 def key(settings: Any) -> str:  # noqa: ANN401 - RefineSettings, which imports this module
     """Return what a plan depends on, to tell whether a stored one still holds."""
-    budget = f"{settings.budget} {getattr(settings, settings.budget)!r} {settings.protect!r}"
+    budget = f"{settings.budget} {getattr(settings, settings.budget)!r} {_demanded(settings)!r}"
     return f"{budget} absorb" if settings.absorb else budget
 
 
@@ -112,8 +122,17 @@ def at_once(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
 def refresh(context: bpy.types.Context) -> None:
     """Work out the plan for the active object if it has scores, store it, and mark what goes."""
     obj = getattr(context, "object", None)
-    if obj is not None and _can_have(obj):
-        _refresh(context.scene, obj)
+    if obj is not None:
+        refresh_object(context.scene, obj)
+
+
+def refresh_object(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
+    """Do the same for any object; without scores, mark what must stay and what must go."""
+    if _can_have(obj):
+        _refresh(scene, obj)
+    elif _is_ours(obj):
+        with contextlib.suppress(RefineError):  # which the panel shows
+            demands.refresh(scene, mesh_layout.check(obj))
 
 
 def ask(context: bpy.types.Context, obj: bpy.types.Object) -> None:
@@ -178,7 +197,7 @@ def sentence(plan: dict[str, Any], *, absorb: bool) -> str:
     """
     text = (
         f"Keeps {'about ' if plan.get('about') else ''}{plan['kept']:,} of {plan['splats']:,}, "
-        f"{plan['bytes_after'] / 1e6:,.1f} of {plan['bytes_before'] / 1e6:,.1f} MB"
+        + sizes_in_words(plan["bytes_after"], "of", plan["bytes_before"])
     )
     if "psnr" not in plan:
         return text
@@ -194,6 +213,8 @@ def remark(plan: dict[str, Any], record: dict[str, Any]) -> str:
     """Return what else there is to say of a plan and of the note of the scoring, or ""."""
     if "psnr" in plan:
         return str(plan.get("remark", ""))
+    if mesh_scores.unrefined(record):
+        return "Refined scores tell dB"
     if record.get("method") == "closed-form":
         return "Score with Auto, or with Quality as the budget, to see dB"
     return "The views see too little to tell dB"
@@ -225,17 +246,22 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
 
 def _can_have(obj: bpy.types.Object) -> bool:
     """Tell whether an object can have a plan: it is scored, and may be written to."""
-    if not mesh_layout.looks_like_splats(obj) or mesh_scores.record(obj.data) is None:
+    return _is_ours(obj) and mesh_scores.record(obj.data) is not None
+
+
+def _is_ours(obj: bpy.types.Object) -> bool:
+    """Tell whether an object holds splats that may be marked."""
+    if not mesh_layout.looks_like_splats(obj) or obj.mode == "EDIT":
         return False
-    return obj.mode != "EDIT" and not obj.data.library and not obj.library
+    return not obj.data.library and not obj.library
 
 
 def _rested() -> None:
     """Make the plan that is waited for; Blender's timer calls it once."""
     for scene_name, name in _waiting:
         scene, obj = bpy.data.scenes.get(scene_name), bpy.data.objects.get(name)
-        if scene is not None and obj is not None and _can_have(obj):
-            _refresh(scene, obj)
+        if scene is not None and obj is not None:
+            refresh_object(scene, obj)
     _waiting.clear()
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
@@ -251,11 +277,13 @@ def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     plan = own
     try:
         group = splat_group.members(bpy.context.view_layer, obj)
-        task = splat_group.stored_task(group, settings.to_budget(), settings.protect)
+        found = splat_group.refresh(scene, group)
+        task = splat_group.stored_task(group, settings.to_budget(), found)
         known = _know(task, _state(objects, settings))
         plan = _noted(known, settings) | own
         keep = pipeline.decide(task).keep
         splat_group.mark_removed(group, keep)
+        keep = keep if task.removed is None else keep[~task.removed]
         plan["unseen_gone"] = int(np.count_nonzero(~keep & (known.tally.scores.seen == 0)))
         price.show(mesh, known.tally.scores, known.kinds, _place(plan, settings), keep)
     except RefineError as error:
@@ -276,6 +304,9 @@ def _key(settings: Any, objects: list[bpy.types.Object]) -> str:  # noqa: ANN401
 
 def _know(task: Task, state: tuple[Any, ...]) -> _Known:
     """Return what holds for any budget; what was known before, where it still does."""
+    forced = task.forced()
+    gone = 0 if forced is None else int(np.count_nonzero(forced))
+    task = task if forced is None else task.without(forced)
     scores = task.scores
     assert scores is not None  # noqa: S101 - a task of what is stored
     old = _known[0] if _known else None
@@ -283,7 +314,7 @@ def _know(task: Task, state: tuple[Any, ...]) -> _Known:
         return old
     kinds = price.histogram(scores)
     tally, unseen = Tally(scores, task.protected), int(np.count_nonzero(scores.seen == 0))
-    known = _Known(state, tally, int(task.row_bytes), task.fixed_bytes, kinds, unseen)
+    known = _Known(state, tally, int(task.row_bytes), task.fixed_bytes, kinds, unseen, gone)
     _known[:] = [known]
     return known
 
@@ -298,33 +329,40 @@ def _state(objects: list[bpy.types.Object], settings: Any) -> tuple[Any, ...]:  
         )
         for obj in objects
     )
-    return scorings, settings.protect
+    return scorings, _demanded(settings)
+
+
+def _demanded(settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
+    """Return what the settings name as to stay or to go; volumes that move are heard of."""
+    listed = [item for item in settings.volumes if item.object is not None]
+    return (settings.protect, *((item.role, item.object.session_uid) for item in listed))
 
 
 def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
     """Return the plan for a budget as plain values."""
-    scores = known.tally.scores
-    count, curve = len(scores.values), scores.quality
+    scores, count, forced = known.tally.scores, known.count, known.forced
+    rest, curve = count - forced, scores.quality
     noted: dict[str, Any] = {"key": key(settings), "splats": count, "unseen": known.unseen}
     try:
         budget = settings.to_budget()
         if budget.psnr is not None and settings.absorb:
-            gone = math.floor(quality_of(scores).share(budget.psnr, absorb=True) * count)
+            gone = math.floor(quality_of(scores).share(budget.psnr, absorb=True) * rest)
             noted["about"] = True
         else:
-            gone = known.tally.removed(budget, known.row_bytes, known.fixed_bytes)
+            left = budget.after(forced, count)
+            gone = known.tally.removed(left, known.row_bytes, known.fixed_bytes)
     except RefineError as error:
         return noted | {"error": str(error)}
-    sizes = splat_object.Plan.of(count, count - gone, known.row_bytes, known.fixed_bytes)
-    noted |= vars(sizes)
+    sizes = splat_object.Plan.of(count, rest - gone, known.row_bytes, known.fixed_bytes)
+    noted |= {**vars(sizes), "forced": forced}
     if curve is None:
         return noted
-    noted["psnr"] = curve.at(gone / count)
+    noted["psnr"] = curve.at(gone / rest)
     if curve.foretold:
-        noted["psnr_absorbed"] = curve.at(gone / count, absorb=True)
+        noted["psnr_absorbed"] = curve.at(gone / rest, absorb=True)
     if budget.psnr is not None:
-        psnr = curve.at(gone / count, absorb=settings.absorb)
-        remark = out_of_reach(budget.psnr, gone, count, psnr)
+        psnr = curve.at(gone / rest, absorb=settings.absorb)
+        remark = out_of_reach(budget.psnr, gone, rest, psnr)
         noted["remark"] = remark[:1].upper() + remark[1:]
     return noted
 
@@ -332,4 +370,5 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
 def _place(plan: dict[str, Any], settings: Any) -> Place | None:  # noqa: ANN401
     if "error" in plan:
         return None
-    return Place(plan["removed"] / plan["splats"], settings.absorb)
+    forced = plan["forced"]  # the chart is of the others
+    return Place((plan["removed"] - forced) / (plan["splats"] - forced), settings.absorb)

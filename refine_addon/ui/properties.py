@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 from bpy.props import (
     BoolProperty,
+    CollectionProperty,
     EnumProperty,
     FloatProperty,
     IntProperty,
@@ -27,6 +28,7 @@ from ..mesh import floaters
 from ..mesh import layout as mesh_layout
 from ..mesh.edit import marking
 from . import plans
+from .volumes import RefineVolume
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -255,6 +257,9 @@ class RefineSettings(bpy.types.PropertyGroup):
         search=_protectable,
         search_options={"SORT", "SUGGESTION"},
         update=_plan_again,
+    )
+    volumes: CollectionProperty(
+        name="Volumes", description="Objects that say what must stay and go", type=RefineVolume
     )
 
     levels: StringProperty(

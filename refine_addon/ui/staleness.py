@@ -32,6 +32,7 @@ def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
     return {
         "matrix": np.array(obj.matrix_world).tolist(),
         "frame": context.scene.frame_current,
+        "volumes": _volumes(context.scene),
         **_cameras(context),
     }
 
@@ -48,10 +49,11 @@ def changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
     """
     record = mesh_scores.record(obj.data) or {}
     try:
-        then, settings = record["origin"], record["settings"]
+        then, settings = record["origin"], record.get("asked") or record["settings"]
         found = {
             "object moved": _moved(then, context.scene, obj),
             "cameras changed": _other_cameras(then, _cameras(context)),
+            "volumes changed": _other_volumes(then, context.scene),
             "settings changed": _deciding(settings)
             != _deciding(asdict(context.scene.refine.to_settings())),
         }
@@ -63,6 +65,31 @@ def changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
 def changes_of(context: bpy.types.Context, objects: Iterable[bpy.types.Object]) -> list[str]:
     """Return what changed since any of several objects was scored; see `changes`."""
     return list(dict.fromkeys(words for obj in objects for words in changes(context, obj)))
+
+
+def _volumes(scene: bpy.types.Scene) -> list[Any]:
+    """Return the volumes that decide what has to go, if any: who, where and how large they are."""
+    listed = [item for item in scene.refine.volumes if item.object is not None]
+    if all(item.role == "PROTECT" for item in listed):
+        return []  # what is protected is scored like the rest
+    found = []
+    for item in listed:
+        obj = item.object
+        kind = obj.empty_display_type if obj.type == "EMPTY" else obj.type
+        size = [obj.empty_display_size] * 3 if obj.type == "EMPTY" else list(obj.dimensions)
+        found.append([item.role, kind, np.array(obj.matrix_world).ravel().tolist() + size])
+    return found
+
+
+def _other_volumes(then: dict[str, Any], scene: bpy.types.Scene) -> bool:
+    before, now = then.get("volumes", []), _volumes(scene)
+    if [volume[:2] for volume in before] != [volume[:2] for volume in now]:
+        return True
+    numbers = zip(before, now, strict=True)
+    return not all(
+        np.allclose(old[2], new[2], rtol=_NOISE, atol=_NOISE * np.abs(old[2]).max())
+        for old, new in numbers
+    )
 
 
 def _moved(then: dict[str, Any], scene: bpy.types.Scene, obj: bpy.types.Object) -> bool:

@@ -14,22 +14,40 @@ GERMAN = {
     "4 Preview": "4 Vorschau",
     "5 Apply": "5 Anwenden",
     "6 Export": "6 Exportieren",
+    "A closed mesh, or an empty that is shown as a cube or a sphere": (
+        "Ein geschlossenes Mesh oder ein Leerobjekt, das als Würfel oder Kugel gezeigt wird"
+    ),
+    "A new box around the middle of the splats": "Ein neuer Quader um die Mitte der Splats",
+    "A new sphere around the middle of the splats": "Eine neue Kugel um die Mitte der Splats",
     "A sphere, for the viewport": "Eine Kugel, für die 3D-Ansicht",
     "Absorb": "Aufnehmen",
     "Active": "Aktive",
+    "Add Volume": "Volumen hinzufügen",
+    "Add a volume to the list": "Der Liste ein Volumen hinzufügen",
     "Advanced": "Erweitert",
     "All cameras that are visible in the scene": "Alle Kameras, die in der Szene sichtbar sind",
+    "All splats go that are in no volume of this kind": (
+        "Alle Splats gehen, die in keinem solchen Volumen liegen"
+    ),
     "Along Axis": "Entlang der Achse",
     "Applied: score again for more": "Angewendet: für mehr erneut bewerten",
     "Apply": "Anwenden",
     "Apply Transform": "Transformation anwenden",
     "Auto": "Automatisch",
+    "Box": "Quader",
     "Budget": "Budget",
     "By how much the PSNR of the pictures may be lower than by Occlusion, in dB": (
         "Um wie viel der PSNR der Bilder niedriger sein darf als mit Verdeckung, in dB"
     ),
+    "By the closed form, not yet refined": "Nach der geschlossenen Form, noch nicht verfeinert",
     "Cameras": "Kameras",
+    "Change which splats are marked to stay": "Ändern, welche Splats als bleibend markiert sind",
+    "Clear": "Leeren",
     "Closed Form": "Geschlossene Form",
+    "Closed meshes, and empties shown as cubes or spheres, that are selected too": (
+        "Geschlossene Meshes und als Würfel oder Kugel gezeigte Leerobjekte, die auch "
+        "ausgewählt sind"
+    ),
     "Collection": "Sammlung",
     "Colour": "Farbe",
     "Colour each splat by its rank: dark goes first, yellow goes last": (
@@ -45,6 +63,11 @@ GERMAN = {
         "Vorgaben für Szenen, in die Splats importiert werden"
     ),
     "Delete Floaters": "Schwebende löschen",
+    "Delete Now": "Jetzt löschen",
+    "Delete now what the volumes say must go, without scores; nothing else is deleted": (
+        "Jetzt löschen, was nach den Volumen gehen muss, ohne Bewertung; nichts anderes wird "
+        "gelöscht"
+    ),
     "Delete the floaters that were found, for the reasons that are switched on": (
         "Die gefundenen schwebenden Splats löschen, aus den eingeschalteten Gründen"
     ),
@@ -118,6 +141,7 @@ GERMAN = {
     ),
     "In Front": "Davor",
     "In the layout that was imported": "In der Anordnung, die importiert wurde",
+    "Index": "Index",
     "Is a huge veil across the pictures": "Ist ein riesiger Schleier vor den Bildern",
     "Is in a small cluster that touches nothing else": (
         "Gehört zu einem kleinen Haufen, der nichts anderes berührt"
@@ -143,6 +167,7 @@ GERMAN = {
         "Es enthält Orte in 24 Bit, alles andere in 8 bis 10 und Harmonische in 4 bis 5"
     ),
     "Keep": "Behalten",
+    "Keep Inside": "Inneres behalten",
     "Keep as many splats as fit in a file of this size": (
         "So viele Splats behalten, wie in eine Datei dieser Größe passen"
     ),
@@ -155,9 +180,12 @@ GERMAN = {
     ("Make objects with ever fewer of the splats, by the cameras, in a collection of their own"): (
         "Objekte mit immer weniger Splats anlegen, nach den Kameras, in einer eigenen Sammlung"
     ),
+    "Mark the selected splats to stay": "Die ausgewählten Splats als bleibend markieren",
     "Method": "Verfahren",
+    "Mode": "Modus",
     "Needle": "Nadel",
     "Nested": "Verschachtelt",
+    "Objects that say what must stay and go": "Objekte, die sagen, was bleiben und was gehen muss",
     "Occlusion": "Verdeckung",
     "Occlusion with no more views than the pictures need": (
         "Verdeckung mit nicht mehr Ansichten, als die Bilder brauchen"
@@ -176,25 +204,34 @@ GERMAN = {
     "Only in Frame": "Nur im Bild",
     "Overwrite": "Überschreiben",
     "PSNR": "PSNR",
+    "Place in the list": "Platz in der Liste",
     "Points": "Punkte",
     "Preview": "Vorschau",
     "Price": "Preis",
     "Protect": "Schützen",
+    "Protect Inside": "Inneres schützen",
+    "Protect Selected": "Auswahl schützen",
+    "Protect Splats": "Splats schützen",
+    "Protect and Crop": "Schützen und beschneiden",
     "Published Constants": "Veröffentlichte Konstanten",
     "Quality": "Qualität",
     "Rank of each splat: dark goes first, yellow last": (
         "Rang jedes Splats: Dunkles geht zuerst, Gelbes zuletzt"
     ),
+    "Release Selected": "Auswahl freigeben",
     "Remove": "Entfernen",
+    "Remove Inside": "Inneres entfernen",
     "Remove as many splats as leave the pictures this close to the unpruned": (
         "So viele Splats entfernen, dass die Bilder den ursprünglichen so nah bleiben"
     ),
+    "Remove from List": "Aus der Liste nehmen",
     "Remove splats that lie in fewer than this share of the views": (
         "Splats entfernen, die in weniger als diesem Anteil der Ansichten liegen"
     ),
     "Remove splats that score below this": "Splats entfernen, deren Wert darunter liegt",
     "Remove this share of the splats": "Diesen Anteil der Splats entfernen",
     "Replace the file if it exists": "Die Datei ersetzen, falls es sie gibt",
+    "Role": "Aufgabe",
     "Scene": "Szene",
     "Scene Range": "Bereich der Szene",
     "Score": "Bewerten",
@@ -204,7 +241,9 @@ GERMAN = {
     "Scored and pruned as one scene": "Als eine Szene bewertet und ausgedünnt",
     "Seen by": "Gesehen von",
     "Selected": "Ausgewählte",
+    "Selected Objects": "Ausgewählte Objekte",
     "Set Render Size": "Rendergröße setzen",
+    "Shape": "Form",
     "Share": "Anteil",
     "Share of the splats to remove": "Anteil der Splats, der entfernt wird",
     "Share of the splats to remove, in per cent": (
@@ -227,7 +266,10 @@ GERMAN = {
     "Size of the exported file, in megabytes of a million bytes": (
         "Größe der exportierten Datei, in Megabyte zu einer Million Byte"
     ),
+    "Sphere": "Kugel",
     "Splats": "Splats",
+    "Splats in it go before all others": "Splats darin gehen vor allen anderen",
+    "Splats in it stay, whatever else is said": "Splats darin bleiben, was auch sonst gesagt ist",
     "Splats that lie in fewer than this share of the views are removed": (
         "Splats, die in weniger als diesem Anteil der Ansichten liegen, werden entfernt"
     ),
@@ -244,6 +286,11 @@ GERMAN = {
     ): (
         "Bleibende Splats übernehmen, was entfernt wird, nach dem, was die Kameras davon sehen: "
         "weit besser, wenn viel entfernt wird, und langsamer; die bleibenden ändern sich"
+    ),
+    "Take the marks off all splats": "Die Markierung aller Splats aufheben",
+    "Take the marks off the selected splats": "Die Markierung der ausgewählten Splats aufheben",
+    "Take the volume off the list; the object stays": (
+        "Das Volumen aus der Liste nehmen; das Objekt bleibt"
     ),
     "Takes nothing as hidden: far faster, and worse": (
         "Nimmt nichts als verdeckt an: weit schneller und schlechter"
@@ -300,13 +347,18 @@ GERMAN = {
     ),
     "Views": "Ansichten",
     "Visible": "Sichtbare",
+    "Volume": "Volumen",
+    "Volumes": "Volumen",
     "What Each Sees": "Was jede sieht",
     "What Goes": "Was geht",
     "What Stays": "Was bleibt",
+    "What becomes of the splats in it": "Was aus den Splats darin wird",
     "What counts as a floater": "Was als schwebend gilt",
     "What counts as the distance between a splat and a view": (
         "Was als Abstand zwischen Splat und Ansicht gilt"
     ),
+    "What is added": "Was hinzugefügt wird",
+    "What is done to the marks": "Was mit den Markierungen geschieht",
     "What is drawn": "Was gezeichnet wird",
     "What is made of each splat": "Was aus jedem Splat wird",
     "What says how much is removed": "Was sagt, wie viel entfernt wird",

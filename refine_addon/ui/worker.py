@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import threading
+import time
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 from ..core.errors import Cancelled
+from ..core.work import checked_by
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -13,6 +15,9 @@ if TYPE_CHECKING:
     from ..core.work import Progress
 
 Result = TypeVar("Result")
+
+PATIENCE = 0.7
+"""Seconds that a thread has to end once it was cancelled; then it is left to itself."""
 
 
 class Worker(Generic[Result]):
@@ -27,23 +32,42 @@ class Worker(Generic[Result]):
     ----------
     fraction : float
         How much is done, 0 to 1.
+    what : str
+        What is being done, in a word or two.
     """
 
     def __init__(self, work: Callable[[Progress], Result]) -> None:
-        self.fraction = 0.0
-        self._cancelled = False
+        self.fraction, self.what = 0.0, ""
+        self._cancelled: float | None = None  # when
         self._outcome: list[Result] = []  # one, once the work ended well
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, args=(work,), name="refine", daemon=True)
         self._thread.start()
 
     def running(self) -> bool:
-        """Tell whether it still works."""
+        """Tell whether there is still something to wait for.
+
+        Work that has not ended `PATIENCE` after it was cancelled, such as the packing of a file, is
+        not: it ends by itself at its next checkpoint, and what comes of it is dropped.
+        """
+        if self._cancelled is not None and time.monotonic() - self._cancelled > PATIENCE:
+            return False
         return self._thread.is_alive()
+
+    @property
+    def cancelled(self) -> bool:
+        """Whether it was asked to stop."""
+        return self._cancelled is not None
 
     def cancel(self) -> None:
         """Ask it to stop; `result` raises `Cancelled` then."""
-        self._cancelled = True
+        if self._cancelled is None:
+            self._cancelled = time.monotonic()
+
+    def end(self) -> None:
+        """Ask it to stop, and wait until it has or `PATIENCE` is over."""
+        self.cancel()
+        self._thread.join(PATIENCE)
 
     def result(self) -> Result:
         """Wait for the result and return it.
@@ -53,6 +77,8 @@ class Worker(Generic[Result]):
         RefineError, Cancelled
             What the work raised.
         """
+        if self.cancelled and self._thread.is_alive():
+            raise Cancelled
         self._thread.join()
         outcome, self._outcome = self._outcome, []
         error, self._error = self._error, None
@@ -65,11 +91,18 @@ class Worker(Generic[Result]):
 
     def _run(self, work: Callable[[Progress], Result]) -> None:
         try:
-            self._outcome.append(work(self._progress))
+            with checked_by(self._check):
+                result = work(self._progress)
+            self._check()  # nobody may be left to ask for the result
+            self._outcome.append(result)
         except BaseException as error:  # noqa: BLE001 - handed to the other thread by `result`
             # Whoever cancels asks for no reason, and a traceback would keep what was worked on.
-            self._error = Cancelled() if self._cancelled else error
+            self._error = Cancelled() if self.cancelled else error
 
-    def _progress(self, fraction: float, _what: str) -> bool:
-        self.fraction = fraction
-        return not self._cancelled
+    def _check(self) -> None:
+        if self.cancelled:
+            raise Cancelled
+
+    def _progress(self, fraction: float, what: str) -> bool:
+        self.fraction, self.what = fraction, what
+        return not self.cancelled

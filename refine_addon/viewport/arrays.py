@@ -27,6 +27,15 @@ WIDTH = 4096
 MOST = 1 << 24
 """Splats drawn at most: float32, in which a texture holds their order, counts no further."""
 
+STAYS, GOES = 1, 2
+"""What stays and what goes in any case, as `mesh.edit.FORCE` has it."""
+
+MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (1.0, 1.0, 1.0)}
+"""Their tints. Neither is a colour of the heat map, nor that of what goes by the budget."""
+
+SHARES = {"SCENE": 0.35, "HEAT": 0.55, "STAYS": 0.35, "GOES": 0.75}
+"""How much of a colour that tint is, by mode of the view."""
+
 _KEYS = 65535.0
 _LARGEST_HALF = 65504.0
 
@@ -160,6 +169,17 @@ def tinted(
     """Return colours, (M, 4), of which a share is the tint."""
     found = rgba.copy()
     found[:, :3] = (1.0 - share) * np.clip(rgba[:, :3], 0.0, 1.0) + share * np.array(tint)
+    return found
+
+
+def marked(rgba: NDArray[np.float32], force: NDArray[Any] | None, mode: str) -> NDArray[np.float32]:
+    """Return colours, (M, 4), with those of what stays and goes in any case, (M,), tinted."""
+    if force is None or mode not in SHARES:
+        return rgba
+    found = rgba.copy()
+    for mark, tint in MARKS.items():
+        rows = force == mark
+        found[rows] = tinted(found[rows], tint, SHARES[mode])
     return found
 
 

@@ -15,7 +15,7 @@ from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import check, sh_degree
 from . import background, shader
-from .arrays import MOST, Packed, as_texture, first_of_each, most_important_first, pack, same
+from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack, same
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -48,6 +48,12 @@ class Held:
         Those packed, the ones that matter most first.
     going : (M,) bool or None
         What the plan removes, of those packed.
+    forced : (M,) int32 or None
+        What stays and what goes in any case, of those packed.
+    marked : int
+        Rises where this has changed.
+    marks : tuple of int
+        Which of `arrays.MARKS` are in it.
     """
 
     signature: tuple[Any, ...] = ()
@@ -58,8 +64,12 @@ class Held:
     going: NDArray[np.bool_] | None = None
     degree: int = 0
     scored: int = 0
+    forced: NDArray[np.int32] | None = None
+    marked: int = 0
+    marks: tuple[int, ...] = ()
     remove: NDArray[np.bool_] | None = field(default=None, repr=False)
     rank: NDArray[Any] | None = field(default=None, repr=False)
+    force: NDArray[np.int32] | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +130,11 @@ class Content:
         self._stale.update(self._held if mesh is None else [mesh])
         self.refused.difference_update(list(self.refused) if mesh is None else [mesh])
 
+    def marks(self) -> set[int]:
+        """Return which of `arrays.MARKS` there are among the splats that are drawn."""
+        slots = self.atlas.slots.values() if self.atlas else ()
+        return {mark for slot in slots for mark in slot.held.marks}
+
     def pending(self) -> bool:
         """Tell whether splats are being packed."""
         return any(held.future for held in self._held.values())
@@ -173,6 +188,7 @@ class Content:
         held.degree = sh_degree(mesh)
         held.rank = _attribute(mesh, mesh_scores.RANK, "FLOAT")
         held.remove = _attribute(mesh, mesh_edit.REMOVE, "BOOLEAN")
+        held.force = _attribute(mesh, mesh_edit.FORCE, "INT")
         columns = mesh_attributes.stored_columns(checked)
         checksum = 1
         for name in REQUIRED:
@@ -190,6 +206,11 @@ class Content:
         if packed is None:
             return
         held.going = None if held.remove is None else held.remove[packed.vertices]
+        forced = None if held.force is None else held.force[packed.vertices]
+        if not same(held.forced, forced):
+            held.forced = forced
+            held.marked += 1
+            held.marks = tuple(mark for mark in MARKS if forced is not None and mark in forced)
         if not same(held.ranks, held.rank):
             held.ranks, held.important = held.rank, None
             held.scored += 1

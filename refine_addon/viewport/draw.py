@@ -171,7 +171,7 @@ def _existing() -> set[tuple[int, int]]:
 
 
 def _draw_legend() -> None:
-    legend.draw(bpy.context, _state.mode)
+    legend.draw(bpy.context, _state.mode, _state.content.marks())
 
 
 def _tick() -> float | None:

@@ -10,8 +10,11 @@ import gpu
 from gpu_extras.batch import batch_for_shader
 
 from ..mesh.heat_map import ramp
+from .arrays import GOES, MARKS, STAYS
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     import bpy
 
 WORDS = {
@@ -21,12 +24,15 @@ WORDS = {
 }
 """What is written in a view, by mode."""
 
+MARKED = {STAYS: "Protected", GOES: "Goes by a volume"}
+"""What is written beside the tint of what stays and goes in any case."""
+
 _WIDE, _HIGH, _EDGE, _FONT = 220, 10, 16, 12  # pixels at scale 1
 
 
-def draw(context: bpy.types.Context, mode: str) -> None:
-    """Draw the legend of a mode into a view."""
-    if mode not in WORDS:
+def draw(context: bpy.types.Context, mode: str, marks: Collection[int] = ()) -> None:
+    """Draw the legend of a mode, and of marks that splats have (`MARKED`), into a view."""
+    if mode not in WORDS and not marks:
         return
     scale = context.preferences.system.ui_scale
     tools = sum(
@@ -37,15 +43,30 @@ def draw(context: bpy.types.Context, mode: str) -> None:
     blf.color(0, 1.0, 1.0, 1.0, 1.0)
     blf.enable(0, blf.SHADOW)
     blf.shadow(0, 5, 0.0, 0.0, 0.0, 1.0)
-    words = ("goes first", "goes last") if mode == "HEAT" else (WORDS[mode],)
+    words = ("goes first", "goes last") if mode == "HEAT" else (WORDS.get(mode, ""),)
     above = y + (_HIGH + 6) * scale if mode == "HEAT" else y
     for place, text in enumerate(words):
         wide = blf.dimensions(0, text)[0]
         blf.position(0, x + place * (_WIDE * scale - wide), above, 0.0)
         blf.draw(0, text)
+    shown = [mark for mark in MARKED if mark in marks]
+    shown = [mark for mark in shown if (mark, mode) not in {(STAYS, "GOES"), (GOES, "STAYS")}]
+    for place, mark in enumerate(shown, start=1 if mode in WORDS else 0):
+        line = (above if mode in WORDS else y) + place * 2 * _HIGH * scale
+        blf.position(0, x + 2 * _HIGH * scale, line, 0.0)
+        blf.draw(0, MARKED[mark])
+        _swatch(x, line, scale, MARKS[mark])
     blf.disable(0, blf.SHADOW)
     if mode == "HEAT":
         _bar(x, y, scale)
+
+
+def _swatch(x: float, y: float, scale: float, color: tuple[float, float, float]) -> None:
+    size = _HIGH * scale
+    corners = [(x, y), (x + size, y), (x, y + size), (x + size, y + size)]
+    program = gpu.shader.from_builtin("UNIFORM_COLOR")
+    program.uniform_float("color", (*color, 1.0))
+    batch_for_shader(program, "TRI_STRIP", {"pos": corners}).draw(program)
 
 
 def _bar(x: float, y: float, scale: float) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from ..mesh.heat_map import ramp
 from . import background, shader
 from .arrays import (
+    GOES,
     Eye,
     as_texture,
     colors,
@@ -23,6 +24,7 @@ from .arrays import (
     first_of_each,
     heat,
     in_front,
+    marked,
     same,
     tinted,
 )
@@ -98,6 +100,7 @@ class _Part(NamedTuple):
     slot: Slot
     going: NDArray[np.bool_] | None
     ranks: NDArray[Any] | None
+    forced: NDArray[np.int32] | None
     important: NDArray[np.int32] | None
     eye: Eye
 
@@ -222,7 +225,8 @@ class View:
         Where nothing is seen yet, only those that matter most, in their constant colours.
         """
         parts = _parts(shown, camera)
-        colors_key: tuple[Any, ...] = (key[0], mode, [p.slot.number for p in parts])
+        objects = [(p.slot.number, p.slot.held.marked) for p in parts]
+        colors_key: tuple[Any, ...] = (key[0], mode, objects)
         if mode == "HEAT":
             colors_key += tuple(p.slot.held.scored for p in parts)
         else:
@@ -296,7 +300,7 @@ def _parts(shown: Iterable[Shown], camera: Camera) -> list[_Part]:
             place = np.linalg.pinv(matrix)[:3, :3] @ (0.0, 0.0, -1.0)
         held = slot.held
         eye = Eye(-matrix[2], place, camera.perspective)
-        parts.append(_Part(slot, held.going, held.ranks, held.important, eye))
+        parts.append(_Part(slot, held.going, held.ranks, held.forced, held.important, eye))
     return parts
 
 
@@ -311,15 +315,16 @@ def _find(
     if rows is None:
         return _Found(as_texture(order), len(order), None)
     painted = np.zeros((rows, 4), np.float32)
-    for slot, _, ranks, _, eye in parts:
+    for slot, _, ranks, forced, _, eye in parts:
         place = slice(slot.start, slot.start + slot.count)
         if mode == "HEAT" and ranks is not None:
             rgba = heat(slot.packed, ranks, ramp())
         else:
             rgba = colors(slot.packed, eye if few is None else None)
-        painted[place] = rgba[: slot.count]
         if mode == "GOES":
-            painted[place] = tinted(painted[place], TINT, TINT_SHARE)
+            goes = tinted(rgba, TINT, TINT_SHARE)
+            rgba = goes if forced is None else np.where((forced == GOES)[:, None], rgba, goes)
+        painted[place] = marked(rgba, forced, mode)[: slot.count]
     return _Found(as_texture(order), len(order), as_texture(painted))
 
 
@@ -328,7 +333,7 @@ def _order(parts: list[_Part], near: float, mode: str, most: int | None = None) 
     counts = [part.slot.count for part in parts]
     counts = counts if most is None else first_of_each(counts, most)
     rows, depths = [], []
-    for (slot, going, _, important, eye), count in zip(parts, counts, strict=True):
+    for (slot, going, _, _, important, eye), count in zip(parts, counts, strict=True):
         if count == slot.count or important is None:
             before, deep = in_front(slot.packed.means[:count], eye, near)
         else:

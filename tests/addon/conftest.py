@@ -56,6 +56,13 @@ def core(addon):
     return addon.core
 
 
+def keep_mask(addon, obj, budget, protect=""):
+    """Return which splats of a scored object stay, as *Apply* decides it; `protect` names some."""
+    checked = addon.mesh.layout.check(obj)
+    found = addon.demands.Demands((protect,) if protect else ()).forced(checked)
+    return addon.core.pipeline.decide(addon.splat_object.stored_task(checked, budget, found)).keep
+
+
 @pytest.fixture(autouse=True)
 def empty_scene():
     """Start from an empty file, with the extension enabled."""

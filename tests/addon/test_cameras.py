@@ -240,7 +240,8 @@ def test_each_source_gives_its_cameras(addon):
     assert _names(addon, "SELECTED") == ["second"]
     assert sorted(_names(addon, "VISIBLE")) == ["first", "second"]
     assert sorted(_names(addon, "COLLECTION", collection=outer)) == ["second", "third"]
-    assert addon.cameras.sets.visible_views(scene).views[0].name in ("first", "second")
+    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
+    assert views.views[0].name in ("first", "second")
 
 
 def _animate(obj, path, values, index=-1):
@@ -373,7 +374,7 @@ def test_the_kept_rows_do_not_hang_on_the_note(addon, core, room, room_cameras, 
     ).keep
     for camera in room_cameras.objects:
         del camera["refine_view"]
-    views = addon.cameras.sets.visible_views(bpy.context.scene)
+    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
     got = core.prune(
         addon.splat_object.gather(addon.mesh.layout.check(room)),
         views,

@@ -11,6 +11,8 @@ import pytest
 
 from tests.strategies import ply_of
 
+from .conftest import keep_mask
+
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 TYPES = bpy.types.Attribute.bl_rna.properties["data_type"].enum_items.keys()
 FOUR = "FLOAT4" if "FLOAT4" in TYPES else "FLOAT_COLOR"
@@ -208,12 +210,12 @@ def test_a_protected_splat_of_a_point_cloud_stays(addon, core, cloud, room_camer
     store(cloud, "sure", "BOOLEAN", mark)
     store(cloud, "weight", "FLOAT", mark.astype(np.float32))
     store(cloud, "number", "INT", mark.astype(np.int32))
-    checked, budget = addon.mesh.layout.check(cloud), core.Budget(ratio=0.5)
-    keep = [addon.splat_object.keep_mask(checked, budget, name) for name in ("", "sure", "weight")]
+    budget = core.Budget(ratio=0.5)
+    keep = [keep_mask(addon, cloud, budget, name) for name in ("", "sure", "weight")]
 
     assert [bool(mask[lowest]) for mask in keep] == [False, True, True]
     with pytest.raises(core.RefineError, match=r"'number' is INT on POINT.*has no vertex groups"):
-        addon.splat_object.keep_mask(checked, budget, "number")
+        keep_mask(addon, cloud, budget, "number")
 
 
 def test_absorbing_changes_survivors_alone(addon, cloud, room_cameras):  # noqa: ARG001

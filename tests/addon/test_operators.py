@@ -10,6 +10,8 @@ import bpy
 import numpy as np
 import pytest
 
+from .conftest import keep_mask
+
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 
 
@@ -71,7 +73,7 @@ def test_every_budget_keeps_the_rows_that_core_keeps(addon, room, room_cameras, 
     settings.budget = kind
     setattr(settings, kind, value)
     bpy.ops.refine.score()
-    got = addon.splat_object.keep_mask(addon.mesh.layout.check(room), settings.to_budget())
+    got = keep_mask(addon, room, settings.to_budget())
     core = addon.core
     file = core.read_ply(ROOM / "point_cloud.ply")
     expected = core.prune(
@@ -129,9 +131,7 @@ def test_apply_keeps_everything_else_of_the_object(addon, room, room_cameras):  
     mesh["mine"], room["yours"] = 3, "x"
     room.modifiers.new("mine", "SUBSURF")
     bpy.ops.refine.score()
-    keep = addon.splat_object.keep_mask(
-        addon.mesh.layout.check(room), bpy.context.scene.refine.to_budget()
-    )
+    keep = keep_mask(addon, room, bpy.context.scene.refine.to_budget())
     names = {a.name for a in mesh.attributes} - {"refine_remove"}
     bpy.ops.refine.apply()
     kept = addon.mesh.attributes.read_attribute(room.data, "row")
@@ -195,15 +195,15 @@ def test_protected_splats_stay_by_group_or_attribute(addon, room, room_cameras):
     mask[lowest] = True
     addon.mesh.attributes.write_attribute(room.data, "mask", "BOOLEAN", mask)
     budget = addon.core.Budget(keep=500)
-    by_group = addon.splat_object.keep_mask(addon.mesh.layout.check(room), budget, "group")
-    by_mask = addon.splat_object.keep_mask(addon.mesh.layout.check(room), budget, "mask")
+    by_group = keep_mask(addon, room, budget, "group")
+    by_mask = keep_mask(addon, room, budget, "mask")
 
     assert by_group[lowest].all()
     assert by_group.sum() == 500
     assert np.array_equal(by_group, by_mask)
     assert "REFINE read" not in bpy.data.objects
     with pytest.raises(addon.core.RefineError, match="named 'opacity' \\('opacity' is FLOAT"):
-        addon.splat_object.keep_mask(addon.mesh.layout.check(room), budget, "opacity")
+        keep_mask(addon, room, budget, "opacity")
 
 
 def test_the_plan_says_before_apply_what_apply_does(addon, room, room_cameras):  # noqa: ARG001
@@ -297,9 +297,7 @@ def test_upright_turns_the_object_and_the_cameras_but_not_the_data(addon, tmp_pa
         obj = bpy.context.object
         bpy.ops.refine.import_cameras(filepath=str(ROOM / "cameras.json"), upright=upright)
         bpy.ops.refine.score()
-        masks.append(
-            addon.splat_object.keep_mask(addon.mesh.layout.check(obj), addon.core.Budget(ratio=0.5))
-        )
+        masks.append(keep_mask(addon, obj, addon.core.Budget(ratio=0.5)))
         bpy.ops.refine.export_ply(filepath=str(tmp_path / f"{upright}.ply"))
     up = np.array(obj.matrix_world)[:3, :3] @ [0, -1, 0]
 
@@ -515,7 +513,7 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
         bpy.context.scene.collection.objects.unlink(room)
         bpy.context.view_layer.layer_collection.children["excluded"].exclude = True
     score(room, views)
-    keep = addon.splat_object.keep_mask(addon.mesh.layout.check(room), addon.core.Budget(ratio=0.5))
+    keep = keep_mask(addon, room, addon.core.Budget(ratio=0.5))
     task = addon.splat_object.stored_task(
         addon.mesh.layout.check(room), addon.core.Budget(ratio=0.5)
     )
@@ -562,7 +560,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
         ("core.pipeline", "decide", "apply", {}),
         ("ui.import_operators", "read_splats", "import_ply", {"filepath": "in.ply"}),
         ("ui.import_operators", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),
-        ("splat_object", "export_object", "export_ply", {"filepath": "out.ply"}),
+        ("splat_object", "write_export", "export_ply", {"filepath": "out.ply"}),
         ("ui.preview", "show", "preview", {}),
     ],
 )

@@ -34,6 +34,12 @@ class Layout:
         self.drawn.append(name)
         return SimpleNamespace()
 
+    def operator_menu_enum(self, name, property, **_options):  # noqa: A002 - Blender's name
+        """Note a menu, and return something to set its properties on."""
+        assert property in bpy.ops.refine.__getattr__(name.split(".")[1]).get_rna_type().properties
+        self.drawn.append(name)
+        return SimpleNamespace()
+
     def prop(self, data, name, **_options):
         """Note a property; it must exist."""
         assert name in data.bl_rna.properties
@@ -73,7 +79,7 @@ def draw(addon, monkeypatch):
     def draw():
         drawn = []
         with monkeypatch.context() as patch:
-            for name in ("keep_mask", "stored_scores", "gather", "apply_object"):
+            for name in ("stored_scores", "gather", "apply_object"):
                 patch.setattr(addon.splat_object, name, never)
             for name in ("members", "stored_task", "mark_removed", "gather", "apply"):
                 patch.setattr(addon.splat_group, name, never)
@@ -238,16 +244,31 @@ def test_one_is_not_counted_as_many(draw, room, room_cameras):  # noqa: ARG001
     assert "1 camera" in draw()
 
 
-def test_while_scoring_a_bar_takes_the_place_of_the_button(draw, room):  # noqa: ARG001
-    """The bar says how to cancel."""
-    manager = bpy.context.window_manager
-    manager.refine_progress = 0.43
-    drawn = draw()
-    manager.refine_progress = -1.0
+@pytest.fixture
+def at_work(addon):
+    """Return a function that lets the panel believe that an operator works."""
+    running = addon.ui.running
 
-    assert "43% (Esc cancels)" in drawn
-    assert "refine.score" not in drawn
-    assert "refine.apply" not in drawn
+    def at_work(operator, doing):
+        worker = SimpleNamespace(fraction=0.43, what="looking")
+        running.begin(running.Running(operator, doing, "cancels", None, [], worker, None))
+
+    yield at_work
+    running._now.clear()
+
+
+@pytest.mark.parametrize("name", ["score", "find_floaters", "apply", "levels"])
+@pytest.mark.usefixtures("room")
+def test_one_bar_is_drawn_in_the_box_of_the_button_that_was_clicked(draw, at_work, name):
+    """It says what is done and how to cancel; the buttons stay where they are."""
+    before = draw()
+    at_work(f"refine.{name}", "Working")
+    drawn = draw()
+
+    buttons = {text for text in before if text.startswith("refine.")}
+    assert drawn.count("43%") == 1
+    assert drawn.count("Working (looking); Esc cancels") == 1
+    assert f"refine.{name}" in buttons <= set(drawn)
 
 
 @pytest.mark.parametrize(

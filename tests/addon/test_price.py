@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import bpy
@@ -269,6 +270,26 @@ def test_the_sentence_tells_both_ways(addon):
     assert sentence(plan | {"psnr": 70.0, "psnr_absorbed": 80.0}, absorb=False).endswith(
         "more than 60 dB in these views (Absorb: more than 60)"
     )
+
+
+def test_what_absorbing_reaches_of_few_splats_is_neither_told_nor_drawn(addon, chart, curve):
+    """There the estimate of it is far off; the curve and the sentence of deleting stay."""
+    plan = {"splats": 900, "kept": 450, "bytes_before": 9.86e6, "bytes_after": 4.93e6, "psnr": 37.8}
+    start, sentence = "Keeps 450 of 900, 4.9 of 9.9 MB", addon.ui.plans.sentence
+    look, few = chart.Look(212, INK), replace(curve, foretold=False)
+    kinds, place = chart.by_views(np.zeros(4, np.int32), 4), chart.Place(0.5, absorb=False)
+    orange = np.array(look.colors["absorb"]) * 255.0
+
+    drawn = [
+        (
+            np.abs(chart.Chart(look, some, kinds).picture(place)[..., :3] - orange).max(axis=2) < 8
+        ).any()
+        for some in (curve, few)
+    ]
+
+    assert drawn == [True, False]
+    assert sentence(plan, absorb=False) == f"{start}, about 38 dB in these views"
+    assert sentence(plan, absorb=True) == f"{start}, about 38 dB in these views without Absorb"
 
 
 def test_a_quality_out_of_reach_is_said(addon, room, room_cameras):  # noqa: ARG001

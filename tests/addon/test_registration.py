@@ -11,10 +11,15 @@ def _traces():
         "types": sorted(name for name in dir(bpy.types) if "REFINE" in name or "Refine" in name),
         "operators": sorted(dir(bpy.ops.refine)),
         "scene": "refine" in bpy.types.Scene.bl_rna.properties,
-        "manager": "refine_progress" in bpy.types.WindowManager.bl_rna.properties,
+        "manager": "refine_cameras" in bpy.types.WindowManager.bl_rna.properties,
         "menus": [
             len(menu._dyn_ui_initialize())
-            for menu in (bpy.types.TOPBAR_MT_file_import, bpy.types.TOPBAR_MT_file_export)
+            for menu in (
+                bpy.types.TOPBAR_MT_file_import,
+                bpy.types.TOPBAR_MT_file_export,
+                bpy.types.TOPBAR_MT_edit,
+                bpy.types.TOPBAR_MT_file,
+            )
         ],
     }
 
@@ -27,11 +32,11 @@ def test_unregister_takes_back_all_that_register_gave(extension):
     extension.register()
 
     assert with_it["scene"]
-    assert len(with_it["operators"]) == 13
+    assert len(with_it["operators"]) == 17
     assert without["types"] == without["operators"] == []
     assert not without["scene"]
     assert not without["manager"]
-    assert [a - b for a, b in zip(with_it["menus"], without["menus"], strict=True)] == [1, 1]
+    assert [a - b for a, b in zip(with_it["menus"], without["menus"], strict=True)] == [1] * 4
     assert _traces() == with_it
 
 

@@ -126,7 +126,8 @@ def test_the_curve_is_that_of_all_and_of_no_part(addon, halves):
     group, scores = addon.splat_group, addon.mesh.scores
     members = group.members(bpy.context.view_layer, halves[1])
 
-    task = group.stored_task(members, settings.to_budget())
+    found = group.forced(bpy.context.scene, members)
+    task = group.stored_task(members, settings.to_budget(), found)
 
     assert task.scores.quality is not None
     assert all(scores.stored_scores(member).quality is None for member in members)
@@ -218,9 +219,8 @@ def test_a_group_that_one_object_has_protects_there(halves):
     assert len(halves[0].data.vertices) == 20_000
     assert len(halves[1].data.vertices) == 19_755 - 15_902
     settings.protect = "none"
-    bpy.ops.refine.score()
     with pytest.raises(RuntimeError, match="nothing to protect is named 'none'"):
-        bpy.ops.refine.apply()
+        bpy.ops.refine.score()
 
 
 def test_one_active_object_beside_a_selection_is_worked_on_alone(addon, halves):

@@ -53,7 +53,7 @@ def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):  # n
     unchanged.start()
     report = addon.splat_object.prune_object(
         "room",
-        addon.cameras.sets.visible_views(bpy.context.scene),
+        addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None),
         addon.core.Budget(keep=1000),
         addon.core.Settings("closed-form"),
         output=tmp_path / "out.ply",
@@ -69,7 +69,7 @@ def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):  # n
 @pytest.mark.parametrize("options", [{}, {"save": True}])
 def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_file, options):  # noqa: ARG001
     """The message lists the splat objects of the scene."""
-    views = addon.cameras.sets.visible_views(bpy.context.scene)
+    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
     with pytest.raises(addon.core.RefineError, match=r"no object 'rooom'.*splat objects: room"):
         addon.splat_object.prune_object(
             "rooom", views, addon.core.Budget(ratio=0.5), addon.core.Settings(), **options
@@ -78,7 +78,7 @@ def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_f
 
 def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_cameras):  # noqa: ARG001
     """There is no file to save to."""
-    views = addon.cameras.sets.visible_views(bpy.context.scene)
+    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
     with pytest.raises(addon.core.RefineError, match="not saved in a"):
         addon.splat_object.prune_object(
             "room", views, addon.core.Budget(ratio=0.5), addon.core.Settings(), save=True
@@ -87,7 +87,7 @@ def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_ca
 
 
 def _ranked(addon, obj, score):
-    score(obj, addon.cameras.sets.visible_views(bpy.context.scene))
+    score(obj, addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None))
     return addon.mesh.attributes.read_attribute(obj.data, "refine_rank")
 
 
@@ -181,7 +181,7 @@ def test_normals_turn_with_the_transform(addon, core, make_splats, tmp_path):
 
 def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):  # noqa: ARG001
     """Someone deleted a vertex while the scoring ran."""
-    views = addon.cameras.sets.visible_views(bpy.context.scene)
+    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
     scores = addon.core.score(
         addon.splat_object.gather(addon.mesh.layout.check(room)),
         views,
@@ -204,7 +204,7 @@ def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, room,
     )
     scores = worker.result()
     cancelled = addon.ui.worker.Worker.__new__(addon.ui.worker.Worker)
-    cancelled._cancelled, cancelled._result, cancelled._error = True, None, None
+    cancelled._cancelled, cancelled._outcome, cancelled._error = 0.0, [], None
     cancelled._run(lambda progress: core.score(splats, room_views, progress=progress))
 
     assert np.array_equal(scores.values, core.score(splats, room_views).values)

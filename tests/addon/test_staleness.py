@@ -5,6 +5,8 @@ from __future__ import annotations
 import bpy
 import pytest
 
+from .conftest import keep_mask
+
 
 def hints(addon, obj):
     """Return what the panel would say of an object's scores."""
@@ -180,7 +182,7 @@ def test_scores_without_a_note_or_with_a_damaged_one_have_nothing_to_say(
 def test_apply_goes_by_the_old_scores_and_says_so(addon, room, room_cameras, capfd, moved):  # noqa: ARG001
     """Blender prints what an operator reports when a script calls it."""
     bpy.ops.refine.score()
-    keep = addon.splat_object.keep_mask(addon.mesh.layout.check(room), addon.core.Budget(ratio=0.5))
+    keep = keep_mask(addon, room, addon.core.Budget(ratio=0.5))
     room.location.x = float(moved)
     capfd.readouterr()
     bpy.ops.refine.apply()

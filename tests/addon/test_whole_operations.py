@@ -7,11 +7,12 @@ import shutil
 import threading
 import time
 import weakref
-from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
+
+from tests.windows import event, started_in_a_window, until_over
 
 
 @pytest.fixture
@@ -195,49 +196,10 @@ def test_the_history_of_operators_holds_no_splats(few, noted, name):  # noqa: AR
     assert left(noted) == []
 
 
-class Context:
-    """Blender's context with a window that nobody sees."""
-
-    def __init__(self):
-        self.window = SimpleNamespace(screen=SimpleNamespace(areas=[]))
-        self.workspace = SimpleNamespace(status_text_set=lambda _text: None)
-        self.window_manager = SimpleNamespace(
-            event_timer_add=lambda _step, **_options: object(),
-            event_timer_remove=lambda _timer: None,
-            modal_handler_add=lambda _operator: None,
-            refine_progress=-1.0,
-        )
-
-    def __getattr__(self, name):
-        """Return what Blender has."""
-        return getattr(bpy.context, name)
-
-
 @pytest.fixture
-def started(addon, few):
+def started(addon, few):  # noqa: ARG001
     """Return a function that starts an operator as a click in a window does."""
-
-    def started(name):
-        cls = getattr(addon.ui.operators, f"REFINE_OT_{name}")
-        body = {key: cls.__dict__[key] for key in ("doing", "prepare", "work", "finish")}
-        said = []
-        body["report"] = lambda _self, _kind, text: said.append(text)
-        operator, context = type(name, (addon.ui.on_thread.OnThread,), body)(), Context()
-        operator.start(context, operator.prepare(context, addon.mesh.layout.check(few)))
-        return operator, context, said
-
-    return started
-
-
-def until_over(operator, context):
-    """Send the timer's events until the operator ends."""
-    for _ in range(2000):
-        answer = operator.modal(context, SimpleNamespace(type="TIMER"))
-        if answer != {"RUNNING_MODAL"}:
-            return answer
-        time.sleep(0.01)
-    msg = "it never ended"
-    raise AssertionError(msg)
+    return lambda name: started_in_a_window(addon, getattr(addon.ui.operators, f"REFINE_OT_{name}"))
 
 
 @pytest.fixture
@@ -277,9 +239,9 @@ def test_an_operation_in_a_window_is_dropped_when_it_is_over(  # noqa: PLR0917
         monkeypatch.setattr(addon.mesh.scores, "store", refuse)
         monkeypatch.setattr(addon.splat_object, "apply_object", refuse)
     operator, context, said = started(name)
-    assert context.window_manager.refine_progress == 0.0
+    assert addon.ui.running.now().operator == f"refine.{name}"
     if how == "escape":
-        operator.modal(context, SimpleNamespace(type="ESC"))
+        operator.modal(context, event("ESC"))
     if how == "cancelled":
         operator.cancel(context)
         for thread in threading.enumerate():
@@ -291,7 +253,7 @@ def test_an_operation_in_a_window_is_dropped_when_it_is_over(  # noqa: PLR0917
 
     assert noted
     assert left(noted) == []
-    assert context.window_manager.refine_progress == -1.0
+    assert addon.ui.running.now() is None
     assert [text for text in said if "failed" in text] == ["failed"] * ("fail" in how)
     assert ("nothing was changed" in "".join(said)) == (how == "escape")
     assert len(few.data.vertices) == (

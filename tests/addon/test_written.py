@@ -18,7 +18,7 @@ def test_the_file_of_a_moved_object_is_compared_where_the_object_stands(
     for obj in (room, *(o for o in bpy.data.objects if o.type == "CAMERA")):
         obj.matrix_world = move @ obj.matrix_world
     bpy.context.view_layer.update()
-    views = addon.cameras.sets.visible_views(bpy.context.scene).take(range(0, 72, 6))
+    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None).take(range(0, 72, 6))
 
     report = addon.splat_object.prune_object(
         "room", views, core.Budget(ratio=0.3), core.Settings("occlusion"),
@@ -26,3 +26,24 @@ def test_the_file_of_a_moved_object_is_compared_where_the_object_stands(
     )  # fmt: skip
 
     assert report["written_psnr"] == pytest.approx(report["estimated_psnr"], abs=0.05)
+
+
+@pytest.mark.parametrize("dry_run", [False, True])
+def test_the_report_of_an_object_counts_what_the_file_holds(
+    addon, room, room_views, tmp_path, dry_run
+):
+    """Three splats at NaN stay at a ratio of 0; `.splat` cannot hold them, and the note says so."""
+    core, out = addon.core, tmp_path / "a.splat"
+    for vertex in room.data.vertices[:3]:
+        vertex.co.x = np.nan
+
+    report = addon.splat_object.prune_object(
+        "room", room_views.take(range(4)), core.Budget(ratio=0.0), core.Settings("closed-form"),
+        output=out, dry_run=dry_run,
+    )  # fmt: skip
+
+    count = len(room.data.vertices)
+    assert report["splats"]["left_out"] == 3
+    assert report["splats"]["written"] == (None if dry_run else count - 3)
+    assert any("3 of the kept splats cannot be drawn" in note for note in report["notes"])
+    assert dry_run or len(core.read_splats(out)) == count - 3

@@ -364,7 +364,7 @@ def test_the_summary_says_what_went_and_where_it_is(capsys):
 
     said = capsys.readouterr()
     pattern = (
-        r"in\.ply: kept 9 of 60 splats \(85\.0% removed\), 6\.1 kB -> 1\.4 kB, by 5 of 5 views, "
+        r"in\.ply: kept 9 of 60 splats \(85\.0% removed\), 6\.1 -> 1\.4 kB, by 5 of 5 views, "
         r"\d+\.\d\d s -> out\.ply\n  \d+ of 60 splats lie in no view\n"
     )
     assert re.fullmatch(pattern, said.out)

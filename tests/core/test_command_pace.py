@@ -10,7 +10,7 @@ import pytest
 
 from refine_addon import command
 from refine_addon.command import options, terminal
-from refine_addon.command.pace import Pace
+from refine_addon.core.pace import Pace
 from tests.strategies import plain_ply
 
 PRUNE = ["--cameras", "cameras.json", "--method", "closed-form"]

@@ -305,7 +305,9 @@ def test_the_command_converts_by_the_suffix(tmp_path, capsys):
     assert main(["convert", there, back]) == 1
 
     said = capsys.readouterr()
-    assert f"in.ply: 600 splats, 0.0 -> 0.0 MB -> {there}\n  note: .splat holds colour" in said.out
+    assert (
+        f"in.ply: 600 splats, 34.0 -> 19.2 kB -> {there}\n  note: .splat holds colour" in said.out
+    )
     assert "exists already" in said.err
     assert read_ply(back).rows.tobytes() == read_splats(there).rows.tobytes()
 

@@ -19,8 +19,10 @@ import pytest
 
 from refine_addon.core import RefineError, read_ply
 from refine_addon.core import whole_file as whole_files
+from refine_addon.core.errors import Cancelled
 from refine_addon.core.formats import ply
 from refine_addon.core.whole_file import expanded, refuse_existing, whole_file
+from refine_addon.core.work import checked_by
 from tests.strategies import plain_header, plain_ply, splat_names
 from tests.users import NOBODY, closed_folder
 
@@ -644,3 +646,17 @@ def forked(work) -> int:
         work()
     finally:
         os._exit(0)
+
+
+def test_a_file_whose_writing_was_cancelled_is_not_put_in_place(tmp_path):
+    """It is asked once more when all is written; the old file stays, and no temporary one."""
+    path = tmp_path / "out.bin"
+    path.write_bytes(b"old")
+
+    def check():
+        raise Cancelled
+
+    with pytest.raises(Cancelled), checked_by(check), whole_file(path, overwrite=True) as stream:
+        stream.write(b"new")
+
+    assert contents(tmp_path) == {"out.bin": b"old"}

@@ -141,6 +141,59 @@ def test_compare_shows_before_after_and_difference_in_a_window_of_their_own(
     assert found["larger"]
 
 
+def test_what_must_stay_and_go_is_shown_in_every_mode(binary: Binary, cloud: Path, cameras: Path):
+    """Before scoring *What Goes* shows what volumes force out; a volume that moves is followed.
+
+    All modes draw the same splats, and those that stay or go are parted between two of them.
+    """
+    try:
+        found = binary.window_step(
+            "volumes", cloud=cloud, cameras=cameras, picture=binary.work / "volumes-{}.png"
+        )
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+
+    unscored = found["unscored"]
+    assert 1000 < unscored["protected"] < 30_000
+    assert 0 < found["unscored GOES"] <= unscored["forced"] < 39_755
+    assert found["unscored SCENE"] == found["SCENE"] == found["HEAT"]
+    assert found["SCENE"] == found["STAYS"] + found["GOES"]
+    assert found["GOES"] > found["unscored GOES"]
+    assert found["moved"] != 0
+    assert found["failure"] == ""
+
+
+def test_the_window_lives_while_splats_are_scored(binary: Binary, blend: Path, cloud: Path):
+    """The view orbits and zooms, and is not drawn for the bar; undo, redo and save are refused.
+
+    The closed form's scores are shown first, refined in place, and one Ctrl+Z takes both back; Esc
+    keeps them. Loading a file, closing the window, switching the extension off and quitting end
+    the thread; a file is imported by a thread that a dialog starts.
+    """
+    try:
+        found = binary.window_step(
+            "alive", blend, size=(1200, 900), blend=blend, cloud=cloud, pictures=binary.work
+        )
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+
+    assert found["before"] is None
+    assert found["shown"] == ["closed-form", True]
+    assert found["drawn"]["view"] <= 1 < found["drawn"]["panel"]
+    assert found["orbited"] > 0.1
+    assert found["zoomed"] < 0.95
+    assert [found[what] for what in ("saved", "undone", "apply", "still")] == [False] * 3 + [True]
+    assert found["refined"] == ["auto", False]
+    assert found["stopped"] == ["closed-form", True]
+    assert found["esc_s"] < 1.0
+    assert found["ended by"] == {how: [True, 0] for how in ("load", "close_window", "disable")}
+    assert found["imported"] == 39_755
+
+
 def _psnr(seen: dict, picture: Path, cloud: Path) -> float:
     """Return how close a view in a picture of the screen is to the reference renderer, dB."""
     view, window = np.array(seen["view"]), np.array(seen["window"])

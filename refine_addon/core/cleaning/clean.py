@@ -11,7 +11,7 @@ Only the second step decides. A splat with nothing behind it, such as one of a s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -21,6 +21,7 @@ from ..scoring import projection
 from ..scoring.measuring import BLOCKS
 from ..scoring.sight_lines import SightLines
 from ..splats import refuse_undrawable
+from ..volumes import among_all, refuse_all
 from ..work import Progress, for_chunks, part, silent
 from . import sight
 from .clusters import cluster_sizes
@@ -139,7 +140,7 @@ class Cleaned:
     past : (N,) int32
         How many views see past each splat.
     seen : (N,) int32
-        In how many of the views used each splat's centre lies.
+        In how many of the views used each splat's centre lies; 0 of those that had to go.
     undrawable : int
         How many splats cannot be drawn. They stay.
     views_given, views_used : int
@@ -159,6 +160,12 @@ class Cleaned:
     def counts(self) -> dict[str, int]:
         """Return how many splats go for each reason that is switched on."""
         return {name: int(np.count_nonzero(self.found[name])) for name in self.settings.reasons}
+
+    def for_all(self, rest: NDArray[np.bool_]) -> Cleaned:
+        """Return this of what was left of N splats, (N,) bool, for them all: the others go too."""
+        found = {name: among_all(mask, rest) for name, mask in self.found.items()}
+        keep, past, seen = (among_all(some, rest) for some in (self.keep, self.past, self.seen))
+        return replace(self, keep=keep, found=found, past=past, seen=seen)
 
     def facts(self) -> dict[str, Any]:
         """Return what a report says of it."""
@@ -188,12 +195,13 @@ class Cleaned:
         return [f"{self.undrawable} splats cannot be drawn: no camera judges them, and they stay"]
 
 
-def clean(
+def clean(  # noqa: PLR0913 - as `pipeline.prune`
     splats: Splats,
     views: ViewSet,
     settings: Cleaning = Cleaning(),
     *,
     protected: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Cleaned:
@@ -207,6 +215,8 @@ def clean(
     settings : Cleaning
     protected : (N,) bool, optional
         Splats that stay, whatever they are. They are evidence all the same.
+    removed : (N,) bool, optional
+        Splats that go, unless they are protected, and are no evidence: as if they had gone before.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
     threads : int, optional
@@ -223,6 +233,15 @@ def clean(
     Cancelled
         If `progress` answers ``False``.
     """
+    if removed is not None and removed.any():
+        rest = ~removed if protected is None else ~removed | protected
+        refuse_all(~rest)
+        found = clean(
+            splats.take(rest), views, settings,
+            protected=None if protected is None else protected[rest],
+            progress=progress, threads=threads,
+        )  # fmt: skip
+        return found.for_all(rest)
     with np.errstate(under="ignore"):
         gaussians, scene, good = projection.prepare(
             splats, views, progress=part(progress, 0.0, 0.05), threads=threads
@@ -232,21 +251,21 @@ def clean(
         run = _Run(gaussians, scene, splats, views.spread(settings.views), threads)
         reasons = run.reasons(part(progress, 0.05, 1.0))
     count = len(splats)
-    found = {name: np.zeros(count, np.bool_) for name in REASONS}
+    masks = {name: np.zeros(count, np.bool_) for name in REASONS}
     keep = np.ones(count, np.bool_)
     for name, rows in reasons.items():
-        found[name][gaussians.index[rows]] = True
+        masks[name][gaussians.index[rows]] = True
         if protected is not None:
-            found[name] &= ~protected
+            masks[name] &= ~protected
         if name in settings.reasons:
-            keep &= ~found[name]
+            keep &= ~masks[name]
     if count and not keep.any():
         msg = f"cleaning would remove all {count} splats; nothing was removed"
         raise RefineError(msg)
     past, seen = np.zeros((2, count), np.int32)
     past[gaussians.index], seen[gaussians.index] = run.evidence.past, run.seen
     undrawable = count - int(np.count_nonzero(good))
-    return Cleaned(keep, found, past, seen, undrawable, len(views), len(run.sights.views), settings)
+    return Cleaned(keep, masks, past, seen, undrawable, len(views), len(run.sights.views), settings)
 
 
 class _Run:

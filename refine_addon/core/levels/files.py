@@ -15,18 +15,20 @@ from ..report import Clock, held, scoring_notes, seen_by
 from ..selection import Budget
 from ..survivors import survivor_columns
 from ..task import DEFAULTS, Task
+from ..volumes import forced
 from ..whole_file import expanded, mode_of, refuse_existing, refuse_mapped, whole_file
 from ..work import Progress, silent
 from .lod import Levels, each_level, short
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
     from typing import Any
 
     from ..formats.ply import SplatFile
     from ..task import Settings
     from ..views import ViewSet
+    from ..volumes import Zone
     from .lod import Level
 
 MANIFEST = "lod.json"
@@ -74,6 +76,7 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
     levels: Levels,
     settings: Settings = DEFAULTS,
     *,
+    zones: Sequence[Zone] = (),
     suffix: str = ".ply",
     goal: float = GOAL,
     overwrite: bool = False,
@@ -90,6 +93,8 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
         Where the files go, named as by `level_paths`; made if it is not there.
     views, levels, settings, progress, threads
         See `lod`.
+    zones : sequence of Zone
+        Volumes that say which splats must stay and which must go.
     suffix : str
         Of the files, which names their format.
     goal : float
@@ -105,8 +110,8 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
     Raises
     ------
     RefineError, Cancelled
-        See `lod`, `read_splats` and `SplatFile.write`. Files that were new are removed again then,
-        and where one was to be replaced, no manifest is left.
+        See `lod`, `volumes.forced`, `read_splats` and `SplatFile.write`. Files that were new are
+        removed again then, and where one was to be replaced, no manifest is left.
     """
     clock = Clock()
     folder, source = expanded(folder), expanded(source)
@@ -120,13 +125,19 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
         entries: list[dict[str, Any]] = []
         notes: list[str] = []
         remarks: dict[float, str] = {}
-        scene = Task(Budget(ratio=0.0), settings, file.splats(), views)
+        splats = file.splats()
+        given = forced(zones, splats.means)
+        scene = Task(
+            Budget(ratio=0.0), settings, splats, views,
+            protected=given.protected, removed=given.removed,
+        )  # fmt: skip
         for level in each_level(scene, levels, progress=progress, threads=threads):
             if level.number == 1:
                 # From here on files of an earlier run are replaced, so its manifest goes first.
                 before = _unlisted(folder) if overwrite else []
                 distances = [short(far) for far, _ in level.reach.psnr]
                 seen, notes = seen_by(level.scores), scoring_notes(level.scores)
+                seen["splats"] |= {"before": len(file), **given.counts()}
             path = paths[level.number - 1]
             facts, found = _write(file, level, path, overwrite=overwrite)
             written.append(path)
@@ -138,7 +149,7 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
         clock.lap("levels_s")
         facts = {
             "lod": 1,
-            "source": {"file": source.name, "splats": len(file), "bytes": file.stored_bytes},
+            "source": {"file": source.name, "bytes": file.stored_bytes},
             **seen,
             "distances": distances,
             "nested": not levels.absorb,
@@ -152,6 +163,7 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
         **facts,
         "files": {"input": str(source), "folder": str(folder), "manifest": MANIFEST},
         "settings": asdict(settings),
+        "volumes": list(given.facts),
         "timings": clock.timings,
         "notes": notes,
     }

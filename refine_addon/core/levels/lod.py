@@ -18,6 +18,7 @@ from ..pipeline import decide, score
 from ..quality import PSNR_CAP
 from ..selection import Budget
 from ..task import DEFAULTS, Origin, Task
+from ..volumes import among_all
 from ..work import Progress, part, silent
 from .distance import Lookout
 
@@ -171,6 +172,12 @@ class Level:
     absorbed: Absorbed | None = None
     remark: str = ""
 
+    def for_all(self, rest: NDArray[np.bool_]) -> Level:
+        """Return a level of what was left of N splats, (N,) bool, as one of them all."""
+        keep = among_all(self.keep, rest)
+        absorbed = None if self.absorbed is None else replace(self.absorbed, keep=keep)
+        return replace(self, keep=keep, absorbed=absorbed)
+
     def facts(self, goal: float) -> dict[str, Any]:
         """Return what is to be known of it as plain JSON values.
 
@@ -204,6 +211,7 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     settings: Settings = DEFAULTS,
     *,
     protected: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> list[Level]:
@@ -219,6 +227,9 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
         How to score; with `Levels.absorb` only its number of views and settings of occlusion count.
     protected : (N,) bool, optional
         Splats that are in all levels, unchanged.
+    removed : (N,) bool, optional
+        Splats that are in no level, unless they are protected. They count as removed, and levels
+        are compared with the pictures of the others.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
     threads : int, optional
@@ -241,7 +252,7 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
         level = lod(file.splats(), views, Levels((0.5, 0.25)))[1]
         file.write("out.ply", level.keep, columns=survivor_columns(file.rows, level.absorbed))
     """
-    scene = Task(Budget(ratio=0.0), settings, splats, views, protected=protected)
+    scene = Task(Budget(ratio=0.0), settings, splats, views, protected=protected, removed=removed)
     return list(each_level(scene, levels, progress=progress, threads=threads))
 
 
@@ -253,14 +264,16 @@ def each_level(
     Parameters
     ----------
     scene : Task
-        Splats, views, settings and what is protected; its budget does not matter.
+        Splats, views, settings, what is protected and what goes; its budget does not matter.
     levels, progress, threads
         See `lod`.
     """
+    total, forced = len(scene.scene()[0]), scene.forced()
+    scene = scene if forced is None else scene.without(forced)
     splats, views = scene.scene()
     lookout = Lookout(splats, views, progress=part(progress, 0.0, 0.05), threads=threads)
-    budgets, ahead = levels.budgets(len(splats)), part(progress, 0.05, 1.0)
-    coarsest, left_before, number = 0.0, len(splats), 0
+    budgets, ahead = levels.budgets(total), part(progress, 0.05, 1.0)
+    coarsest, left_before, number = 0.0, total, 0
     made = (_absorbing if levels.absorb else _deleting)(scene, budgets, ahead, threads)
     for place, (keep, left, result, absorbed) in enumerate(made, start=1):
         gone, left_before = left_before - len(left), len(left)
@@ -277,12 +290,13 @@ def each_level(
         if number == 1:
             scores = result.scores
         report = result.report
-        yield Level(
+        level = Level(
             number, levels.asked[place - 1], keep, left, report["estimated_psnr"], reach, scores,
             absorbed, report["budget_remark"],
         )  # fmt: skip
+        yield level if forced is None else level.for_all(~forced)
     if not number:
-        msg = f"no level has fewer splats than the input, which has {len(splats)}"
+        msg = f"no level has fewer splats than the input, which has {total}"
         raise RefineError(msg)
 
 

@@ -52,6 +52,7 @@ def main(name: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
     yield from until(lambda: count(name) == 39_755, "they are back")
     scene = bpy.context.scene
     scene.refine.absorb, scene.refine.budget, scene.refine.percent = False, "ratio", 60.0
+    yield from hand.scroll(down=True)
     yield from hand.click("refine.apply(")
     yield from until(lambda: count(name) < 39_755, "splats are removed")
     found["again"] = state(name)

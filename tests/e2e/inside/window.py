@@ -47,7 +47,7 @@ def main(name: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
     found = {"opened": state(name)}
 
     yield from hand.click("refine.score(")
-    yield from until(lambda: state(name)["scored"], "there are scores")
+    yield from until(lambda: state(name)["scored"] and not at_work(), "there are scores")
     found["scored"] = state(name)
 
     yield from hand.scroll(down=True)
@@ -86,6 +86,11 @@ def state(name: str) -> dict[str, Any]:
     """Return what the panel's buttons are to change; by name, as undo replaces the object."""
     mesh = bpy.data.objects[name].data
     return {"vertices": len(mesh.vertices), "scored": "refine_score" in mesh.attributes}
+
+
+def at_work() -> bool:
+    """Tell whether an operator works on a thread: scores are shown before they are refined."""
+    return importlib.import_module(f"{extension.MODULE}.ui.running").now() is not None
 
 
 def price(name: str) -> dict[str, Any]:

@@ -1,0 +1,172 @@
+"""What must stay and what must go, as the options and the open scene say it."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from ..core import RefineError, Zone
+from ..core.volumes import parse
+
+if TYPE_CHECKING:
+    from ..core.volumes import Role, Volume
+    from ..demands import Demands
+
+ROLES: dict[str, Role] = {"protect": "protect", "remove_inside": "remove", "keep_inside": "keep"}
+"""Options -> what becomes of the splats in a volume."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """What an option names.
+
+    Attributes
+    ----------
+    text : str
+        As it was given.
+    volume : Volume or None
+        In numbers; None for a name.
+    """
+
+    text: str
+    volume: Volume | None
+
+
+def given(text: str) -> Given:
+    """Return what an argument names.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        If it is nothing, or numbers that are no volume.
+    """
+    if not text:
+        msg = "expected a name or a volume, got none"
+        raise argparse.ArgumentTypeError(msg)
+    try:
+        return Given(text, parse(text))
+    except RefineError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+
+
+def add(parser: argparse.ArgumentParser, *, protects: bool = True, names: str = "") -> None:
+    """Add the options to a subcommand.
+
+    Parameters
+    ----------
+    parser : argparse.ArgumentParser
+    protects : bool
+        Whether it knows splats that stay.
+    names : str
+        What else may be named than a volume.
+    """
+    volume = "box:x0,y0,z0,x1,y1,z1 or sphere:x,y,z,radius in the coordinates of the cameras, or "
+    volume += "in Blender an object, a closed mesh or an empty shown as cube or sphere"
+    texts = {
+        "--protect": f"splats in it stay unchanged, whatever else is said: {names}{volume}",
+        "--remove-inside": "splats in it go first, and count as removed; see --protect"
+        if protects
+        else f"score as if the splats in it had gone, which score 0: {volume}",
+        "--keep-inside": "all splats go that are in no volume of this kind; like --remove-inside",
+    }
+    for option, text in texts.items():
+        if protects or option != "--protect":
+            parser.add_argument(
+                option,
+                action="append",
+                default=[],
+                type=given,
+                metavar="VOLUME" if not (names and option == "--protect") else "NAME_OR_VOLUME",
+                help=f"{text}; may be given several times",
+            )
+
+
+def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Refuse names where there is no scene that could hold what they name; leaves with code 2."""
+    if options.scene:
+        return
+    for name in ROLES:
+        for item in getattr(options, name, ()):
+            if item.volume is None:
+                parser.error(
+                    f"--{name.replace('_', '-')} {item.text}: objects have names in Blender alone; "
+                    "here give box:x0,y0,z0,x1,y1,z1 or sphere:x,y,z,radius"
+                )
+
+
+def of_files(options: argparse.Namespace) -> tuple[Zone, ...]:
+    """Return the volumes that decide on INPUT files.
+
+    Raises
+    ------
+    RefineError
+        If no object of the open scene has such a name, or one can be no volume.
+    """
+    return tuple(_zone(role, item, "") for role, item in _items(options))
+
+
+def of_object(options: argparse.Namespace) -> Demands:
+    """Return what is demanded of the splats of --object: by the options, and by the scene.
+
+    Raises
+    ------
+    RefineError
+        See `of_files` and `Demands.of_scene`.
+    """
+    import bpy  # noqa: PLC0415 - only there inside Blender
+
+    from .. import demands, splat_object  # noqa: PLC0415 - need Blender
+
+    obj = splat_object.find(options.object)
+    names, zones = [], []
+    for role, item in _items(options):
+        if role == "protect" and item.volume is None and _marks(obj, item.text):
+            names.append(item.text)
+        else:
+            also = f", nor has '{obj.name}' a group or an attribute" if role == "protect" else ""
+            zones.append(_zone(role, item, also))
+    scene = demands.Demands.of_scene(bpy.context.scene)
+    return scene + demands.Demands(tuple(names), tuple(zones))
+
+
+def words(done: dict[str, Any]) -> str:
+    """Return what a report says of it in one line, "" where nothing was demanded."""
+    splats, parts = done["splats"], []
+    if splats.get("protected"):
+        parts.append(f"{splats['protected']:,} protected")
+    if splats.get("forced"):
+        parts.append(f"{splats['forced']:,} forced out")
+    volumes = [
+        f"{volume['role']} {volume['name'].removeprefix('object ')}: {volume['splats']:,}"
+        for volume in done.get("volumes", ())
+    ]
+    return ", ".join(parts) + (f" ({'; '.join(volumes)})" if volumes else "")
+
+
+def _items(options: argparse.Namespace) -> list[tuple[Role, Given]]:
+    return [
+        (role, item) for name, role in ROLES.items() for item in getattr(options, name, ()) or ()
+    ]
+
+
+def _marks(obj: Any, name: str) -> bool:  # noqa: ANN401 - an object of Blender
+    return name in obj.vertex_groups or name in obj.data.attributes
+
+
+def _zone(role: Role, item: Given, also: str) -> Zone:
+    if item.volume is not None:
+        return Zone(role, f"'{item.text}'", item.volume)
+    import bpy  # noqa: PLC0415 - only there inside Blender
+
+    from .. import demands  # noqa: PLC0415 - needs Blender
+
+    obj = bpy.context.scene.objects.get(item.text)
+    if obj is None:
+        fit = [o.name for o in bpy.context.scene.objects if demands.can_be_volume(o)]
+        there = ", ".join(fit[:8]) or "none"
+        msg = (
+            f"no object '{item.text}' in the open .blend{also} (objects that are volumes: {there})"
+        )
+        raise RefineError(msg)
+    return demands.zone(role, obj)

@@ -1,0 +1,304 @@
+"""Which points lie inside a closed mesh.
+
+A line upward from a point counts the triangles that it crosses: those that turn their outer side
+up count 1, the others -1. The sum is the winding number of the mesh about the point, 0 outside.
+Where neighbours do not turn the same way, the number of crossings decides, odd inside.
+
+Points are sorted into a grid. A cell that no triangle touches lies inside or outside as a whole, so
+that lines are drawn from the points of the others alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .errors import RefineError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    Index = NDArray[np.int64]
+
+_GRID = 128  # cells along each axis at most; four points a cell hold more than the grid costs
+_FEW = 512  # points below which a grid does not pay
+_LEAF = 1 << 13  # pairs of point and triangle that are compared one by one
+_AT_ONCE = 1 << 20  # pairs that are computed together
+_SLACK = 1e-6  # of a cell: by how much a triangle may reach into the next by rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """The inside of a closed mesh.
+
+    A point on its surface belongs to the side towards which x, y and z grow, but for rounding, so
+    that solids that share a face share no point. Parts that overlap are joined; where one turns its
+    faces the other way, their overlap is outside, as the hollow of a sphere in a sphere is.
+
+    Attributes
+    ----------
+    vertices : (V, 3) float64
+        Equal ones are made one.
+    triangles : (T, 3) int64
+        Three vertices each; those without area are left out where two of these are one.
+    turned : bool
+        Whether all triangles turn the same way as their neighbours.
+
+    Examples
+    --------
+    >>> corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    >>> solid = Solid(corners, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]))
+    >>> solid.inside(np.array([[0.2, 0.2, 0.2], [0.5, 0.5, 0.5]])).tolist()
+    [True, False]
+    """
+
+    vertices: NDArray[Any]
+    triangles: NDArray[Any]
+    turned: bool = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Join equal vertices, and check the mesh.
+
+        Raises
+        ------
+        RefineError
+            If it has no faces, a vertex is not finite, or the mesh is not closed.
+        """
+        vertices = np.asarray(self.vertices, np.float64).reshape(-1, 3) + 0.0  # -0 equals 0
+        triangles = np.asarray(self.triangles, np.int64).reshape(-1, 3)
+        if not len(triangles):
+            msg = "has no faces, expected a closed mesh"
+            raise RefineError(msg)
+        if not np.isfinite(vertices).all():
+            msg = "has a vertex that is not finite, expected a closed mesh"
+            raise RefineError(msg)
+        order = np.lexsort(vertices.T)
+        new = np.ones(len(order), np.bool_)
+        new[1:] = (vertices[order[1:]] != vertices[order[:-1]]).any(axis=1)
+        joined = np.empty(len(order), np.int64)
+        joined[order] = np.cumsum(new) - 1
+        triangles = joined[triangles]
+        a, b, c = triangles.T
+        triangles = triangles[(a != b) & (b != c) & (c != a)]
+        open_edges, turned = _edges(triangles, len(order))
+        if open_edges or not len(triangles):
+            msg = (
+                f"is not closed: {open_edges} of its edges belong to an odd number of faces; fill "
+                "the holes, or add a Remesh modifier"
+            )
+            raise RefineError(msg)
+        for name, value in (
+            ("vertices", vertices[order[new]]),
+            ("triangles", triangles),
+            ("turned", turned),
+        ):
+            object.__setattr__(self, name, value)
+
+    def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which points, (N, 3) floating, lie inside, (N,); none that is not finite."""
+        found = np.zeros(len(points), np.bool_)
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        rows = np.flatnonzero(((points >= low) & (points < high)).all(axis=1))
+        near = np.asarray(points[rows], np.float64)
+        doubted = slice(None)
+        if len(rows) >= _FEW:
+            cells = min(int(np.cbrt(4 * len(rows))), _GRID)
+            scale = cells / (high - low)
+            place = np.minimum(((near - low) * scale).astype(np.int64), cells - 1)
+            flat = np.ravel_multi_index(tuple(place.T), (cells,) * 3)
+            found[rows] = self._grid(low, scale, cells).reshape(-1)[flat]
+            doubted = _touched((self.vertices - low) * scale, self.triangles, cells)[flat]
+            rows, near = rows[doubted], near[doubted]
+        found[rows] = self._crossed(near)
+        return found
+
+    def _crossed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which points, (N, 3), lie inside, each by its own line."""
+        turns = np.zeros(len(points))
+        for rows, heights, signs in self._crossings(points[:, :2]):
+            above = heights > points[rows, 2]
+            turns += np.bincount(rows[above], signs[above], len(points))
+        return self._holds(turns)
+
+    def _holds(self, turns: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which winding numbers are those of the inside."""
+        return np.asarray(turns != 0.0 if self.turned else turns % 2.0 == 1.0)
+
+    def _grid(
+        self, low: NDArray[np.float64], scale: NDArray[np.float64], cells: int
+    ) -> NDArray[np.bool_]:
+        """Return which cells of a grid lie inside, (G, G, G); without meaning where one is touched.
+
+        Parameters
+        ----------
+        low, scale : (3,) float64
+            The lowest corner of the grid, and cells a unit.
+        cells : int
+            G.
+        """
+        centers = np.arange(cells) + 0.5
+        columns = np.stack(np.meshgrid(centers, centers, indexing="ij"), -1).reshape(-1, 2)
+        turns = np.zeros(cells**3)
+        for rows, heights, signs in self._crossings(columns / scale[:2] + low[:2]):
+            level = np.clip((heights - low[2]) * scale[2], 0, cells - 1).astype(np.int64)
+            turns += np.bincount(rows * cells + level, signs, cells**3)
+        turns = turns.reshape(cells, cells, cells)
+        above = turns[:, :, ::-1].cumsum(axis=2)[:, :, ::-1] - turns
+        return self._holds(above)
+
+    def _crossings(
+        self, places: NDArray[np.float64]
+    ) -> Iterator[tuple[Index, NDArray[np.float64], NDArray[np.float64]]]:
+        """Yield where lines along z cross triangles.
+
+        An edge is crossed on the same side of a line for both of its triangles, since its vertices
+        are taken in the same order for both, and lines through a vertex count the edges that begin
+        there: so no line slips between two triangles or meets both.
+
+        Parameters
+        ----------
+        places : (N, 2) float64
+
+        Yields
+        ------
+        rows : (C,) int64
+            Which lines.
+        heights : (C,) float64
+        signs : (C,) float64
+            1 or -1 by the way that the triangle turns, or 1 throughout if not all are `turned`.
+        """
+        y = self.vertices[:, 1]
+        for rows, triangles in _pairs(places, self.vertices[self.triangles, :2]):
+            px, py = places[rows].T
+            corners = self.triangles[triangles]  # (C, 3)
+            below = y[corners] <= py[:, None]
+            one = below.sum(axis=1) == 1
+            # The corner that the line along x has on its own side; two edges meet in it.
+            own = np.where(one, below.argmax(axis=1), below.argmin(axis=1))
+            every = np.arange(len(rows))
+            apex = corners[every, own]
+            x1, z1 = self._cut(apex, corners[every, (own + 1) % 3], py)
+            x2, z2 = self._cut(corners[every, (own + 2) % 3], apex, py)
+            crossed = (x1 > px) != (x2 > px)
+            x1, x2, z1, z2, px = (values[crossed] for values in (x1, x2, z1, z2, px))
+            heights = z1 + (px - x1) / (x2 - x1) * (z2 - z1)
+            signs = np.ones(len(px))
+            if self.turned:
+                signs[(x1 > px) != one[crossed]] = -1.0
+            yield rows[crossed], heights, signs
+
+    def _cut(
+        self, one: Index, other: Index, height: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return x and z where edges between vertices, (C,) each, have these y, (C,)."""
+        first, last = np.minimum(one, other), np.maximum(one, other)
+        x, y, z = self.vertices.T
+        share = (height - y[first]) / (y[last] - y[first])
+        cut = x[first] + share * (x[last] - x[first])
+        # Within its ends, which the boxes of triangles go by.
+        cut = np.clip(cut, np.minimum(x[first], x[last]), np.maximum(x[first], x[last]))
+        return cut, z[first] + share * (z[last] - z[first])
+
+
+def _edges(triangles: Index, count: int) -> tuple[int, bool]:
+    """Return how many edges belong to an odd number of triangles, and whether all turn one way."""
+    start = triangles.reshape(-1)
+    end = np.roll(triangles, -1, axis=1).reshape(-1)
+    names = np.minimum(start, end) * count + np.maximum(start, end)
+    _, edge = np.unique(names, return_inverse=True)
+    edge = edge.reshape(-1)
+    turns = np.bincount(edge, np.where(start < end, 1.0, -1.0))
+    return int(np.count_nonzero(np.bincount(edge) % 2)), not turns.any()
+
+
+def _pairs(
+    places: NDArray[np.float64], corners: NDArray[np.float64]
+) -> Iterator[tuple[Index, Index]]:
+    """Yield places and triangles whose boxes hold them, as pairs: (C,) and (C,).
+
+    Parameters
+    ----------
+    places : (N, 2) float64
+    corners : (T, 3, 2) float64
+    """
+    low, high = corners.min(axis=1).T.copy(), corners.max(axis=1).T.copy()  # (2, T) each
+    waiting = [(np.arange(len(places)), np.arange(len(corners)))] if len(places) else []
+    found: list[tuple[Index, Index]] = []
+    total = 0
+    while waiting:
+        rows, triangles = waiting.pop()
+        here = places[rows]
+        first, last = here.min(axis=0), here.max(axis=0)
+        (left, bottom), (right, top) = low[:, triangles], high[:, triangles]
+        triangles = triangles[
+            (left <= last[0]) & (right > first[0]) & (bottom <= last[1]) & (top > first[1])
+        ]
+        if len(rows) * len(triangles) > _LEAF and len(rows) > 1:
+            half, axis = len(rows) // 2, int(np.argmax(last - first))
+            order = np.argpartition(here[:, axis], half)
+            waiting += [(rows[order[:half]], triangles), (rows[order[half:]], triangles)]
+            continue
+        if not len(triangles):
+            continue
+        x, y = here.T[:, :, None]
+        (left, bottom), (right, top) = low[:, triangles], high[:, triangles]
+        there = (x >= left) & (x < right) & (y >= bottom) & (y < top)
+        which, met = np.nonzero(there)
+        found.append((rows[which], triangles[met]))
+        total += len(which)
+        if total > _AT_ONCE:
+            yield np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
+            found, total = [], 0
+    if total:
+        yield np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
+
+
+def _touched(vertices: NDArray[np.float64], triangles: Index, cells: int) -> NDArray[np.bool_]:
+    """Return which cells of a grid triangles touch, (G * G * G,), and some beside them.
+
+    Triangles wider than a cell are halved until they are not; of the eight cells in which the
+    others may lie, those count that their plane meets.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float64
+        In cells.
+    triangles : (T, 3) int64
+    cells : int
+        G.
+    """
+    touched = np.zeros(cells**3, np.bool_)
+    corners = vertices[triangles]  # (T, 3, 3)
+    while len(corners):
+        first = np.floor(corners.min(axis=1) - _SLACK)
+        wide = (np.floor(corners.max(axis=1) + _SLACK) - first > 1.0).any(axis=1)
+        _touch(touched, corners[~wide], first[~wide], cells)
+        corners = corners[wide]
+        sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)  # (T, 3)
+        every, longest = np.arange(len(corners)), sides.argmax(axis=1)
+        after = (longest + 1) % 3
+        middle = (corners[every, longest] + corners[every, after]) / 2.0
+        halves = corners.copy(), corners.copy()
+        halves[0][every, longest], halves[1][every, after] = middle, middle
+        corners = np.concatenate(halves)
+    return touched
+
+
+def _touch(
+    touched: NDArray[np.bool_],
+    corners: NDArray[np.float64],
+    first: NDArray[np.float64],
+    cells: int,
+) -> None:
+    """Set which of the eight cells from `first` on the planes of small triangles meet."""
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    reach = np.abs(normals).sum(axis=1) * (0.5 + _SLACK)
+    for offset in np.ndindex(2, 2, 2):
+        cell = first + offset
+        away = np.einsum("ij,ij->i", normals, cell + 0.5 - corners[:, 0])
+        place = np.clip(cell[np.abs(away) <= reach], 0, cells - 1).astype(np.int64)
+        touched[np.ravel_multi_index(tuple(place.T), (cells,) * 3)] = True

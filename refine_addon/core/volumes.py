@@ -1,0 +1,293 @@
+"""Volumes that say what must stay and what must go: splats count by where their centres lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+
+from .affine import moved
+from .errors import RefineError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+Role = Literal["protect", "remove", "keep"]
+
+
+class Volume(Protocol):
+    """A part of space."""
+
+    def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which points, (N, 3) floating, lie inside, (N,); none that is not finite."""
+        ...
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box along the axes. It holds its lower faces and not its upper ones, so boxes side by side
+    share no point.
+
+    Attributes
+    ----------
+    low, high : tuple of 3 float
+        Two corners; infinite where it has no end.
+
+    Examples
+    --------
+    >>> Box((0, 0, 0), (1, 1, np.inf)).inside(np.array([[0.5, 0, 9], [0.5, 1, 9]])).tolist()
+    [True, False]
+    """  # noqa: D205 - the first two lines are one paragraph
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        """Check the corners.
+
+        Raises
+        ------
+        RefineError
+            If one of them is no number, or does not lie above the other.
+        """
+        for axis, low, high in zip("xyz", self.low, self.high, strict=True):
+            if not low < high:
+                msg = f"box goes from {low:g} to {high:g} in {axis}, expected a larger number last"
+                raise RefineError(msg)
+
+    def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which points, (N, 3), lie inside, (N,)."""
+        found = ((points >= self.low) & (points < self.high)).all(axis=1)
+        return np.asarray(found & np.isfinite(points).all(axis=1))
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """A sphere with its surface.
+
+    Attributes
+    ----------
+    center : tuple of 3 float
+    radius : float
+    """
+
+    center: tuple[float, float, float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        """Check the numbers.
+
+        Raises
+        ------
+        RefineError
+            If one is not finite, or the radius is not above 0.
+        """
+        if not np.isfinite([*self.center, self.radius]).all():
+            msg = f"sphere at {self.center} has radius {self.radius}, expected finite numbers"
+            raise RefineError(msg)
+        if self.radius <= 0.0:
+            msg = f"sphere has radius {self.radius:g}, expected more than 0"
+            raise RefineError(msg)
+
+    def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which points, (N, 3), lie inside, (N,)."""
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+            away: NDArray[np.float64] = points - np.asarray(self.center, np.float64)
+            return np.asarray(np.einsum("ij,ij->i", away, away) <= self.radius**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A volume that a matrix has moved.
+
+    Attributes
+    ----------
+    volume : Volume
+    matrix : (4, 4) float64
+        From its frame to that of the points.
+    """
+
+    volume: Volume
+    matrix: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        """Check the matrix.
+
+        Raises
+        ------
+        RefineError
+            If it is flat.
+        """
+        scales = np.linalg.svd(self.matrix[:3, :3], compute_uv=False)
+        if not scales[2] > 1e-9 * scales[0]:
+            msg = f"is flat (scales {scales.round(9).tolist()}), expected a volume"
+            raise RefineError(msg)
+
+    def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which points, (N, 3), lie inside, (N,)."""
+        return self.volume.inside(moved(points, np.linalg.inv(self.matrix)))
+
+
+def parse(text: str) -> Volume | None:
+    """Return the volume that a text gives in numbers, None where it is a name.
+
+    Raises
+    ------
+    RefineError
+        If the numbers are no volume.
+
+    Examples
+    --------
+    >>> parse("sphere:0,0,1.5,2")
+    Sphere(center=(0.0, 0.0, 1.5), radius=2.0)
+    >>> parse("box:0,0,0,1,1,inf").high
+    (1.0, 1.0, inf)
+    """
+    kind, colon, rest = text.partition(":")
+    if not colon or kind not in _FORMS:
+        return None
+    try:
+        numbers = [float(word) for word in rest.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != len(_FORMS[kind].split(",")):
+        msg = f"expected {kind}:{_FORMS[kind]} in numbers, got '{text}'"
+        raise RefineError(msg)
+    a, b, c, *others = numbers
+    try:
+        if kind == "sphere":
+            return Sphere((a, b, c), others[0])
+        return Box((a, b, c), (others[0], others[1], others[2]))
+    except RefineError as error:
+        msg = f"'{text}': {error}"
+        raise RefineError(msg) from error
+
+
+_FORMS = {"box": "x0,y0,z0,x1,y1,z1", "sphere": "x,y,z,radius"}
+
+
+@dataclass(frozen=True, eq=False)
+class Zone:
+    """A volume with what becomes of the splats in it.
+
+    Attributes
+    ----------
+    role : {"protect", "remove", "keep"}
+        They stay; they go; or all others go, those in no volume of this kind.
+    name : str
+        Of the volume, for messages and the report.
+    volume : Volume
+        In the frame of the views.
+    idle : bool
+        Whether it may hold no splat, as a volume may from which they were removed.
+    """
+
+    role: Role
+    name: str
+    volume: Volume
+    idle: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Forced:
+    """What volumes decide of N splats.
+
+    Attributes
+    ----------
+    protected : (N,) bool or None
+        Those that stay as they are, for this or another reason.
+    removed : (N,) bool or None
+        Those that go whatever they are worth; none that is protected.
+    facts : list of dict
+        For the report: ``role``, ``name`` and number of ``splats`` of each volume.
+    """
+
+    protected: NDArray[np.bool_] | None = None
+    removed: NDArray[np.bool_] | None = None
+    facts: tuple[dict[str, Any], ...] = ()
+
+    def counts(self) -> dict[str, int]:
+        """Return how many splats are ``protected`` and how many ``forced`` out."""
+        masks = (("protected", self.protected), ("forced", self.removed))
+        return {n: 0 if mask is None else int(np.count_nonzero(mask)) for n, mask in masks}
+
+    def of(self, rows: NDArray[np.bool_]) -> Forced:
+        """Return the same of some of the splats, (N,) bool."""
+        protected, removed = (
+            None if mask is None else mask[rows] for mask in (self.protected, self.removed)
+        )
+        return replace(self, protected=protected, removed=removed)
+
+
+FREE = Forced()
+"""Nothing must stay, and nothing must go."""
+
+
+def forced(
+    zones: Sequence[Zone], means: NDArray[Any], protected: NDArray[np.bool_] | None = None
+) -> Forced:
+    """Return what must stay and what must go by volumes.
+
+    Parameters
+    ----------
+    zones : sequence of Zone
+    means : (N, 3) floating
+        Centres of the splats, in the frame of the volumes.
+    protected : (N,) bool, optional
+        Splats that stay for another reason.
+
+    Returns
+    -------
+    Forced
+
+    Raises
+    ------
+    RefineError
+        If a volume holds no splat and is not `Zone.idle`, or all splats would go.
+    """
+    masks: dict[str, NDArray[np.bool_]] = {}
+    facts = []
+    for zone in zones:
+        inside = zone.volume.inside(means)
+        count = int(np.count_nonzero(inside))
+        if not count and not zone.idle:
+            msg = f"{zone.name} holds the centre of no splat ({_extent(means)})"
+            raise RefineError(msg)
+        facts.append({"role": zone.role, "name": zone.name, "splats": count})
+        masks[zone.role] = masks[zone.role] | inside if zone.role in masks else inside
+    removed = masks.get("remove")
+    if "keep" in masks:
+        removed = ~masks["keep"] if removed is None else removed | ~masks["keep"]
+    if "protect" in masks:
+        protected = masks["protect"] if protected is None else protected | masks["protect"]
+    if removed is not None:
+        if protected is not None:
+            removed = removed & ~protected
+        refuse_all(removed)
+    return Forced(protected, removed, tuple(facts))
+
+
+def among_all(some: NDArray[Any], rest: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return values of what was left of N splats, (N,) bool, as those of all: 0 for the others."""
+    values = np.zeros(len(rest), some.dtype)
+    values[rest] = some
+    return values
+
+
+def refuse_all(removed: NDArray[np.bool_]) -> None:
+    """Raise `RefineError` if all splats must go."""
+    if len(removed) and removed.all():
+        msg = f"all {len(removed)} splats lie where they must go; nothing was removed"
+        raise RefineError(msg)
+
+
+def _extent(means: NDArray[Any]) -> str:
+    """Return in words from where to where splats lie."""
+    finite = means[np.isfinite(means).all(axis=1)]
+    if not len(finite):
+        return "there is none with a finite centre"
+    low, high = (",".join(f"{x:g}" for x in ends(finite, axis=0)) for ends in (np.min, np.max))
+    return f"they lie from {low} to {high}"

@@ -1,0 +1,273 @@
+"""What must stay of a splat object and what must go, as a scene and the command line say it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import numpy as np
+
+from .cameras.objects import world_matrix
+from .core.affine import moved
+from .core.errors import RefineError
+from .core.solid import Solid
+from .core.volumes import Box, Forced, Placed, Sphere, Zone, forced
+from .mesh import attributes as mesh_attributes
+from .mesh import edit as mesh_edit
+from .mesh import floaters as mesh_floaters
+from .mesh import scores as mesh_scores
+from .mesh.layout import splat_count
+from .mesh.notes import parsed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from .core.volumes import Role, Volume
+    from .mesh.layout import SplatObject
+
+FACTS = "refine_forced"
+"""Custom property of the mesh: what was last found to stay and to go, or why not, as JSON."""
+
+UNFIT = "expected a mesh, or an empty that is shown as a cube or a sphere"
+
+_REMEMBERED = 16  # answers of volumes that are kept; 1 MB each at a million splats
+
+_answers: dict[bytes, NDArray[np.bool_]] = {}
+
+
+@dataclass(frozen=True, eq=False)
+class Demands:
+    """What must stay and what must go.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Vertex groups and attributes of the splats that protect, see `mesh.edit.protected_mask`;
+        what is marked by `mesh.edit.PROTECT` is protected without being named.
+    zones : tuple of Zone
+        Volumes in the world.
+    """
+
+    names: tuple[str, ...] = ()
+    zones: tuple[Zone, ...] = ()
+
+    @classmethod
+    def of_scene(cls, scene: bpy.types.Scene) -> Demands:
+        """Return what the panel lists, as the scene keeps it.
+
+        Raises
+        ------
+        RefineError
+            See `zone`.
+        """
+        settings = scene.refine
+        listed = [item for item in settings.volumes if item.object is not None]
+        zones = (zone(item.role.lower(), item.object, idle=True) for item in listed)
+        return cls((settings.protect,) if settings.protect else (), tuple(zones))
+
+    def __add__(self, other: Demands) -> Demands:
+        """Return both together."""
+        return Demands(self.names + other.names, self.zones + other.zones)
+
+    def forced(self, checked: SplatObject) -> Forced:
+        """Return what must stay and what must go of an object's splats.
+
+        Raises
+        ------
+        RefineError
+            See `mesh.edit.protected_mask` and `core.volumes.forced`.
+        """
+        protected = None
+        for name in ("", *self.names):
+            mask = mesh_edit.protected_mask(checked.obj, name)
+            protected = mask if protected is None or mask is None else protected | mask
+        if not self.zones:
+            return Forced(protected)
+        try:
+            return forced(self.zones, world_means(checked), protected)
+        except RefineError as error:
+            msg = f"object '{checked.obj.name}': {error}"
+            raise RefineError(msg) from error
+
+
+NONE = Demands()
+
+
+def world_means(checked: SplatObject) -> NDArray[np.float64]:
+    """Return the centres of an object's splats in the world, (N, 3)."""
+    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
+    return moved(mesh_attributes.read_attribute(checked.mesh, "position"), matrix)
+
+
+def can_be_volume(obj: bpy.types.Object) -> bool:
+    """Tell whether an object can be a volume, at first sight; one of splats has no faces."""
+    if obj.type == "MESH":
+        return bool(obj.data.polygons or obj.modifiers)
+    return obj.type == "EMPTY" and obj.empty_display_type in {"CUBE", "SPHERE"}
+
+
+def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
+    """Return what an object of the scene demands, as a volume in the world.
+
+    A mesh counts as it is evaluated, with modifiers; an empty as it is drawn.
+
+    Raises
+    ------
+    RefineError
+        If it is neither, or cannot be evaluated. Whether a mesh is closed is found out when it is
+        used.
+    """
+    label = f"object '{obj.name}'"
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    matrix = world_matrix(obj, depsgraph)
+    if obj.type == "EMPTY" and obj.empty_display_type in {"CUBE", "SPHERE"}:
+        size = obj.empty_display_size
+        shape = Sphere((0.0, 0.0, 0.0), size) if obj.empty_display_type == "SPHERE" else None
+        volume = shape or Box((-size,) * 3, (size,) * 3)
+        key = _digest(repr((obj.empty_display_type, size)).encode(), matrix.tobytes())
+        return Zone(role, label, _Recalled(label, key, partial(Placed, volume, matrix)), idle)
+    if obj.type != "MESH":
+        kind = obj.type.replace("_", " ").lower()
+        if obj.type == "EMPTY":
+            kind = f"an empty shown as {obj.empty_display_type.replace('_', ' ').lower()}"
+        msg = f"{label}: is {kind}, {UNFIT}"
+        raise RefineError(msg)
+    local, triangles = _surface(obj, depsgraph)
+    vertices = moved(local, matrix)
+    key = _digest(vertices.tobytes(), triangles.tobytes())
+    return Zone(role, label, _Recalled(label, key, partial(Solid, vertices, triangles)), idle)
+
+
+def mark(checked: SplatObject, found: Forced) -> None:
+    """Mark for the previews what must stay and what must go, and note how many it is.
+
+    What must go is also marked as what goes, unless scores or floaters tell that.
+
+    Raises
+    ------
+    RefineError
+        If the object cannot be written to.
+    """
+    mesh, removed = checked.mesh, found.removed
+    mesh_edit.mark_forced(checked.obj, found.protected, removed)
+    elsewhere = mesh_scores.record(mesh) or mesh_floaters.counts(mesh)
+    if removed is not None:
+        if mesh_scores.record(mesh) is None:
+            mesh_edit.mark_removed(checked.obj, removed)
+    elif not elsewhere:
+        mesh_attributes.remove_attribute(mesh, mesh_edit.REMOVE)
+    volumes = [[fact["name"], fact["splats"]] for fact in found.facts]
+    _note(mesh, {**found.counts(), "volumes": volumes})
+
+
+def refresh(scene: bpy.types.Scene, checked: SplatObject) -> Forced:
+    """Mark what a scene demands of an object, and return it.
+
+    Raises
+    ------
+    RefineError
+        See `Demands`; it is noted as well.
+    """
+    try:
+        found = Demands.of_scene(scene).forced(checked)
+        mark(checked, found)
+    except RefineError as error:
+        _note(checked.mesh, {"error": str(error)})
+        raise
+    return found
+
+
+def facts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
+    """Return what is noted of a mesh; empty where it is not known of all its splats.
+
+    Returns
+    -------
+    dict
+        ``protected`` and ``forced``, how many; ``volumes``, how many each holds by its label; or
+        ``error``, why that is not known.
+    """
+    try:
+        noted = parsed(mesh[FACTS])
+        if noted["splats"] != splat_count(mesh):
+            return {}
+        if "error" in noted:
+            return {"error": str(noted["error"])}
+        counts = {name: int(noted[name]) for name in ("protected", "forced")}
+        return {**counts, "volumes": dict(noted["volumes"])}
+    except (KeyError, TypeError, ValueError):
+        return {}
+
+
+def _note(mesh: bpy.types.Mesh, found: dict[str, Any]) -> None:
+    mesh[FACTS] = json.dumps({"splats": splat_count(mesh), **found})
+
+
+def _surface(
+    obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Return vertices, (V, 3), and triangles, (T, 3), of a mesh with its modifiers."""
+    evaluated = obj.evaluated_get(depsgraph)
+    if not evaluated.is_evaluated:
+        if obj.modifiers:
+            msg = (
+                f"object '{obj.name}': is disabled in viewports or excluded from the view layer, "
+                "where Blender applies no modifiers; enable it first"
+            )
+            raise RefineError(msg)
+        evaluated = obj
+    mesh = evaluated.to_mesh()
+    try:
+        mesh.calc_loop_triangles()
+        vertices = np.empty(3 * len(mesh.vertices), np.float32)
+        triangles = np.empty(3 * len(mesh.loop_triangles), np.int32)
+        mesh.vertices.foreach_get("co", vertices)
+        mesh.loop_triangles.foreach_get("vertices", triangles)
+    finally:
+        evaluated.to_mesh_clear()
+    return vertices.reshape(-1, 3), triangles.reshape(-1, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class _Recalled:
+    """A volume that answers again what it, or one like it, was asked before.
+
+    Attributes
+    ----------
+    label : str
+        What to call it where it is none.
+    key : bytes
+        What tells it from others.
+    make : callable
+        Returns the volume itself.
+    """
+
+    label: str
+    key: bytes
+    make: Callable[[], Volume]
+
+    def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which points, (N, 3), lie inside, (N,); nobody may change it."""
+        question = _digest(self.key, np.ascontiguousarray(points))
+        if question not in _answers:
+            try:
+                found = self.make().inside(points)
+            except RefineError as error:
+                msg = f"{self.label}: {error}"
+                raise RefineError(msg) from error
+            while len(_answers) >= _REMEMBERED:
+                del _answers[next(iter(_answers))]  # the oldest
+            _answers[question] = found
+        return _answers[question]
+
+
+def _digest(*parts: Any) -> bytes:  # noqa: ANN401 - buffers
+    digest = hashlib.blake2b(digest_size=16)
+    for part in parts:
+        digest.update(part)
+    return digest.digest()

@@ -1,0 +1,64 @@
+"""Calls that other threads ask Blender's main thread to make: its data is not safe elsewhere."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import threading
+from concurrent.futures import CancelledError, Future
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from .core.errors import Cancelled
+from .core.work import checkpoint
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+Answer = TypeVar("Answer")
+
+_LOOK = 0.1
+"""Seconds between two looks at whether the work that waits for an answer was cancelled."""
+
+_asked: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
+
+
+def call(function: Callable[[], Answer]) -> Answer:
+    """Return what a function returns that the main thread calls: at once there, else by `serve`.
+
+    Raises
+    ------
+    Cancelled
+        See `work.checkpoint`; the function may not be called then.
+    Exception
+        What the function raises.
+    """
+    if threading.current_thread() is threading.main_thread():
+        return function()
+    answer: Future[Answer] = Future()
+    _asked.put((function, answer))
+    while True:
+        try:
+            return answer.result(_LOOK)
+        except CancelledError:
+            raise Cancelled from None
+        except TimeoutError:
+            if answer.done():
+                raise  # the function's own
+        try:
+            checkpoint()
+        except Cancelled:
+            answer.cancel()
+            raise
+
+
+def serve() -> None:
+    """Make the calls that were asked for, in the main thread."""
+    with contextlib.suppress(queue.Empty):
+        while True:
+            function, answer = _asked.get_nowait()
+            if not answer.set_running_or_notify_cancel():
+                continue
+            try:
+                answer.set_result(function())
+            except BaseException as error:  # noqa: BLE001 - raised where it was asked for
+                answer.set_exception(error)

@@ -1,0 +1,446 @@
+"""While an operator works on a thread the window lives, and what it writes fits what is there."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+
+from tests.windows import event, started_in_a_window, until, until_over
+
+
+@pytest.fixture
+def few(addon, room, room_cameras):  # noqa: ARG001
+    """Every tenth splat of the room, to be scored by four views with what hides what."""
+    addon.mesh.edit.delete_vertices(room, np.arange(len(room.data.vertices)) % 10 != 0)
+    settings = bpy.context.scene.refine
+    settings.method, settings.views = "auto", 4
+    return room
+
+
+@pytest.fixture
+def start(addon, few):  # noqa: ARG001
+    """Return a function that clicks an operator's button; by default it is *Score*."""
+
+    def start(cls=None, **properties):
+        return started_in_a_window(addon, cls or addon.ui.operators.REFINE_OT_score, **properties)
+
+    yield start
+    addon.ui.running._end()
+
+
+@pytest.fixture
+def gate(addon, monkeypatch):
+    """Hold back the scoring that was asked for, not its sketch, until `open`; or let it fail."""
+    gate, score = SimpleNamespace(open=threading.Event(), error=None), addon.core.pipeline.score
+
+    def held(splats, views, settings, *, progress, **options):
+        if threading.current_thread().name == "refine" and settings.method != "closed-form":
+            while not gate.open.wait(0.01):
+                addon.core.work.report(progress, 0.4, "looking")
+            if gate.error:
+                raise gate.error
+        return score(splats, views, settings, progress=progress, **options)
+
+    monkeypatch.setattr(addon.core.pipeline, "score", held)
+    return gate
+
+
+def noted(addon, obj):
+    """Return the note of an object's scores."""
+    return addon.mesh.scores.record(obj.data)
+
+
+def values(obj, name="refine_score"):
+    """Return a point attribute."""
+    found = np.empty(len(obj.data.vertices), np.float32)
+    obj.data.attributes[name].data.foreach_get("value", found)
+    return found
+
+
+def scored_by(obj, method):
+    """Return what *Score* writes at once, by a method."""
+    settings = bpy.context.scene.refine
+    before, settings.method = settings.method, method
+    bpy.ops.refine.score()
+    settings.method = before
+    return values(obj).copy()
+
+
+@pytest.mark.parametrize("kind", ["MOUSEMOVE", "MIDDLEMOUSE", "WHEELUPMOUSE", "TAB", "G", "SPACE"])
+def test_events_go_on_to_the_window(start, gate, kind):  # noqa: ARG001
+    """So views orbit, panels scroll and editors work."""
+    operator, context, said = start()
+
+    assert operator.modal(context, event(kind)) == {"PASS_THROUGH"}
+    assert said == []
+
+
+@pytest.fixture
+def keys():
+    """Give the window's keys their usual meaning, which Blender as a module leaves out."""
+    user = bpy.context.window_manager.keyconfigs.user
+    screen, window = user.keymaps["Screen"], user.keymaps["Window"]
+    made = [
+        (screen, screen.keymap_items.new("ed.undo", "Z", "PRESS", ctrl=True)),
+        (screen, screen.keymap_items.new("ed.redo", "Z", "PRESS", ctrl=True, shift=True)),
+        (window, window.keymap_items.new("wm.save_mainfile", "S", "PRESS", ctrl=True)),
+    ]
+    yield
+    for keymap, item in made:
+        keymap.keymap_items.remove(item)
+
+
+@pytest.mark.usefixtures("keys")
+@pytest.mark.parametrize(
+    ("held", "word"),
+    [({"type": "Z"}, "Undo"), ({"type": "Z", "shift": True}, "Redo"), ({"type": "S"}, "Save")],
+)
+def test_undo_redo_and_save_are_refused_with_a_sentence(start, gate, held, word):  # noqa: ARG001
+    """By what the key map says; the same key alone, or let go of, is none of these."""
+    operator, context, said = start()
+    kind = held.pop("type")
+
+    assert operator.modal(context, event(kind, ctrl=True, **held)) == {"RUNNING_MODAL"}
+    assert said == [
+        f"{word} waits: Scoring splats: wait until it is over, or press Esc, which cancels"
+    ]
+    assert context.said[-1] == said[0]
+    for other in (event(kind, **held), event(kind, "RELEASE", ctrl=True, **held)):
+        assert operator.modal(context, other) == {"PASS_THROUGH"}
+
+
+def test_only_one_operation_works_at_a_time(start, gate, addon):  # noqa: ARG001
+    """Those that look at splats stay; the others come back when it is over."""
+    names = ["score", "apply", "levels", "find_floaters", "delete_floaters", "convert"]
+    names += ["export_ply", "import_ply", "import_cameras"]
+    bpy.ops.refine.score()
+    bpy.ops.refine.find_floaters()
+
+    def polls(those):
+        return [getattr(bpy.ops.refine, name).poll() for name in those]
+
+    before = polls(names)
+    operator, context, _ = start()
+    during, looks = polls(names), polls(["preview", "plan"])
+    operator.modal(context, event("ESC"))
+    until_over(operator, context)
+
+    assert before == polls(names) == [True] * 9
+    assert during == [False] * 9
+    assert looks == [True, True]
+
+
+def test_only_sidebars_are_drawn_again(start, gate):  # noqa: ARG001
+    """A 3D view with a million splats is not; the status bar says phase and share, .4 of 97 %."""
+    operator, context, _ = start()
+    until(operator, context, lambda: any("39%" in str(text) for text in context.said))
+    operator.modal(context, event("ESC"))
+    until_over(operator, context)
+
+    assert set(context.drawn) == {"VIEW_3D UI"}
+    assert "Refining scores (looking); Esc keeps the closed form's: 39%" in context.said
+    assert context.timers == 0
+
+
+def _delete(obj):
+    bpy.data.objects.remove(obj)
+
+
+def _replace(obj):
+    obj.data = obj.data.copy()
+
+
+def _move_a_vertex(obj):
+    obj.data.vertices[7].co.x += 1e-3
+
+
+def _fade_a_splat(obj):
+    obj.data.attributes["opacity"].data[7].value -= 0.5
+
+
+def _add_a_vertex(obj):
+    obj.data.vertices.add(1)
+
+
+CHANGES = {
+    _delete: "object 'room': was deleted meanwhile; there is nothing to write to",
+    _replace: "object 'room': has other data, 'point_cloud.001', since; start again",
+    _move_a_vertex: "object 'room': its splats were changed meanwhile; start again",
+    _fade_a_splat: "object 'room': its splats were changed meanwhile; start again",
+    _add_a_vertex: "object 'room': had 3976 splats and has 3977 since; start again",
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("stage", ["sketch", "work"])
+def test_a_result_for_splats_that_changed_is_refused(start, gate, addon, few, change, stage):
+    """Whatever was done to the object; nothing is written to what it is now."""
+    operator, context, said = start()
+    if stage == "work":
+        until(operator, context, lambda: addon.ui.running.now().stage == "shown")
+    change(few)
+    gate.open.set()
+    answer = until_over(operator, context)
+
+    assert said[0] == CHANGES[change]
+    assert answer == ({"FINISHED"} if stage == "work" else {"CANCELLED"})
+    if change is not _delete:
+        assert (noted(addon, few) is None) == (stage == "sketch")
+    assert context.timers == 0
+    assert addon.ui.running.now() is None
+
+
+def test_all_objects_that_are_written_to_have_to_be_as_they_were(start, gate, addon, few):
+    """Where an operator writes to several; the second is the one that changed."""
+    other = few.copy()
+    other.data = few.data.copy()
+    bpy.context.scene.collection.objects.link(other)
+    check = addon.mesh.layout.check
+    operator, context, said = start(written=lambda *_: [check(few), check(other)])
+    _move_a_vertex(other)
+    gate.open.set()
+
+    assert until_over(operator, context) == {"CANCELLED"}
+    assert said == ["object 'room.001': its splats were changed meanwhile; start again"]
+    assert noted(addon, few) is None
+
+
+def test_a_renamed_object_gets_its_result(start, gate, addon, few):
+    """Another one has its name by then, and stays as it is."""
+    operator, context, _ = start()
+    few.name = "other"
+    decoy = bpy.data.objects.new("room", few.data.copy())
+    bpy.context.scene.collection.objects.link(decoy)
+    gate.open.set()
+
+    assert until_over(operator, context) == {"FINISHED"}
+    assert noted(addon, few)["method"] == "auto"
+    assert noted(addon, decoy) is None
+
+
+def test_a_result_waits_until_edit_mode_is_left(start, gate, addon, few):
+    """Attributes cannot be written there; the sketch is left out."""
+    operator, context, _ = start()
+    bpy.ops.object.mode_set(mode="EDIT")
+    gate.open.set()
+    until(operator, context, lambda: addon.ui.running.now().waits)
+    waits = addon.ui.running.now().sentence
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+    assert waits == "Scoring splats: go back to object mode for the result (Esc cancels)"
+    assert until_over(operator, context) == {"FINISHED"}
+    assert noted(addon, few)["method"] == "auto"
+
+
+def test_the_closed_form_is_shown_first_and_refined_in_place(start, gate, addon, few):
+    """What is there in the end is what scoring at once writes, to the bit; it is one step."""
+    expected = {name: scored_by(few, name) for name in ("closed-form", "auto")}
+    plain = noted(addon, few)
+    del few.data[addon.mesh.scores.RECORD]
+    operator, context, _ = start()
+    until(operator, context, lambda: addon.ui.running.now().stage == "shown")
+    first, note = values(few).copy(), noted(addon, few)
+    ranks = values(few, "refine_rank").copy()
+    gate.open.set()
+    answer = until_over(operator, context)
+
+    assert np.array_equal(first, expected["closed-form"])
+    assert np.array_equal(ranks, addon.core.selection.rank(first).astype(np.float32))
+    assert (note["method"], note["asked"]["method"]) == ("closed-form", "auto")
+    assert addon.ui.staleness.changes(bpy.context, few) == []
+    assert answer == {"FINISHED"}
+    assert np.array_equal(values(few), expected["auto"])
+    assert noted(addon, few) == plain
+
+
+@pytest.mark.parametrize("how", ["escape", "fails"])
+def test_what_stops_the_refinement_leaves_the_closed_form(start, gate, addon, few, how):
+    """Named as such, with a step to undo; *Apply* goes by it."""
+    expected = scored_by(few, "closed-form")
+    scored_by(few, "auto")
+    operator, context, said = start()
+    until(operator, context, lambda: addon.ui.running.now().stage == "shown")
+    waits = bpy.ops.refine.apply.poll()
+    if how == "fails":
+        gate.error = MemoryError("Unable to allocate 9 GiB")
+        gate.open.set()
+    else:
+        operator.modal(context, event("ESC"))
+    answer = until_over(operator, context)
+
+    assert not waits
+    assert answer == {"FINISHED"}
+    assert said[-1] == "Refining scores stopped; the scores are the closed form's"
+    assert said[:-1] == (["not enough memory (Unable to allocate 9 GiB)"] if how == "fails" else [])
+    assert np.array_equal(values(few), expected)
+    assert addon.mesh.scores.unrefined(noted(addon, few))
+    assert bpy.ops.refine.apply() == {"FINISHED"}
+
+
+def test_esc_before_anything_is_shown_leaves_the_old_scores(start, addon, few, monkeypatch):
+    """To the bit, with their note."""
+    expected, note = scored_by(few, "auto"), noted(addon, few)
+    module, tell = addon.ui.operators, threading.Event()
+
+    def slow(_job, progress):
+        tell.set()
+        while progress(0.1, "reading"):
+            time.sleep(0.01)
+        raise addon.core.Cancelled
+
+    monkeypatch.setattr(module, "_sketched", slow)
+    operator, context, said = start()
+    tell.wait(10.0)
+    operator.modal(context, event("ESC"))
+
+    assert until_over(operator, context) == {"CANCELLED"}
+    assert said == ["Scoring splats cancelled; nothing was changed"]
+    assert np.array_equal(values(few), expected)
+    assert noted(addon, few) == note
+
+
+def test_the_closed_form_itself_has_no_sketch(start, addon, few):
+    """It would be done twice."""
+    bpy.context.scene.refine.method = "closed-form"
+    operator, context, _ = start()
+
+    assert addon.ui.running.now().stage == "work"
+    assert until_over(operator, context) == {"FINISHED"}
+    assert noted(addon, few)["asked"] is None
+
+
+def test_while_unrefined_the_panel_promises_no_decibels(start, gate, addon, few):
+    """A PSNR as budget has to wait, which is no error of the user's."""
+    bpy.context.scene.refine.budget = "psnr"
+    operator, context, _ = start()
+    until(operator, context, lambda: addon.ui.running.now().stage == "shown")
+    plan = json.loads(few.data[addon.ui.plans.PLAN])
+
+    assert "error" in plan
+    assert addon.ui.plans.remark(plan, noted(addon, few)) == "Refined scores tell dB"
+    gate.open.set()
+    until_over(operator, context)
+    assert "psnr" in json.loads(few.data[addon.ui.plans.PLAN])
+
+
+def threads():
+    """Return the threads of operators."""
+    return [thread for thread in threading.enumerate() if thread.name == "refine"]
+
+
+@pytest.mark.parametrize("how", ["another file", "disabled"])
+def test_what_ends_the_session_ends_the_thread(start, gate, addon, how):  # noqa: ARG001
+    """Another file is loaded, or the extension is switched off: nothing runs on or is left."""
+    operator, context, _ = start()
+    until(operator, context, lambda: addon.ui.running.now().stage == "shown")
+    assert threads()
+    if how == "another file":
+        bpy.ops.wm.read_homefile(use_empty=True)
+        operator.cancel(context)  # as Blender does, after load_pre
+        assert context.timers == 0
+    else:
+        addon.ui.running.unregister()
+        addon.ui.running.register()
+
+    assert threads() == []
+    assert addon.ui.running.now() is None
+    assert bpy.ops.refine.import_ply.poll()
+
+
+def test_work_that_listens_to_nobody_is_left_behind_within_a_second(start, addon, few, monkeypatch):
+    """What it comes to later is dropped."""
+    free, expected = threading.Event(), scored_by(few, "auto")
+    monkeypatch.setattr(addon.ui.operators, "_sketched", lambda _job, _progress: free.wait(20.0))
+    operator, context, _ = start()
+    begun = time.monotonic()
+    operator.modal(context, event("ESC"))
+    answer = until_over(operator, context)
+    passed = time.monotonic() - begun
+    free.set()
+    for thread in threads():
+        thread.join()
+
+    assert answer == {"CANCELLED"}
+    assert passed < 1.0
+    assert np.array_equal(values(few), expected)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".sog"])
+def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, few, tmp_path, suffix):
+    """The same bytes, images of a SOG by Blender's library on the main thread included."""
+    export, read = addon.ui.operators.REFINE_OT_export_ply, addon.ui.import_operators
+    at_once, later = (tmp_path / f"{name}{suffix}" for name in ("now", "later"))
+    bpy.ops.refine.export_ply(filepath=str(at_once))
+    options = {"overwrite": False, "apply_transform": False}
+    ended = until_over(*start(export, filepath=str(later), **options)[:2])
+    options = {"files": [], "directory": "", "upright": False}
+    operator, context, said = start(read.REFINE_OT_import_ply, filepath=str(later), **options)
+    imported = until_over(operator, context)
+    obj = bpy.context.view_layer.objects.active
+
+    assert ended == imported == {"FINISHED"}
+    assert later.read_bytes() == at_once.read_bytes()
+    assert said[-1] == "Imported 3,976 splats from 1 file"
+    assert (obj.name, len(obj.data.vertices)) == ("later", len(few.data.vertices))
+
+
+def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, monkeypatch):  # noqa: ARG001
+    """Packing does not listen; what it wrote is not put in place afterwards."""
+    begun, free = threading.Event(), threading.Event()
+    form = addon.core.formats.dot_splat.FORMAT
+    registry = addon.core.formats.registry
+
+    def write(stream, _splats):
+        stream.write(b"half")
+        begun.set()
+        free.wait(20.0)
+
+    held = SimpleNamespace(suffix=".splat", degree=form.degree, write=write, loss="", sizes=None)
+    monkeypatch.setattr(registry, "format_named", lambda _path: held)
+    export = addon.ui.operators.REFINE_OT_export_ply
+    options = {"overwrite": False, "apply_transform": False}
+    operator, context, _ = start(export, filepath=str(tmp_path / "out.splat"), **options)
+    begun.wait(10.0)
+    operator.modal(context, event("ESC"))
+    answer = until_over(operator, context)
+    free.set()
+    for thread in threads():
+        thread.join()
+
+    assert answer == {"CANCELLED"}
+    assert list(tmp_path.iterdir()) == []
+
+
+def served(addon, function):
+    """Return what a thread gets that asks the main thread to call a function."""
+    worker = addon.ui.worker.Worker(lambda _progress: addon.main_thread.call(function))
+    while worker.running():
+        addon.main_thread.serve()
+    return worker.result()
+
+
+def test_the_main_thread_answers_the_thread(addon):
+    """With what the function returns or raises."""
+    assert served(addon, threading.current_thread) == threading.main_thread()
+    with pytest.raises(ZeroDivisionError):
+        served(addon, lambda: 1 // 0)
+
+
+def test_a_thread_that_is_cancelled_waits_for_no_answer(addon):
+    """And what it asked for is not done."""
+    main_thread, calls = addon.main_thread, []
+    worker = addon.ui.worker.Worker(lambda _progress: main_thread.call(lambda: calls.append(1)))
+    while not main_thread._asked.qsize():
+        time.sleep(0.01)
+    worker.end()
+    main_thread.serve()
+
+    assert calls == []
+    with pytest.raises(addon.core.Cancelled):
+        worker.result()

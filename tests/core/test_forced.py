@@ -1,0 +1,268 @@
+"""Splats that go whatever they are worth: as if they had gone before, and counted as removed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from refine_addon.core import (
+    Box,
+    Budget,
+    Cleaning,
+    Levels,
+    RefineError,
+    Settings,
+    Zone,
+    clean,
+    lod,
+    prune,
+    prune_file,
+    read_ply,
+    score,
+)
+from refine_addon.core.file_to_file import forced as forced_by
+from refine_addon.core.levels.files import lod_file
+from refine_addon.core.pipeline import decide
+from refine_addon.core.task import Task
+from tests.core.test_cleaning import FLOATER, cameras, joined, wall
+from tests.core.test_levels import cameras as level_cameras
+from tests.core.test_levels import colourful
+from tests.strategies import ply_of
+
+COUNT = 576
+
+BUDGETS = [
+    Budget(ratio=0.5), Budget(ratio=0.1), Budget(keep=300), Budget(keep=1), Budget(max_mb=0.008),
+    Budget(threshold=0.4), Budget(min_seen=40.0), Budget(psnr=35.0),
+]  # fmt: skip
+
+
+WAYS = pytest.mark.parametrize(
+    "absorb", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["delete", "absorb"]
+)
+
+
+@pytest.fixture(scope="module")
+def splats():
+    """Make a wall of 576 splats in many colours."""
+    return colourful()
+
+
+@pytest.fixture(scope="module")
+def views():
+    return level_cameras()
+
+
+@pytest.fixture(scope="module")
+def removed():
+    """Choose a quarter of them, and more."""
+    return np.random.default_rng(3).random(COUNT) < 0.3
+
+
+def rest_budget(budget, gone):
+    """Return what is left to a budget of 576 splats when some have gone."""
+    if budget.ratio is None:
+        return budget
+    return Budget(keep=COUNT - max(int(budget.ratio * COUNT), gone))
+
+
+@WAYS
+@pytest.mark.parametrize("budget", BUDGETS, ids=lambda budget: f"{budget}")
+def test_forcing_out_is_pruning_what_is_left_by_the_rest_of_the_budget(
+    splats, views, removed, budget, absorb
+):
+    """The same splats, values and estimate as when they are deleted first, by hand."""
+    settings, rest = Settings("occlusion"), ~removed
+    size = {"row_bytes": 20.0}
+    left = prune(
+        splats.take(rest), views, rest_budget(budget, int(removed.sum())), settings,
+        absorb=absorb, **size,
+    )  # fmt: skip
+
+    found = prune(splats, views, budget, settings, removed=removed, absorb=absorb, **size)
+
+    assert not found.keep[removed].any()
+    assert np.array_equal(found.keep[rest], left.keep)
+    assert np.array_equal(found.scores.values[rest], left.scores.values)
+    assert found.report["estimated_psnr"] == left.report["estimated_psnr"]
+    assert found.report["splats"]["removed"] == COUNT - left.keep.sum()
+    assert found.report["splats"]["forced"] == removed.sum()
+    assert found.report["budget"] == {budget.kind: getattr(budget, budget.kind)}
+    if absorb:
+        assert np.array_equal(found.absorbed.splats.means, left.absorbed.splats.means)
+        assert np.array_equal(found.absorbed.keep, found.keep)
+
+
+def test_a_share_counts_what_had_to_go(splats, views, removed):
+    """Half of 576 is 288, of which what is forced out is a part; a tenth of them is less."""
+    half = prune(splats, views, Budget(ratio=0.5), removed=removed).report["splats"]
+    tenth = prune(splats, views, Budget(ratio=0.1), removed=removed).report["splats"]
+
+    assert half["removed"] == 288
+    assert tenth["removed"] == tenth["forced"] == removed.sum() > 57
+
+
+def test_protection_wins_over_force(splats, views):
+    """The first hundred must go, the first ten stay: ninety are forced out."""
+    rows = np.arange(COUNT)
+
+    found = prune(
+        splats, views, Budget(ratio=0.9), protected=rows < 10, removed=rows < 100, absorb=True
+    )
+
+    assert found.keep[:10].all()
+    assert not found.keep[10:100].any()
+    assert not found.absorbed.changed[:10].any()
+    assert (found.report["splats"]["protected"], found.report["splats"]["forced"]) == (10, 90)
+
+
+@pytest.mark.parametrize("method", ["auto", "occlusion", "closed-form"])
+def test_scores_of_what_is_left_decide_as_well_as_a_pruning_that_scores(
+    splats, views, removed, method
+):
+    """As the panel does it: score without them, store, apply. They score 0 and no other does."""
+    settings, budget = Settings(method), Budget(ratio=0.6)
+    scores = score(splats, views, settings, removed=removed)
+    task = Task(budget, settings, scores=scores, removed=removed)
+
+    assert np.array_equal(scores.values == 0.0, removed)
+    expected = prune(splats, views, budget, settings, removed=removed)
+    for given in (scores, replace(scores, sights=None)):
+        assert np.array_equal(decide(replace(task, scores=given)).keep, expected.keep)
+
+
+def test_what_was_forced_out_when_scored_and_is_no_more_has_no_score(splats, views, removed):
+    """It might be worth most: nothing tells."""
+    scores = score(splats, views, removed=removed)
+    fewer = removed & (np.arange(COUNT) > 100)
+    task = Task(Budget(ratio=0.6), scores=scores, removed=fewer)
+
+    with pytest.raises(RefineError, match=r"splats had to go when the others were scored"):
+        decide(task)
+
+
+def test_more_than_was_forced_out_when_scored_goes_by_the_scores_there_are(splats, views, removed):
+    """The others are ranked as they were."""
+    scores = score(splats, views, removed=removed)
+    more = removed | (np.arange(COUNT) < 50)
+
+    found = decide(Task(Budget(keep=200), scores=scores, removed=more))
+
+    assert not found.keep[more].any()
+    assert found.keep.sum() == 200
+    assert scores.values[found.keep].min() > scores.values[~found.keep & ~more].max()
+
+
+def test_nothing_left_is_refused(splats, views):
+    """In one sentence, before any work."""
+    with pytest.raises(RefineError, match="all 576 splats lie where they must go"):
+        prune(splats, views, Budget(ratio=0.5), removed=np.ones(COUNT, bool))
+    with pytest.raises(RefineError, match="all 576 splats"):
+        score(splats, views, removed=np.ones(COUNT, bool))
+
+
+def test_all_but_what_is_protected_may_go(splats, views):
+    """One stays, and more is not asked for."""
+    mine = np.arange(COUNT) == 300
+
+    found = prune(
+        splats, views, Budget(ratio=0.0), Settings("closed-form"),
+        protected=mine, removed=np.ones(COUNT, bool),
+    )  # fmt: skip
+
+    assert np.array_equal(found.keep, mine)
+
+
+@WAYS
+def test_levels_hold_nothing_of_it_and_are_those_of_the_rest(splats, views, removed, absorb):
+    """Half of 576 stays in the first, of the others; as when the others are the scene."""
+    rest = ~removed
+    shares = (287.5 / rest.sum(), 57.5 / rest.sum())  # rounded up
+    expected = lod(splats.take(rest), views, Levels(shares, absorb=absorb))
+
+    found = lod(splats, views, Levels((0.5, 0.1), absorb=absorb), removed=removed)
+
+    for one, other in zip(found, expected, strict=True):
+        assert np.array_equal(one.keep[rest], other.keep)
+        assert not one.keep[removed].any()
+        assert np.array_equal(one.splats.means, other.splats.means)
+        assert one.psnr == other.psnr
+    assert [level.keep.sum() for level in found] == [288, 58]
+
+
+def test_cleaning_takes_what_is_forced_out_as_gone():
+    """The wall before the floater is no surface then: of what no view sees past, nothing floats."""
+    splats = joined(wall(), FLOATER)
+    walls = np.arange(len(splats)) < len(splats) - 1
+    half = walls & (splats.means[:, 0] > 100.0)
+    half[:5] = True
+
+    found = clean(splats, cameras(), removed=half)
+    expected = clean(splats.take(~half), cameras())
+    alone = clean(splats, cameras(), Cleaning(), removed=walls)
+
+    assert not found.keep[:5].any()
+    assert np.array_equal(found.keep[5:], expected.keep)
+    assert found.counts() == expected.counts()
+    assert alone.counts()["front"] == 0
+
+
+def scene(splats, path):
+    """Write splats to a file."""
+    columns = {f"f_dc_{k}": splats.sh_dc[:, k] for k in range(3)}
+    columns |= dict(zip("xyz", splats.means.T, strict=True))
+    columns |= {f"scale_{k}": splats.log_scales[:, k] for k in range(3)}
+    columns |= {f"rot_{k}": splats.quaternions[:, k] for k in range(4)}
+    columns["opacity"] = splats.opacity_logits
+    path.write_bytes(ply_of(columns))
+    return path
+
+
+ZONES = (
+    Zone("keep", "box", Box((-9, -9, -9), (1, 9, 9))),
+    Zone("protect", "edge", Box((-9, -9, -9), (-2, 9, 9))),
+    Zone("remove", "lower", Box((-9, -9, -9), (9, -1, 9))),
+)
+
+
+@pytest.mark.parametrize("cleaning", [None, Cleaning()], ids=["whole", "cleaned"])
+def test_a_file_is_pruned_by_volumes_as_by_masks(splats, views, tmp_path, cleaning):
+    """The report names the volumes and how many each holds."""
+    path = scene(splats, tmp_path / "in.ply")
+    loaded = read_ply(path).splats()
+    masks = forced_by(ZONES, loaded.means)
+    budget = Budget(ratio=0.8)
+
+    found = prune_file(path, tmp_path / "out.ply", views, budget, zones=ZONES, cleaning=cleaning)
+
+    x, y = loaded.means[:, 0], loaded.means[:, 1]
+    protected, removed = x < -2, ((x >= 1) | (y < -1)) & (x >= -2)
+    assert np.array_equal(masks.protected, protected)
+    assert np.array_equal(masks.removed, removed)
+    if cleaning is None:
+        expected = prune(loaded, views, budget, protected=protected, removed=removed)
+        assert np.array_equal(found.keep, expected.keep)
+    assert found.keep[protected].all()
+    assert not found.keep[removed].any()
+    assert found.report["volumes"] == [
+        {"role": "keep", "name": "box", "splats": int((x < 1).sum())},
+        {"role": "protect", "name": "edge", "splats": int(protected.sum())},
+        {"role": "remove", "name": "lower", "splats": int((y < -1).sum())},
+    ]
+    assert len(read_ply(tmp_path / "out.ply")) == found.keep.sum()
+
+
+def test_levels_of_a_file_go_by_volumes(splats, views, tmp_path):
+    """No level holds what is forced out, and each holds what is protected."""
+    path = scene(splats, tmp_path / "in.ply")
+
+    told = lod_file(path, tmp_path / "out", views, Levels((0.5, 0.4)), zones=ZONES)
+
+    x = splats.means[:, 0].astype(np.float32)
+    for entry in told["levels"]:
+        level = read_ply(tmp_path / "out" / entry["file"]).splats()
+        assert (level.means[:, 0] < 1.0).all()
+        assert (level.means[:, 0] < -2.0).sum() >= (x < -2.0).sum()
+    assert [fact["role"] for fact in told["volumes"]] == ["keep", "protect", "remove"]

@@ -1,0 +1,100 @@
+"""docs/report.md names every key that is written, and none that is not."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from refine_addon.command import main
+
+from .test_command_clean import files  # noqa: F401 - a fixture
+
+SECTIONS = (Path(__file__).parents[2] / "docs/report.md").read_text("utf-8").split("\n## ")
+CAMERAS = ["--cameras", "."]
+ABSORBING = ["--absorb", "--clean", "--ratio", ".3"]
+RUNS = {
+    "prune": [["-o", "a.splat", *ABSORBING, *CAMERAS], ["--dry-run", "--max-mb", "9", *CAMERAS]],
+    "score": [["-o", "scored.ply", *CAMERAS]],
+    "clean": [["--reasons", "front,isolated,giant,needle,transparent", *CAMERAS]],
+    "convert": [["b.splat"]],
+    "lod": [["-o", "levels", "--nested", *CAMERAS]],
+    "info": [[]],
+}
+
+
+def documented(title):
+    """Return the keys in the table of a section, each with what stands in its second column."""
+    section = next(text for text in SECTIONS if text.startswith(title))
+    rows = re.findall(r"^\| (`.*?) \| (.*?) \|", section, re.MULTILINE)
+    return [(key, text) for keys, text in rows for key in re.findall(r"`([^`]+)`", keys)]
+
+
+def written(value, name=""):
+    """Yield the dotted names of all values in a JSON value; those in lists once for each item."""
+    if isinstance(value, dict):
+        for key, inner in value.items():
+            yield from written(inner, f"{name}.{key}" if name else key)
+    elif isinstance(value, list) and value and isinstance(value[0], dict):
+        for inner in value:
+            yield from written(inner, f"{name}[]")
+    else:
+        yield name
+
+
+def missing(names, patterns):
+    """Return the names that no pattern has; one that ends in ``.*`` has all that begin so."""
+    exact = {pattern for pattern in patterns if not pattern.endswith("*")}
+    starts = tuple(pattern[:-1] for pattern in patterns if pattern.endswith("*"))
+    return {name for name in names if name not in exact and not name.startswith(starts or "\0")}
+
+
+def reports(command):
+    """Yield the report of each run of a command, in the current folder."""
+    for options in RUNS[command]:
+        arguments = [command, "scene.ply", *options, "--quiet"]
+        assert main([*arguments, "--report", "report.json", "--overwrite"]) == 0
+        yield json.loads(Path("report.json").read_text())
+
+
+@pytest.mark.parametrize("command", RUNS)
+def test_every_key_of_a_report_is_in_the_reference(files, monkeypatch, command):  # noqa: F811
+    """And every key that the reference has for the command is written by one of its runs.
+
+    Without a curve `quality` itself is null.
+    """
+    monkeypatch.chdir(files)
+    keys = [key for key, of in documented("An entry") if command in of.split(", ")]
+    if command == "lod":
+        keys += [key for key, _ in documented("The manifest")]
+
+    found = set()
+    for report in reports(command):
+        assert set(report) == {key for key, _ in documented("The file")}
+        found |= set(written(report["results"][0]))
+    found.discard("quality")
+    keys = [key for key in keys if key not in ("levels", "quality")]
+
+    assert missing(found, keys) == set()
+    assert [key for key in keys if len(missing(found, [key])) == len(found)] == []
+
+
+def test_the_manifest_is_in_the_reference(files, monkeypatch):  # noqa: F811
+    """Key by key."""
+    monkeypatch.chdir(files)
+    list(reports("lod"))
+
+    found = set(written(json.loads(Path("levels/lod.json").read_text())))
+
+    assert found == {key for key, _ in documented("The manifest")} - {"levels"}
+
+
+def test_an_input_that_fails_has_three_keys(files, monkeypatch):  # noqa: F811
+    """As the reference says."""
+    monkeypatch.chdir(files)
+    assert main(["info", "nothing.ply", "--report", "report.json", "--quiet"]) == 1
+
+    (entry,) = json.loads(Path("report.json").read_text())["results"]
+    assert list(entry) == ["status", "input", "error"]

@@ -1,0 +1,105 @@
+"""Protect and crop in a window: marks and volumes in the panel, and in every mode of the view."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import extension
+import numpy as np
+from view import Show
+from window import Hand
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+
+
+def main(cloud: str, cameras: str, picture: str) -> Generator[float, None, dict[str, Any]]:
+    """Mark splats, add volumes, look, score, look again, and move a volume.
+
+    Parameters
+    ----------
+    cloud, cameras
+        Files of splats and cameras.
+    picture
+        Where pictures of the whole screen go, with ``{}`` for the mode.
+
+    Yields
+    ------
+    float
+        Seconds to wait.
+    """
+    extension.enable()
+    yield 1.0
+    demands = importlib.import_module(f"{extension.MODULE}.demands")
+    show = Show(picture)
+    hand = Hand()
+    yield from hand.press("ESC")  # the splash screen
+    bpy.data.batch_remove(bpy.data.objects)
+    show.call(bpy.ops.refine.import_ply, filepath=cloud)
+    show.call(bpy.ops.refine.import_cameras, filepath=cameras)
+    show.call(bpy.ops.view3d.view_camera)
+    splats = bpy.data.objects["point_cloud"]
+    bpy.context.view_layer.objects.active = splats
+    settings = bpy.context.scene.refine
+    settings.method = "closed-form"
+    yield from hand.open_tab()
+
+    mark(splats, 1000)
+    show.call(bpy.ops.refine.protect, mode="ADD")
+    for shape, role in (("SPHERE", "PROTECT"), ("BOX", "REMOVE"), ("BOX", "KEEP")):
+        show.call(bpy.ops.refine.add_volume, shape=shape, role=role)
+    box = settings.volumes[1].object
+    box.location.x += 0.8 * box.scale.x
+    yield from wait(lambda: not marked(demands, splats, 0))
+    found: dict[str, Any] = {"unscored": demands.facts(splats.data)}
+    for mode in ("SCENE", "GOES"):
+        show.call(bpy.ops.refine.view, mode=mode)
+        found[f"unscored {mode}"] = yield from show.picture(f"unscored-{mode}")
+
+    yield from open_panel(hand)
+    found["panel"] = yield from show.picture("panel")
+
+    show.call(bpy.ops.refine.score)
+    for mode in ("SCENE", "HEAT", "STAYS", "GOES"):
+        show.call(bpy.ops.refine.view, mode=mode)
+        yield 1.0
+        found[mode] = yield from show.picture(mode)
+    before = demands.facts(splats.data)["forced"]
+    box.location.x -= 0.5
+    yield from wait(lambda: not marked(demands, splats, before))
+    found["moved"] = demands.facts(splats.data)["forced"] - before
+    found["failure"] = show.draw.failure()
+    return found
+
+
+def open_panel(hand: Hand) -> Generator[float, None, None]:
+    """Have the panel open, which Blender then puts below the others; show it."""
+    panel = bpy.types.REFINE_PT_volumes
+    bpy.utils.unregister_class(panel)
+    panel.bl_options = set()
+    bpy.utils.register_class(panel)
+    yield 1.0
+    yield from hand.scroll(down=True)
+    yield 1.0
+
+
+def mark(splats: bpy.types.Object, count: int) -> None:
+    """Select so many splats, as edit mode leaves it."""
+    flags = np.arange(len(splats.data.vertices)) < count
+    splats.data.vertices.foreach_set("select", flags)
+
+
+def marked(demands: Any, splats: bpy.types.Object, count: int) -> bool:
+    """Tell whether so many splats are said to go."""
+    return demands.facts(splats.data).get("forced") == count
+
+
+def wait(is_so: Any) -> Generator[float, None, None]:
+    """Let Blender work until something is so, and a little longer; ten seconds at most."""
+    for _ in range(50):
+        yield 0.2
+        if is_so():
+            break
+    yield 1.0
