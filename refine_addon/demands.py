@@ -133,7 +133,7 @@ def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
         key = _digest(repr((obj.empty_display_type, size)).encode(), matrix.tobytes())
         return Zone(role, label, _Recalled(label, key, partial(Placed, volume, matrix)), idle)
     if obj.type != "MESH":
-        kind = obj.type.replace("_", " ").lower()
+        kind = f"of type {obj.type}"
         if obj.type == "EMPTY":
             kind = f"an empty shown as {obj.empty_display_type.replace('_', ' ').lower()}"
         msg = f"{label}: is {kind}, {UNFIT}"
@@ -162,8 +162,11 @@ def mark(checked: SplatObject, found: Forced) -> None:
             mesh_edit.mark_removed(checked.obj, removed)
     elif not elsewhere:
         mesh_attributes.remove_attribute(mesh, mesh_edit.REMOVE)
-    volumes = [[fact["name"], fact["splats"]] for fact in found.facts]
-    _note(mesh, {**found.counts(), "volumes": volumes})
+    if found.facts or found.protected is not None:
+        volumes = [[fact["name"], fact["splats"]] for fact in found.facts]
+        _note(mesh, {**found.counts(), "volumes": volumes})
+    elif FACTS in mesh:
+        del mesh[FACTS]
 
 
 def refresh(scene: bpy.types.Scene, checked: SplatObject) -> Forced:

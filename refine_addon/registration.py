@@ -34,6 +34,12 @@ from .ui.panel import (
 )
 from .ui.preferences import RefinePreferences
 from .ui.properties import RefineSettings
+from .ui.remedies import (
+    REFINE_OT_add_ring,
+    REFINE_OT_keep_unseen,
+    REFINE_OT_leave_out,
+    REFINE_OT_turn_cameras,
+)
 from .ui.view_operators import REFINE_OT_view
 from .ui.volumes import (
     REFINE_OT_add_volume,
@@ -68,6 +74,10 @@ CLASSES = (
     REFINE_OT_convert,
     REFINE_OT_export_ply,
     REFINE_OT_levels,
+    REFINE_OT_turn_cameras,
+    REFINE_OT_add_ring,
+    REFINE_OT_leave_out,
+    REFINE_OT_keep_unseen,
     REFINE_FH_ply,
     REFINE_PT_splats,
     REFINE_PT_cameras,

@@ -75,7 +75,43 @@ MUTANTS = {
         ("<= side.half * z", "<= side.half", "image of another depth"),
         ("(z >= planes[0]) &", "(z > planes[0]) &", "near plane excluded"),
     ],
-    "scoring/closed_form.py": [
+    "radix.py": [
+        ("(values + values.dtype.type(0.0))", "values", "-0 before 0"),
+        ("keys[undefined] = ~unsigned(0)", "keys[undefined] = unsigned(0)", "NaN is the lowest"),
+        ("ranks = [(total - 1) // 2,", "ranks = [total // 2,", "upper median"),
+        ('side="right"', 'side="left"', "off by one"),
+    ],
+    "tiles/units.py": [
+        ("room -= stop - start", "room = room", "units beyond their rows"),
+        ("tile.begin + part.start", "tile.begin + 0 * part.start", "always the first rows"),
+        ("!= (tile.size, tile.changed)", "!= (tile.size, found.st_mtime_ns)", "time not compared"),
+    ],
+    "tiles/steps.py": [
+        (
+            'found["values"] < np.float32(rule.threshold)',
+            'found["values"] <= np.float32(rule.threshold)',
+            "threshold goes",
+        ),
+        ("rule.left[unit.index]", "rule.left[0]", "ties of the first unit"),
+        ("if part.tile == tile:", "if True:", "rows of other tiles"),
+        (
+            "        if noted:\n            self.folder.note(name, result)",
+            "        if False:\n            pass",
+            "nothing is done for good",
+        ),
+    ],
+    "tiles/folder.py": [
+        ("result or ()]", "()]", "results forgotten"),
+        ("fcntl.LOCK_EX | fcntl.LOCK_NB", "fcntl.LOCK_SH | fcntl.LOCK_NB", "two runs at once"),
+    ],
+    "tiles/prune.py": [
+        ("(amount - below - before)", "(amount - below - 0 * before)", "ties in each unit"),
+        ("except Exception:\n            job.folder.remove()", "except Exception:", "leavings"),
+        ("kept * tile.row_bytes)", "kept * tile.row_bytes + shorter)", "size of another header"),
+        ("if target.resolve() in read:", "if False:", "tiles replaced while read"),
+        ("if target in targets[:place]:", "if False:", "one output for two tiles"),
+    ],
+    "scoring/closed_form_block.py": [
         ("total *= self.alpha[piece]", "total *= self.alpha[piece] ** 2", "opacity twice"),
         ("LUMA = (0.299, 0.587, 0.114)", "LUMA = (0.114, 0.587, 0.299)", "BGR"),
         ("largest + middle", "largest + smallest", "wrong two scales"),
@@ -83,8 +119,8 @@ MUTANTS = {
         ("depth.ravel()[index] + away", "depth.ravel()[index]", "depth beside the camera"),
         ("between > inside", "beyond > 0.0", "planes forgotten outside the image"),
         (
-            "weight * powers[cells[piece]]",
-            "powers[cells[piece]]",
+            "weight * powers[self.cells[piece]]",
+            "powers[self.cells[piece]]",
             "neighbours count from the first",
         ),
     ],
@@ -96,11 +132,19 @@ MUTANTS = {
         (" - 5.0 / math.log(10.0) * relative", "", "chance not mended"),
         ("np.where(back < on, before, after)", "after", "only those behind take over"),
         ('order[np.argsort(protected[order], kind="stable")]', "order", "protection forgotten"),
+        ("weights @ values / weights.sum()", "values.mean(axis=0)", "views count alike"),
+    ],
+    "scoring/alignment.py": [
+        (" or there >= WHOLE * count", "", "rings around all are judged"),
+        ("spans.max() < SMALL", "spans.min() < SMALL", "what is thin is far"),
+        ("            if view.weight:", "            if True:", "views of weight 0 are far"),
+        ("weight / (1.0 + square[lines.met[owner]])", "weight", "blobs are fine"),
     ],
     "selection.py": [
-        ("ties[: count", "ties[-count :][: count", "ties from the end"),
-        ("count - 1)[count - 1]", "count)[count]", "off by one"),
-        ("free & (values < edge)", "(values < edge)", "protection forgotten"),
+        ("ties[: max(left, 0)]", "ties[-left:]", "ties from the end"),
+        ("[amount - 1])[0]", "[amount])[0]", "off by one"),
+        ("else free\n    keys", "else slice(None)\n    keys", "protection forgotten"),
+        ("np.cumsum(each) - each < left", "np.cumsum(each) < left", "a row of text too many"),
         ("Fraction(repr(float(self.ratio)))", "self.ratio", "binary ratio"),
         ("count = min(count or 0, len(self._values))", "count = count or 0", "protected counted"),
         ("self._seen = np.sort(scores.seen[free])", "self._seen = scores.seen", "not in order"),
@@ -132,6 +176,7 @@ MUTANTS = {
             "len(order) // 2",
             "median without weights",
         ),
+        ("rotation @ rotation.T, center=", "rotation @ rotation, center=", "turned back"),
     ],
     "formats/compressed_ply.py": [
         (
@@ -573,7 +618,7 @@ MUTANTS = {
 """Module of core -> lines to change, what they become, and what is wrong then."""
 
 TESTS = {
-    "closed_form": ["frustum.py", "scoring/adaptive.py"],
+    "closed_form": ["frustum.py", "scoring/adaptive.py", "scoring/closed_form_block.py"],
     "occlusion": [
         "scoring/measuring.py",
         "scoring/froxels.py",
@@ -597,6 +642,7 @@ TESTS = {
     "glb": ["formats/glb_document.py"],
     "viewport_arrays": ["../viewport/arrays.py"],
     "command_counts": ["report.py"],
+    "tiles": ["tiles/units.py", "tiles/steps.py", "tiles/folder.py", "tiles/prune.py"],
     "levels": ["levels/lod.py", "levels/distance.py", "levels/files.py"],
     "pictures": ["png.py", "picture_files.py"],
 }

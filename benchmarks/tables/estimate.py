@@ -6,7 +6,9 @@
 
 For a scene's folder see `evaluate`. The splats are deleted by occlusion's order, and absorbed; the
 estimates are those of the reports. Every view that scores is rendered. "Expected" is what a result
-without absorbing says of absorbing. With `--psnr` the pictures are those of that budget.
+without absorbing says of absorbing. With `--psnr` the pictures are those of that budget. The last
+columns are of single views: by how much their estimates are off on average and at most, and which
+place the view that is expected to change most has among those that do (1: it does).
 """
 
 from __future__ import annotations
@@ -18,14 +20,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from refine_addon.core.errors import RefineError
-from refine_addon.core.pipeline import Settings, prune
+from refine_addon.core.pipeline import Settings, prune, with_quality
 from refine_addon.core.selection import Budget
 
 from .evaluate import Evaluator, read_scene
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+
+    from numpy.typing import NDArray
 
     from refine_addon.core.splats import Splats
     from refine_addon.core.views import ViewSet
@@ -34,6 +40,7 @@ DELETE, ABSORB = "delete", "absorb"
 HEADING = (
     f"{'scene':12}{'':10}{'budget':>12}{'removed':>9}{'estimate':>10}{'truth':>8}{'off by':>8}"
     f"{'expected':>10}{'seconds':>9}"
+    f"{'views off':>11}{'at most':>9}{'worst is':>9}"
 )
 
 
@@ -53,6 +60,10 @@ class Estimated:
         What a result without absorbing says of absorbing, dB.
     seconds : float
         Of the prune.
+    single : (V,) float64
+        By how much the estimates of single views exceed the truth, dB.
+    worst : int
+        Place of the view of the lowest estimate among the views by their truth, from 1.
     """
 
     way: str
@@ -62,6 +73,8 @@ class Estimated:
     truth: float
     expected: float | None
     seconds: float
+    single: NDArray[np.float64]
+    worst: int
 
     @property
     def off(self) -> float:
@@ -93,14 +106,21 @@ def measure(
             estimate = result.report["estimated_psnr"]
             if estimate is None:
                 raise RefineError(result.report["estimated_psnr_note"])
+            renders, gone = evaluator.evaluate(left).renders, 1.0 - float(result.keep.mean())
+            truth, curve = renders.values["psnr"], with_quality(result.scores).quality
+            assert curve is not None  # noqa: S101 - there is an estimate
+            of_views = curve.of_views(gone, absorb=way == ABSORB)
+            guess = np.array([of_views[name] for name in renders.names])  # (V,)
             yield Estimated(
                 way,
                 budget,
-                1.0 - float(result.keep.mean()),
+                gone,
                 estimate,
-                float(evaluator.evaluate(left).renders.mean["psnr"]),
+                renders.mean["psnr"],
                 result.report["estimated_psnr_absorbed"] if way == DELETE else None,
                 seconds,
+                guess - truth,
+                1 + int(np.count_nonzero(truth < truth[np.argmin(guess)])),
             )
 
 
@@ -133,6 +153,7 @@ def _line(name: str, row: Estimated) -> str:
     return (
         f"{name:12}{row.way:10}{goal:>12}{row.removed:9.1%}{row.estimate:10.2f}{row.truth:8.2f}"
         f"{row.off:+8.2f}{expected:>10}{row.seconds:9.1f}"
+        f"{np.abs(row.single).mean():11.2f}{np.abs(row.single).max():9.2f}{row.worst:9}"
     )
 
 

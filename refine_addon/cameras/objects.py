@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from ..core.affine import quaternion
+from ..core.affine import QUARTER, quaternion
 from ..core.errors import RefineError
 from ..core.views import View
 
@@ -27,7 +27,8 @@ WEIGHT = "refine_weight"
 SOURCE = "refine_view"
 """Custom property of an imported camera: the view of the file in full precision, as JSON."""
 
-UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
+UPRIGHT = np.eye(4)
+UPRIGHT[:3, :3] = QUARTER
 """A quarter turn about x: the y-down world of COLMAP to the z-up world of Blender."""
 
 SENSOR = 36.0
@@ -155,7 +156,7 @@ def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
     bpy.types.Object
         In no collection yet.
     """
-    view = turned(view, UPRIGHT) if upright else view
+    view = view.turned(QUARTER) if upright else view
     name = PurePosixPath(view.name).name or "view"
     data = bpy.data.cameras.new(name)
     data.sensor_fit = "HORIZONTAL"
@@ -169,8 +170,36 @@ def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
     _place(obj, view)
     if view.weight != 1.0:
         obj[WEIGHT] = view.weight
-    obj[SOURCE] = json.dumps(_noted(view, obj))
+    obj[SOURCE] = json.dumps(_noted(view, obj) | {"upright": upright})
     return obj
+
+
+def quarter_turn(obj: bpy.types.Object, view: View, axes: NDArray[np.float64]) -> int | None:
+    """Return by how many quarters about x a camera is to be turned to stand as in its file.
+
+    Parameters
+    ----------
+    obj : bpy.types.Object
+        The camera.
+    view : View
+        What it sees now.
+    axes : (3, 3) float64
+        Rotation to the world of an object that holds splats as their file does.
+
+    Returns
+    -------
+    {0, 1, -1} or None
+        By `QUARTER` or its inverse; None where it was not imported, or stands otherwise.
+    """
+    source = _source(obj)
+    if not source or not isinstance(source.get("upright"), bool):
+        return None
+    in_file = np.array(source["rotation"]) @ (QUARTER if source["upright"] else np.eye(3))
+    turn = axes @ in_file.T @ view.rotation  # from where the camera looks to where its file says
+    for number, quarter in ((0, np.eye(3)), (1, QUARTER), (-1, QUARTER.T)):
+        if np.abs(turn - quarter).max() < SHEAR:
+            return number
+    return None
 
 
 def _intrinsics(data: bpy.types.Camera, size: tuple[int, int], aspect: float) -> dict[str, Any]:
@@ -230,16 +259,6 @@ def _snapped(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     snapped = matrix.copy()
     snapped[:3, :3] = scale * signs if abs(scale - 1.0) > _RESIDUE else signs
     return snapped
-
-
-def turned(view: View, matrix: NDArray[np.float64]) -> View:
-    """Return a view moved with the world by a rigid (4, 4) matrix."""
-    linear = matrix[:3, :3]
-    return replace(
-        view,
-        rotation=view.rotation @ linear.T,
-        center=linear @ view.center + matrix[:3, 3],
-    )
 
 
 def _place(obj: bpy.types.Object, view: View) -> None:

@@ -9,9 +9,13 @@ import numpy as np
 
 from ..core.errors import RefineError
 from ..core.views import View, ViewSet
-from .objects import SHEAR, camera_from_view, turned, view_from_camera, world_matrix
+from ..mesh.layout import LAYOUT
+from ..mesh.native import is_native
+from .objects import SHEAR, camera_from_view, quarter_turn, view_from_camera, world_matrix
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import bpy
     from numpy.typing import NDArray
 
@@ -166,7 +170,31 @@ def views_from_scene(
         msg = f"no cameras: {where}; scoring needs at least one"
         raise RefineError(msg)
     depsgraph = context.evaluated_depsgraph_get()
-    return ViewSet(tuple(view_from_camera(camera, scene, depsgraph) for camera in cameras))
+    views = tuple(view_from_camera(camera, scene, depsgraph) for camera in cameras)
+    return ViewSet(views, turn=_turn(cameras, views, splats, depsgraph))
+
+
+def _turn(
+    cameras: Sequence[bpy.types.Object],
+    views: Sequence[View],
+    splats: bpy.types.Object | None,
+    depsgraph: bpy.types.Depsgraph,
+) -> int | None:
+    """Return by how many quarters about x cameras are to be turned; see `ViewSet`.
+
+    It is known where splats and at least half of the cameras were imported, and stand alike.
+    """
+    if splats is None or not (LAYOUT in splats.data or is_native(splats.data)):
+        return None
+    linear = world_matrix(splats, depsgraph)[:3, :3]
+    scale = np.cbrt(np.linalg.det(linear))
+    axes = linear / scale if scale else linear
+    if np.abs(axes @ axes.T - np.eye(3)).max() > SHEAR:
+        return None
+    found = [quarter_turn(camera, view, axes) for camera, view in zip(cameras, views, strict=True)]
+    turns = [turn for turn in found if turn is not None]
+    alike = len(set(turns)) == 1 and 2 * len(turns) >= len(cameras)
+    return turns[0] if alike else None
 
 
 def chosen_cameras(
@@ -219,4 +247,4 @@ def _against(
             "see different splats: choose one frame"
         )
         raise RefineError(msg)
-    return turned(view, motion)
+    return view.turned(motion[:3, :3], motion[:3, 3])

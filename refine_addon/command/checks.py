@@ -162,6 +162,10 @@ def _check_source(parser: argparse.ArgumentParser, given: argparse.Namespace) ->
 def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     if given.clean and given.object:
         parser.error("--clean goes with INPUT files, not with --object")
+    if given.together:
+        _check_together(parser, given)
+    elif given.workers is not None or given.scheduler:
+        parser.error("--workers and --scheduler go with --together")
     _check_source(parser, given)
     if given.object:
         if given.output_dir:
@@ -174,6 +178,21 @@ def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
         if not (given.output or given.output_dir or given.dry_run):
             parser.error("expected -o OUT.ply, --output-dir DIR or --dry-run")
         _check_files(parser, given)
+
+
+def _check_together(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Refuse what needs all splats at once, or one output."""
+    alone = ("object", "output", "absorb", "clean", "psnr")
+    for name in alone:
+        if getattr(given, name):
+            option = "-o" if name == "output" else f"--{name}"
+            parser.error(f"{option} does not go with --together")
+    if given.method != "closed-form":
+        parser.error("--together scores by the closed form so far: add --method closed-form")
+    if given.workers is not None and given.scheduler:
+        parser.error("expected --workers or --scheduler, and not both")
+    if given.workers is not None and given.workers < 1:
+        parser.error(f"workers is {given.workers}, expected 1 or more")
 
 
 def _check_score(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
@@ -190,13 +209,18 @@ def _check_files(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
     if given.output and len(given.inputs) > 1:
         parser.error(f"-o takes one input, got {len(given.inputs)}: use --output-dir")
     if given.output_dir:
-        _refuse_doubles(parser, given.inputs, lambda path: given.output_dir / path.name)
-    if given.pictures:
+        advice = "call the command for each, with its own --output-dir or -o"
+        if getattr(given, "together", False):
+            advice = "rename one of them"
+        _refuse_doubles(parser, given.inputs, lambda path: given.output_dir / path.name, advice)
+    if getattr(given, "pictures", None):
+        if given.together:
+            parser.error("--pictures draws each input by itself, not --together")
         _refuse_doubles(
             parser,
             given.inputs,
             lambda path: given.pictures / f"{without_suffix(path.name)}-CAMERA-after.png",
-            "--pictures",
+            "call the command for each, with its own --pictures",
         )
 
 
@@ -204,14 +228,11 @@ def _refuse_doubles(
     parser: argparse.ArgumentParser,
     inputs: Sequence[Path],
     made: Callable[[Path], Path],
-    option: str = "--output-dir or -o",
+    advice: str,
 ) -> None:
     """Refuse two inputs of which the same file would be made."""
     first: dict[Path, Path] = {}
     for path in inputs:
         other = first.setdefault(made(path), path)
         if other is not path:
-            parser.error(
-                f"{other} and {path} would both be {made(path)}: call the command for each, with "
-                f"its own {option}"
-            )
+            parser.error(f"{other} and {path} would both be {made(path)}: {advice}")

@@ -33,6 +33,7 @@ EXAMPLES = {
         "refine prune in.ply --cameras sparse/0 --max-mb 5 --absorb -o out.ply",
         "refine prune in.ply --cameras sparse/0 --keep-inside box:-2,-2,-1,2,2,3 -o out.ply",
         f"{BLENDER}refine prune --object Splats --protect Statue --remove-inside Sky -o out.ply",
+        "refine prune *.ply --together --cameras sparse/0 --method closed-form --output-dir out",
         f"{BLENDER}refine prune --object Splats -o out.ply",
         f"{BLENDER}refine prune --object Splats --frames 1:250:10 --save",
         f"{BLENDER}refine prune --object Splats --source collection:Shot --dry-run",
@@ -153,6 +154,25 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         help="draw up to 3 of the views before and after, and what differs, as "
         "NAME-CAMERA-before.png and so on; made if it is not there; --dry-run draws them too",
     )
+    prune.add_argument(
+        "--together",
+        action="store_true",
+        help="the inputs are tiles of one scene: one budget over all of them, with a few rows at a "
+        "time in memory; for plain PLY and --method closed-form; all are written or none",
+    )
+    prune.add_argument(
+        "--workers",
+        type=int,
+        metavar="N",
+        help="with --together: on N processes of a Dask cluster, started here (needs the extra "
+        "distributed)",
+    )
+    prune.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="with --together: on the workers of this Dask scheduler, which see the same files "
+        "under the same paths",
+    )
     prune.add_argument("--dry-run", action="store_true", help="decide and report, write no splats")
     _add_common(prune)
 
@@ -255,7 +275,8 @@ def _add_object(parser: argparse.ArgumentParser) -> None:
         type=_name,
         metavar="NAME",
         help="in place of INPUT: this splat object of the open .blend, by the cameras that are "
-        "chosen in the panel there; of the panel's other settings none counts",
+        "chosen in the panel there, with what it protects and crops; of the panel's other settings "
+        "none counts",
     )
     parser.add_argument(
         "--source",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -16,6 +17,7 @@ from ..core import (
     forced,
     picture_files,
     prune_file,
+    prune_tiles,
     read_splats,
     score,
 )
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
     from ..core import ViewSet
     from ..core.formats.ply import SplatFile
     from ..core.scores import Scores
+    from ..core.tiles.workers import Workers
     from ..core.volumes import Forced
 
 
@@ -79,7 +82,9 @@ class _Run:
         self.entries: list[dict[str, Any]] = []
         self.failed = False
         self._started = time.perf_counter()
-        self._pace = Pace([_size(path) for path in options.inputs] or [0])
+        each = [_size(path) for path in options.inputs]
+        together = getattr(options, "together", False)
+        self._pace = Pace([sum(each)] if together else each or [0])
         self._cameras: dict[str, Any] = {}
 
     def views(self) -> ViewSet:
@@ -143,6 +148,10 @@ def _prune(run: _Run) -> None:
     if options.object:
         run.attempt(options.object, lambda: _prune_object(run))
         return
+    if options.together:
+        views, label = run.views(), f"{len(options.inputs)} tiles"
+        run.attempt(label, lambda: _prune_together(run, label, views))
+        return
     _each(run, _prune_one)
 
 
@@ -193,6 +202,45 @@ def _prune_one(run: _Run, source: Path, output: Path | None, views: ViewSet) -> 
     run.terminal.clear()
     _say_result(run, str(source), result.report)
     return result.report
+
+
+def _prune_together(run: _Run, label: str, views: ViewSet) -> dict[str, Any]:
+    options = run.options
+    try:
+        with _workers(options) as workers:
+            done = prune_tiles(
+                options.inputs,
+                None if options.dry_run else options.output_dir,
+                views,
+                budget(options),
+                settings(options),
+                overwrite=options.overwrite,
+                progress=run.progress(label),
+                workers=workers,
+            )
+    except KeyboardInterrupt:
+        run.terminal.clear()
+        if not options.dry_run:
+            run.terminal.say("the same command goes on where this one was")
+        raise
+    run.terminal.clear()
+    _say_result(run, label, done)
+    for tile in done["tiles"]:
+        share = (tile["before"] - tile["kept"]) / max(tile["before"], 1)
+        run.terminal.say(
+            f"  {Path(tile['input']).name}: {tile['kept']:,} of {tile['before']:,} splats "
+            f"({share:.1%} removed), {sizes(tile['input_bytes'], tile['output_bytes'])}"
+        )
+    return done
+
+
+def _workers(options: argparse.Namespace) -> contextlib.AbstractContextManager[Workers | None]:
+    """Return who works on tiles; None for this process alone."""
+    if options.workers is None and not options.scheduler:
+        return contextlib.nullcontext()
+    from ..core.tiles.cluster import cluster  # noqa: PLC0415 - needs Dask
+
+    return cluster(options.workers, options.scheduler)
 
 
 def _prune_object(run: _Run) -> dict[str, Any]:

@@ -24,6 +24,7 @@ from .solid import Solid
 from .splats import Splats
 from .survivors import survivor_columns
 from .task import METHODS, Result, Settings
+from .tiles.prune import prune_tiles
 from .views import View, ViewSet
 from .volumes import Box, Placed, Sphere, Zone, forced
 
@@ -58,6 +59,7 @@ __all__ = [
     "lod_file",
     "prune",
     "prune_file",
+    "prune_tiles",
     "rank",
     "read_cameras",
     "read_ply",

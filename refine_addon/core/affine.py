@@ -14,6 +14,9 @@ from .splats import Splats, rotation_matrices
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""A quarter turn about x: the y-down world of COLMAP to the z-up world of Blender."""
+
 UNIFORM_TOLERANCE = 1e-4
 """Relative difference between the scales of a matrix that still counts as uniform scaling."""
 

@@ -20,6 +20,7 @@ from .absorbing.merging import ViewSums
 from .quality import FEWEST, left_to_lose, out_of_reach
 from .report import Clock, make_report, size_in_words
 from .scoring import auto, closed_form, occlusion, sight_lines
+from .scoring.alignment import alignment
 from .selection import Budget
 from .task import DEFAULTS, Result, Settings, Task
 from .volumes import refuse_all
@@ -123,9 +124,9 @@ def score(  # noqa: PLR0913 - as `prune`
             )
         if quality and scores.sights is None:
             ahead = part(whole, 0.9, 0.95)
-            sights = sight_lines.sights(splats, used, progress=ahead, threads=threads)
-            scores = replace(scores, sights=sights)
-    scores = _with_views(scores, views)
+            lines = sight_lines.sights(splats, used, progress=ahead, threads=threads)
+            scores = replace(scores, sights=lines)
+    scores = _with_views(scores, splats, views, used, part(whole, 0.95, 0.95), threads)
     return with_quality(scores, progress=part(whole, 0.95, 1.0), threads=threads)
 
 
@@ -154,10 +155,30 @@ def with_quality(
     return replace(scores, quality=curve)
 
 
-def _with_views(scores: Scores, views: ViewSet) -> Scores:
-    """Return scores with the number and the note of all views, not only of those used."""
+def _with_views(
+    scores: Scores,
+    splats: Splats,
+    views: ViewSet,
+    used: ViewSet,
+    progress: Progress,
+    threads: int | None,
+) -> Scores:
+    """Return scores with what there is to say of all views, not only of those used.
+
+    Parameters
+    ----------
+    scores : Scores
+    splats : Splats
+    views, used : ViewSet
+        Those given, and those chosen from them.
+    progress : callable
+    threads : int, optional
+    """
     notes = (*scores.notes, views.note) if views.note else scores.notes
-    return replace(scores, views_given=len(views), notes=notes)
+    # Beside the closed form, measuring would take as long as scoring.
+    some = None if scores.sights is None else used
+    found = alignment(splats, views, some, progress=progress, threads=threads)
+    return replace(scores, views_given=len(views), notes=notes, alignment=found)
 
 
 def prune(  # noqa: PLR0913 - the main function of core; all but three are optional
@@ -283,7 +304,7 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     else:
         psnr = _estimated(scores, keep, threads)
     facts = make_report(scores, keep, task.budget, task.settings, clock)
-    facts |= _quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
+    facts |= quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
     if psnr is None and scores.sights is not None:
         facts["notes"].append(UNSEEN)
     facts["budget_remark"] = _remark(task, keep, psnr)
@@ -304,11 +325,16 @@ def _remark(task: Task, keep: NDArray[np.bool_], psnr: float | None) -> str:
         return out_of_reach(budget.psnr, gone, len(keep), psnr)
     if budget.max_mb is not None and not gone:
         rows = np.broadcast_to(task.row_bytes, len(keep)).sum() + task.fixed_bytes
-        return f"already {size_in_words(int(rows))}: nothing was removed"
+        return nothing_removed(int(rows))
     return ""
 
 
-def _quality_facts(
+def nothing_removed(size: int) -> str:
+    """Return the remark on a file that is no larger than it may be; `size` is its bytes."""
+    return f"already {size_in_words(size)}: nothing was removed"
+
+
+def quality_facts(
     scores: Scores, keep: NDArray[np.bool_], psnr: float | None, *, absorbed: bool
 ) -> dict[str, Any]:
     """Return what a report says about the quality of the pictures.
@@ -446,15 +472,13 @@ def _score_once(
     splats: Splats, views: ViewSet, settings: Settings, progress: Progress, threads: int | None
 ) -> tuple[Scores, Measured]:
     """Return scores by occlusion in one round, and what was measured of each splat."""
+    used = views.spread(settings.views)
     with np.errstate(under="ignore"):  # as in `score`
         scores, measured = occlusion.score_once(
-            splats,
-            views.spread(settings.views),
-            settings.occlusion,
-            progress=progress,
-            threads=threads,
+            splats, used, settings.occlusion, progress=part(progress, 0.0, 0.99), threads=threads
         )
-    return _with_views(scores, views), measured
+    ahead = part(progress, 0.99, 1.0)
+    return _with_views(scores, splats, views, used, ahead, threads), measured
 
 
 def absorb_removed(  # noqa: PLR0913 - as `prune`

@@ -7,13 +7,13 @@ itself, at most 100, and of these the mean. `scoring.sight_lines` estimates it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -63,6 +63,8 @@ class Quality:
         About what absorbing reaches with as many survivors; dB, never rising.
     foretold : bool
         Whether that is near enough to be told to anybody.
+    views : dict of str to (L,) float64
+        As `psnr`, of single views by their names; those that no line of sight tells of are missing.
 
     Examples
     --------
@@ -75,6 +77,7 @@ class Quality:
     psnr: NDArray[np.float64]
     absorbed: NDArray[np.float64]
     foretold: bool = True
+    views: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
     def at(self, share: float, *, absorb: bool = False) -> float:
         """Return the PSNR with a share of the splats removed, dB; with `absorb`, about.
@@ -83,6 +86,25 @@ class Quality:
         ``share / (1 - share)``, which it nearly is; beyond the last it stays.
         """
         return float(np.interp(_log_odds(share), *self._points(absorb=absorb)))
+
+    def of_views(self, share: float, *, absorb: bool = False) -> dict[str, float]:
+        """Return the PSNR of single views with a share of the splats removed, dB.
+
+        Absorbing is taken to gain as much in each view as it gains in all together.
+
+        Examples
+        --------
+        >>> curve = Quality(np.array([0.2, 0.5]), *np.array([[50.0, 40.0], [53.0, 46.0]]))
+        >>> curve.views["a"] = np.array([48.0, 36.0])
+        >>> curve.of_views(0.5), curve.of_views(0.5, absorb=True)
+        ({'a': 36.0}, {'a': 42.0})
+        """
+        odds, place = self._odds(), _log_odds(share)
+        gain = self.at(share, absorb=True) - self.at(share) if absorb else 0.0
+        return {
+            name: min(float(np.interp(place, odds, _begun(own))) + gain, PSNR_CAP)
+            for name, own in self.views.items()
+        }
 
     def share(self, psnr: float, *, absorb: bool = False) -> float:
         """Return the largest share that can go while the PSNR is at least `psnr`, dB; or 0.
@@ -101,17 +123,19 @@ class Quality:
 
     def _points(self, *, absorb: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the curve with its beginning, where nothing is removed: odds and PSNR."""
-        values = self.absorbed if absorb else self.psnr
-        odds = np.concatenate([[_log_odds(0.0)], [_log_odds(float(s)) for s in self.shares]])
-        return odds, np.concatenate([[PSNR_CAP], values])
+        return self._odds(), _begun(self.absorbed if absorb else self.psnr)
+
+    def _odds(self) -> NDArray[np.float64]:
+        return np.array([_log_odds(share) for share in (0.0, *self.shares.tolist())])
 
     def facts(self) -> dict[str, Any]:
-        """Return the curve as plain JSON values."""
+        """Return the curve as plain JSON values; those of single views to hundredths of a dB."""
         return {
             "shares": self.shares.tolist(),
             "psnr": self.psnr.tolist(),
             "absorbed": self.absorbed.tolist(),
             "foretold": self.foretold,
+            "views": {name: own.round(2).tolist() for name, own in self.views.items()},
         }
 
     @classmethod
@@ -120,11 +144,14 @@ class Quality:
         names = ("shares", "psnr", "absorbed")
         try:
             shares, psnr, absorbed = (np.array((facts or {})[name], np.float64) for name in names)
-        except (KeyError, TypeError, ValueError):
+            single = dict((facts or {}).get("views") or {})  # files of older versions have none
+            views = {str(name): np.array(own, np.float64) for name, own in single.items()}
+        except (AttributeError, KeyError, TypeError, ValueError):
             return None
-        whole = len(shares) and shares.shape == psnr.shape == absorbed.shape == (len(shares),)
+        curves: Sequence[NDArray[np.float64]] = (shares, psnr, absorbed, *views.values())
+        whole = len(shares) and all(curve.shape == (len(shares),) for curve in curves)
         foretold = bool((facts or {}).get("foretold", True))
-        return cls(shares, psnr, absorbed, foretold) if whole else None
+        return cls(shares, psnr, absorbed, foretold, views) if whole else None
 
 
 def absorbed_from(
@@ -211,6 +238,11 @@ def in_words(psnr: float) -> str:
     ('about 38 dB', 'more than 60 dB')
     """
     return f"more than {UNSEEN:.0f} dB" if psnr > UNSEEN else f"about {psnr:.0f} dB"
+
+
+def _begun(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a curve with its beginning, where nothing is removed."""
+    return np.concatenate([[PSNR_CAP], values])
 
 
 def _log_odds(share: float) -> float:

@@ -84,7 +84,7 @@ def sizes_in_words(first: int, between: str, second: int) -> str:
 
 def scoring_notes(scores: Scores) -> list[str]:
     """Return what the user should know about a scoring, in sentences."""
-    notes = list(scores.notes)
+    notes = [*scores.notes, *(scores.alignment.notes() if scores.alignment else ())]
     if scores.undrawable:
         notes.append(f"{scores.undrawable} splats cannot be drawn; they rank lowest")
     return notes

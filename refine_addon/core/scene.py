@@ -81,7 +81,12 @@ def median_size(squared: NDArray[np.float64], drawable: NDArray[np.bool_]) -> fl
     """
     if not drawable.any():
         return 1.0
-    return float(np.sqrt(np.median(squared if drawable.all() else squared[drawable]))) or 1.0
+    return size_of(float(np.median(squared if drawable.all() else squared[drawable])))
+
+
+def size_of(median: float) -> float:
+    """Return the size of a scene from the median that `median_size` takes."""
+    return float(np.sqrt(median)) or 1.0
 
 
 def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -> Scene:

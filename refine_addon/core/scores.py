@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .quality import Quality
+    from .scoring.alignment import Alignment
     from .scoring.sight_lines import SightLines
 
 _DISTINCT = 1 << 24
@@ -51,6 +52,8 @@ class Scores:
         can be judged.
     quality : Quality, optional
         How close the pictures stay with ever more of these removed in the order of the scores.
+    alignment : Alignment, optional
+        How the views stand to the splats.
     """
 
     values: NDArray[np.float32]
@@ -64,6 +67,7 @@ class Scores:
     views_given: int = 0
     sights: SightLines | None = None
     quality: Quality | None = None
+    alignment: Alignment | None = None
 
     def for_all(self, rest: NDArray[np.bool_]) -> Scores:
         """Return scores of what was left of N splats as scores of them all.

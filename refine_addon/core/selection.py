@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from fractions import Fraction
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from . import radix
 from .errors import RefineError
 from .quality import PSNR_CAP
 
@@ -212,14 +213,16 @@ def select(
     free = np.ones(len(values), np.bool_) if protected is None else ~protected
     removals = _removals(scores, budget, row_bytes, fixed_bytes)
     if budget.threshold is not None:
-        keep[free & (values < _single(budget.threshold))] = False
+        keep[free & (values < single(budget.threshold))] = False
     elif budget.min_seen is not None:
-        keep[free & (scores.seen < _least_seen(budget.min_seen, scores.views_used))] = False
+        keep[free & (scores.seen < least_seen(budget.min_seen, scores.views_used))] = False
     elif removals:
-        _remove_lowest(keep, values, free, min(removals, int(np.count_nonzero(free))))
+        _remove_lowest(keep, values, free, removals)
     elif removals is None:
-        _remove_until_fitting(keep, values, free, budget, np.asarray(row_bytes), fixed_bytes)
-    _refuse_none_left(budget, len(values), int(np.count_nonzero(keep)))
+        lengths = np.asarray(row_bytes, np.int64)
+        excess = int(lengths.sum()) - budget.room(fixed_bytes)
+        _remove_lowest(keep, values, free, excess, lengths)
+    refuse_none_left(budget, len(values), int(np.count_nonzero(keep)))
     return keep
 
 
@@ -281,16 +284,16 @@ class Tally:
         budget.refuse_meaningless(scores.method, frustum=scores.frustum)
         count = _removals(scores, budget, row_bytes, fixed_bytes)
         if budget.threshold is not None:
-            count = int(np.searchsorted(self._values, _single(budget.threshold)))
+            count = int(np.searchsorted(self._values, single(budget.threshold)))
         elif budget.min_seen is not None:
-            least = _least_seen(budget.min_seen, scores.views_used)
+            least = least_seen(budget.min_seen, scores.views_used)
             count = int(np.searchsorted(self._seen, least))
         count = min(count or 0, len(self._values))
-        _refuse_none_left(budget, len(scores.values), len(scores.values) - count)
+        refuse_none_left(budget, len(scores.values), len(scores.values) - count)
         return count
 
 
-def _single(threshold: float) -> np.float32:
+def single(threshold: float) -> np.float32:
     """Return a threshold in the precision of scores; beyond its range all of them are below."""
     with np.errstate(over="ignore"):
         return np.float32(threshold)
@@ -306,7 +309,7 @@ def _removals(scores: Scores, budget: Budget, row_bytes: RowBytes, fixed_bytes: 
     return budget.removals(len(scores.values), row_bytes, fixed_bytes)
 
 
-def _least_seen(percentage: float, views: int) -> int:
+def least_seen(percentage: float, views: int) -> int:
     """Return in how many of the views a splat must lie to stay.
 
     In exact fractions: a splat that lies in 16 of 64 views lies in 25 % of them, and stays.
@@ -314,7 +317,8 @@ def _least_seen(percentage: float, views: int) -> int:
     return math.ceil(Fraction(repr(float(percentage))) * views / 100)
 
 
-def _refuse_none_left(budget: Budget, before: int, after: int) -> None:
+def refuse_none_left(budget: Budget, before: int, after: int) -> None:
+    """Raise `RefineError` if none of the splats would stay."""
     if not after:
         msg = f"{budget.kind} would remove all {before} splats; nothing was removed"
         raise RefineError(msg)
@@ -337,34 +341,58 @@ def quality_of(scores: Scores) -> Quality:
     return scores.quality
 
 
+def lowest(
+    keys: NDArray[np.unsignedinteger[Any]],
+    edge: int,
+    left: int,
+    weights: NDArray[np.int64] | None = None,
+) -> NDArray[np.bool_]:
+    """Return which splats go, (N,): those below an edge, and the first of those at it.
+
+    Parameters
+    ----------
+    keys : (N,) unsigned
+        `radix.keys_of` their scores.
+    edge : int
+        The key of the last one that goes.
+    left : int
+        Of the splats at the edge go as many of the first as have this weight together, or more.
+    weights : (N,) int64, optional
+        By default 1 each.
+    """
+    gone: NDArray[np.bool_] = keys < edge
+    ties = np.flatnonzero(keys == edge)
+    if weights is None:
+        gone[ties[: max(left, 0)]] = True
+    else:
+        each = weights[ties]
+        gone[ties[np.cumsum(each) - each < left]] = True
+    return gone
+
+
 def _remove_lowest(
-    keep: NDArray[np.bool_], values: NDArray[np.float32], free: NDArray[np.bool_], count: int
-) -> None:
-    """Set `keep` to False for the `count` lowest `free` values; of equal ones, for the first."""
-    if not count:
-        return
-    candidates = values if free.all() else values[free]
-    edge = np.partition(candidates, count - 1)[count - 1]
-    below = free & (values < edge)
-    keep[below] = False
-    ties = np.flatnonzero(free & (values == edge))
-    keep[ties[: count - int(np.count_nonzero(below))]] = False
-
-
-def _remove_until_fitting(
     keep: NDArray[np.bool_],
     values: NDArray[np.float32],
     free: NDArray[np.bool_],
-    budget: Budget,
-    lengths: NDArray[np.int64],
-    fixed_bytes: int,
+    amount: int,
+    weights: NDArray[np.int64] | None = None,
 ) -> None:
-    """Set `keep` to False for the lowest `free` values until the rows that stay fit."""
-    places = np.flatnonzero(free)
-    order = places[np.argsort(values[places], kind="stable")]
-    excess = int(lengths.sum()) - budget.room(fixed_bytes)
-    count = int(np.searchsorted(np.cumsum(lengths[order]), excess)) + 1
-    keep[order[:count]] = False
+    """Set `keep` to False for the lowest `free` values; of equal ones, for the first.
+
+    As many of them as have the weight `amount` together, or more; by default each weighs 1.
+    """
+    some: slice | NDArray[np.bool_] = slice(None) if free.all() else free
+    keys = radix.keys_of(values[some])
+    weights = None if weights is None else weights[some]
+    amount = min(amount, len(keys) if weights is None else int(weights.sum()))
+    if amount <= 0:
+        return
+
+    def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:
+        return radix.counts(keys, prefixes, shift, weights)
+
+    edge, below = radix.find(count, 8 * keys.dtype.itemsize, [amount - 1])[0]
+    keep[some] = ~lowest(keys, edge, amount - below, weights)
 
 
 def rank(values: NDArray[np.float32]) -> NDArray[np.float64]:

@@ -281,16 +281,16 @@ def drawable(splats: Splats) -> NDArray[np.bool_]:
     return good
 
 
-def refuse_undrawable(good: NDArray[np.bool_]) -> None:
+def refuse_undrawable(good: int, total: int) -> None:
     """Raise `RefineError` if no splat can be drawn.
 
     Parameters
     ----------
-    good : (N,) bool
-        Which splats can be drawn.
+    good, total : int
+        How many splats can be drawn, and how many there are.
     """
-    if not good.any():
-        msg = f"none of the {len(good)} splats can be drawn: each is transparent or not finite"
+    if not good:
+        msg = f"none of the {total} splats can be drawn: each is transparent or not finite"
         raise RefineError(msg)
 
 

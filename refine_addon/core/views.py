@@ -77,6 +77,20 @@ class View:
         object.__setattr__(self, "rotation", left @ right)  # exactly orthonormal again
         object.__setattr__(self, "center", center)
 
+    def turned(
+        self, rotation: NDArray[np.float64], shift: NDArray[np.float64] | float = 0.0
+    ) -> View:
+        """Return the view moved with the world: p goes to ``rotation @ p + shift``.
+
+        Parameters
+        ----------
+        rotation : (3, 3) float64
+            Orthonormal.
+        shift : (3,) float64, optional
+        """
+        center = rotation @ self.center + shift
+        return replace(self, rotation=self.rotation @ rotation.T, center=center)
+
     def _check_image(self) -> None:
         numbers = (self.fx, self.fy, self.cx, self.cy, self.near, self.weight)
         if not all(math.isfinite(number) for number in numbers) or math.isnan(self.far):
@@ -124,10 +138,14 @@ class ViewSet:
         At least one has a positive weight.
     note : str
         What is not modelled of the source of the views, such as lens distortion; or "".
+    turn : int or None
+        By how many quarters about x (`affine.QUARTER`) the views are to be turned to stand to the
+        splats as in the files that both came from; None where that is not known.
     """
 
     views: tuple[View, ...]
     note: str = ""
+    turn: int | None = None
 
     def __post_init__(self) -> None:
         """Refuse a set without any view that counts.

@@ -145,6 +145,31 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
         raise RefineError(_explain(path, error)) from error
 
 
+def publish(made: Path, path: Path, *, overwrite: bool) -> None:
+    """Rename a finished file on the same disk to `path`, as `whole_file` does with its own.
+
+    Raises
+    ------
+    RefineError
+        See `whole_file`.
+    """
+    refuse_existing(path, overwrite=overwrite)
+    try:
+        target = path.resolve()
+        if not overwrite:
+            _publish_new(made, target)
+            made.unlink(missing_ok=True)  # which may be a second name now
+            return
+        with made.open("rb+") as stream:
+            mode = _inherited(
+                target, stream.fileno(), stat.S_IMODE(os.fstat(stream.fileno()).st_mode)
+            )
+            made.chmod(mode)
+        made.replace(target)
+    except (OSError, RuntimeError) as error:
+        raise RefineError(_explain(path, error)) from error
+
+
 def _prefix(target: Path) -> str:
     """Return the start of the names of a target's temporary files on this machine.
 

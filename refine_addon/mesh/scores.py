@@ -104,6 +104,7 @@ def store(  # noqa: PLR0913 - all that a note holds
             "weights": scores.facts,
             "notes": scores.notes,
             "quality": scores.quality.facts() if scores.quality else None,
+            "alignment": scores.alignment.facts() if scores.alignment else None,
             "origin": origin,
             "cameras": cameras,
             "forced": forced,

@@ -206,8 +206,8 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     ) -> Answer:
         """Store the scores on the meshes and say what came of it."""
         scores, counts = found
-        names = [view.name for view in job.views]
-        cameras = list(zip(names, counts.tolist(), strict=True))
+        pairs = zip(job.views, counts.tolist(), strict=True)
+        cameras = [(view.name, count) for view, count in pairs if view.weight]
         group, forced = splat_group.by_uids(job.uids), _forced(job)
         noted = splat_group.Noted(job.settings, job.origins, cameras, job.removed)
         splat_group.store(group, scores, noted)

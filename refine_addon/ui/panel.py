@@ -79,6 +79,7 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
         layout.use_property_decorate = False
         settings = context.scene.refine
         layout.operator("refine.import_cameras", icon="IMPORT")
+        layout.operator("refine.add_ring", icon="OUTLINER_OB_CAMERA")
         layout.prop(settings, "source")
         if settings.source == "COLLECTION":
             layout.prop(settings, "collection")
@@ -138,11 +139,7 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
             layout.label(text=f"Scored by {record['views_used']} of {views}", icon="CHECKMARK")
             if mesh_scores.unrefined(record):
                 wrapped.label(layout, context, "By the closed form, not yet refined", icon="INFO")
-            objects = splat_group.chosen(context.view_layer, obj)
-            records = tuple(each.data.get(mesh_scores.RECORD) for each in objects)
-            question = ("changes", records)
-            changed = kept.answer(question, context, lambda: staleness.changes_of(context, objects))
-            if changed:
+            if changed := _changes(context, obj):
                 text = f"Score again: {', '.join(changed)}"
                 wrapped.label(layout, context, text, icon="ERROR")
         elif mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes:
@@ -296,6 +293,13 @@ def _cameras(context: bpy.types.Context) -> list[bpy.types.Object]:
     return chosen_cameras(context, settings.source, settings.collection)
 
 
+def _changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
+    """Return what changed since the objects that are worked on were scored."""
+    objects = splat_group.chosen(context.view_layer, obj)
+    question = ("changes", tuple(each.data.get(mesh_scores.RECORD) for each in objects))
+    return kept.answer(question, context, lambda: staleness.changes_of(context, objects))
+
+
 def _draw_plan(
     layout: bpy.types.UILayout, context: bpy.types.Context, record: dict[str, Any]
 ) -> None:
@@ -320,4 +324,8 @@ def _draw_plan(
         if remark := plans.remark(plan, record):
             wrapped.label(layout, context, remark, icon="INFO")
         for warning in plans.warnings(plan, record):
-            wrapped.label(layout, context, warning, icon="ERROR")
+            wrapped.label(layout, context, warning.text, icon="ERROR")
+            if warning.remedy and not _changes(context, obj):  # else these may be put right
+                button = layout.operator(warning.remedy)
+                for name, value in warning.options.items():
+                    setattr(button, name, value)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -21,6 +21,7 @@ from ..core import pipeline
 from ..core.errors import RefineError
 from ..core.quality import in_words, out_of_reach
 from ..core.report import sizes_in_words
+from ..core.scoring.alignment import Alignment
 from ..core.selection import Tally, quality_of
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
@@ -29,6 +30,7 @@ from . import camera_list, price
 from .chart import Place
 
 if TYPE_CHECKING:
+    from ..core.scores import Scores
     from ..core.task import Task
     from .chart import Histogram
 
@@ -117,6 +119,7 @@ def at_once(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     plan = _noted(_known[0], settings) | {"key": _key(settings, objects)}
     mesh[PLAN] = json.dumps(plan | {"marked": False})
     price.move(mesh, _place(plan, settings))
+    _tell_cameras(_known[0].tally.scores, plan, settings)
 
 
 def refresh(context: bpy.types.Context) -> None:
@@ -220,8 +223,27 @@ def remark(plan: dict[str, Any], record: dict[str, Any]) -> str:
     return "The views see too little to tell dB"
 
 
-def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
-    """Return what the cameras do not know, as far as it matters to a plan, in sentences.
+@dataclass(frozen=True)
+class Warned:
+    """What the cameras do not know, and what can be done about it.
+
+    Attributes
+    ----------
+    text : str
+        A sentence.
+    remedy : str
+        Name of an operator; "" where none helps.
+    options : dict of str to Any
+        Its properties.
+    """
+
+    text: str
+    remedy: str = ""
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[Warned]:
+    """Return what the cameras do not know, as far as it matters to a plan.
 
     Parameters
     ----------
@@ -231,17 +253,31 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[str]:
         The note of the scoring.
     """
     found = []
+    stands = Alignment.from_facts(record.get("alignment"))
+    if stands.turn:
+        options = {"quarter": str(stands.turn)}
+        found.append(Warned(_sentence(stands.turned()), "refine.turn_cameras", options))
     if record["views_used"] == 1:
-        found.append("One camera decides: add others if the splats are seen from elsewhere too")
-    if text := camera_list.warning(record):
-        found.append(text)
+        text = "One camera decides: add others if the splats are seen from elsewhere too"
+        found.append(Warned(text, "refine.add_ring"))
+    useless = camera_list.useless(record)
+    least = len(useless) < len(record.get("cameras") or ())
+    remedy = "refine.leave_out" if least else "refine.add_ring"
+    texts = (camera_list.warning(record), _sentence(stands.distant()))
+    found += [Warned(text, remedy) for text in texts if text]
     unseen = plan.get("unseen", 0)
     if unseen >= MANY_UNSEEN * plan["splats"]:
         text = f"{unseen / plan['splats']:.0%} of the splats lie in no view"
         if "unseen_gone" in plan:
             text += f"; {plan['unseen_gone'] / unseen:.0%} of these go"
-        found.append(text)
+        keeps = plan.get("unseen_gone") != 0
+        found.append(Warned(text, "refine.keep_unseen" if keeps else ""))
     return found
+
+
+def _sentence(note: str) -> str:
+    """Return a note of the core as a sentence of the panel."""
+    return note[:1].upper() + note[1:]
 
 
 def _can_have(obj: bpy.types.Object) -> bool:
@@ -286,6 +322,7 @@ def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
         keep = keep if task.removed is None else keep[~task.removed]
         plan["unseen_gone"] = int(np.count_nonzero(~keep & (known.tally.scores.seen == 0)))
         price.show(mesh, known.tally.scores, known.kinds, _place(plan, settings), keep)
+        _tell_cameras(known.tally.scores, plan, settings)
     except RefineError as error:
         plan["error"] = str(error)
     mesh[PLAN] = json.dumps(plan)
@@ -365,6 +402,16 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
         remark = out_of_reach(budget.psnr, gone, rest, psnr)
         noted["remark"] = remark[:1].upper() + remark[1:]
     return noted
+
+
+def _tell_cameras(scores: Scores, plan: dict[str, Any], settings: Any) -> None:  # noqa: ANN401
+    """Have the list of the cameras say how much of each picture a plan changes."""
+    curve = None if "error" in plan else scores.quality
+    if curve is None:
+        camera_list.tell({})
+        return
+    absorb = settings.absorb and curve.foretold
+    camera_list.tell(curve.of_views(plan["removed"] / plan["splats"], absorb=absorb))
 
 
 def _place(plan: dict[str, Any], settings: Any) -> Place | None:  # noqa: ANN401

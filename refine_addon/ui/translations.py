@@ -20,10 +20,15 @@ GERMAN = {
     "A new box around the middle of the splats": "Ein neuer Quader um die Mitte der Splats",
     "A new sphere around the middle of the splats": "Eine neue Kugel um die Mitte der Splats",
     "A sphere, for the viewport": "Eine Kugel, für die 3D-Ansicht",
+    "About the world's X axis": "Um die X-Achse der Welt",
     "Absorb": "Aufnehmen",
     "Active": "Aktive",
     "Add Volume": "Volumen hinzufügen",
+    "Add a Ring of Cameras": "Einen Ring von Kameras hinzufügen",
     "Add a volume to the list": "Der Liste ein Volumen hinzufügen",
+    "Add cameras around the splats that see all of them; they decide with those there are": (
+        "Kameras um die Splats hinzufügen, die alle sehen; sie entscheiden mit den vorhandenen"
+    ),
     "Advanced": "Erweitert",
     "All cameras that are visible in the scene": "Alle Kameras, die in der Szene sichtbar sind",
     "All splats go that are in no volume of this kind": (
@@ -33,7 +38,9 @@ GERMAN = {
     "Applied: score again for more": "Angewendet: für mehr erneut bewerten",
     "Apply": "Anwenden",
     "Apply Transform": "Transformation anwenden",
+    "As Upright": "Wie Aufrecht",
     "Auto": "Automatisch",
+    "Back": "Zurück",
     "Box": "Quader",
     "Budget": "Budget",
     "By how much the PSNR of the pictures may be lower than by Occlusion, in dB": (
@@ -90,6 +97,7 @@ GERMAN = {
     "End": "Ende",
     "Every how many frames": "Jeder wievielte Frame",
     "Export Splats": "Splats exportieren",
+    "Far Away": "Weit weg",
     "File Size": "Dateigröße",
     "Find Floaters": "Schwebende finden",
     (
@@ -107,7 +115,15 @@ GERMAN = {
     "For Renders": "Für Renderbilder",
     "Format": "Format",
     "Frames": "Frames",
+    "From y down to z up, as Upright turns what is imported": (
+        "Von y unten nach z oben, wie Aufrecht Importiertes dreht"
+    ),
+    "From z up to y down": "Von z oben nach y unten",
     "Giant": "Riesig",
+    ("Give cameras that see nothing, or all from far away, the weight 0: they no longer decide"): (
+        "Kameras, die nichts oder alles von weit weg sehen, das Gewicht 0 geben: sie "
+        "entscheiden nicht mehr"
+    ),
     (
         "Give the scene the image size of the first camera, so that renders show what the "
         "cameras saw"
@@ -119,6 +135,9 @@ GERMAN = {
     "Heat Map": "Wärmebild",
     "Hide What Goes": "Verbergen, was geht",
     "Hide the splats that the budget removes": "Die Splats verbergen, die das Budget entfernt",
+    "How close its picture is estimated to stay; negative where nothing tells": (
+        "Wie nah ihr Bild nach der Schätzung bleibt; negativ, wo nichts es sagt"
+    ),
     (
         "How close the pictures of the cameras stay to those of all splats, in dB: 40 is hard "
         "to tell apart, 30 is seen"
@@ -166,14 +185,17 @@ GERMAN = {
     "It holds positions in 24 bits, all else in 8 to 10, and harmonics in 4 to 5": (
         "Es enthält Orte in 24 Bit, alles andere in 8 bis 10 und Harmonische in 4 bis 5"
     ),
+    "It sees the splats from far away": "Sie sieht die Splats von weit weg",
     "Keep": "Behalten",
     "Keep Inside": "Inneres behalten",
+    "Keep What Is Unseen": "Ungesehenes behalten",
     "Keep as many splats as fit in a file of this size": (
         "So viele Splats behalten, wie in eine Datei dieser Größe passen"
     ),
     "Keep this many splats": "So viele Splats behalten",
     "Knows what hides what; uses all views": "Weiß, was was verdeckt; nutzt alle Ansichten",
     "Last frame": "Letzter Frame",
+    "Leave Them Out": "Auslassen",
     "Levels": "Stufen",
     "MB": "MB",
     "Make Levels": "Stufen anlegen",
@@ -213,6 +235,9 @@ GERMAN = {
     "Protect Selected": "Auswahl schützen",
     "Protect Splats": "Splats schützen",
     "Protect and Crop": "Schützen und beschneiden",
+    "Protect the splats that lie in no view, with those that are protected": (
+        "Die Splats schützen, die in keiner Ansicht liegen, zusammen mit den geschützten"
+    ),
     "Published Constants": "Veröffentlichte Konstanten",
     "Quality": "Qualität",
     "Rank of each splat: dark goes first, yellow last": (
@@ -310,9 +335,14 @@ GERMAN = {
     "The splat's own colour": "Die eigene Farbe des Splats",
     "Tolerance": "Toleranz",
     "Transparent": "Durchsichtig",
+    "Turn": "Drehung",
     ("Turn a splat mesh into a point cloud of Blender's own splats, or such a point cloud back"): (
         "Ein Splat-Mesh in eine Punktwolke mit Blenders eigenen Splats verwandeln, oder eine "
         "solche zurück"
+    ),
+    "Turn the Cameras": "Die Kameras drehen",
+    "Turn the cameras that decide a quarter about the world's X axis": (
+        "Die entscheidenden Kameras um eine Vierteldrehung um die X-Achse der Welt drehen"
     ),
     (
         "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to "
@@ -374,6 +404,7 @@ GERMAN = {
         "Die Splats schreiben, wie sie in der Welt stehen: Orte, Drehungen, Größen und "
         "blickabhängige Farbe folgen dem Objekt"
     ),
+    "dB": "dB",
 }
 """What is shown in English -> in German."""
 

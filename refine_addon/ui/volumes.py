@@ -15,7 +15,7 @@ from ..core.errors import RefineError
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
-from . import plans, wrapped
+from . import plans, running, wrapped
 from .on_thread import FAILURES, Answer, fail
 
 if TYPE_CHECKING:
@@ -86,11 +86,22 @@ def _splats(context: bpy.types.Context) -> list[bpy.types.Object]:
     return [o for o in objects if o.visible_get()][:1]
 
 
+_edited: set[str] = set()
+"""Names of objects whose marks were changed in edit mode, where nothing can be counted."""
+
+
 @persistent
 def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
-    """Hear of volumes that move, and of splats that move under them."""
+    """Hear of volumes that move, of splats that move under them, and of the end of edit mode."""
+    if depsgraph is None or bpy.app.background:
+        return
+    objects = {bpy.data.objects.get(name) for name in _edited} - {None}
+    if objects and all(obj.mode != "EDIT" for obj in objects):
+        _edited.clear()
+        again(bpy.context)
+        return
     volumes = scene.refine.volumes
-    if depsgraph is None or not volumes or bpy.app.background:
+    if not volumes:
         return
     there = {item.object for item in volumes if item.object is not None}
     there |= {obj.data for obj in there if obj.data is not None}
@@ -104,14 +115,28 @@ def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = Non
             return
 
 
+@persistent
+def _undone(*_: object) -> None:
+    """Mark anew what may be marked as before or after a step."""
+    if not bpy.app.background and bpy.context.scene.refine.volumes:
+        again(bpy.context)
+
+
 def register() -> None:
     """Hear of changes."""
-    bpy.app.handlers.depsgraph_update_post.append(_updated)
+    handlers = bpy.app.handlers
+    handlers.depsgraph_update_post.append(_updated)
+    handlers.undo_post.append(_undone)
+    handlers.redo_post.append(_undone)
 
 
 def unregister() -> None:
     """Hear of changes no more."""
-    bpy.app.handlers.depsgraph_update_post.remove(_updated)
+    handlers = bpy.app.handlers
+    handlers.redo_post.remove(_undone)
+    handlers.undo_post.remove(_undone)
+    handlers.depsgraph_update_post.remove(_updated)
+    _edited.clear()
 
 
 class _OnSplats(bpy.types.Operator):
@@ -163,7 +188,9 @@ class REFINE_OT_protect(_OnSplats):
                 _mark(obj, self.mode)
         except FAILURES as error:
             return fail(self, error)
-        if obj.mode != "EDIT":
+        if obj.mode == "EDIT":
+            _edited.add(obj.name)
+        else:
             marked = mesh_edit.protected_mask(obj, "")
             count = 0 if marked is None else int(np.count_nonzero(marked))
             self.report({"INFO"}, f"{count:,} splats are marked to stay")
@@ -305,7 +332,10 @@ def _new_empty(
     obj = bpy.data.objects.new(f"{checked.obj.name} {role.lower()}", None)
     obj.empty_display_type = "CUBE" if shape == "BOX" else "SPHERE"
     obj.location = (low + high) / 2.0
-    obj.scale = half if shape == "BOX" else (float(half.max()),) * 3
+    obj.scale = half
+    if shape == "SPHERE":
+        away = np.linalg.norm(means - (low + high) / 2.0, axis=1)
+        obj.scale = (max(float(np.quantile(away, 1.0 - 2.0 * share)), 1e-3),) * 3
     obj.show_in_front = True
     context.collection.objects.link(obj)
     for other in context.selected_objects:
@@ -342,6 +372,9 @@ class REFINE_OT_crop(_OnSplats):
     def poll(cls, context: bpy.types.Context) -> bool:
         """Tell whether the operator can run, and if not, why."""
         if not super().poll(context):
+            return False
+        if why := running.refusal():
+            cls.poll_message_set(why)
             return False
         if context.object.mode == "EDIT":
             cls.poll_message_set("Leave edit mode first")

@@ -118,7 +118,7 @@ def test_undo_redo_and_save_are_refused_with_a_sentence(start, gate, held, word)
 def test_only_one_operation_works_at_a_time(start, gate, addon):  # noqa: ARG001
     """Those that look at splats stay; the others come back when it is over."""
     names = ["score", "apply", "levels", "find_floaters", "delete_floaters", "convert"]
-    names += ["export_ply", "import_ply", "import_cameras"]
+    names += ["export_ply", "import_ply", "import_cameras", "crop"]
     bpy.ops.refine.score()
     bpy.ops.refine.find_floaters()
 
@@ -131,8 +131,8 @@ def test_only_one_operation_works_at_a_time(start, gate, addon):  # noqa: ARG001
     operator.modal(context, event("ESC"))
     until_over(operator, context)
 
-    assert before == polls(names) == [True] * 9
-    assert during == [False] * 9
+    assert before == polls(names) == [True] * 10
+    assert during == [False] * 10
     assert looks == [True, True]
 
 

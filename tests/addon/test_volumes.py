@@ -467,7 +467,7 @@ ODD = {
     "no faces": (_no_faces, "object 'Odd': has no faces, expected a closed mesh"),
     "open": (_open, "object 'Odd': is not closed: 4 of its edges belong to an odd number of faces"),
     "axes": (_axes, "object 'Odd': is an empty shown as plain axes, expected a mesh, or an empty"),
-    "camera": (_camera, "object 'Odd': is camera, expected a mesh, or an empty"),
+    "camera": (_camera, "object 'Odd': is of type CAMERA, expected a mesh, or an empty"),
     "flat": (_flat, "object 'Odd': is flat"),
     "far": (_far, "object 'Odd' holds the centre of no splat (they lie from"),
 }

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from refine_addon.core import ClosedForm, RefineError, Splats, View, ViewSet
 from refine_addon.core.scene import principal_axes
-from refine_addon.core.scoring import closed_form
+from refine_addon.core.scoring import closed_form, closed_form_block
 
 READINGS = [
     ClosedForm(),
@@ -389,8 +389,8 @@ def test_chunks_threads_and_view_blocks_change_nothing(monkeypatch, chunk, threa
     """Only sums of float64 are split differently."""
     splats, views = random_scene(5)
     expected = closed_form.score(splats, views, threads=1)
-    monkeypatch.setattr(closed_form, "_CHUNK", chunk)
-    monkeypatch.setattr(closed_form, "_VIEW_BLOCK", block)
+    monkeypatch.setattr(closed_form_block, "_CHUNK", chunk)
+    monkeypatch.setattr(closed_form_block, "_VIEW_BLOCK", block)
 
     scores = closed_form.score(splats, views, threads=threads)
 

@@ -353,7 +353,8 @@ def test_the_report_of_scores_is_plain_too(folder):
 
     (entry,) = json.loads((folder / "report.json").read_text())["results"]
     assert entry["files"] == {"input": "in.ply", "output": "out.ply"}
-    assert entry["splats"] == {"before": COUNT, "undrawable": 0, "unseen": unseen}
+    counts = {"before": COUNT, "undrawable": 0, "unseen": unseen, "forced": 0}
+    assert entry["splats"] == counts
     assert all(map(math.isfinite, numbers(entry)))
 
 

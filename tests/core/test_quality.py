@@ -230,6 +230,43 @@ def test_the_curve_is_what_each_share_reaches():
         assert scores.sights.psnr(keep) == pytest.approx(value, abs=1e-9)
 
 
+def test_the_curve_is_the_mean_of_those_of_single_views():
+    """Weighted as the views are: one counts three times as much as each of the others.
+
+    What removing the splats that one view alone sees would change, is told by its own curve.
+    """
+    views = ViewSet(tuple(
+        replace(view, name=f"view {k}", weight=3.0 if k == 2 else 1.0)
+        for k, view in enumerate(ring())
+    ))  # fmt: skip
+    scores = score(cloud(), views, Settings("occlusion"))
+
+    assert scores.quality is not None
+    single = scores.quality.views
+    assert sorted(single) == [view.name for view in views]
+    mean = sum(view.weight * single[view.name] for view in views) / 7.0
+    assert np.allclose(mean, scores.quality.psnr, atol=1e-9)
+    assert len({tuple(curve) for curve in single.values()}) == 5
+    assert all(np.all(np.diff(curve) <= 0.0) for curve in single.values())
+
+
+def test_a_view_whose_splats_stay_is_not_changed():
+    """Ten splats before each of two cameras; the lowest half is what one of them sees."""
+    away = 40.0 * np.arange(2)[:, None] * np.array([1.0, 0.0, 0.0])
+    grid = np.random.default_rng(2).normal(size=(2, 10, 3)) * 0.3 + [0.0, 0.0, 4.0]
+    splats = splats_of((grid + away[:, None]).reshape(-1, 3), gray=0.9, scales=0.2)
+    views = ViewSet(tuple(
+        replace(look_along_z(), center=center, name=name)
+        for center, name in zip(away, "ab", strict=True)
+    ))  # fmt: skip
+    found = sight_lines.sights(splats, views)
+
+    curve = found.curve(np.arange(20, dtype=np.float32))
+
+    assert curve.of_views(0.5) == {"a": pytest.approx(curve.views["a"][4]), "b": PSNR_CAP}
+    assert curve.of_views(0.5)["a"] < 30.0
+
+
 @pytest.mark.parametrize("method", ["closed-form", "occlusion", "auto"])
 def test_the_estimate_depends_on_nothing_but_the_scene(method):
     """Order of splats and of views, frame, and threads: only the last digits may differ."""
@@ -339,15 +376,18 @@ def test_on_a_line_the_nearest_that_stays_takes_over():
 
 def test_a_curve_comes_back_from_json():
     """As the mesh and the report keep it; what is none gives none."""
-    facts = json.loads(json.dumps(CURVE.facts()))
+    views = {"a": np.array([51.0, 41.0, 31.004])}
+    facts = json.loads(json.dumps(replace(CURVE, views=views).facts()))
     again = Quality.from_facts(facts)
 
     assert again is not None
     assert np.array_equal(again.shares, CURVE.shares)
     assert np.array_equal(again.psnr, CURVE.psnr)
     assert np.array_equal(again.absorbed, CURVE.absorbed)
+    assert again.views["a"].tolist() == [51.0, 41.0, 31.0]
     for wrong in (None, {}, {"shares": [0.5]}, facts | {"psnr": [1.0]}, facts | {"psnr": ["x"]},
-                  {name: [] for name in facts}, 3):  # fmt: skip
+                  {name: [] for name in facts}, 3,
+                  facts | {"views": {"a": [1.0]}}, facts | {"views": 1}):  # fmt: skip
         assert Quality.from_facts(wrong) is None
 
 

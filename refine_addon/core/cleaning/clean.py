@@ -247,7 +247,7 @@ def clean(  # noqa: PLR0913 - as `pipeline.prune`
             splats, views, progress=part(progress, 0.0, 0.05), threads=threads
         )
         if len(splats):
-            refuse_undrawable(good)
+            refuse_undrawable(int(np.count_nonzero(good)), len(good))
         run = _Run(gaussians, scene, splats, views.spread(settings.views), threads)
         reasons = run.reasons(part(progress, 0.05, 1.0))
     count = len(splats)

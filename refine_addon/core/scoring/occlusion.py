@@ -278,7 +278,7 @@ class Run:
             splats, views, progress=part(progress, 0.0, 0.5), threads=threads
         )
         self.undrawable = ~good  # (N,) bool
-        refuse_undrawable(good)
+        refuse_undrawable(int(np.count_nonzero(good)), len(good))
         self.measuring = Measuring(scene, views, settings, threads, members)
         self.sights = SightLines(self.measuring.views, self.gaussians, splats)
         self.rounds = settings.rounds

@@ -300,9 +300,9 @@ class SightLines:
         keep : (N,) bool
         threads : int, optional
         """
-        place = keep[self.index].astype(np.int64)
-        found = self._removing(place, [1], self._seen(), silent, threads)
-        return None if found is None else float(found[0])
+        place, seen = keep[self.index].astype(np.int64), self._seen()
+        found = self._removing(place, [1], seen, silent, threads)
+        return None if found is None else float(self._mean(found, seen)[0])
 
     def curve(
         self,
@@ -330,8 +330,9 @@ class SightLines:
         """
         place = _places(values, protected)[self.index]
         counts = [math.floor(share * len(values)) for share in SHARES]
-        found = self._removing(place, counts, self._seen(), part(progress, 0.0, 0.5), threads)
-        if found is None:
+        seen = self._seen()
+        single = self._removing(place, counts, seen, part(progress, 0.0, 0.5), threads)
+        if single is None:
             return None
         gains = self._taking_over(
             place,
@@ -340,9 +341,12 @@ class SightLines:
             threads,
         )
         assert gains is not None  # noqa: S101 - the same lines tell it
-        found = np.minimum.accumulate(found)
+        found = np.minimum.accumulate(self._mean(single, seen))
+        names = [self.views[number][0].name for number in seen]
+        views = dict(zip(names, np.minimum.accumulate(single, axis=1), strict=True))
         absorbed = absorbed_from(found, gains, len(values))
-        return Quality(np.array(SHARES), found, absorbed, foretold=len(values) >= FEWEST)
+        foretold = len(values) >= FEWEST
+        return Quality(np.array(SHARES), found, absorbed, foretold, views)
 
     def judged(
         self,
@@ -368,7 +372,8 @@ class SightLines:
             return None
         seen = sorted(set(views) & set(self._seen()))
         counts = [math.floor(share * len(values)) for share in shares]
-        return self._removing(_places(values)[self.index], counts, seen, silent, threads)
+        found = self._removing(_places(values)[self.index], counts, seen, silent, threads)
+        return None if found is None else self._mean(found, seen)
 
     def against(
         self,
@@ -406,8 +411,9 @@ class SightLines:
                 whole = lines.colors(colors_from(self.splats, self.index[lines.met], view))
             return np.array([psnr_of(seen, whole, view)])
 
-        found = self._mean(compare, self._judges(), part(progress, 0.2, 1.0), threads)
-        return None if found is None else float(found[0])
+        judges = self._judges()
+        found = self._of_each(compare, judges, part(progress, 0.2, 1.0), threads)
+        return None if found is None else float(self._mean(found, judges)[0])
 
     def _removing(
         self,
@@ -417,7 +423,7 @@ class SightLines:
         progress: Progress,
         threads: int | None,
     ) -> NDArray[np.float64] | None:
-        """Return the PSNR, (L,), with each of L numbers of splats removed.
+        """Return the PSNR of each of v views, (v, L), with each of L numbers of splats removed.
 
         Parameters
         ----------
@@ -443,7 +449,7 @@ class SightLines:
                 values.append(psnr_of(lines.colors(colors), whole, view))
             return np.array(values)
 
-        return self._mean(compare, views, progress, threads)
+        return self._of_each(compare, views, progress, threads)
 
     def _taking_over(
         self,
@@ -469,7 +475,9 @@ class SightLines:
                 gains.append(psnr_of(taken, whole, view) - psnr_of(left, whole, view))
             return np.array(gains)
 
-        return self._mean(compare, self._judges(), progress, threads)
+        judges = self._judges()
+        found = self._of_each(compare, judges, progress, threads)
+        return None if found is None else self._mean(found, judges)
 
     def _judges(self) -> list[int]:
         """Return the numbers of the views that judge where not all can."""
@@ -484,14 +492,14 @@ class SightLines:
         """Return how many lines of some views meet a splat."""
         return sum(lines.meeting for lines in map(self.lines.__getitem__, views) if lines)
 
-    def _mean(
+    def _of_each(
         self,
         compare: Callable[[int, Lines], NDArray[np.float64]],
         views: Sequence[int],
         progress: Progress,
         threads: int | None,
     ) -> NDArray[np.float64] | None:
-        """Return the weighted mean over some views of what `compare` returns for each of them.
+        """Return what `compare` returns for each of v views, (v, L).
 
         None if too few lines of all views meet a splat.
         """
@@ -507,8 +515,12 @@ class SightLines:
         values = for_chunks(
             work, len(views), 1, progress=progress, what="estimating", threads=threads
         )
+        return np.array(values)
+
+    def _mean(self, values: NDArray[np.float64], views: Sequence[int]) -> NDArray[np.float64]:
+        """Return the mean of values of some views, (v, L), weighted as the views are, (L,)."""
         weights = np.array([self.views[number][1] for number in views])
-        return np.asarray(weights @ np.array(values) / weights.sum())
+        return np.asarray(weights @ values / weights.sum())
 
 
 def _places(

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 NAME = "Splats"
 
+STRETCHES = 15
+"""How often to look whether the panel is drawn twice without the view."""
+
 
 def main(blend: str, cloud: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
     """Score the splats of the open scene again and again; return what went on meanwhile.
@@ -83,9 +86,11 @@ def main(blend: str, cloud: str, pictures: str) -> Generator[float, None, dict[s
 def meanwhile(hand: window.Hand, gate: Gate, blend: str) -> Generator[float, None, dict[str, Any]]:
     """Do while splats are scored what the window is to allow, and what it is to refuse."""
     view, draws = hand.area.spaces.active.region_3d, Draws()
-    yield from window.until(lambda: draws.counts["panel"] > 1, "the window is drawn")
-    draws.clear()
-    yield from window.until(lambda: draws.counts["panel"] > 2, "the bar is drawn")
+    for _ in range(STRETCHES):  # at first the view is still drawn for what came before
+        draws.clear()
+        yield from window.until(lambda: draws.counts["panel"] > 1, "the bar is drawn")
+        if not draws.counts["view"]:
+            break
     drawn = draws.stop()
     turned, far = view.view_rotation.copy(), view.view_distance
     yield from orbit(hand)

@@ -58,8 +58,11 @@ def main(cloud: str, cameras: str, picture: str) -> Generator[float, None, dict[
         show.call(bpy.ops.refine.view, mode=mode)
         found[f"unscored {mode}"] = yield from show.picture(f"unscored-{mode}")
 
-    yield from open_panel(hand)
-    found["panel"] = yield from show.picture("panel")
+    yield from hand.move(500, 500)
+    show.call(bpy.ops.wm.call_panel, name="REFINE_PT_volumes", keep_open=True)
+    yield 1.0
+    yield from show.picture("panel")
+    yield from hand.press("ESC")
 
     show.call(bpy.ops.refine.score)
     for mode in ("SCENE", "HEAT", "STAYS", "GOES"):
@@ -70,19 +73,20 @@ def main(cloud: str, cameras: str, picture: str) -> Generator[float, None, dict[
     box.location.x -= 0.5
     yield from wait(lambda: not marked(demands, splats, before))
     found["moved"] = demands.facts(splats.data)["forced"] - before
+    found["edited"] = yield from edit(show, demands, splats)
     found["failure"] = show.draw.failure()
     return found
 
 
-def open_panel(hand: Hand) -> Generator[float, None, None]:
-    """Have the panel open, which Blender then puts below the others; show it."""
-    panel = bpy.types.REFINE_PT_volumes
-    bpy.utils.unregister_class(panel)
-    panel.bl_options = set()
-    bpy.utils.register_class(panel)
-    yield 1.0
-    yield from hand.scroll(down=True)
-    yield 1.0
+def edit(show: Show, demands: Any, splats: bpy.types.Object) -> Generator[float, None, int]:
+    """Protect all splats in edit mode; return how many the panel counts when it is left."""
+    show.call(bpy.ops.object.mode_set, mode="EDIT")
+    show.call(bpy.ops.mesh.select_all, action="SELECT")
+    show.call(bpy.ops.refine.protect, mode="ADD")
+    yield 0.5
+    show.call(bpy.ops.object.mode_set, mode="OBJECT")
+    yield from wait(lambda: marked(demands, splats, 0))
+    return int(demands.facts(splats.data)["protected"])
 
 
 def mark(splats: bpy.types.Object, count: int) -> None:

@@ -1,0 +1,297 @@
+"""Whether cameras and splats can belong together, by how fine the pictures are; of a sample.
+
+Training made splats small where cameras looked at them, and left them large, or out, elsewhere. So
+pictures from where the capture was made are finer than from where it was not::
+
+    fineness = mean over pixels of the sum of  T_i alpha_i / (1 + (s_i / (FINE side))^2)
+
+s is the geometric mean of a footprint's two standard deviations and side that of the image's sides,
+in pixels. Where nothing is, and where a splat fills the picture, it is 0. No threshold on it would
+hold for all scenes. But if the pictures become much finer once all cameras are turned a quarter
+about x, cameras and splats came from files of which only one was turned upright.
+
+From far away all is fine. A view that sees many splats, all of them in a small part of its picture,
+is told by where the splats lie in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .. import frustum
+from ..affine import QUARTER
+from ..work import Progress, for_chunks, part, report, silent
+from . import projection
+from .sight_lines import SightLines, meet
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from ..scene import Scene
+    from ..splats import Splats
+    from ..views import View, ViewSet
+    from .projection import Gaussians
+
+SAMPLE = 4096
+"""About so many splats stand for all, each as much larger as it stands for others."""
+
+POINTS = 512
+"""Of about so many splats it is told where in the pictures they lie."""
+
+VIEWS = 12
+"""So many views at most are turned."""
+
+LINES = 1024
+"""How many lines of sight all of them together have."""
+
+FINE = 0.015
+"""Standard deviation of a splat that is half as fine as one of no size, as a share of the image."""
+
+BETTER = 1.5
+"""By which factor turned cameras must see finer pictures."""
+
+LEAST = 0.04
+"""Pictures that are less fine than that show too little to tell anything."""
+
+ONE_WAY = 0.95
+"""Length of the mean of the viewing directions from which on the views look one way: then turning
+them shows another part of the scene, and its fineness tells nothing."""
+
+WHOLE = 0.8
+"""Share of the splats that are in the picture, on average, from which on views are not judged: they
+look at all of it from outside, and turned they do so too."""
+
+FEW = 8
+"""Of fewer splats of the sample in a picture it is not told how far away they are."""
+
+SMALL = 0.02
+"""Share of a picture's width and of its height that the splats in it fill, but for a tenth of them
+to each side, below which they are far away."""
+
+_TURNS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T}
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """How the views stand to the splats.
+
+    Attributes
+    ----------
+    turn : {0, 1, -1}
+        By how many quarters about x, `affine.QUARTER` or its inverse, the views are to be turned.
+    known : bool
+        Whether that is known from how views and splats were imported; else it was measured.
+    fineness : tuple of float
+        Of the pictures as the views are, turned by a quarter, and back; empty if not measured.
+    far : tuple of str
+        Names of the views that see the splats from far away.
+    """
+
+    turn: int = 0
+    known: bool = False
+    fineness: tuple[float, ...] = ()
+    far: tuple[str, ...] = ()
+
+    def notes(self) -> list[str]:
+        """Return what the user should know, in sentences."""
+        return [note for note in (self.turned(), self.distant()) if note]
+
+    def turned(self) -> str:
+        """Return a sentence if the views are to be turned, else ""."""
+        if not self.turn:
+            return ""
+        if self.known:
+            return (
+                "cameras and splats do not share an up axis: only one of them was imported "
+                "upright; turn the cameras a quarter about X"
+            )
+        now, turned = self.fineness[0], self.fineness[list(_TURNS).index(self.turn)]
+        return (
+            "cameras and splats do not seem to share an up axis: turned a quarter about X, the "
+            f"cameras would see pictures {min(turned / max(now, 1e-9), 99.0):.1f} times as fine"
+        )
+
+    def distant(self) -> str:
+        """Return a sentence if views see the splats from far away, else ""."""
+        if not self.far:
+            return ""
+        count = "1 camera sees" if len(self.far) == 1 else f"{len(self.far):,} cameras see"
+        return (
+            f"{count} the splats from so far away that they fill less than {SMALL:.0%} of a picture"
+        )
+
+    def facts(self) -> dict[str, Any]:
+        """Return it as plain JSON values."""
+        return {
+            "turn": self.turn,
+            "known": self.known,
+            "fineness": [round(value, 4) for value in self.fineness],
+            "far": list(self.far),
+        }
+
+    @classmethod
+    def from_facts(cls, facts: Mapping[str, Any] | None) -> Alignment:
+        """Return what `facts` were made of; of what is none, that nothing is known."""
+        try:
+            found = facts or {}
+            turn, known = int(found.get("turn", 0)), bool(found.get("known", False))
+            fineness = tuple(float(value) for value in found.get("fineness", ()))
+            far = tuple(str(name) for name in found.get("far", ()))
+        except (AttributeError, TypeError, ValueError):
+            return cls()
+        told = turn in _TURNS and len(fineness) in {0, len(_TURNS)} and (known or fineness)
+        return cls(turn if told else 0, known, fineness, far)
+
+
+def alignment(
+    splats: Splats,
+    views: ViewSet,
+    used: ViewSet | None = None,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Alignment:
+    """Return how views stand to splats.
+
+    Parameters
+    ----------
+    splats : Splats
+        In the frame of the views.
+    views : ViewSet
+        All that were given; if they know their turn, it is not measured.
+    used : ViewSet, optional
+        Those that are turned to measure; without them nothing is measured.
+    progress : callable, optional
+    threads : int, optional
+
+    Raises
+    ------
+    Cancelled
+        If `progress` answers ``False``.
+    """
+    means = splats.means[_some(splats, POINTS)].astype(np.float64)  # (n, 3)
+    far, there, count = [], 0, 0
+    with np.errstate(under="ignore"):
+        for view in views:
+            report(progress, 0.0, "checking")
+            if view.weight:
+                points = _in_picture(means, view)
+                there, count = there + points.shape[1], count + len(means)
+                far += [view.name] if _is_far(points, view) else []
+        found = Alignment(far=tuple(far))
+        if views.turn is not None:
+            return replace(found, turn=views.turn, known=True)
+        one_way = np.linalg.norm(views.rotations[:, 2].mean(axis=0)) >= ONE_WAY
+        if used is None or one_way or there >= WHOLE * count:
+            return found
+        rows = _some(splats, SAMPLE)
+        fineness = _fineness(splats, rows, used.spread(VIEWS), progress, threads)
+    best = list(_TURNS)[int(np.argmax(fineness))]
+    turn = best if max(fineness) > max(BETTER * fineness[0], LEAST) else 0
+    return replace(found, turn=turn, fineness=fineness)
+
+
+def _some(splats: Splats, count: int) -> NDArray[np.int64]:
+    """Return the rows of at least `count` splats, if there are as many, evenly spread."""
+    return np.arange(0, len(splats), max(len(splats) // count, 1))
+
+
+def _in_picture(means: NDArray[np.float64], view: View) -> NDArray[np.float64]:
+    """Return where those of some points, (n, 3), that lie in a view are in its picture, (2, m).
+
+    In depths, from the middle of the lens.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        local = view.rotation @ (means - view.center).T  # (3, n)
+        planes = frustum.clip_planes(view, float(np.finfo(np.float64).tiny))
+        local = local[:, frustum.contains(view, local, planes)]
+        return np.asarray(local[:2] / local[2])
+
+
+def _is_far(points: NDArray[np.float64], view: View) -> bool:
+    """Tell whether all that a view sees, (2, m), lies in a small part of its picture."""
+    if points.shape[1] < FEW:
+        return False
+    ordered, tenth = np.sort(points, axis=1), points.shape[1] // 10
+    widths = ordered[:, -1 - tenth] - ordered[:, tenth]  # (2,)
+    spans = widths * (view.fx / view.width, view.fy / view.height)
+    return bool(spans.max() < SMALL)
+
+
+def _fineness(
+    splats: Splats,
+    rows: NDArray[np.int64],
+    views: ViewSet,
+    progress: Progress,
+    threads: int | None,
+) -> tuple[float, ...]:
+    """Return the fineness of the pictures of views, turned by each of `_TURNS`.
+
+    Parameters
+    ----------
+    splats : Splats
+    rows : (n,) int64
+        Those that stand for all.
+    views : ViewSet
+    progress : callable
+    threads : int, optional
+    """
+    crowd = len(splats) / len(rows)
+    some = splats.take(rows)
+    larger = np.asarray(some.log_scales, np.float64) + 0.5 * np.log(crowd)
+    some = replace(some, log_scales=larger, sh_rest=some.sh_rest[:, :0])
+    gaussians, scene, _ = projection.prepare(
+        some, views, progress=part(progress, 0.0, 0.2), threads=threads
+    )
+    sights = SightLines(views.by_distance(), gaussians, some)
+    count, rotations = len(sights.views), list(_TURNS.values())
+
+    def work(piece: slice) -> float:
+        turn, number = divmod(piece.start, count)
+        columns, rows = sights.pixels(number, LINES / count)
+        view = sights.views[number][0].turned(rotations[turn])
+        return _fineness_of(gaussians, scene, view, (columns, rows), crowd)
+
+    found = for_chunks(
+        work, len(_TURNS) * count, 1,
+        progress=part(progress, 0.2, 1.0), what="checking", threads=threads,
+    )  # fmt: skip
+    return tuple(np.reshape(found, (len(_TURNS), count)).mean(axis=1).tolist())
+
+
+def _fineness_of(
+    gaussians: Gaussians,
+    scene: Scene,
+    view: View,
+    pixels: tuple[NDArray[np.int64], NDArray[np.int64]],
+    crowd: float,
+) -> float:
+    """Return the fineness of one picture.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+        Each stands for `crowd` others, and its footprint is as much larger.
+    scene : Scene
+    view : View
+    pixels : tuple of (C,) and (R,) int64
+        Columns and rows through which lines of sight go.
+    crowd : float
+    """
+    with np.errstate(under="ignore"):
+        footprints = projection.project(gaussians, scene, view)
+        lines = meet(gaussians, footprints, *pixels)
+        if not len(lines.line):
+            return 0.0
+        square = np.zeros(len(gaussians))  # px^2
+        square[footprints.index] = footprints.sigmas[0] * footprints.sigmas[1] / crowd
+        square /= FINE**2 * view.width * view.height
+        _, owner, weight = lines.contributions()
+        total = float((weight / (1.0 + square[lines.met[owner]])).sum())
+    return total / (len(lines.columns) * len(lines.rows))

@@ -1,0 +1,468 @@
+"""A run of consecutive splats, and what the closed form computes of it step by step.
+
+Between the steps stand sums, counts and medians over all splats, which `closed_form.steps` puts
+together from those of the blocks. A block needs no other block, so blocks may be computed one after
+the other, with their numbers on disk in between, or on several machines.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from .. import radix
+from ..frustum import Frustums
+from ..splats import base_color, drawable, opacity
+from ..work import for_chunks, silent
+from . import adaptive
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from ..splats import Splats
+    from ..views import ViewSet
+    from ..work import Progress
+    from .closed_form import ClosedForm
+
+LUMA = (0.299, 0.587, 0.114)
+"""Factors of red, green and blue in the luma (Rec. 601)."""
+
+UNSEEN = 1e-6
+"""A splat that no view sees has H = this / (squared distance to the views + eta): such splats are
+ordered by distance, and nearly always below all that are seen."""
+
+REACH = 2.0
+"""Standard deviations along its longest axis that a splat reaches into an image from outside."""
+
+CROWDED = 0.05
+"""Score, over the mean of all, from which on a splat's neighbourhood counts half."""
+
+CELLS = 64
+"""Cells of the neighbourhoods along each axis."""
+
+ROWS = 1 << 18
+"""Splats of a block: its numbers take 18 MB. Sums over cells depend on it in their last bits."""
+
+_CHUNK = 4096
+_VIEW_BLOCK = 64
+_SMALLEST_AREA = -300.0  # natural logarithm
+_SMALLEST_SQUARE = 1e-300
+
+
+class Frame(NamedTuple):
+    """What the views are seen in, of all splats.
+
+    Attributes
+    ----------
+    axes : (3, 3) float64
+        Rotation into the scene's axes, over the size of the scene.
+    eta : float
+        Squared world units.
+    near : float
+        Near plane of views that have none of their own, world units.
+    """
+
+    axes: NDArray[np.float64]
+    eta: float
+    near: float
+
+
+class Crowds(NamedTuple):
+    """Neighbourhoods, those of them that occur.
+
+    Attributes
+    ----------
+    cells : (C,) int32
+        Which.
+    sums : (C,) float64
+        Sum of the scores in each.
+    counts : (C,) int64
+        How many splats that can be drawn are in each.
+    """
+
+    cells: NDArray[np.int32]
+    sums: NDArray[np.float64]
+    counts: NDArray[np.int64]
+
+
+class _Fringe(NamedTuple):
+    """Pairs of a splat and a view whose image it reaches into from outside, k of them.
+
+    Attributes
+    ----------
+    view, splat : (k,) int64
+        Places in a block.
+    share : (k,) float64
+        1 at the edge of the image, falling to 0 at `REACH` standard deviations.
+    across : (k,) float64
+        The depth at which the image is wide enough to show its centre, world units.
+    """
+
+    view: NDArray[np.int64]
+    splat: NDArray[np.int64]
+    share: NDArray[np.float64]
+    across: NDArray[np.float64]
+
+
+STEPS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = {
+    "read": (
+        (),
+        ("good", "means", "squared", "alpha", "area", "reach", "luma"),
+        (),
+    ),
+    "count": (("good", "squared"), (), ()),
+    "sum_views": (
+        ("good", "means", "squared", "alpha", "area", "reach", "luma"),
+        ("visibility", "seen", "cells"),
+        ("means", "squared", "reach"),
+    ),
+    "add": (
+        ("good", "alpha", "area", "luma", "visibility", "cells"),
+        ("plain",),
+        ("alpha", "area", "luma", "visibility"),
+    ),
+    "compare": (("good", "plain", "cells"), ("values",), ("good", "plain", "cells")),
+}
+"""Step -> arrays that it needs, that it makes, and that nobody needs after it."""
+
+
+class Block:
+    """What the formula needs of n splats, filled step by step, chunk by chunk.
+
+    The splats are read once, in the first step; it keeps 69 bytes of each.
+
+    Parameters
+    ----------
+    splats : Splats or None
+        Needed for `read` alone.
+    views : ViewSet
+    settings : ClosedForm
+    middle : (3,) float64, float
+        Of the views, as `ViewSet.middle` returns it.
+    threads : int, optional
+    arrays : mapping of str to array, optional
+        Those that the next step needs; see `STEPS`.
+
+    Attributes
+    ----------
+    origin : (3,) float64
+        Middle of the scene, world units.
+    view_variance : float
+        Median over views of their squared distance to the origin.
+    good : (n,) bool
+        Which splats can be drawn.
+    means : (n, 3) floating
+    squared : (n,) float64
+        Squared distance to the origin plus `view_variance`.
+    alpha, area, visibility : (n,) float64
+        Opacity, the product of the two largest scales, and H.
+    reach : (n,) float64
+        How far outside an image a splat still counts, world units.
+    luma, plain, values : (n,) float32
+        Of the base colour, 0..1 to 6e-8; the scores before and after splats are compared with
+        those around them.
+    seen, cells : (n,) int32
+        In how many views each lies; its neighbourhood.
+    progress : callable
+        Of the step that runs.
+    """
+
+    good: NDArray[np.bool_]
+    means: NDArray[np.floating[Any]]
+    squared: NDArray[np.float64]
+    alpha: NDArray[np.float64]
+    area: NDArray[np.float64]
+    visibility: NDArray[np.float64]
+    reach: NDArray[np.float64]
+    luma: NDArray[np.float32]
+    plain: NDArray[np.float32]
+    values: NDArray[np.float32]
+    seen: NDArray[np.int32]
+    cells: NDArray[np.int32]
+
+    def __init__(
+        self,
+        splats: Splats | None,
+        views: ViewSet,
+        settings: ClosedForm,
+        middle: tuple[NDArray[np.float64], float],
+        *,
+        threads: int | None = None,
+        arrays: Mapping[str, NDArray[Any]] | None = None,
+    ) -> None:
+        self.splats, self.views, self.settings = splats, views, settings
+        self.threads = threads
+        self.progress: Progress = silent
+        self.weights = views.weights
+        self.origin, self.view_variance = middle
+        vars(self).update(arrays or {})
+
+    def step(self, name: str, *arguments: Any) -> Any:  # noqa: ANN401 - of each step its own
+        """Do a step, and forget what none after it needs; return what it returns."""
+        result = getattr(self, name)(*arguments)
+        for array in STEPS[name][2]:
+            vars(self).pop(array, None)
+        return result
+
+    def read(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Activate the splats.
+
+        Returns
+        -------
+        tallies : (chunks, 5) float64
+        moments : (chunks, 4, 3) float64
+            See `_read`.
+        """
+        assert self.splats is not None  # noqa: S101 - whoever calls this gave them
+        count = len(self.splats)
+        self.good = np.empty(count, np.bool_)
+        self.means = np.empty((count, 3), self.splats.means.dtype.newbyteorder("="))
+        self.squared, self.alpha, self.area, self.reach = (np.empty(count) for _ in range(4))
+        self.luma = np.empty(count, np.float32)
+        found = for_chunks(
+            self._read, count, 4 * _CHUNK,
+            progress=self.progress, what="reading", threads=self.threads,
+        )  # fmt: skip
+        self.splats = None
+        tallies, moments = zip(*found, strict=True)
+        return np.array(tallies), np.array(moments)
+
+    def _read(self, piece: slice) -> tuple[tuple[float, ...], NDArray[np.float64]]:
+        """Activate one slice of splats.
+
+        Returns
+        -------
+        count, ratios, translucency, luma, squares : tuple of float
+            Over the drawable splats: their number, the sums of the axis ratio and of
+            4 alpha (1 - alpha), the mean of the luma and the sum of its squared deviations.
+        moments : (4, 3) float64
+            Over the drawable splats, weighted by 1 / `squared`: the sums of the products of their
+            coordinates from the origin, and of the coordinates.
+        """
+        chunk = self.splats.take(piece)  # type: ignore[union-attr]
+        good = self.good[piece] = drawable(chunk)  # (n,)
+        means = self.means[piece] = np.where(good[:, None], chunk.means, 0.0)  # (n, 3)
+        offset = means - self.origin
+        # Values that underflow to 0 are negligible in the sums.
+        with np.errstate(under="ignore"):
+            self.squared[piece] = np.einsum("ij,ij->i", offset, offset) + self.view_variance
+            alpha = self.alpha[piece] = opacity(np.where(good, chunk.opacity_logits, -np.inf))
+            red, green, blue = base_color(np.where(good[:, None], chunk.sh_dc, 0.0)).T
+            self.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
+            logs = np.where(good[:, None], chunk.log_scales, 0.0).astype(np.float64)
+            self.area[piece], ratio, longest = self._axes(logs)
+            self.reach[piece] = REACH * longest
+            alpha, luma = alpha[good], self.luma[piece][good].astype(np.float64)
+            mean = luma.sum() / max(len(luma), 1)
+            squares = np.sum(np.square(luma - mean))
+            translucency = np.sum(4.0 * alpha * (1.0 - alpha))
+            # Nearer than this, the products underflow anyway.
+            weighted = offset / np.maximum(self.squared[piece], _SMALLEST_SQUARE)[:, None]
+            weighted[~good] = 0.0
+            moments = np.vstack([weighted.T @ offset, weighted.sum(axis=0)])
+        return (len(luma), ratio[good].sum(), translucency, mean, squares), moments
+
+    def _axes(self, logs: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """Return the two largest scales' product, longest over shortest, and longest, (n,)."""
+        a, b, c = logs.T  # (n,) each
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        largest, smallest = np.maximum(high, c), np.minimum(low, c)
+        middle = np.maximum(low, np.minimum(high, c))
+        area = np.exp(np.maximum(largest + middle, _SMALLEST_AREA))
+        longest = np.exp(largest)
+        offset = self.settings.anisotropy_offset
+        if offset is None:
+            limit = np.log(adaptive.RATIO_LIMIT)
+            ratio = np.exp(np.minimum(largest - np.maximum(smallest, -1e300), limit))
+            return area, ratio, longest
+        return area, longest / (np.exp(smallest) + offset), longest
+
+    def count(self, prefixes: list[int], shift: int) -> radix.Sparse:
+        """Return `radix.counts` of the squared distances of what can be drawn."""
+        squared = self.squared if self.good.all() else self.squared[self.good]
+        return radix.Sparse.of(radix.counts(radix.keys_of(squared), prefixes, shift))
+
+    def sum_views(self, frame: Frame) -> NDArray[np.float64]:
+        """Compute H, and in how many views each splat lies.
+
+        Returns
+        -------
+        (chunks, 4) float64
+            Sums over a chunk's splats of ``H G`` for each of the three G, and of the views that
+            each lies in.
+        """
+        count = len(self.good)
+        self.axes, self.eta = frame.axes, frame.eta
+        self.frustums = Frustums(self.views, self.origin, frame.near)
+        self.visibility = np.empty(count)
+        self.seen = np.zeros(count, np.int32)
+        self.cells = np.zeros(count, np.int32)
+        return np.array(
+            for_chunks(
+                self._sum_views, count, _CHUNK,
+                progress=self.progress, what="scoring", threads=self.threads,
+            )
+        )  # fmt: skip
+
+    def _sum_views(self, piece: slice) -> list[float]:
+        points = np.ones((4, piece.stop - piece.start))  # x, y, z, 1
+        points[:3] = (self.means[piece] - self.origin).T
+        total = np.zeros(points.shape[1])  # (n,), H before alpha
+        seen = np.zeros(points.shape[1], np.int32)
+        with np.errstate(under="ignore"):
+            for start in range(0, len(self.weights), _VIEW_BLOCK):
+                block = slice(start, start + _VIEW_BLOCK)
+                depth, beyond, inside = self.frustums.project(points, block)  # (V, n) each
+                fringe = None
+                if self.settings.frustum:
+                    between, inside = inside, beyond <= 0.0
+                    inside &= between
+                    fringe = self._fringe(depth, beyond, between > inside, piece, block)
+                else:
+                    inside[:] = True
+                # A byte can count the at most 64 views of a block.
+                seen += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.uint8)
+                total += self._block(points, depth, inside, fringe, block)
+            if not total.all():
+                near = self.squared[piece] + self.eta if self.settings.projection else 1.0
+                total = np.where(total == 0.0, UNSEEN / near, total)
+            if self.settings.visibility:
+                total *= self.alpha[piece]
+            visibility = self.visibility[piece] = total * self.good[piece]
+            sums = [float(np.sum(visibility * content)) for content in self._contents(piece)]
+            if self.settings.local:
+                self.cells[piece] = self._cells(points)
+        self.seen[piece] = seen * self.good[piece]
+        return [*sums, float(np.sum(self.seen[piece]))]
+
+    def _cells(self, points: NDArray[np.float64]) -> NDArray[np.int32]:
+        """Return which neighbourhood each of n points lies in, (n,)."""
+        place = self.axes @ points[:3]  # (3, n), scene sizes
+        # All of space is mapped into a ball, so cells grow with the distance.
+        place *= CELLS / 2 / (1.0 + np.sqrt(np.einsum("in,in->n", place, place)))
+        x, y, z = np.minimum((place + CELLS / 2).astype(np.int32), CELLS - 1)
+        return np.asarray((x * CELLS + y) * CELLS + z)
+
+    def _block(
+        self,
+        points: NDArray[np.float64],
+        depth: NDArray[np.float64],
+        inside: NDArray[np.bool_],
+        fringe: _Fringe | None,
+        block: slice,
+    ) -> NDArray[np.float64]:
+        """Return H before alpha of n splats from a block of views, (n,); `depth` is overwritten."""
+        weights = self.weights[block]
+        counted = inside
+        share = fringe.share if fringe else None
+        if self.settings.projection:
+            squared = self._squared(points, depth, block)
+            if fringe:
+                at = np.square(fringe.across)
+                if self.settings.depth == "distance":
+                    at = squared[fringe.view, fringe.splat]
+                share = fringe.share / (at + self.eta)
+            squared += self.eta
+            counted = np.divide(inside, squared, out=squared)
+        total: NDArray[np.float64] = np.einsum("v,vn->n", weights, counted)
+        if fringe and share is not None:
+            total += np.bincount(fringe.splat, weights[fringe.view] * share, len(total))
+        return total
+
+    def _fringe(
+        self,
+        depth: NDArray[np.float64],
+        beyond: NDArray[np.float64],
+        outside: NDArray[np.bool_],
+        piece: slice,
+        block: slice,
+    ) -> _Fringe:
+        """Return which splats reach into which views from outside, and how far."""
+        steepness = self.frustums.steepness[block]
+        limit = self.reach[piece] * (steepness if np.ptp(steepness) > 0.0 else steepness[:1])
+        outside &= beyond < limit  # (b, n)
+        index = np.flatnonzero(outside)  # of few; everything else is done for all of them
+        view = index // outside.shape[1]
+        splat = index - view * outside.shape[1]
+        away = beyond.ravel()[index]
+        share = 1.0 - away / (limit[0, splat] if len(limit) == 1 else limit[view, splat])
+        return _Fringe(view, splat, share, depth.ravel()[index] + away)
+
+    def _contents(self, piece: slice) -> tuple[NDArray[np.float64], ...]:
+        """Return the three G of n splats, (n,) each."""
+        luma, alpha = self.luma[piece].astype(np.float64), self.alpha[piece]
+        return self.area[piece], luma * luma, alpha * alpha
+
+    def _squared(
+        self, points: NDArray[np.float64], depth: NDArray[np.float64], block: slice
+    ) -> NDArray[np.float64]:
+        """Return d^2, (V, n); `depth` is overwritten by it."""
+        if self.settings.depth == "z":
+            return np.multiply(depth, depth, out=depth)
+        depth[:] = 0.0
+        for axis in range(3):
+            step = points[axis] - self.frustums.centers[block, axis, None]
+            depth += np.multiply(step, step, out=step)
+        return depth
+
+    def add(self, factors: NDArray[np.float64]) -> Crowds | None:
+        """Set the scores: the sum of the three terms, each times its factor.
+
+        Returns
+        -------
+        Crowds or None
+            None where splats are not compared with those around them.
+        """
+        self.plain = np.empty(len(self.good), np.float32)
+        self._in_chunks(partial(self._add, factors))
+        if not self.settings.local:
+            return None
+        sums = np.bincount(self.cells, self.plain).astype(np.float64, copy=False)
+        counts = np.bincount(self.cells, self.good).astype(np.int64)
+        there = np.flatnonzero(np.bincount(self.cells)).astype(np.int32)
+        return Crowds(there, sums[there], counts[there])
+
+    def _add(self, factors: NDArray[np.float64], piece: slice) -> None:
+        visibility = self.visibility[piece]
+        with np.errstate(under="ignore"):
+            terms = zip(factors, self._contents(piece), strict=True)
+            total = sum(factor * (visibility * content) for factor, content in terms)
+            self._store(self.plain, np.asarray(total), piece)
+
+    def compare(self, powers: NDArray[np.float64] | None, overall: float) -> None:
+        """Divide each score by a power of the mean score around it.
+
+        Parameters
+        ----------
+        powers : (cells,) float64 or None
+            -1/2 times the logarithm of the mean score in each neighbourhood, in units of `overall`;
+            None leaves scores as they are.
+        overall : float
+            Mean score of all.
+        """
+        self.values = self.plain
+        if powers is not None:
+            self._in_chunks(partial(self._compare, powers, overall))
+
+    def _compare(self, powers: NDArray[np.float64], overall: float, piece: slice) -> None:
+        values = self.plain[piece].astype(np.float64)
+        weight = values / (values + CROWDED * overall)
+        with np.errstate(under="ignore"):
+            values *= np.exp(weight * powers[self.cells[piece]])
+            self._store(self.values, values, piece)
+
+    def _in_chunks(self, work: Any) -> None:  # noqa: ANN401 - a function of a slice
+        for_chunks(work, len(self.good), 4 * _CHUNK, threads=self.threads)
+
+    def _store(self, into: NDArray[np.float32], values: NDArray[np.float64], piece: slice) -> None:
+        """Set the scores of some splats; call it where underflow is ignored."""
+        good = self.good[piece]
+        stored = np.asarray(values, np.float32)
+        # Undrawable splats score 0; a drawable splat must not tie with them by underflow.
+        stored[good] = np.maximum(stored[good], np.finfo(np.float32).tiny)
+        into[piece] = stored

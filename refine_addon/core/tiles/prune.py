@@ -1,0 +1,362 @@
+"""Pruning many files as one scene, by one ranking and one budget over all of them."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import tempfile
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...version import VERSION
+from .. import radix
+from ..errors import RefineError
+from ..formats.ply_header import with_count
+from ..pipeline import nothing_removed, quality_facts
+from ..report import Clock, Files, complete_report, make_report
+from ..scores import Scores
+from ..scoring import closed_form
+from ..scoring.closed_form_block import ROWS
+from ..selection import least_seen, refuse_none_left, single
+from ..task import DEFAULTS, Settings
+from ..whole_file import expanded, publish, refuse_existing
+from ..work import Progress, part, silent
+from .folder import Folder
+from .steps import Job, Rule, Shared
+from .units import reopened, tile_at, units_of
+from .workers import Call, Here, Interrupted
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+
+    from ..selection import Budget
+    from ..views import ViewSet
+    from .units import Tile
+    from .workers import Workers
+
+SHARES = {
+    "read": (0.0, 0.2),
+    "count": (0.2, 0.2),
+    "sum_views": (0.2, 0.75),
+    "add": (0.75, 0.78),
+    "compare": (0.78, 0.82),
+    "select": (0.82, 0.82),
+    "write": (0.82, 1.0),
+}
+"""Step -> the part of the progress that is its own."""
+
+STEP_NAMES = {
+    "read": "reading",
+    "count": "reading",
+    "sum_views": "scoring",
+    "add": "scoring",
+    "compare": "scoring",
+}
+
+_SMALL = 1 << 16
+"""Bytes of an argument that travels with each step; larger ones lie in the folder."""
+
+
+def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
+    sources: Sequence[Path | str],
+    folder: Path | str | None,
+    views: ViewSet,
+    budget: Budget,
+    settings: Settings = DEFAULTS,
+    *,
+    overwrite: bool = False,
+    progress: Progress = silent,
+    threads: int | None = None,
+    workers: Workers | None = None,
+) -> dict[str, Any]:
+    """Prune files of splats as one scene, by one budget over all of them; none is held in memory.
+
+    The same splats stay as if all files were one, in the order in which they are given: of equal
+    scores, those of the first file go first. All files are written, or none. What stands between
+    the steps, 50 bytes a splat, lies in a folder beside the outputs until the job is done. If the
+    process is killed, the same call later goes on from there.
+
+    Parameters
+    ----------
+    sources : sequence of path-like
+        Plain binary PLY files in one frame and unit.
+    folder : path-like or None
+        Where each goes under its own name; made if it is not there. None writes nothing.
+    views, budget, settings, progress, threads
+        See `pipeline.prune`; the method is the closed form.
+    overwrite : bool
+        Whether files may be replaced.
+    workers : callable, optional
+        Who does the steps; by default this process. See `cluster`.
+
+    Returns
+    -------
+    dict
+        The report, with ``tiles``: of each its name, counts and bytes.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `pipeline.prune` and `units.tile_at`; also if the method or budget is none that works
+        over tiles, or two files have one name. Then nothing is written.
+    """
+    clock = Clock()
+    _refuse_what_needs_all(budget, settings)
+    tiles = [tile_at(path) for path in sources]
+    output = None if folder is None else expanded(folder)
+    targets = [] if output is None else _targets(tiles, output, overwrite=overwrite)
+    used = views.spread(settings.views)
+    with contextlib.ExitStack() as held:
+        if output is None:
+            place = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="refine-")))
+        else:
+            place = output.absolute() / f".refine-{_digest(tiles, used, budget, settings)}"
+        job = Job(Folder(place), used, settings.closed_form, used.middle())
+        held.enter_context(job.folder.opened())
+        try:
+            run = _Run(job, tiles, workers or Here(threads), progress)
+            facts = run.prune(budget, settings, views, clock)
+            sizes = run.write() if targets else run.sizes()
+            for target in targets:
+                publish(job.folder.tiles / target.name, target, overwrite=overwrite)
+        except Interrupted:
+            raise
+        except Exception:
+            job.folder.remove()
+            raise
+        job.folder.remove()
+    clock.lap("write_s")
+    facts["splats"]["written"] = facts["splats"]["kept"] if targets else None
+    before = sum(tile.size for tile in tiles)
+    complete_report(facts, clock, Files(f"{len(tiles)} tiles", _shown(output), before, sum(sizes)))
+    names: list[Path | None] = [*targets] or [None] * len(tiles)
+    facts["tiles"] = [
+        {
+            "input": tile.path,
+            "output": _shown(name),
+            "before": tile.splats,
+            "kept": kept,
+            "unseen": unseen,
+            "input_bytes": tile.size,
+            "output_bytes": size,
+        }
+        for tile, name, size, (kept, unseen) in zip(
+            tiles, names, sizes, run.counts.tolist(), strict=True
+        )
+    ]
+    return facts
+
+
+class _Run:
+    """A job under way.
+
+    Parameters
+    ----------
+    job : Job
+    tiles : list of Tile
+    workers : callable
+    progress : callable
+
+    Attributes
+    ----------
+    counts : (tiles, 2) int64
+        Of each tile, how many splats stay, and how many lie in no view.
+    """
+
+    def __init__(self, job: Job, tiles: list[Tile], workers: Workers, progress: Progress) -> None:
+        self.job, self.tiles, self.units = job, tiles, units_of(tiles)
+        self.total = sum(tile.splats for tile in tiles)
+        self.counts = np.zeros((len(tiles), 2), np.int64)
+        self._workers, self._progress = workers, progress
+        self._shared = 0
+        job.folder.note("begun", None)
+        workers.check(job, tiles)
+
+    def prune(
+        self, budget: Budget, settings: Settings, views: ViewSet, clock: Clock
+    ) -> dict[str, Any]:
+        """Score the tiles and decide what stays; return the report as far as it is known."""
+        job = self.job
+        with np.errstate(under="ignore"):  # as in `pipeline.score`
+            found = closed_form.steps(
+                self._each, self.total, job.views, job.settings, remember=self._remember
+            )
+        clock.lap("score_s")
+        rule = self._rule(budget)
+        places = {tile: place for place, tile in enumerate(self.tiles)}
+        for unit, each in zip(self.units, self._map("choose", rule), strict=True):
+            for (tile, _, _), pair in zip(unit.parts, each, strict=True):
+                self.counts[places[tile]] += pair
+        kept, unseen = self.counts.sum(axis=0).tolist()
+        refuse_none_left(budget, self.total, kept)
+        clock.lap("select_s")
+        nothing = Scores(
+            np.empty(0, np.float32), np.empty(0, np.int32), len(job.views), found.undrawable,
+            found.facts, (views.note,) if views.note else (), "closed-form",
+            job.settings.frustum, len(views),
+        )  # fmt: skip
+        facts = make_report(nothing, np.empty(0, np.bool_), budget, settings, clock)
+        facts["splats"] |= {
+            "before": self.total,
+            "kept": kept,
+            "removed": self.total - kept,
+            "unseen": unseen,
+            "left_out": 0,
+        }
+        facts["budget_remark"] = ""
+        if budget.max_mb is not None and kept == self.total:
+            facts["budget_remark"] = nothing_removed(sum(tile.size for tile in self.tiles))
+            facts["notes"].append(facts["budget_remark"])
+        return facts | quality_facts(nothing, np.empty(0, np.bool_), None, absorbed=False)
+
+    def write(self) -> list[int]:
+        """Write each tile into the folder of the job; return their bytes."""
+        calls = [
+            Call(
+                "write",
+                (tile, [u for u in self.units if any(tile == part.tile for part in u.parts)], kept),
+                tile.splats / self.total,
+            )
+            for tile, (kept, _) in zip(self.tiles, self.counts.tolist(), strict=True)
+        ]
+        return [*self._workers(self.job, calls, part(self._progress, *SHARES["write"]), "writing")]
+
+    def sizes(self) -> list[int]:
+        """Return the bytes that `write` would write of each tile."""
+        found = []
+        for tile, (kept, _) in zip(self.tiles, self.counts.tolist(), strict=True):
+            header = reopened(tile).header
+            shorter = len(header) - len(with_count(header, kept))
+            found.append(tile.fixed_bytes - shorter + kept * tile.row_bytes)
+        return found
+
+    def _each(self, step: str, *arguments: Any) -> Iterator[Any]:  # noqa: ANN401 - of each step its own
+        """Do a step of the closed form with each unit."""
+        given = tuple(self._small(argument) for argument in arguments)
+        calls = [
+            Call("score", (unit, step, given), len(unit) / self.total, chunked=True)
+            for unit in self.units
+        ]
+        return self._workers(self.job, calls, part(self._progress, *SHARES[step]), STEP_NAMES[step])
+
+    def _map(self, step: str, *arguments: Any, **options: Any) -> Iterator[Any]:  # noqa: ANN401 - of each its own
+        """Do a step of `Job` with each unit."""
+        calls = [
+            Call(step, (unit, *arguments), len(unit) / self.total, options=options)
+            for unit in self.units
+        ]
+        ahead = part(self._progress, *SHARES["select"])
+        return self._workers(self.job, calls, ahead, "selecting")
+
+    def _small(self, argument: Any) -> Any:  # noqa: ANN401 - as given
+        """Return an argument, or where it lies if it is large."""
+        if not isinstance(argument, np.ndarray) or argument.nbytes <= _SMALL:
+            return argument
+        self._shared += 1
+        name = f"shared-{self._shared}"
+        self.job.folder.note(name, argument)
+        return Shared(name)
+
+    def _remember(self, name: str, make: Callable[[], Any]) -> Any:  # noqa: ANN401 - as made
+        """Return what was made of the name, even by a run before this one."""
+        done, found = self.job.folder.noted(name)
+        if not done:
+            found = make()
+            self.job.folder.note(name, found)
+        return found
+
+    def _rule(self, budget: Budget) -> Rule:
+        """Return which splats a budget removes."""
+        if budget.threshold is not None:
+            return Rule(threshold=float(single(budget.threshold)))
+        if budget.min_seen is not None:
+            return Rule(least_seen=least_seen(budget.min_seen, len(self.job.views)))
+        amount, by_bytes = _amount(budget, self.tiles)
+        if not amount:
+            return Rule(left=(0,) * len(self.units))
+
+        def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:
+            return radix.added(self._map("rank", prefixes, shift, by_bytes=by_bytes))
+
+        edge, below = radix.find(count, 32, [amount - 1])[0]
+        tied = [*self._map("tied", edge, by_bytes=by_bytes)]
+        before = np.cumsum([0, *tied[:-1]])
+        return Rule(edge=edge, left=tuple((amount - below - before).tolist()), by_bytes=by_bytes)
+
+
+def _amount(budget: Budget, tiles: Sequence[Tile]) -> tuple[int, bool]:
+    """Return how many splats a budget removes; or how many bytes, and True.
+
+    Raises
+    ------
+    RefineError
+        See `Budget.removals`.
+    """
+    lengths = {tile.row_bytes for tile in tiles if tile.splats}
+    total, fixed = sum(tile.splats for tile in tiles), sum(tile.fixed_bytes for tile in tiles)
+    removals = budget.removals(total, min(lengths), fixed)
+    if budget.max_mb is None or len(lengths) == 1:
+        return removals or 0, False
+    excess = sum(tile.splats * tile.row_bytes for tile in tiles) - budget.room(fixed)
+    return max(excess, 0), True
+
+
+def _refuse_what_needs_all(budget: Budget, settings: Settings) -> None:
+    """Raise `RefineError` for methods and budgets that need all splats at once."""
+    if settings.method != "closed-form":
+        msg = (
+            f"method is {settings.method}, which needs all splats in memory: over tiles together "
+            "only closed-form works so far"
+        )
+        raise RefineError(msg)
+    if budget.psnr is not None:
+        msg = "a PSNR needs all splats in memory: over tiles together choose another budget"
+        raise RefineError(msg)
+    budget.refuse_meaningless(settings.method, frustum=settings.frustum)
+
+
+def _targets(tiles: Sequence[Tile], folder: Path, *, overwrite: bool) -> list[Path]:
+    """Return where each tile goes, and make the folder.
+
+    Raises
+    ------
+    RefineError
+        If two tiles have one name, or a file could not be made, or may not be replaced.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        msg = f"{folder}: cannot be made ({error.strerror or error})"
+        raise RefineError(msg) from error
+    targets = [folder / Path(tile.path).name for tile in tiles]
+    read = {Path(tile.path).resolve() for tile in tiles}
+    for place, target in enumerate(targets):
+        if target in targets[:place]:
+            msg = f"{tiles[place].path}: another tile is called {target.name} too"
+            raise RefineError(msg)
+        if target.resolve() in read:
+            msg = f"{target}: is read until all tiles are written; write to another folder"
+            raise RefineError(msg)
+        refuse_existing(target, overwrite=overwrite)
+    return targets
+
+
+def _digest(tiles: Sequence[Tile], views: ViewSet, budget: Budget, settings: Settings) -> str:
+    """Return a name for a job: that of the same job again, and of no other."""
+    told = hashlib.blake2b(digest_size=8)
+    for fact in (VERSION, ROWS, [*tiles], budget, settings):
+        told.update(repr(fact).encode("utf-8", "surrogateescape"))
+    for view in views:
+        for field in fields(view):
+            value = getattr(view, field.name)
+            told.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
+    return told.hexdigest()
+
+
+def _shown(path: Path | None) -> str | None:
+    return None if path is None else str(path)

@@ -1,0 +1,225 @@
+"""One step with one unit or one tile: what a worker does.
+
+A step reads the files and the folder of the job and writes into the folder. What it returns is
+small. It does nothing that could not be done again: where its result is noted, that is returned.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from .. import radix
+from ..errors import RefineError
+from ..formats.ply_header import with_count
+from ..formats.ply_write import write_rows
+from ..scoring.closed_form_block import STEPS, Block
+from ..selection import lowest
+from ..whole_file import whole_file
+from ..work import Progress, report, silent
+from .units import reopened, rows_of, splats_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..scoring.closed_form import ClosedForm
+    from ..views import ViewSet
+    from .folder import Folder
+    from .units import Tile, Unit
+
+_REPEATED = ("count",)
+"""Steps of `STEPS` that are done with several arguments: their results are not noted."""
+
+
+class Shared(NamedTuple):
+    """An argument that lies in the folder, since it is large.
+
+    Attributes
+    ----------
+    name : str
+    """
+
+    name: str
+
+
+class Rule(NamedTuple):
+    """Which splats go.
+
+    Attributes
+    ----------
+    threshold : float or None
+        Those with lower scores, in float32.
+    least_seen : int or None
+        Or those in fewer views.
+    edge : int
+        Or those whose scores have a lower key, and of those at it some of the first; see
+        `selection.lowest`.
+    left : tuple of int
+        How many of those, or of their bytes, in each unit.
+    by_bytes : bool
+        Whether each splat counts as many bytes as it takes in its file.
+    """
+
+    threshold: float | None = None
+    least_seen: int | None = None
+    edge: int = 0
+    left: tuple[int, ...] = ()
+    by_bytes: bool = False
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all steps of a job need.
+
+    Attributes
+    ----------
+    folder : Folder
+    views : ViewSet
+        Those that are used.
+    settings : ClosedForm
+    middle : (3,) float64, float
+        Of the views, as `ViewSet.middle` returns it.
+    """
+
+    folder: Folder
+    views: ViewSet
+    settings: ClosedForm
+    middle: tuple[NDArray[np.float64], float]
+
+    def score(
+        self,
+        unit: Unit,
+        step: str,
+        arguments: tuple[Any, ...],
+        *,
+        progress: Progress = silent,
+        threads: int | None = 1,
+    ) -> Any:  # noqa: ANN401 - of each step its own
+        """Do a step of `STEPS` with a unit."""
+        name, noted = f"{unit.index:06d}.{step}", step not in _REPEATED
+        if noted:
+            done, result = self.folder.noted(name)
+            if done:
+                return result
+        needed, made, over = STEPS[step]
+        try:
+            arrays = self.folder.load(unit.index, needed)
+        except FileNotFoundError:
+            # Another worker, taken for dead, ended this step just now.
+            done, result = self.folder.noted(name)
+            if done:
+                return result
+            raise
+        splats = splats_of(unit) if step == "read" else None
+        block = Block(
+            splats, self.views, self.settings, self.middle, threads=threads, arrays=arrays
+        )
+        del splats
+        block.progress = progress
+        result = getattr(block, step)(*map(self._whole, arguments))
+        self.folder.save(unit.index, {array: getattr(block, array) for array in made})
+        if noted:
+            self.folder.note(name, result)
+        self.folder.drop(unit.index, over)
+        return result
+
+    def rank(self, unit: Unit, prefixes: list[int], shift: int, *, by_bytes: bool) -> radix.Sparse:
+        """Return `radix.counts` of the scores of a unit."""
+        keys, weights = self._keys(unit), _bytes(unit) if by_bytes else None
+        return radix.Sparse.of(radix.counts(keys, prefixes, shift, weights))
+
+    def tied(self, unit: Unit, edge: int, *, by_bytes: bool) -> int:
+        """Return how many splats of a unit score as much as the last that goes, or their bytes."""
+        ties = self._keys(unit) == edge
+        return int(_bytes(unit)[ties].sum() if by_bytes else np.count_nonzero(ties))
+
+    def choose(self, unit: Unit, rule: Rule) -> NDArray[np.int64]:
+        """Decide which splats of a unit stay.
+
+        Returns
+        -------
+        (parts, 2) int64
+            Of each part, how many splats stay, and how many lie in no view.
+        """
+        found = self.folder.load(unit.index, ["values", "seen"])
+        if rule.threshold is not None:
+            gone = found["values"] < np.float32(rule.threshold)
+        elif rule.least_seen is not None:
+            gone = found["seen"] < rule.least_seen
+        else:
+            weights = _bytes(unit) if rule.by_bytes else None
+            keys = radix.keys_of(found["values"])
+            gone = lowest(keys, rule.edge, rule.left[unit.index], weights)
+        self.folder.save(unit.index, {"keep": ~gone})
+        unseen = found["seen"] == 0
+        return np.array(
+            [
+                [np.count_nonzero(~gone[piece]), np.count_nonzero(unseen[piece])]
+                for piece in unit.slices()
+            ]
+        )
+
+    def write(
+        self, tile: Tile, units: list[Unit], kept: int, *, progress: Progress = silent
+    ) -> int:
+        """Write what stays of a tile into the folder of the job, and return its bytes.
+
+        Parameters
+        ----------
+        tile : Tile
+        units : list of Unit
+            Those in which it lies.
+        kept : int
+            How many of its splats stay.
+        progress : callable, optional
+        """
+        name = f"{Path(tile.path).name}.written"
+        made = self.folder.tiles / Path(tile.path).name
+        done, result = self.folder.noted(name)
+        if done and made.exists():  # it may have been renamed, just before a kill
+            return int(result)
+        file = reopened(tile)
+        with whole_file(made, overwrite=True) as stream:
+            stream.write(with_count(file.header, kept))
+            stream.write(file.before.data)
+            for unit in units:
+                report(progress, (unit.index - units[0].index) / len(units), "writing")
+                keep = self.folder.load(unit.index, ["keep"])["keep"]
+                for part, piece in zip(unit.parts, unit.slices(), strict=True):
+                    if part.tile == tile:
+                        write_rows(stream, rows_of(part), keep[piece], {})
+            stream.write(file.after.data)
+            size = stream.tell()
+        self.folder.note(name, np.array(size))
+        return size
+
+    def _keys(self, unit: Unit) -> NDArray[np.unsignedinteger[Any]]:
+        return radix.keys_of(self.folder.load(unit.index, ["values"])["values"])
+
+    def _whole(self, argument: Any) -> Any:  # noqa: ANN401 - as given
+        if not isinstance(argument, Shared):
+            return argument
+        return self.folder.noted(argument.name)[1]
+
+
+def unseen_files(job: Job, tiles: list[Tile]) -> str:
+    """Return what this process cannot see of a job's files, in a sentence; "" if all is there."""
+    if not job.folder.noted("begun")[0]:
+        return f"{job.folder.path} is not there"
+    for tile in tiles:
+        with contextlib.suppress(RefineError, OSError):
+            reopened(tile)
+            continue
+        return f"{tile.path} is not there, or another file"
+    return ""
+
+
+def _bytes(unit: Unit) -> NDArray[np.int64]:
+    """Return how many bytes each splat of a unit takes in its file, (n,)."""
+    return np.repeat(
+        [part.tile.row_bytes for part in unit.parts], [part.rows for part in unit.parts]
+    )

@@ -1,0 +1,216 @@
+"""Tiles, and the runs of rows that they are worked through in."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ..errors import RefineError
+from ..formats.ply_columns import splats_from_columns
+from ..formats.registry import read_splats
+from ..scoring.closed_form_block import ROWS
+from ..splats import Splats
+from ..whole_file import expanded
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from ..formats.ply import SplatFile
+
+
+class Tile(NamedTuple):
+    """A file of splats, as it was when the job began.
+
+    Attributes
+    ----------
+    path : str
+        Absolute.
+    splats : int
+        How many it holds.
+    dtype : structured
+        Of a row.
+    begin : int
+        Bytes before the first row.
+    fixed_bytes : int
+        Bytes of everything but the rows.
+    size, changed : int
+        Bytes of the file, and when it was changed last, ns.
+    """
+
+    path: str
+    splats: int
+    dtype: np.dtype[Any]
+    begin: int
+    fixed_bytes: int
+    size: int
+    changed: int
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of one splat."""
+        return self.dtype.itemsize
+
+
+class Part(NamedTuple):
+    """Rows ``start`` to ``stop`` of a tile.
+
+    Attributes
+    ----------
+    tile : Tile
+    start, stop : int
+    """
+
+    tile: Tile
+    start: int
+    stop: int
+
+    @property
+    def rows(self) -> int:
+        """How many."""
+        return self.stop - self.start
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A run of the rows of all tiles together, which may begin in one tile and end in another.
+
+    Attributes
+    ----------
+    index : int
+        Which one of all.
+    parts : tuple of Part
+        Of the tiles that it lies in, in their order; none is empty.
+    """
+
+    index: int
+    parts: tuple[Part, ...]
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return sum(part.rows for part in self.parts)
+
+    def slices(self) -> list[slice]:
+        """Return where in the unit each part lies."""
+        ends = np.cumsum([0, *(part.rows for part in self.parts)]).tolist()
+        return [slice(*pair) for pair in itertools.pairwise(ends)]
+
+
+def tile_at(path: Path | str) -> Tile:
+    """Look at a file of splats.
+
+    Raises
+    ------
+    RefineError
+        See `read_splats`; also if it is no plain binary PLY.
+    """
+    path = expanded(path)
+    file = read_splats(path)
+    if file.origin is not None or file.lines is not None:
+        msg = (
+            f"{path}: is {file.format}, expected a plain binary PLY as a tile, which 'refine "
+            "convert IN OUT.ply' makes of other formats"
+        )
+        raise RefineError(msg)
+    found = path.stat()
+    return Tile(
+        str(path.absolute()), len(file), file.rows.dtype, len(file.header) + len(file.before),
+        file.fixed_bytes, found.st_size, found.st_mtime_ns,
+    )  # fmt: skip
+
+
+def reopened(tile: Tile) -> SplatFile:
+    """Open a tile again.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be read, or is another file than it was.
+    """
+    _refuse_changed(tile)
+    return read_splats(tile.path)
+
+
+def rows_of(part: Part) -> NDArray[Any]:
+    """Read the rows of a part.
+
+    They are read rather than mapped: pages that are mapped stay in memory as long as the map.
+
+    Raises
+    ------
+    RefineError
+        See `reopened`.
+    """
+    tile = part.tile
+    _refuse_changed(tile)
+    rows = np.fromfile(
+        tile.path, tile.dtype, part.rows, offset=tile.begin + part.start * tile.row_bytes
+    )
+    _refuse_changed(tile)
+    return rows
+
+
+def _refuse_changed(tile: Tile) -> None:
+    """Raise `RefineError` if a tile is another file than it was when the job began."""
+    try:
+        found = Path(tile.path).stat()
+    except OSError as error:
+        msg = f"{tile.path}: cannot be read ({error.strerror or error})"
+        raise RefineError(msg) from error
+    if (found.st_size, found.st_mtime_ns) != (tile.size, tile.changed):
+        msg = f"{tile.path}: was changed while it was worked on; nothing was written"
+        raise RefineError(msg)
+
+
+def units_of(tiles: Sequence[Tile]) -> list[Unit]:
+    """Return the runs of `ROWS` rows of all tiles together; only the last may be shorter."""
+    units: list[Unit] = []
+    parts: list[Part] = []
+    room = ROWS
+    for tile in tiles:
+        start = 0
+        while start < tile.splats:
+            stop = min(start + room, tile.splats)
+            parts.append(Part(tile, start, stop))
+            room -= stop - start
+            start = stop
+            if not room:
+                units.append(Unit(len(units), tuple(parts)))
+                parts, room = [], ROWS
+    return [*units, Unit(len(units), tuple(parts))] if parts else units
+
+
+def splats_of(unit: Unit) -> Splats:
+    """Return the splats of a unit.
+
+    Returns
+    -------
+    Splats
+        Of the highest degree among its parts: coefficients that a part lacks are 0.
+    """
+    parts = [splats_from_columns(rows_of(part)) for part in unit.parts]
+    if len(parts) == 1:
+        return parts[0]
+    most = max(part.sh_rest.shape[1] for part in parts)
+    columns = {
+        field.name: _joined(getattr(part, field.name) for part in parts)
+        for field in fields(Splats)
+        if field.name != "sh_rest"
+    }
+    return Splats(**columns, sh_rest=_joined(_padded(part.sh_rest, most) for part in parts))
+
+
+def _joined(arrays: Iterable[NDArray[Any]]) -> NDArray[Any]:
+    with np.errstate(invalid="ignore"):  # signalling NaN converted to float64
+        return np.concatenate([*arrays])
+
+
+def _padded(rest: NDArray[Any], most: int) -> NDArray[Any]:
+    """Return harmonics (n, K, 3) with zeros up to K = `most`."""
+    return np.pad(rest, ((0, 0), (0, most - rest.shape[1]), (0, 0)))

@@ -1,0 +1,288 @@
+"""Operators that put right what the warnings beside Apply tell, each in one click."""
+
+# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, NamedTuple
+
+import bpy
+import mathutils
+import numpy as np
+from bpy.props import EnumProperty, IntProperty
+
+from ..cameras.objects import UPRIGHT, WEIGHT, world_matrix
+from ..cameras.sets import chosen_cameras
+from ..core.errors import RefineError
+from ..mesh import attributes as mesh_attributes
+from ..mesh import edit as mesh_edit
+from ..mesh import layout as mesh_layout
+from ..mesh import scores as mesh_scores
+from . import camera_list, plans
+from .on_thread import FAILURES, Answer, fail
+from .operators import OnSplats
+from .wrapped import counted
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from numpy.typing import NDArray
+
+KEEP = "refine_keep"
+"""Boolean point attribute: what was protected and, with it, what no view saw."""
+
+_INNER = (5.0, 95.0)  # percentiles of the splats' positions that a ring frames
+_ELEVATIONS = (15.0, 40.0)  # degrees, by turns
+_MARGIN = 1.1  # how much farther away than would just do
+
+
+class _Bounds(NamedTuple):
+    """The ball around most of the splats, world units."""
+
+    middle: NDArray[np.float64]  # (3,)
+    radius: float
+
+
+class REFINE_OT_turn_cameras(OnSplats, bpy.types.Operator):
+    """Turn the cameras that decide a quarter about the world's X axis"""
+
+    bl_idname = "refine.turn_cameras"
+    bl_label = "Turn the Cameras"
+    bl_options = {"REGISTER", "UNDO"}
+
+    quarter: EnumProperty(
+        name="Turn",
+        description="About the world's X axis",
+        items=(
+            ("1", "As Upright", "From y down to z up, as Upright turns what is imported"),
+            ("-1", "Back", "From z up to y down"),
+        ),
+    )
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Turn them."""
+        context.view_layer.update()  # or what a script just made stands at the origin
+        try:
+            cameras = _deciding(context)
+            roots = _roots(cameras, context.object)
+        except FAILURES as error:
+            return fail(self, error)
+        turn = mathutils.Matrix(UPRIGHT.tolist())
+        if self.quarter == "-1":
+            turn = turn.inverted()
+        moving = [root for root in roots if root.animation_data]
+        for root in roots:
+            if root not in moving:
+                root.matrix_world = turn @ root.matrix_world
+        if moving:
+            _turn_animated(context, moving, turn)
+        context.view_layer.update()
+        self.report({"INFO"}, f"Turned {counted(len(cameras), 'camera')}; score again")
+        return {"FINISHED"}
+
+
+class REFINE_OT_add_ring(OnSplats, bpy.types.Operator):
+    """Add cameras around the splats that see all of them; they decide with those there are"""
+
+    bl_idname = "refine.add_ring"
+    bl_label = "Add a Ring of Cameras"
+    bl_options = {"REGISTER", "UNDO"}
+
+    count: IntProperty(name="Cameras", default=16, min=3, max=360)
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Add them."""
+        try:
+            bounds = _bounds(context)
+        except FAILURES as error:
+            return fail(self, error)
+        collection = bpy.data.collections.new("Ring of Cameras")
+        for number in range(self.count):
+            collection.objects.link(_camera(context.scene, bounds, number, self.count))
+        _join(context, collection)
+        self.report({"INFO"}, f"Added {self.count} cameras in '{collection.name}'; score again")
+        return {"FINISHED"}
+
+
+class REFINE_OT_leave_out(OnSplats, bpy.types.Operator):
+    """Give cameras that see nothing, or all from far away, the weight 0: they no longer decide"""
+
+    bl_idname = "refine.leave_out"
+    bl_label = "Leave Them Out"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Leave them out."""
+        record = mesh_scores.record(context.object.data) or {}
+        out = camera_list.useless(record)
+        try:
+            cameras = _deciding(context)
+            leave = [camera for camera in cameras if camera.name in out]
+            _refuse_libraries(leave)
+            if not leave:
+                msg = "none of the cameras is known to see nothing; score first"
+                raise RefineError(msg)
+            if all(camera in leave or camera.get(WEIGHT, 1.0) == 0.0 for camera in cameras):
+                msg = "no camera would be left; add a ring of cameras"
+                raise RefineError(msg)
+        except FAILURES as error:
+            return fail(self, error)
+        for camera in leave:
+            camera[WEIGHT] = 0.0
+        self.report({"INFO"}, f"Left out {counted(len(leave), 'camera')}; score again")
+        return {"FINISHED"}
+
+
+class REFINE_OT_keep_unseen(OnSplats, bpy.types.Operator):
+    """Protect the splats that lie in no view, with those that are protected"""
+
+    bl_idname = "refine.keep_unseen"
+    bl_label = "Keep What Is Unseen"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Mark them, and protect what is marked."""
+        obj, settings = context.object, context.scene.refine
+        try:
+            checked = mesh_layout.check(obj)
+            mesh_edit.check_writable(obj)
+            keep = mesh_scores.stored_scores(checked).seen == 0  # (N,)
+            count = int(np.count_nonzero(keep))
+            protected = mesh_edit.protected_mask(obj, settings.protect)
+        except FAILURES as error:
+            return fail(self, error)
+        if protected is not None:
+            keep |= protected
+        mesh_attributes.write_attribute(obj.data, KEEP, "BOOLEAN", keep)
+        mesh_attributes.updated(obj.data)
+        settings.protect = KEEP
+        plans.refresh(context)
+        self.report({"INFO"}, f"{count:,} splats that lie in no view stay")
+        return {"FINISHED"}
+
+
+def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:
+    """Return the cameras that decide; of a shot all that take part in it.
+
+    Raises
+    ------
+    RefineError
+        If there is none.
+    """
+    scene, settings = context.scene, context.scene.refine
+    cameras = chosen_cameras(context, settings.source, settings.collection)
+    if settings.source == "FRAMES":
+        cameras = [marker.camera for marker in scene.timeline_markers] + [scene.camera]
+        cameras = list(dict.fromkeys(camera for camera in cameras if camera))
+    if not cameras:
+        msg = "no cameras: choose those that decide, or add a ring of cameras"
+        raise RefineError(msg)
+    return cameras
+
+
+def _refuse_libraries(objects: Iterable[bpy.types.Object]) -> None:
+    for obj in objects:
+        if obj.library:
+            msg = f"'{obj.name}': is linked from {obj.library.filepath}; make it local first"
+            raise RefineError(msg)
+
+
+def _roots(cameras: Sequence[bpy.types.Object], splats: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return what is to be turned so that cameras turn, and the splats do not.
+
+    Raises
+    ------
+    RefineError
+        If that cannot be.
+    """
+    own = [splats]
+    while own[-1].parent:
+        own.append(own[-1].parent)
+    roots = []
+    for camera in cameras:
+        root = camera
+        while root.parent and root.parent not in own:
+            root = root.parent
+        if root.parent:
+            msg = f"camera '{camera.name}' turns with the splats, being parented to them or theirs"
+            raise RefineError(msg)
+        if root.constraints:
+            msg = f"'{root.name}': has constraints, which decide where it is; turn it by hand"
+            raise RefineError(msg)
+        roots.append(root)
+    roots = list(dict.fromkeys(roots))
+    _refuse_libraries(roots)
+    return roots
+
+
+def _turn_animated(
+    context: bpy.types.Context, roots: Sequence[bpy.types.Object], turn: mathutils.Matrix
+) -> None:
+    """Turn objects whose place is animated, by a parent."""
+    empty = bpy.data.objects.new("Turned Cameras", None)
+    context.scene.collection.objects.link(empty)
+    empty.matrix_world = turn
+    for root in roots:
+        root.parent = empty
+        root.matrix_parent_inverse.identity()
+
+
+def _bounds(context: bpy.types.Context) -> _Bounds:
+    """Return the ball around most of the active object's splats.
+
+    Raises
+    ------
+    RefineError
+        If it holds none that are finite.
+    """
+    checked = mesh_layout.check(context.object)
+    matrix = world_matrix(checked.obj, context.evaluated_depsgraph_get())
+    means = mesh_attributes.read_attribute(checked.mesh, "position").astype(np.float64)
+    means = means[np.isfinite(means).all(axis=1)]
+    if not len(means):
+        msg = f"object '{checked.obj.name}': has no splat at a finite place"
+        raise RefineError(msg)
+    means = means @ matrix[:3, :3].T + matrix[:3, 3]
+    low, high = np.percentile(means, _INNER, axis=0)
+    # Of one point, and of what is flat, a ball of some size.
+    return _Bounds((low + high) / 2.0, float(np.linalg.norm(high - low)) / 2.0 or 1.0)
+
+
+def _camera(scene: bpy.types.Scene, bounds: _Bounds, number: int, count: int) -> bpy.types.Object:
+    """Make one camera of a ring; it frames the ball in renders of the scene's size."""
+    data = bpy.data.cameras.new("Ring")
+    render = scene.render
+    width = render.resolution_x * render.pixel_aspect_x
+    height = render.resolution_y * render.pixel_aspect_y
+    # The sensor lies along the longer side of the picture.
+    half = data.sensor_width / 2.0 / data.lens * min(width, height) / max(width, height)
+    distance = _MARGIN * bounds.radius / math.sin(math.atan(half))
+    data.clip_start, data.clip_end = 1e-3 * distance, 1e2 * distance
+    data.display_size = 0.1 * bounds.radius
+    around = 2.0 * math.pi * number / count
+    up = math.radians(_ELEVATIONS[number % len(_ELEVATIONS)])
+    away = mathutils.Vector(
+        (math.cos(around) * math.cos(up), math.sin(around) * math.cos(up), math.sin(up))
+    )
+    camera = bpy.data.objects.new("Ring", data)
+    camera.location = mathutils.Vector(bounds.middle) + distance * away
+    camera.rotation_euler = away.to_track_quat("Z", "Y").to_euler()
+    return camera
+
+
+def _join(context: bpy.types.Context, ring: bpy.types.Collection) -> None:
+    """Have a ring decide with the cameras that decide already."""
+    scene, settings = context.scene, context.scene.refine
+    parent = settings.collection if settings.source == "COLLECTION" else None
+    if parent and not parent.library:
+        parent.children.link(ring)
+        return
+    scene.collection.children.link(ring)
+    if settings.source == "VISIBLE":
+        return
+    if parent:
+        ring.children.link(parent)
+    else:
+        for camera in chosen_cameras(context, settings.source, None):
+            ring.objects.link(camera)
+    settings.collection, settings.source = ring, "COLLECTION"

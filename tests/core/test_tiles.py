@@ -1,0 +1,381 @@
+"""Many files pruned as one scene, against one file in memory."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from refine_addon.core import (
+    Budget,
+    RefineError,
+    Settings,
+    prune_file,
+    prune_tiles,
+    read_cameras,
+    read_ply,
+    score,
+)
+from refine_addon.core.formats.ply_header import with_count
+from refine_addon.core.scoring import closed_form
+from refine_addon.core.selection import select
+from refine_addon.core.tiles import prune as together
+from refine_addon.core.tiles import steps, units
+from refine_addon.core.tiles.folder import Folder
+from tests.strategies import plain_ply
+
+ROOM = Path(__file__).parents[2] / "tests/data/room_small"
+CLOSED = Settings(method="closed-form", views=8)
+COUNT = 5000
+CUTS = (0, 700, 700, 2600, COUNT)
+"""Rows at which the room is cut: a short tile, an empty one, and two that span units."""
+
+
+@pytest.fixture
+def rows(monkeypatch):
+    """Give rows of the room; some are equal, some cannot be drawn. A unit has 1000 of them."""
+    monkeypatch.setattr(closed_form, "ROWS", 1000)
+    monkeypatch.setattr(units, "ROWS", 1000)
+    rows = read_ply(ROOM / "point_cloud.ply").rows[::7][:COUNT].copy()
+    rows[900:1300] = rows[100]
+    rows["x"][[5, 2000]] = np.nan
+    rows["opacity"][10:400:7] = -np.inf
+    rows["scale_0"][4000] = np.inf
+    return rows
+
+
+@pytest.fixture
+def views():
+    """Give the room's cameras."""
+    return read_cameras(ROOM / "cameras.json")
+
+
+@pytest.fixture
+def tiles(tmp_path, rows):
+    """Write the rows as four files, and as one."""
+    write(tmp_path / "whole.ply", rows)
+    paths = [tmp_path / f"{name}.ply" for name in "badc"]
+    for path, start, stop in zip(paths, CUTS, CUTS[1:], strict=False):
+        write(path, rows[start:stop])
+    return paths
+
+
+def write(path, rows):
+    """Write rows of the room as a file."""
+    header = read_ply(ROOM / "point_cloud.ply").header
+    path.write_bytes(with_count(header, len(rows)) + rows.tobytes())
+
+
+def joined(paths):
+    """Return the rows of files as bytes."""
+    return b"".join(read_ply(path).rows.tobytes() for path in paths)
+
+
+BUDGETS = [
+    Budget(ratio=0.6),
+    Budget(ratio=0.1),  # among the equal ones, which are those from the 253rd to the 653rd
+    Budget(ratio=0.0),
+    Budget(keep=1),
+    Budget(max_mb=0.4),
+    Budget(threshold=0.05),
+    Budget(min_seen=30),
+]
+
+
+@pytest.mark.parametrize("budget", BUDGETS, ids=str)
+def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budget):
+    """Every row to the byte, in the order of the files, whatever decides and wherever it is cut.
+
+    For a size, the four headers take bytes that one does not: here the rows left are compared with
+    those of as many in one file.
+    """
+    report = prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+
+    if budget.max_mb:
+        assert 0 <= 400_000 - report["files"]["output_bytes"] < 2 * 248
+        budget = Budget(keep=report["splats"]["kept"])
+    whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", views, budget, CLOSED)
+    assert joined(tmp_path / "out" / path.name for path in tiles) == joined(
+        [tmp_path / "pruned.ply"]
+    )
+    assert report["splats"] == whole.report["splats"]
+    assert report["weights"] == whole.report["weights"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in tiles}
+
+
+def test_splats_at_the_threshold_stay(tmp_path, tiles, views):
+    """401 splats are equal: those below them go, and none of them."""
+    splats = read_ply(tmp_path / "whole.ply").splats()
+    values = score(splats, views, CLOSED).values
+    threshold = float(values[900])
+
+    report = prune_tiles(tiles, None, views, Budget(threshold=threshold), CLOSED)
+
+    assert np.count_nonzero(values == values[900]) == 401
+    assert report["splats"]["removed"] == np.count_nonzero(values < values[900])
+
+
+def test_a_report_says_what_stays_of_each_tile(tmp_path, tiles, views):
+    """Counts and bytes add up to those of all, and bytes are those of the files."""
+    report = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+
+    each = report["tiles"]
+    assert [tile["input"] for tile in each] == [str(path) for path in tiles]
+    assert [tile["before"] for tile in each] == [700, 0, 1900, 2400]
+    assert sum(tile["kept"] for tile in each) == report["splats"]["kept"] == COUNT // 2
+    assert sum(tile["unseen"] for tile in each) == report["splats"]["unseen"]
+    for tile in each:
+        output = Path(tile["output"])
+        assert (len(read_ply(output)), output.stat().st_size) == (
+            tile["kept"],
+            tile["output_bytes"],
+        )
+
+
+def test_without_a_folder_the_sizes_are_told_and_nothing_is_written(tmp_path, tiles, views):
+    """The same sizes as those of a run that writes."""
+    before = sorted(tmp_path.rglob("*"))
+    told = prune_tiles(tiles, None, views, Budget(ratio=0.5), CLOSED)
+
+    assert sorted(tmp_path.rglob("*")) == before
+    written = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+    assert [tile["output_bytes"] for tile in told["tiles"]] == [
+        tile["output_bytes"] for tile in written["tiles"]
+    ]
+
+
+@pytest.mark.parametrize("megabytes", [0.1, 0.35, 10.0])
+def test_tiles_of_other_degrees_go_by_their_bytes(tmp_path, views, rows, megabytes):
+    """As in memory, where rows have several lengths: the lowest go until the rest fits.
+
+    The files have degree 3, 1 and 0; scores do not depend on the harmonics above the constant one.
+    """
+    names = rows.dtype.names
+    paths, lengths = [], []
+    for index, degree in enumerate((3, 1, 0)):
+        file = tmp_path / f"{degree}.ply"
+        file.write_bytes(plain_ply(400, degree))
+        data = read_ply(file)
+        some = data.rows.copy()
+        for name in set(names) & set(some.dtype.names) - {"nx", "ny", "nz"}:
+            if not name.startswith("f_rest"):
+                some[name] = rows[name][index * 400 : index * 400 + 400]
+        file.write_bytes(data.header + some.tobytes())
+        paths.append(file)
+        lengths.append(np.full(400, some.dtype.itemsize))
+    write(tmp_path / "whole.ply", rows[:1200])
+    scores = score(read_ply(tmp_path / "whole.ply").splats(), views, CLOSED)
+    fixed = sum(read_ply(path).fixed_bytes for path in paths)
+    keep = select(
+        scores, Budget(max_mb=megabytes), row_bytes=np.concatenate(lengths), fixed_bytes=fixed
+    )
+
+    report = prune_tiles(paths, tmp_path / "out", views, Budget(max_mb=megabytes), CLOSED)
+
+    for path, part in zip(paths, np.split(keep, 3), strict=True):
+        expected = read_ply(path).rows[part]
+        assert read_ply(tmp_path / "out" / path.name).rows.tobytes() == expected.tobytes()
+    assert report["files"]["output_bytes"] <= megabytes * 1e6
+
+
+def test_a_size_that_no_splat_fits_in_is_refused(tmp_path, tiles, views):
+    """The headers alone are longer than 1 kB."""
+    with pytest.raises(RefineError, match="too small for one splat of 248 bytes"):
+        prune_tiles(tiles, tmp_path / "out", views, Budget(max_mb=0.001), CLOSED)
+
+
+# What is refused.
+
+
+@pytest.mark.parametrize(
+    ("settings", "budget", "words"),
+    [
+        (Settings(), Budget(ratio=0.5), "method is auto.*only closed-form"),
+        (CLOSED, Budget(psnr=40.0), "PSNR needs all splats"),
+        (CLOSED, Budget(threshold=1e30), "would remove all 5000 splats"),
+    ],
+)
+def test_what_does_not_work_over_tiles_is_refused_and_leaves_nothing(
+    tmp_path, tiles, views, settings, budget, words
+):
+    """Before or after the work, the folder is as empty as it was."""
+    with pytest.raises(RefineError, match=words):
+        prune_tiles(tiles, tmp_path / "out", views, budget, settings)
+
+    assert not list((tmp_path / "out").glob("*"))
+
+
+def damaged(path, tiles):
+    """Return tiles, one of which is at fault, and what is said of it."""
+    kind = path.name
+    if kind == "missing":
+        return [*tiles, path], "missing: cannot be read"
+    if kind == "short.ply":
+        path.write_bytes(tiles[0].read_bytes()[:-100])
+        return [*tiles, path], "short.ply: truncated"
+    if kind == "text.ply":
+        header, _, _ = plain_ply(1).partition(b"end_header")
+        header = header.replace(b"binary_little_endian", b"ascii") + b"end_header\n"
+        path.write_bytes(header + b" ".join([b"0"] * header.count(b"property")) + b"\n")
+        return [*tiles, path], "text.ply: is ascii 1.0, expected a plain binary PLY"
+    (path.parent / "more").mkdir()
+    again = path.parent / "more" / tiles[1].name
+    again.write_bytes(tiles[1].read_bytes())
+    return [*tiles, again], f"another tile is called {again.name} too"
+
+
+@pytest.mark.parametrize("kind", ["missing", "short.ply", "text.ply", "same"])
+def test_one_tile_at_fault_stops_all(tmp_path, tiles, views, kind):
+    """It is named, and no tile is written."""
+    given, words = damaged(tmp_path / kind, tiles)
+
+    with pytest.raises(RefineError, match=words):
+        prune_tiles(given, tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+
+    assert not list((tmp_path / "out").glob("*"))
+
+
+def test_files_that_exist_stay_until_they_may_be_replaced(tmp_path, tiles, views):
+    """One of four is there already: none is written; then all of them are."""
+    there = tmp_path / "out" / tiles[3].name
+    there.parent.mkdir()
+    there.write_bytes(b"mine")
+
+    with pytest.raises(RefineError, match="exists already"):
+        prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+
+    assert [*(tmp_path / "out").iterdir()] == [there]
+    assert there.read_bytes() == b"mine"
+    there.chmod(0o640)
+    prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED, overwrite=True)
+    assert len(list((tmp_path / "out").iterdir())) == 4
+    assert there.stat().st_mode & 0o777 == 0o640
+
+
+def test_tiles_are_not_replaced_while_they_are_read(tmp_path, tiles, views):
+    """A run that goes on after a kill would prune again what was pruned already."""
+    with pytest.raises(RefineError, match="is read until all tiles are written"):
+        prune_tiles(tiles, tmp_path, views, Budget(ratio=0.5), CLOSED, overwrite=True)
+
+
+def test_a_tile_that_changes_meanwhile_stops_all(tmp_path, tiles, views):
+    """Written again, of the same length: its rows may no longer be those that were scored."""
+
+    def progress(fraction, _what):
+        if fraction > 0.5:
+            tiles[2].write_bytes(tiles[2].read_bytes())
+
+    with pytest.raises(RefineError, match="was changed while it was worked on"):
+        prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED, progress=progress)
+
+    assert not list((tmp_path / "out").glob("*"))
+
+
+def test_a_tile_that_cannot_be_written_leaves_none(tmp_path, tiles, views, monkeypatch):
+    """As on a full disk at the third tile."""
+    write_tile = steps.Job.write
+
+    def full(self, tile, *more, **options):
+        if tile.path.endswith(tiles[2].name):
+            msg = "no space left on the disk"
+            raise RefineError(msg)
+        return write_tile(self, tile, *more, **options)
+
+    monkeypatch.setattr(steps.Job, "write", full)
+
+    with pytest.raises(RefineError, match="no space left"):
+        prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+
+    assert not list((tmp_path / "out").glob("*"))
+
+
+# What is done after an interruption.
+
+
+@pytest.mark.parametrize("stop", [0.1, 0.5, 0.77, 0.8, 0.83, 0.9])
+def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views, monkeypatch, stop):
+    """Units that were read are not read again, tiles that were written not written again.
+
+    Stopped in the middle of every step, the second run ends with the same bytes as a run at once.
+    """
+    budget = Budget(ratio=0.5)
+    prune_tiles(tiles, tmp_path / "once", views, budget, CLOSED)
+    done = []
+    read, write_rows = steps.splats_of, steps.write_rows
+    monkeypatch.setattr(steps, "splats_of", lambda unit: done.append(unit.index) or read(unit))
+    monkeypatch.setattr(
+        steps, "write_rows", lambda *rows: done.append(len(rows[1])) or write_rows(*rows)
+    )
+
+    def interrupt(fraction, _what):
+        if fraction > stop:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED, progress=interrupt)
+    assert not list((tmp_path / "out").glob("*.ply"))
+    prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+
+    for path in tiles:
+        once, again = ((tmp_path / folder / path.name).read_bytes() for folder in ("once", "out"))
+        assert once == again
+    assert len(list((tmp_path / "out").iterdir())) == 4
+    assert sorted(index for index in done if index < 5) == [0, 1, 2, 3, 4]
+    # Rows that are copied: of each tile once, or once more of the tile under way.
+    assert sum(index for index in done if index >= 5) <= COUNT + (1900 if stop > 0.82 else 0)
+
+
+def test_a_job_that_was_stopped_while_it_renamed_goes_on(tmp_path, tiles, views, monkeypatch):
+    """One of four files is in its place already; replacing it, the second run ends."""
+    publish, budget = together.publish, Budget(ratio=0.5)
+
+    def stop(made, path, **options):
+        if path.name == tiles[1].name:
+            raise KeyboardInterrupt
+        publish(made, path, **options)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(together, "publish", stop)
+        with pytest.raises(KeyboardInterrupt):
+            prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+
+    with pytest.raises(RefineError, match="exists already"):
+        prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+    prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED, overwrite=True)
+    assert sum(len(read_ply(tmp_path / "out" / path.name)) for path in tiles) == COUNT // 2
+
+
+def test_another_job_does_not_take_over_what_is_left(tmp_path, tiles, views):
+    """Of another budget, the folder has another name."""
+
+    def interrupt(fraction, _what):
+        if fraction > 0.9:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED, progress=interrupt)
+    report = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.25), CLOSED)
+
+    assert report["splats"]["removed"] == COUNT // 4
+
+
+def test_two_runs_do_not_work_in_one_folder(tmp_path):
+    """The second is told so."""
+    folder = Folder(tmp_path / "job")
+    with folder.opened(), pytest.raises(RefineError, match="another run"), folder.opened():
+        pass
+
+
+def test_what_is_noted_is_read_back(tmp_path):
+    """Nothing, one array, several; what was not noted is told from nothing."""
+    folder = Folder(tmp_path / "job")
+    with folder.opened():
+        folder.note("none", None)
+        folder.note("one", np.arange(3))
+        folder.note("two", (np.eye(2), 0.1))
+
+    assert folder.noted("none") == (True, None)
+    assert folder.noted("one")[1].tolist() == [0, 1, 2]
+    assert [each.tolist() for each in folder.noted("two")[1]] == [[[1, 0], [0, 1]], 0.1]
+    assert folder.noted("three") == (False, None)
