@@ -8,8 +8,9 @@ from bpy.props import PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
-from .ui import camera_list, kept, plans, price, running, volumes
+from .ui import camera_list, kept, plans, price, running, translations, volumes
 from .ui.camera_list import REFINE_PT_camera_list, REFINE_UL_cameras, RefineCamera
+from .ui.compare import REFINE_OT_compare
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
 from .ui.operators import (
@@ -31,6 +32,7 @@ from .ui.panel import (
     REFINE_PT_score,
     REFINE_PT_splats,
 )
+from .ui.preferences import RefinePreferences
 from .ui.properties import RefineSettings
 from .ui.remedies import (
     REFINE_OT_add_ring,
@@ -54,6 +56,7 @@ CLASSES = (
     RefineCamera,
     RefineVolume,
     RefineSettings,
+    RefinePreferences,
     REFINE_OT_import_ply,
     REFINE_OT_import_cameras,
     REFINE_OT_find_floaters,
@@ -65,6 +68,7 @@ CLASSES = (
     REFINE_OT_score,
     REFINE_OT_plan,
     REFINE_OT_apply,
+    REFINE_OT_compare,
     REFINE_OT_preview,
     REFINE_OT_view,
     REFINE_OT_convert,
@@ -101,6 +105,7 @@ def register() -> None:
     bpy.types.Scene.refine = PointerProperty(type=RefineSettings)
     bpy.types.TOPBAR_MT_file_import.append(_draw_import)
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
+    translations.register()
     camera_list.register()
     kept.register()
     volumes.register()
@@ -121,6 +126,7 @@ def unregister() -> None:
     volumes.unregister()
     kept.unregister()
     camera_list.unregister()
+    translations.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)
     bpy.types.TOPBAR_MT_file_import.remove(_draw_import)
     del bpy.types.Scene.refine

@@ -7,6 +7,7 @@ leaves the scene as it was.
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from .cameras.objects import world_matrix
 from .core import pipeline
 from .core.affine import is_uniform, transformed
 from .core.errors import RefineError
+from .core.file_to_file import picture_facts
 from .core.formats.ply import columns_from_splats
 from .core.formats.registry import as_written, format_named, refuse_unknown_size
 from .core.report import Clock, Files, complete_report, held
@@ -35,6 +37,7 @@ from .mesh.layout import SplatObject, check
 from .mesh.scores import RECORD, store, stored_scores
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -43,6 +46,7 @@ if TYPE_CHECKING:
     from .core.formats.ply import SplatFile
     from .core.formats.registry import Packed
     from .core.levels.lod import Level
+    from .core.picture_files import PictureFiles
     from .core.scores import Scores
     from .core.selection import Budget
     from .core.splats import Splats
@@ -168,13 +172,6 @@ def stored_task(
     )
 
 
-def mark_removed(checked: SplatObject, task: Task) -> NDArray[np.bool_]:
-    """Mark the splats that a task (`stored_task`) removes; return which stay, (N,)."""
-    keep = pipeline.decide(task).keep
-    mesh_edit.mark_removed(checked.obj, ~keep)
-    return keep
-
-
 def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
     """Delete the splats that do not stay, and set what the others became: all of it or nothing.
 
@@ -197,17 +194,28 @@ def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
     RefineError
         See `mesh_edit.check_deletable`; also if there are no longer as many splats.
     """
-    mesh_edit.check_deletable(checked.obj)
-    if len(result.keep) != len(checked):
-        msg = (
-            f"object '{checked.obj.name}': has {len(checked)} splats and had {len(result.keep)} "
-            "when it was decided which stay; apply again"
-        )
-        raise RefineError(msg)
-    done = _plan(checked, result.keep)
-    columns = absorbed_columns(checked, result.absorbed) if result.absorbed else {}
-    with mesh_edit.all_or_nothing(checked.obj):
-        _reduce(checked, result.keep, columns)
+    (done,) = apply_objects([(checked, result)])
+    return done
+
+
+def apply_objects(parts: Sequence[tuple[SplatObject, Result | Level]]) -> list[Plan]:
+    """Do what `apply_object` does to several objects: to all of them or to none."""
+    done, columns = [], []
+    for checked, result in parts:
+        mesh_edit.check_deletable(checked.obj)
+        if len(result.keep) != len(checked):
+            msg = (
+                f"object '{checked.obj.name}': has {len(checked)} splats and had "
+                f"{len(result.keep)} when it was decided which stay; apply again"
+            )
+            raise RefineError(msg)
+        done.append(_plan(checked, result.keep))
+        columns.append(absorbed_columns(checked, result.absorbed) if result.absorbed else {})
+    with ExitStack() as stack:
+        for checked, _ in parts:
+            stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
+        for (checked, result), changed in zip(parts, columns, strict=True):
+            _reduce(checked, result.keep, changed)
     return done
 
 
@@ -381,6 +389,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     *,
     absorb: bool = False,
     output: Path | None = None,
+    pictures: PictureFiles | None = None,
     save: bool = False,
     dry_run: bool = False,
     overwrite: bool = False,
@@ -398,6 +407,8 @@ def prune_object(  # noqa: PLR0913 - the command's options
         What must stay and what must go.
     output : Path, optional
         The file to make, in the format that its suffix names.
+    pictures : PictureFiles, optional
+        Where pictures before and after go; none are drawn without it.
     save : bool
         Whether to delete the splats from the object and save the .blend.
     dry_run : bool
@@ -422,16 +433,19 @@ def prune_object(  # noqa: PLR0913 - the command's options
     target = None if output is None or dry_run else expanded(output)
     if target is not None:
         refuse_existing(target, overwrite=overwrite)
+    if pictures is not None:
+        pictures.refuse_existing(views)
     if save and not dry_run:
         _check_savable(checked.obj)
     row_bytes, fixed_bytes = _file_size(checked, budget, output)
-    estimates = settings.estimates or budget.psnr is not None
+    seen = settings.estimates or budget.psnr is not None or pictures is not None
     matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
+    splats = gather(checked, whole=absorb or (None if seen else False))
     found = demands.forced(checked)
     task = Task(
         budget=budget,
         settings=settings,
-        splats=gather(checked, whole=absorb or (None if estimates else False)),
+        splats=splats,
         views=views,
         protected=found.protected,
         removed=found.removed,
@@ -460,6 +474,11 @@ def prune_object(  # noqa: PLR0913 - the command's options
     if target is not None:
         used = views.spread(settings.views)
         result.report.update(written_facts(target, result.scores, used, matrix=matrix))
+    drawn = picture_facts(
+        pictures, splats, result, target, views,
+        clock=clock, matrix=matrix, progress=part(progress, 0.85, 1.0),
+    )  # fmt: skip
+    result.report.update(drawn)
     result.report["volumes"] = list(found.facts)
     result.report["notes"] += modifier_notes(checked.obj)
     source, output_name = f"{bpy.data.filepath}#{name}", None if target is None else str(target)

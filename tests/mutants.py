@@ -485,6 +485,24 @@ MUTANTS = {
         ("if half[id(view)] else rest", "if True else rest", "the rest not left out"),
         ("(FIRST, FIRST + MORE,", "(FIRST, FIRST,", "an eighth not added"),
     ],
+    "pictures.py": [
+        ("near=near if near < far else view.near", "near=view.near", "near plane of each state"),
+        ("through[line[first]] += behind[last] - before", "pass", "nothing hides what is behind"),
+        (
+            "front -= np.repeat(before - through[line[first]], last + 1 - first)",
+            "front -= np.repeat(before, last + 1 - first)",
+            "blocks of footprints side by side",
+        ),
+        ("cx=view.cx * across", "cx=view.cx", "principal point of the large image"),
+    ],
+    "png.py": [
+        ("kind + data + struct.pack", "data + kind + struct.pack", "kind behind the data"),
+        ("prepend=np.zeros((1, rows.shape[1]), np.uint8)", "prepend=rows[:1]", "first row black"),
+    ],
+    "picture_files.py": [
+        ("refuse_existing(path, overwrite=self.overwrite)", "pass", "existing pictures replaced"),
+        ("views.spread(CAMERAS)", "views.take(range(min(CAMERAS, len(views))))", "the first views"),
+    ],
     "pipeline.py": [
         (
             "found.error + (1.0 - share) * expected.error",
@@ -626,6 +644,7 @@ TESTS = {
     "command_counts": ["report.py"],
     "tiles": ["tiles/units.py", "tiles/steps.py", "tiles/folder.py", "tiles/prune.py"],
     "levels": ["levels/lod.py", "levels/distance.py", "levels/files.py"],
+    "pictures": ["png.py", "picture_files.py"],
 }
 """Modules whose tests are not in the file of their own name; those run first."""
 

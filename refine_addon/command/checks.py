@@ -7,7 +7,7 @@ import stat
 from typing import TYPE_CHECKING
 
 from ..core import RefineError
-from ..core.formats.registry import format_named
+from ..core.formats.registry import format_named, without_suffix
 from ..core.levels.files import MANIFEST, check_goal, is_manifest, level_paths
 from . import options, zones
 from .report import is_report
@@ -15,6 +15,7 @@ from .zones import ROLES
 
 if TYPE_CHECKING:
     import argparse
+    from collections.abc import Callable, Sequence
     from pathlib import Path
 
 
@@ -208,14 +209,31 @@ def _check_files(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
         parser.error("expected -o or --output-dir, and not both")
     if given.output and len(given.inputs) > 1:
         parser.error(f"-o takes one input, got {len(given.inputs)}: use --output-dir")
-    if not given.output_dir:
-        return
-    first: dict[str, Path] = {}
-    for path in given.inputs:
-        other = first.setdefault(path.name, path)
+    if given.output_dir:
+        advice = "call the command for each, with its own --output-dir or -o"
+        if getattr(given, "together", False):
+            advice = "rename one of them"
+        _refuse_doubles(parser, given.inputs, lambda path: given.output_dir / path.name, advice)
+    if getattr(given, "pictures", None):
+        if given.together:
+            parser.error("--pictures draws each input by itself, not --together")
+        _refuse_doubles(
+            parser,
+            given.inputs,
+            lambda path: given.pictures / f"{without_suffix(path.name)}-CAMERA-after.png",
+            "call the command for each, with its own --pictures",
+        )
+
+
+def _refuse_doubles(
+    parser: argparse.ArgumentParser,
+    inputs: Sequence[Path],
+    made: Callable[[Path], Path],
+    advice: str,
+) -> None:
+    """Refuse two inputs of which the same file would be made."""
+    first: dict[Path, Path] = {}
+    for path in inputs:
+        other = first.setdefault(made(path), path)
         if other is not path:
-            target = given.output_dir / path.name
-            advice = "call the command for each, with its own --output-dir or -o"
-            if getattr(given, "together", False):
-                advice = "rename one of them"
-            parser.error(f"{other} and {path} would both be {target}: {advice}")
+            parser.error(f"{other} and {path} would both be {made(path)}: {advice}")

@@ -37,6 +37,7 @@ EXAMPLES = {
         f"{BLENDER}refine prune --object Splats -o out.ply",
         f"{BLENDER}refine prune --object Splats --frames 1:250:10 --save",
         f"{BLENDER}refine prune --object Splats --source collection:Shot --dry-run",
+        f"{BLENDER}refine prune --object Splats --dry-run --pictures before_and_after",
     ),
     "score": (
         "refine score in.ply --cameras cameras.json -o scored.ply",
@@ -147,6 +148,13 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     )
     zones.add(prune, names="a vertex group or boolean attribute of --object, ")
     prune.add_argument(
+        "--pictures",
+        type=_path,
+        metavar="DIR",
+        help="draw up to 3 of the views before and after, and what differs, as "
+        "NAME-CAMERA-before.png and so on; made if it is not there; --dry-run draws them too",
+    )
+    prune.add_argument(
         "--together",
         action="store_true",
         help="the inputs are tiles of one scene: one budget over all of them, with a few rows at a "
@@ -165,7 +173,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         help="with --together: on the workers of this Dask scheduler, which see the same files "
         "under the same paths",
     )
-    prune.add_argument("--dry-run", action="store_true", help="decide and report, write nothing")
+    prune.add_argument("--dry-run", action="store_true", help="decide and report, write no splats")
     _add_common(prune)
 
 

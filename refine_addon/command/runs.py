@@ -15,13 +15,16 @@ from ..core import (
     as_written,
     clean,
     forced,
+    picture_files,
     prune_file,
     prune_tiles,
     read_splats,
     score,
 )
 from ..core.errors import printable
+from ..core.formats.registry import without_suffix
 from ..core.pace import Pace
+from ..core.picture_files import PictureFiles
 from ..core.quality import UNSEEN, in_words
 from ..core.report import held, kept_and_removed, scoring_notes, seen_by, what_was_seen
 from ..core.whole_file import refuse_existing, refuse_mapped
@@ -172,6 +175,14 @@ def _make_folder(folder: Path) -> None:
         raise RefineError(msg) from error
 
 
+def _pictures(options: argparse.Namespace, name: str) -> PictureFiles | None:
+    """Return where the pictures of an input go, if they are wanted; makes the folder."""
+    if options.pictures is None:
+        return None
+    _make_folder(options.pictures)
+    return PictureFiles(options.pictures, name, options.overwrite)
+
+
 def _prune_one(run: _Run, source: Path, output: Path | None, views: ViewSet) -> dict[str, Any]:
     options = run.options
     result = prune_file(
@@ -183,6 +194,7 @@ def _prune_one(run: _Run, source: Path, output: Path | None, views: ViewSet) -> 
         zones=zones.of_files(options),
         absorb=options.absorb,
         cleaning=cleaning(options) if options.clean else None,
+        pictures=_pictures(options, without_suffix(source.name)),
         overwrite=options.overwrite,
         dry_run=options.dry_run,
         progress=run.progress(source.name),
@@ -243,6 +255,7 @@ def _prune_object(run: _Run) -> dict[str, Any]:
         zones.of_object(options),
         absorb=options.absorb,
         output=options.output,
+        pictures=_pictures(options, options.object),
         save=options.save,
         dry_run=options.dry_run,
         overwrite=options.overwrite,
@@ -276,6 +289,9 @@ def _say_result(run: _Run, label: str, done: dict[str, Any]) -> None:
     quality = _quality(done)
     if quality:
         run.terminal.say(f"  quality: {quality}")
+    if "pictures" in done:
+        measured = picture_files.in_words(done["pictures"])
+        run.terminal.say(f"  pictures: {measured} -> {run.options.pictures}")
     run.terminal.notes(done["notes"])
 
 

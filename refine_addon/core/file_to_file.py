@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .affine import is_uniform, transformed
 from .cleaning.clean import clean
-from .formats.registry import Packed, as_written, read_splats, refuse_unknown_size
+from .formats.registry import (
+    Packed,
+    as_written,
+    format_named,
+    read_splats,
+    refuse_unknown_size,
+)
 from .pipeline import decide
 from .report import Clock, Files, complete_report, held
 from .survivors import survivor_columns
@@ -21,8 +28,12 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from numpy.typing import NDArray
+
     from .cleaning.clean import Cleaning
+    from .picture_files import PictureFiles
     from .selection import Budget, RowBytes
+    from .splats import Splats
     from .views import ViewSet
     from .volumes import Zone
 
@@ -37,6 +48,7 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
     zones: Sequence[Zone] = (),
     absorb: bool = False,
     cleaning: Cleaning | None = None,
+    pictures: PictureFiles | None = None,
     overwrite: bool = False,
     dry_run: bool = False,
     progress: Progress = silent,
@@ -57,6 +69,8 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
         Volumes that say which splats must stay and which must go.
     cleaning : Cleaning, optional
         What to clean away first. The budget then counts what is left.
+    pictures : PictureFiles, optional
+        Where pictures before and after go; none are drawn without it.
     overwrite : bool
         Whether `output` may replace a file.
     dry_run : bool
@@ -74,6 +88,8 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
         budget is a size, and the format of `output` compresses the file as a whole. Then nothing is
         written.
     """
+    if pictures is not None:
+        pictures.refuse_existing(views)
     clock = Clock()
     target = None if output is None else expanded(output)
     written = None if dry_run else target
@@ -129,9 +145,69 @@ def prune_file(  # noqa: PLR0913 - as `pipeline.prune`
     if written is not None:
         used = views.spread(settings.views)
         result.report.update(written_facts(written, result.scores, used, threads=threads))
-    result.report["volumes"] = list(given.facts)
+    ahead = part(progress, 0.85, 1.0)
+    result.report.update(
+        picture_facts(
+            pictures, file.splats(), result, written, views,
+            clock=clock, progress=ahead, threads=threads,
+        ),
+        volumes=list(given.facts),
+    )  # fmt: skip
     result.report["splats"] |= held(made, result.keep, written=written is not None)
     result.report["notes"] += made.notes(result.keep)
-    names = (str(file.path), None if written is None else str(written))
-    complete_report(result.report, clock, Files(*names, *sizes))
+
+    complete_report(
+        result.report, clock, Files(str(file.path), str(written) if written else None, *sizes)
+    )
     return result
+
+
+def picture_facts(  # noqa: PLR0913 - what was pruned, and what to draw of it
+    pictures: PictureFiles | None,
+    splats: Splats,
+    result: Result,
+    written: Path | None,
+    views: ViewSet,
+    *,
+    clock: Clock,
+    matrix: NDArray[np.float64] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> dict[str, Any]:
+    """Write the pictures of a prune; return what the report says of them, nothing without any.
+
+    Parameters
+    ----------
+    pictures : PictureFiles or None
+    splats : Splats
+        All of them, in the frame of the views.
+    result : Result
+        What was decided of them.
+    written : Path or None
+        The file that holds what stays, if there is one: what a lossy format rounds is to be seen.
+    views : ViewSet
+        Those that decided.
+    clock : Clock
+        Gets the time that it took.
+    matrix : (4, 4) float64, optional
+        From the frame of the file to that of the views; by default they are the same. Where it
+        scales directions differently, nothing that is rounded is seen.
+    progress, threads
+        See `PictureFiles.write`.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `PictureFiles.write`.
+    """
+    if pictures is None:
+        return {}
+    after = result.survivors(splats)
+    matrix = np.eye(4) if matrix is None else matrix
+    if written is not None and format_named(written) and is_uniform(matrix):
+        after = read_splats(written).splats()
+        if not np.array_equal(matrix, np.eye(4)):
+            after = transformed(after, matrix)
+    facts = pictures.write(splats, after, views, progress=progress, threads=threads)
+    clock.lap("pictures_s")
+    return {"pictures": facts}

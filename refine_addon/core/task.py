@@ -211,6 +211,16 @@ class Result:
     report: dict[str, Any]
     absorbed: Absorbed | None = None
 
+    def survivors(self, splats: Splats) -> Splats:
+        """Return the splats that stay, as they became; in the frame of the views.
+
+        Parameters
+        ----------
+        splats : Splats
+            All of them, in that frame.
+        """
+        return self.absorbed.splats if self.absorbed else splats.take(self.keep)
+
     def for_all(self, rest: NDArray[np.bool_]) -> Result:
         """Return a result for what was left of N splats, (N,) bool, as one for them all."""
         keep = among_all(self.keep, rest)

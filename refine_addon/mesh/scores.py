@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,24 @@ RECORD = "refine_scores"
 """Custom property of the mesh: how its scores came to be, as JSON."""
 
 
+class Together(NamedTuple):
+    """What an object's scores have in common with those of others that were scored with it.
+
+    Attributes
+    ----------
+    id : str
+        Of the scoring.
+    splats : int
+        How many all objects have.
+    ranks : (N,) float64
+        Of this object's splats among all.
+    """
+
+    id: str
+    splats: int
+    ranks: NDArray[np.float64]
+
+
 def store(  # noqa: PLR0913 - all that a note holds
     checked: SplatObject,
     scores: Scores,
@@ -40,6 +58,7 @@ def store(  # noqa: PLR0913 - all that a note holds
     *,
     forced: int = 0,
     asked: Settings | None = None,
+    together: Together | None = None,
 ) -> None:
     """Write scores to the attributes of an object's mesh, and note how they came to be.
 
@@ -56,6 +75,8 @@ def store(  # noqa: PLR0913 - all that a note holds
         How many splats had to go, and have the score 0.
     asked : Settings, optional
         What the scores are to be refined by, if that is still to come.
+    together : Together, optional
+        Where other objects were scored with them; the curve of `scores` is that of all then.
 
     Raises
     ------
@@ -70,7 +91,7 @@ def store(  # noqa: PLR0913 - all that a note holds
             f"{len(scores.values)}; score it again"
         )
         raise RefineError(msg)
-    ranks = rank(scores.values)
+    ranks = together.ranks if together else rank(scores.values)
     note = json.dumps(
         {
             "splats": len(scores.values),
@@ -88,6 +109,7 @@ def store(  # noqa: PLR0913 - all that a note holds
             "cameras": cameras,
             "forced": forced,
             "asked": asdict(asked) if asked else None,
+            "together": together and {"id": together.id, "splats": together.splats},
         }
     )
     # What can fail comes first: scores and note are to belong together.
@@ -151,6 +173,7 @@ def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None
     # The curve is that of all splats that were scored.
     gone = 0 if removed is None else int(np.count_nonzero(removed))
     whole = (len(values), gone) == (noted["splats"], noted.get("forced", 0))
+    whole = whole and not noted.get("together")  # then it is that of several objects
     return Scores(
         values=values,
         seen=mesh_attributes.read_attribute(mesh, SEEN),

@@ -3,6 +3,7 @@
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,8 +23,9 @@ from ..core.work import part, report
 from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
 from ..viewport import draw
-from . import running
+from . import preferences, running
 from .on_thread import FAILURES, Answer, AskedFirst, described, fail
+from .properties import UPRIGHT_TEXT
 from .wrapped import counted
 
 if TYPE_CHECKING:
@@ -36,10 +38,13 @@ _ROWS = 1 << 16
 FILE_NAMES = ";".join(f"*{suffix}" for suffix in SUFFIXES)
 """What a file browser shows."""
 
-UPRIGHT_TEXT = (
-    "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "
-    "z-up world of Blender"
-)
+FOLDER = "refine_folder"
+"""Custom property of an imported object: the folder of its file."""
+
+_CAMERAS = ("cameras.json", "transforms.json", "sparse", "cameras.bin", "cameras.txt")
+"""What lies where the cameras of a capture are."""
+
+_ABOVE = 3  # folders above the splats in which their cameras are looked for
 
 
 class _InObjectMode:
@@ -70,7 +75,7 @@ class REFINE_OT_import_ply(AskedFirst, _InObjectMode, bpy.types.Operator, Import
 
     bl_idname = "refine.import_ply"
     bl_label = "Import Splats"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options = {"REGISTER", "UNDO", "PRESET"}
 
     filename_ext = ".ply"
     filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
@@ -85,6 +90,7 @@ class REFINE_OT_import_ply(AskedFirst, _InObjectMode, bpy.types.Operator, Import
 
     def ask(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
         """Ask for the files, or only for the options where files were dropped."""
+        preferences.suggest(self, context, "upright")
         return self.invoke_popup(context)
 
     def prepare(self, _context: bpy.types.Context, _checked: None) -> list[Path]:
@@ -122,6 +128,7 @@ class REFINE_OT_import_ply(AskedFirst, _InObjectMode, bpy.types.Operator, Import
         for obj in imported:
             obj.select_set(True)
         context.view_layer.objects.active = imported[-1]
+        preferences.give_defaults(context)
         if not bpy.app.background:
             draw.show("SCENE")
         count = sum(len(obj.data.vertices) for obj in imported)
@@ -137,6 +144,7 @@ class REFINE_OT_import_ply(AskedFirst, _InObjectMode, bpy.types.Operator, Import
     def _import(self, context: bpy.types.Context, file: SplatFile) -> bpy.types.Object:
         mesh = mesh_attributes.mesh_from_file(file)
         obj = bpy.data.objects.new(mesh.name, mesh)
+        obj[FOLDER] = str(Path(file.path).parent.absolute())
         if self.upright:
             obj.matrix_world = mathutils.Matrix(UPRIGHT.tolist())
         _target(context).objects.link(obj)
@@ -150,7 +158,7 @@ class REFINE_OT_import_cameras(_InObjectMode, bpy.types.Operator, ImportHelper):
 
     bl_idname = "refine.import_cameras"
     bl_label = "Import Cameras"
-    bl_options = {"REGISTER", "UNDO"}
+    bl_options = {"REGISTER", "UNDO", "PRESET"}
 
     filename_ext = ".json"
     filter_glob: StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})
@@ -169,7 +177,12 @@ class REFINE_OT_import_cameras(_InObjectMode, bpy.types.Operator, ImportHelper):
         obj = context.object
         if mesh_layout.looks_like_splats(obj) and not self.properties.is_property_set("upright"):
             self.upright = np.allclose(np.array(obj.matrix_world)[:3, :3], UPRIGHT[:3, :3])
-        return self.invoke_popup(context)
+        folder = None if self.properties.is_property_set("filepath") else _capture_folder(obj)
+        if folder is None:
+            return self.invoke_popup(context)
+        self.filepath = os.path.join(folder, "")  # noqa: PTH118 - ends in a separator
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Import the cameras into a collection of their own."""
@@ -207,6 +220,22 @@ class REFINE_FH_ply(bpy.types.FileHandler):
     def poll_drop(cls, context: bpy.types.Context) -> bool:
         """Tell whether files can be dropped here."""
         return context.area is not None and context.area.type == "VIEW_3D"
+
+
+def _capture_folder(obj: bpy.types.Object | None) -> Path | None:
+    """Return where the cameras of a splat object may lie: where its file came from, or above it.
+
+    Trained scenes have their splats some folders below their cameras, in
+    ``point_cloud/iteration_30000``.
+    """
+    noted = obj.get(FOLDER) if obj is not None else None
+    if not isinstance(noted, str) or not noted or not os.path.isdir(noted):  # noqa: PTH112
+        return None
+    folder = Path(noted)
+    for place in (folder, *folder.parents[:_ABOVE]):
+        if any((place / name).exists() for name in _CAMERAS):
+            return place
+    return folder
 
 
 def _read(path: Path, progress: Progress) -> SplatFile:

@@ -17,7 +17,7 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from .. import level_objects, splat_object
+from .. import level_objects, splat_group, splat_object
 from ..cameras.sets import Choice
 from ..core import frustum, pipeline
 from ..core.formats.registry import FORMATS, Packed, without_suffix
@@ -32,6 +32,7 @@ from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
 from ..viewport import draw
 from . import plans, preview, running, staleness
+from .adjust import Adjustable
 from .import_operators import FILE_NAMES
 from .on_thread import FAILURES, Answer, AskedFirst, OnThread, fail
 from .running import Sketch
@@ -79,7 +80,7 @@ class OnSplats:
         return True
 
 
-class _OnScored(OnSplats):
+class OnScored(OnSplats):
     """An operator on the active object, which must be scored."""
 
     @classmethod
@@ -96,6 +97,23 @@ class _OnScored(OnSplats):
 def chosen_views(context: bpy.types.Context) -> ViewSet:
     """Return the views of the cameras that the panel names."""
     return Choice.of_scene(context.scene).views(context, context.object)
+
+
+def apply_task(context: bpy.types.Context, group: splat_group.Members) -> Task:
+    """Return what *Apply* has to decide of the selected objects by the settings of the panel."""
+    settings = context.scene.refine
+    return splat_group.stored_task(
+        group,
+        settings.to_budget(),
+        splat_group.forced(context.scene, group),
+        settings=settings.to_settings(),
+        views=chosen_views(context) if settings.absorb else None,
+    )
+
+
+def _of_objects(group: splat_group.Members) -> str:
+    """Return how many objects were worked on, if more than one."""
+    return f" of {len(group)} objects" if len(group) > 1 else ""
 
 
 def _new_name(obj: bpy.types.Object) -> str:
@@ -120,7 +138,8 @@ class _Scoring:
     views: ViewSet
     settings: Settings
     quality: bool
-    origin: dict[str, Any]
+    uids: tuple[int, ...]
+    origins: list[dict[str, Any]]
 
 
 class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
@@ -134,12 +153,19 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Scoring:
         """Gather splats, views and settings."""
         settings, views = context.scene.refine.to_settings(), chosen_views(context)
-        mesh_edit.check_writable(checked.obj)
+        group = splat_group.members(context.view_layer, checked.obj)
+        for member in group:
+            mesh_edit.check_writable(member.obj)
         quality = settings.estimates or context.scene.refine.budget == "psnr"
-        splats = splat_object.gather(checked, whole=None if quality else False)
-        origin = staleness.origin(context, checked.obj)
-        removed = Demands.of_scene(context.scene).forced(checked).removed
-        return _Scoring(splats, removed, views, settings, quality, origin)
+        splats = splat_group.gather(group, whole=None if quality else False)
+        origins = [staleness.origin(context, member.obj) for member in group]
+        removed = splat_group.removed_of(splat_group.forced(context.scene, group), group)
+        uids = splat_group.uids_of(group)
+        return _Scoring(splats, removed, views, settings, quality, uids, origins)
+
+    def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
+        """Return the objects that are scored, the active one first."""
+        return splat_group.active_first(context.view_layer, checked)
 
     def sketch(self, job: _Scoring) -> Sketch | None:
         """Score by the closed form first, which takes a fraction of the time."""
@@ -151,13 +177,12 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
 
     @staticmethod
     def show(
-        context: bpy.types.Context, checked: SplatObject, job: _Scoring, scores: Scores
+        context: bpy.types.Context, _checked: SplatObject, job: _Scoring, scores: Scores
     ) -> None:
         """Store the closed form's scores, to be looked at until those asked for are there."""
-        forced = _forced(job)
-        mesh_scores.store(
-            checked, scores, _rough(job), job.origin, forced=forced, asked=job.settings
-        )
+        group = splat_group.by_uids(job.uids)
+        noted = splat_group.Noted(_rough(job), job.origins, removed=job.removed, asked=job.settings)
+        splat_group.store(group, scores, noted)
         plans.refresh(context)
 
     @staticmethod
@@ -175,24 +200,27 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     def finish(
         self,
         context: bpy.types.Context,
-        checked: SplatObject,
+        _checked: SplatObject,
         job: _Scoring,
         found: tuple[Scores, NDArray[np.int64]],
     ) -> Answer:
-        """Store the scores on the mesh and say what came of it."""
+        """Store the scores on the meshes and say what came of it."""
         scores, counts = found
         pairs = zip(job.views, counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
-        forced = _forced(job)
-        mesh_scores.store(checked, scores, job.settings, job.origin, cameras, forced=forced)
+        group, forced = splat_group.by_uids(job.uids), _forced(job)
+        noted = splat_group.Noted(job.settings, job.origins, cameras, job.removed)
+        splat_group.store(group, scores, noted)
         plans.refresh(context)
         unseen = int((scores.seen == 0).sum()) - forced
         self.report(
             {"INFO"},
-            f"Scored {len(scores.values) - forced:,} splats by {scores.views_used} of "
+            f"Scored {len(scores.values) - forced:,} splats{_of_objects(group)} by "
+            f"{scores.views_used} of "
             f"{counted(scores.views_given, 'view')}; {unseen:,} lie in none",
         )
-        for note in (*scoring_notes(scores), *splat_object.modifier_notes(checked.obj)):
+        modified = [note for m in group for note in splat_object.modifier_notes(m.obj)]
+        for note in (*scoring_notes(scores), *modified):
             self.report({"WARNING"}, note)
         return {"FINISHED"}
 
@@ -212,7 +240,7 @@ def _sketched(job: _Scoring, progress: Progress) -> Scores:
     )
 
 
-class REFINE_OT_plan(_OnScored, bpy.types.Operator):
+class REFINE_OT_plan(OnScored, bpy.types.Operator):
     """Work out again how many splats stay and go"""
 
     bl_idname = "refine.plan"
@@ -226,7 +254,15 @@ class REFINE_OT_plan(_OnScored, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
+@dataclass(frozen=True, eq=False)
+class _Applying:
+    """What is to be decided, and of which objects."""
+
+    task: Task
+    uids: tuple[int, ...]
+
+
+class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
     """Delete the splats that the budget does not keep; with Absorb, survivors take them over"""
 
     bl_idname = "refine.apply"
@@ -234,46 +270,67 @@ class REFINE_OT_apply(OnThread, _OnScored, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
     doing = "Absorbing splats"
 
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run, and if not, why.
+
+        Also where it has run: to adjust it, Blender asks before it undoes it.
+        """
+        if not super().poll(context):
+            return False
+        mesh = context.object.data
+        if mesh_scores.record(mesh) is None and mesh_scores.RANK not in mesh.attributes:
+            cls.poll_message_set("Score the splats first")
+            return False
+        return True
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Do all of it at once; adjusted, by another budget than that of the panel."""
+        self.adjust(context)
+        return super().execute(context)
+
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Delete at once; absorb on a thread."""
+        self.adjust(context)
         if not context.scene.refine.absorb:
             return self.execute(context)
         return super().invoke(context, event)
 
-    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> Task:
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Applying:
         """Gather the scores that decide; to absorb, splats and views besides."""
-        settings = context.scene.refine
-        mesh_edit.check_deletable(checked.obj)
-        return splat_object.stored_task(
-            checked,
-            settings.to_budget(),
-            Demands.of_scene(context.scene).forced(checked),
-            settings=settings.to_settings(),
-            views=chosen_views(context) if settings.absorb else None,
-        )
+        group = splat_group.members(context.view_layer, checked.obj)
+        for member in group:
+            mesh_edit.check_deletable(member.obj)
+        return _Applying(apply_task(context, group), splat_group.uids_of(group))
+
+    def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
+        """Return the objects that lose splats, the active one first."""
+        return splat_group.active_first(context.view_layer, checked)
 
     @staticmethod
-    def work(task: Task, progress: Progress) -> Result:
+    def work(job: _Applying, progress: Progress) -> Result:
         """Decide which splats stay, and what they absorb."""
-        return pipeline.decide(task, progress=progress)
+        return pipeline.decide(job.task, progress=progress)
 
     def finish(
-        self, context: bpy.types.Context, checked: SplatObject, task: Task, result: Result
+        self, context: bpy.types.Context, _checked: SplatObject, job: _Applying, result: Result
     ) -> Answer:
         """Delete what does not stay, and change what absorbed it."""
         context.view_layer.update()
-        changed = staleness.changes(context, checked.obj)
-        if result.absorbed and not task.budget.needs_scores:
+        group = splat_group.by_uids(job.uids)
+        changed = staleness.changes_of(context, [member.obj for member in group])
+        if result.absorbed and not job.task.budget.needs_scores:
             changed = []  # nothing went by the scores
-        done = splat_object.apply_object(checked, result)
-        plans.forget(checked.mesh)
+        done = splat_group.apply(group, result)
+        for member in group:
+            plans.forget(member.mesh)
         plans.refresh(context)
         psnr = result.report["estimated_psnr"]
         if result.absorbed:
             self.report({"INFO"}, result.absorbed.note())
         self.report(
             {"INFO"},
-            f"Kept {done.kept:,} splats, removed {done.removed:,}: "
+            f"Kept {done.kept:,} splats{_of_objects(group)}, removed {done.removed:,}: "
             + sizes_in_words(done.bytes_before, "->", done.bytes_after)
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
@@ -461,7 +518,7 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
 
     bl_idname = "refine.export_ply"
     bl_label = "Export Splats"
-    bl_options = {"REGISTER"}
+    bl_options = {"REGISTER", "PRESET"}
     doing = "Writing splats"
 
     filename_ext = ".ply"

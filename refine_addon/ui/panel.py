@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
+from .. import splat_group
 from ..cameras.sets import chosen_cameras
 from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
@@ -49,9 +50,16 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
             wrapped.label(layout, context, text, icon="ERROR" if lost else "INFO")
             _draw_progress(layout, context, "refine.import_ply")
             return
-        count = mesh_layout.splat_count(obj.data)
-        layout.label(text=obj.name, icon="OUTLINER_OB_POINTCLOUD")
-        layout.label(text=f"{count:,} splats, SH degree {mesh_layout.sh_degree(obj.data)}")
+        objects = splat_group.chosen(context.view_layer, obj)
+        count = sum(mesh_layout.splat_count(each.data) for each in objects)
+        several = len(objects) > 1
+        name = counted(len(objects), "object") if several else obj.name
+        layout.label(text=name, icon="OUTLINER_OB_POINTCLOUD")
+        degree = max(mesh_layout.sh_degree(each.data) for each in objects)
+        layout.label(text=f"{count:,} splats, SH degree {degree}")
+        if several:
+            wrapped.label(layout, context, "Scored and pruned as one scene", icon="INFO")
+            return
         size = kept.answer("bytes", context, lambda: mesh_layout.export_bytes(obj))
         if size is not None:
             layout.label(text=size_in_words(size))
@@ -211,7 +219,12 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
         if record:
             _draw_plan(layout, context, record)
-        layout.operator("refine.apply", icon="TRASH")
+        if record:
+            layout.operator("refine.compare", icon="IMAGE_DATA")
+            _draw_progress(layout, context, "refine.compare")
+        row = layout.row()
+        row.enabled = record is not None
+        row.operator("refine.apply", icon="TRASH")
         _draw_progress(layout, context, "refine.apply")
 
 
@@ -281,9 +294,10 @@ def _cameras(context: bpy.types.Context) -> list[bpy.types.Object]:
 
 
 def _changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
-    """Return what changed since the active object was scored."""
-    question = ("changes", obj.data.get(mesh_scores.RECORD))
-    return kept.answer(question, context, lambda: staleness.changes(context, obj))
+    """Return what changed since the objects that are worked on were scored."""
+    objects = splat_group.chosen(context.view_layer, obj)
+    question = ("changes", tuple(each.data.get(mesh_scores.RECORD) for each in objects))
+    return kept.answer(question, context, lambda: staleness.changes_of(context, objects))
 
 
 def _draw_plan(

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from .. import demands, splat_object
+from .. import demands, splat_group, splat_object
+from ..core import pipeline
 from ..core.errors import RefineError
 from ..core.quality import in_words, out_of_reach
 from ..core.report import sizes_in_words
@@ -112,9 +113,10 @@ def changed(context: bpy.types.Context) -> None:
 def at_once(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     """Store what the budget comes to, if enough is known of the object; nothing is marked yet."""
     settings, mesh = scene.refine, obj.data
-    if not _known or _known[0].holds != _state(mesh, settings):
+    objects = _objects(obj)
+    if not _known or _known[0].holds != _state(objects, settings):
         return
-    plan = _noted(_known[0], settings)
+    plan = _noted(_known[0], settings) | {"key": _key(settings, objects)}
     mesh[PLAN] = json.dumps(plan | {"marked": False})
     price.move(mesh, _place(plan, settings))
     _tell_cameras(_known[0].tally.scores, plan, settings)
@@ -140,10 +142,15 @@ def ask(context: bpy.types.Context, obj: bpy.types.Object) -> None:
     """Have a plan and its chart made soon where they are missing; to be called when drawn."""
     settings, mesh = context.scene.refine, obj.data
     plan = stored(obj, settings)
+    objects = _objects(obj)
     drawn = price.shows(mesh) and price.fits(context.preferences)
     if bpy.app.background or (plan and drawn and plan.get("marked", True)) or not _can_have(obj):
         return
-    state = (*_state(mesh, settings), key(settings), price.look_of(context.preferences))
+    state = (
+        *_state(objects, settings),
+        _key(settings, objects),
+        price.look_of(context.preferences),
+    )
     if _tried != [state] and not _waiting:
         _tried[:] = [state]
         wait(context.scene, obj, 0.0)
@@ -161,8 +168,9 @@ def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:  # no
     """Return the stored plan if it is that of the current budget and mesh, else None."""
     try:
         noted: dict[str, Any] = parsed(obj.data[PLAN])
-        count = mesh_layout.splat_count(obj.data)
-        holds = noted["key"] == key(settings) and noted["splats"] == count
+        objects = _objects(obj)
+        count = sum(mesh_layout.splat_count(each.data) for each in objects)
+        holds = noted["key"] == _key(settings, objects) and noted["splats"] == count
     except (KeyError, TypeError, ValueError):
         return None
     return noted if holds else None
@@ -298,23 +306,37 @@ def _rested() -> None:
 
 
 def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
-    settings, mesh = scene.refine, obj.data
+    settings, mesh, objects = scene.refine, obj.data, _objects(obj)
     camera_list.fill(mesh_scores.record(mesh) or {})
-    plan: dict[str, Any] = {"key": key(settings), "splats": mesh_layout.splat_count(mesh)}
+    count = sum(mesh_layout.splat_count(each.data) for each in objects)
+    own: dict[str, Any] = {"key": _key(settings, objects), "splats": count}
+    plan = own
     try:
-        checked = mesh_layout.check(obj)
-        found = demands.refresh(scene, checked)
-        task = splat_object.stored_task(checked, settings.to_budget(), found)
-        known = _know(task, _state(mesh, settings))
-        plan = _noted(known, settings)
-        keep = splat_object.mark_removed(checked, task)
-        keep = keep if found.removed is None else keep[~found.removed]
+        group = splat_group.members(bpy.context.view_layer, obj)
+        found = splat_group.refresh(scene, group)
+        task = splat_group.stored_task(group, settings.to_budget(), found)
+        known = _know(task, _state(objects, settings))
+        plan = _noted(known, settings) | own
+        keep = pipeline.decide(task).keep
+        splat_group.mark_removed(group, keep)
+        keep = keep if task.removed is None else keep[~task.removed]
         plan["unseen_gone"] = int(np.count_nonzero(~keep & (known.tally.scores.seen == 0)))
         price.show(mesh, known.tally.scores, known.kinds, _place(plan, settings), keep)
         _tell_cameras(known.tally.scores, plan, settings)
     except RefineError as error:
         plan["error"] = str(error)
     mesh[PLAN] = json.dumps(plan)
+
+
+def _objects(obj: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the objects that a plan is for: those that *Apply* would work on."""
+    return splat_group.chosen(bpy.context.view_layer, obj)
+
+
+def _key(settings: Any, objects: list[bpy.types.Object]) -> str:  # noqa: ANN401
+    """Return what a plan for several objects depends on; see `key`."""
+    others = [obj.name for obj in objects] if len(objects) > 1 else []
+    return " ".join([key(settings), *map(repr, others)])
 
 
 def _know(task: Task, state: tuple[Any, ...]) -> _Known:
@@ -334,14 +356,17 @@ def _know(task: Task, state: tuple[Any, ...]) -> _Known:
     return known
 
 
-def _state(mesh: bpy.types.Mesh, settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
-    """Return what tells a scoring of an object from another, and what is protected in it."""
-    return (
-        mesh.session_uid,
-        mesh_layout.splat_count(mesh),
-        mesh.get(mesh_scores.RECORD),
-        _demanded(settings),
+def _state(objects: list[bpy.types.Object], settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
+    """Return what tells a scoring of objects from another, and what is protected in them."""
+    scorings = tuple(
+        (
+            obj.data.session_uid,
+            mesh_layout.splat_count(obj.data),
+            obj.data.get(mesh_scores.RECORD),
+        )
+        for obj in objects
     )
+    return scorings, _demanded(settings)
 
 
 def _demanded(settings: Any) -> tuple[Any, ...]:  # noqa: ANN401

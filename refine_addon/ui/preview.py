@@ -66,7 +66,7 @@ def show(
     mode : {"COLOR", "HEAT"}
         The splats' own colour, or the heat map of their ranks.
     hide_removed : bool
-        Whether to hide what the budget last planned (`splat_object.mark_removed`) would remove.
+        Whether to hide what the budget last planned (`splat_group.mark_removed`) would remove.
     style : {"POINTS", "SPLATS"}
         See the module.
 

@@ -50,6 +50,75 @@ BUDGETS = (
 )
 """Kinds of budget, by the names that core gives them."""
 
+UPRIGHT_TEXT = (
+    "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "
+    "z-up world of Blender"
+)
+
+VIEWS: dict[str, Any] = {
+    "name": "Views",
+    "description": "Use at most this many views, spread out evenly; 0 uses all",
+    "default": 64,
+    "min": 0,
+}
+
+AMOUNTS: dict[str, dict[str, Any]] = {
+    "budget": {
+        "name": "Budget",
+        "description": "What says how much is removed",
+        "items": BUDGETS,
+    },
+    "percent": {
+        "name": "Remove",
+        "description": "Share of the splats to remove, in per cent",
+        "subtype": "PERCENTAGE",
+        "precision": 1,
+        "default": 50.0,
+        "min": 0.0,
+        "max": 99.99,
+    },
+    "keep": {
+        "name": "Keep",
+        "description": "How many splats stay",
+        "default": 100_000,
+        "min": 1,
+    },
+    "max_mb": {
+        "name": "MB",
+        "description": "Size of the exported file, in megabytes of a million bytes",
+        "default": 100.0,
+        "min": 1e-6,
+    },
+    "threshold": {
+        "name": "Score",
+        "description": "Splats that score below this are removed",
+        "default": 0.01,
+        "precision": 5,
+    },
+    "min_seen": {
+        "name": "Seen by",
+        "description": "Splats that lie in fewer than this share of the views are removed",
+        "subtype": "PERCENTAGE",
+        "default": 1.0,
+        "min": 0.0,
+        "max": 100.0,
+    },
+    "psnr": {
+        "name": "PSNR",
+        "description": "How close the pictures of the cameras stay to those of all splats, in dB: "
+        "40 is hard to tell apart, 30 is seen",
+        "default": 40.0,
+        "min": 1.0,
+        "max": 99.0,
+    },
+    "absorb": {
+        "name": "Absorb",
+        "description": "Survivors take over what is removed, by what the cameras see of it: far "
+        "better when much is removed, and slower; the survivors change",
+    },
+}
+"""What says how much is removed, and how: properties of the panel and of *Apply*."""
+
 FLOATERS = (
     ("front", "In Front", "Stands in front of surfaces, seen by itself"),
     ("isolated", "Isolated", "Is in a small cluster that touches nothing else"),
@@ -139,12 +208,7 @@ class RefineSettings(bpy.types.PropertyGroup):
         description="Count a view only for the splats that lie in its frame or reach into it",
         default=True,
     )
-    views: IntProperty(
-        name="Views",
-        description="Use at most this many views, spread out evenly; 0 uses all",
-        default=64,
-        min=0,
-    )
+    views: IntProperty(**VIEWS)
     tolerance: FloatProperty(
         name="Tolerance",
         description="By how much the PSNR of the pictures may be lower than by Occlusion, in dB",
@@ -170,12 +234,7 @@ class RefineSettings(bpy.types.PropertyGroup):
         default=set(DEFAULT_REASONS),
         update=_mark_floaters,
     )
-    budget: EnumProperty(
-        name="Budget",
-        description="What says how much is removed",
-        items=BUDGETS,
-        update=_plan_again,
-    )
+    budget: EnumProperty(**AMOUNTS["budget"], update=_plan_again)
     ratio: FloatProperty(
         name="Remove",
         description="Share of the splats to remove",
@@ -185,62 +244,13 @@ class RefineSettings(bpy.types.PropertyGroup):
         max=0.9999,
         update=_plan_again,
     )
-    percent: FloatProperty(
-        name="Remove",
-        description="Share of the splats to remove, in per cent",
-        subtype="PERCENTAGE",
-        precision=1,
-        default=50.0,
-        min=0.0,
-        max=99.99,
-        get=_percent,
-        set=_set_percent,
-    )
-    keep: IntProperty(
-        name="Keep",
-        description="How many splats stay",
-        default=100_000,
-        min=1,
-        update=_plan_again,
-    )
-    max_mb: FloatProperty(
-        name="MB",
-        description="Size of the exported file, in megabytes of a million bytes",
-        default=100.0,
-        min=1e-6,
-        update=_plan_again,
-    )
-    threshold: FloatProperty(
-        name="Score",
-        description="Splats that score below this are removed",
-        default=0.01,
-        precision=5,
-        update=_plan_again,
-    )
-    min_seen: FloatProperty(
-        name="Seen by",
-        description="Splats that lie in fewer than this share of the views are removed",
-        subtype="PERCENTAGE",
-        default=1.0,
-        min=0.0,
-        max=100.0,
-        update=_plan_again,
-    )
-    psnr: FloatProperty(
-        name="PSNR",
-        description="How close the pictures of the views stay to those of all splats, in dB: 40 "
-        "is hard to tell apart, 30 is seen",
-        default=40.0,
-        min=1.0,
-        max=99.0,
-        update=_plan_again,
-    )
-    absorb: BoolProperty(
-        name="Absorb",
-        description="Survivors take over what is removed, by what the cameras see of it: far "
-        "better when much is removed, and slower; the survivors change",
-        update=_plan_again,
-    )
+    percent: FloatProperty(**AMOUNTS["percent"], get=_percent, set=_set_percent)
+    keep: IntProperty(**AMOUNTS["keep"], update=_plan_again)
+    max_mb: FloatProperty(**AMOUNTS["max_mb"], update=_plan_again)
+    threshold: FloatProperty(**AMOUNTS["threshold"], update=_plan_again)
+    min_seen: FloatProperty(**AMOUNTS["min_seen"], update=_plan_again)
+    psnr: FloatProperty(**AMOUNTS["psnr"], update=_plan_again)
+    absorb: BoolProperty(**AMOUNTS["absorb"], update=_plan_again)
     protect: StringProperty(
         name="Protect",
         description="Vertex group or boolean point attribute: the splats in it stay",

@@ -16,6 +16,8 @@ from ..cameras.sets import chosen_cameras
 from ..mesh import scores as mesh_scores
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     import bpy
 
 _NOISE = 1e-6
@@ -58,6 +60,11 @@ def changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
     except (KeyError, TypeError, ValueError):  # whoever wrote there, these are no scores of ours
         return []
     return [words for words, so in found.items() if so]
+
+
+def changes_of(context: bpy.types.Context, objects: Iterable[bpy.types.Object]) -> list[str]:
+    """Return what changed since any of several objects was scored; see `changes`."""
+    return list(dict.fromkeys(words for obj in objects for words in changes(context, obj)))
 
 
 def _volumes(scene: bpy.types.Scene) -> list[Any]:

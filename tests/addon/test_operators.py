@@ -147,12 +147,15 @@ def test_apply_keeps_everything_else_of_the_object(addon, room, room_cameras):  
 
 
 def test_apply_asks_for_new_scores_before_it_removes_more(room, room_cameras):  # noqa: ARG001
-    """Pressed twice, it must not halve twice."""
+    """Pressed twice, it must not halve twice; only adjusted, which Blender undoes first."""
+    assert not bpy.ops.refine.apply.poll()
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     count = len(room.data.vertices)
 
-    assert not bpy.ops.refine.apply.poll()
+    assert bpy.ops.refine.apply.poll()
+    with pytest.raises(RuntimeError, match="has no scores; score it first"):
+        bpy.ops.refine.apply()
     assert len(room.data.vertices) == count
 
 
@@ -578,3 +581,19 @@ def test_too_little_memory_is_a_sentence(  # noqa: PLR0917
     expected = "not enough memory" + (f" ({said})" if said else "")
     with pytest.raises(RuntimeError, match=f"^Error: {re.escape(expected)}\n$"):
         getattr(bpy.ops.refine, operator)(**arguments)
+
+
+def test_apply_takes_another_budget_and_leaves_it_in_the_panel(room, room_cameras):  # noqa: ARG001
+    """As when it is adjusted: 30 % of 39,755 are 11,926. Without a value the panel's counts."""
+    settings = bpy.context.scene.refine
+    settings.ratio = 0.9
+    bpy.ops.refine.score()
+
+    bpy.ops.refine.apply(percent=30.0)
+
+    assert len(room.data.vertices) == 39_755 - 11_926
+    assert settings.ratio == pytest.approx(0.3)
+    bpy.ops.refine.score()
+    bpy.ops.refine.apply(budget="keep", keep=1000)
+    assert len(room.data.vertices) == 1000
+    assert settings.budget == "keep"

@@ -79,8 +79,10 @@ def draw(addon, monkeypatch):
     def draw():
         drawn = []
         with monkeypatch.context() as patch:
-            for name in ("mark_removed", "stored_scores", "gather", "apply_object"):
+            for name in ("stored_scores", "gather", "apply_object"):
                 patch.setattr(addon.splat_object, name, never)
+            for name in ("members", "stored_task", "mark_removed", "gather", "apply"):
+                patch.setattr(addon.splat_group, name, never)
             patch.setattr(addon.mesh.attributes, "read_attribute", never)
             patch.setattr(addon.mesh.attributes, "write_attribute", never)
             for cls in addon.registration.CLASSES:

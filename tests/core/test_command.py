@@ -24,9 +24,13 @@ from refine_addon.core import (
     prune_file,
     read_cameras,
     read_ply,
+    read_splats,
     score,
 )
 from refine_addon.core.formats import ply
+from refine_addon.core.picture_files import chosen
+from refine_addon.core.pictures import compare
+from refine_addon.core.png import png
 from refine_addon.core.scoring import closed_form
 from refine_addon.version import VERSION
 from tests.strategies import plain_header, plain_ply, splat_names
@@ -424,6 +428,49 @@ def test_a_dry_run_says_the_same_and_writes_nothing(folder, capsys):
     assert capsys.readouterr().out.count("in.ply: would keep 30 of 60 splats (50.0% removed)") == 4
 
 
+@pytest.mark.parametrize(
+    "options",
+    [["--dry-run"], ["-o", "out.ply"], ["-o", "out.splat", "--absorb"]],
+    ids=["dry run", "written", "absorbed, rounded"],
+)
+def test_pictures_show_what_was_and_what_is_written(folder, capsys, options):
+    """Of five cameras along a line three are drawn: both ends and the middle; 400 x 300 px each."""
+    shown = [*PRUNE, *options, "--pictures", "shown", "--report", "report.json"]
+
+    assert command.main(shown) == 0
+
+    (entry,) = json.loads((folder / "report.json").read_text())["results"]
+    drawn = entry["pictures"]
+    assert [view["camera"] for view in drawn["views"]] == ["-0.4", "0.0", "0.4"]
+    assert names(folder / "shown") == {
+        f"in-{camera}-{kind}.png"
+        for camera in ("-0.4", "0.0", "0.4")
+        for kind in ("before", "after", "difference")
+    }
+    before = read_ply(folder / "in.ply").splats()
+    made = folder / options[1] if "-o" in options else None
+    keep = prune(before, read_cameras(folder / "cameras.json"), Budget(ratio=0.5)).keep
+    after = read_splats(made).splats() if made else before.take(keep)
+    found = compare(before, after, chosen(read_cameras(folder / "cameras.json")))
+    assert [view["psnr"] for view in drawn["views"]] == [round(one.psnr, 2) for one in found]
+    for view, one in zip(drawn["views"], found, strict=True):
+        assert (folder / view["after"]).read_bytes() == png(one.after)
+    assert f"pictures: {drawn['psnr']:.1f} dB measured in 3 views" in capsys.readouterr().out
+
+
+def test_pictures_that_exist_are_left_alone_and_nothing_is_pruned(folder, capsys):
+    (folder / "shown").mkdir()
+    (folder / "shown/in-0.0-after.png").write_bytes(b"precious")
+
+    assert command.main([*PRUNE, "-o", "out.ply", "--pictures", "shown"]) == 1
+
+    assert "in-0.0-after.png: exists already" in capsys.readouterr().err
+    assert names(folder / "shown") == {"in-0.0-after.png"}
+    assert not (folder / "out.ply").exists()
+    assert command.main([*PRUNE, "-o", "out.ply", "--pictures", "shown", "--overwrite"]) == 0
+    assert (folder / "shown/in-0.0-after.png").read_bytes().startswith(b"\x89PNG")
+
+
 @pytest.mark.slow
 def test_a_name_that_the_terminal_cannot_show_is_no_error(folder):
     """As bytes that are no UTF-8, and on a terminal that knows ASCII alone."""
@@ -447,6 +494,8 @@ USAGE = {
     "no cameras": ["prune", "in.ply", "-o", "out.ply"],
     "two outputs": [*PRUNE, "-o", "out.ply", "--output-dir", "made"],
     "one output of two": ["prune", "in.ply", "b.ply", *PRUNE[2:], "-o", "out.ply"],
+    "one picture twice": ["prune", "in.ply", "in.spz", *PRUNE[2:], "--dry-run", "--pictures", "p"],
+    "no name of pictures": [*PRUNE, "--dry-run", "--pictures", ""],
     "one name twice": ["prune", "in.ply", "b/in.ply", *PRUNE[2:], "--output-dir", "made"],
     "two budgets": [*PRUNE, "-o", "out.ply", "--ratio", ".5", "--keep", "3"],
     "ratio of 1": [*PRUNE, "-o", "out.ply", "--ratio", "1"],

@@ -90,6 +90,57 @@ def test_the_viewport_shows_splats_as_the_reference_renderer(
     assert found["handlers"] == [1, 0]
 
 
+def test_apply_is_adjusted_as_the_last_operation(binary: Binary, blend: Path):
+    """Each time from all 39,755 again: floor(.3 of them) = 11,926 go, then 35,755, then merged.
+
+    The panel says what was done. The next click goes by the panel, and remembers nothing: 60 % of
+    39,755 are 23,853.
+    """
+    try:
+        found = binary.window_step("adjust", blend, name="Splats", pictures=binary.work)
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+
+    left = {stage: told["vertices"] for stage, told in found.items()}
+    assert left == {
+        "applied": 39_755 - 19_877,
+        "less": 39_755 - 11_926,
+        "count": 4_000,
+        "absorbed": 4_000,
+        "again": 39_755 - 23_853,
+    }
+    assert found["less"]["panel"][:2] == ["ratio", 30.0]
+    assert found["absorbed"]["panel"] == ["keep", 30.0, 4000, True]
+    assert {told["last"] for told in found.values()} == {"REFINE_OT_apply"}
+
+
+def test_compare_shows_before_after_and_difference_in_a_window_of_their_own(
+    binary: Binary, blend: Path
+):
+    """One click: three thirds of a window; the next click, at 90 % removed, changes them in place.
+
+    The images are 240 x 160, the render size. Nothing asks to be saved on leaving.
+    """
+    try:
+        found = binary.window_step("compare", blend, pictures=binary.work)
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+
+    names = ["Compare: before", "Compare: after", "Compare: difference"]
+    for shown in (found["first"], found["again"]):
+        assert shown["areas"] == names
+        assert shown["images"] == sorted(names)
+        assert shown["windows"] == 2
+        assert shown["size"] == [240, 160]
+        assert shown["unsaved"] == []
+        assert max(shown["widths"]) - min(shown["widths"]) <= 8
+    assert found["larger"]
+
+
 def test_what_must_stay_and_go_is_shown_in_every_mode(binary: Binary, cloud: Path, cameras: Path):
     """Before scoring *What Goes* shows what volumes force out; a volume that moves is followed.
 

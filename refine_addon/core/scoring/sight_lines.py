@@ -53,9 +53,11 @@ ENOUGH = 256
 JUDGES = 24
 """At most about so many views judge what takes more time than splats that are deleted."""
 
+DARK = -9.3
+"""Logarithm of the transmittance below which nothing is seen, 1e-4."""
+
 _BLOCK = 1 << 17  # pairs of footprint and pixel at a time, which limits temporary memory
 _LARGE = 1 << 14  # pixels; for images no larger, a table says how many lines lie before each
-_DARK = -9.3  # logarithm of the transmittance below which nothing is seen, 1e-4
 
 
 def sights(
@@ -158,7 +160,7 @@ class Lines:
         before[self.line[last + 1]] = through[last]
         front = through - self.dark  # logarithm of the transmittance in front
         front -= before.take(self.line)
-        seen = np.flatnonzero(front > _DARK)
+        seen = np.flatnonzero(front > DARK)
         line, owner = self.line.take(seen), self.owner.take(seen)
         return line, owner, self.alpha.take(seen) * np.exp(front.take(seen).astype(np.float32))
 
@@ -576,7 +578,7 @@ def spread(size: int, count: int, start: float) -> NDArray[np.int64]:
 def crowding(gaussians: Gaussians, footprints: Footprints, view: View) -> float:
     """Return about how many footprints a line of sight of a view meets, at most all of them."""
     size = float(view.width * view.height)
-    area = _reach(gaussians.alphas[footprints.index])  # (n,), px^2
+    area = reaches(gaussians.alphas[footprints.index])  # (n,), px^2
     area *= np.float32(math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
     return float(np.minimum(area, np.float32(size)).sum(dtype=np.float64)) / size
 
@@ -597,10 +599,10 @@ def meet(
     columns, rows : (C,), (R,) int64
         See `Lines`; ascending.
     """
-    reach = _reach(gaussians.alphas[footprints.index])  # (n,), squared Mahalanobis distance
+    reach = reaches(gaussians.alphas[footprints.index])  # (n,), squared Mahalanobis distance
     # Of each footprint: the first column and row that its box holds, and how many it holds.
     (left, wide), (top, tall) = (
-        _held(footprints, reach, axis, places) for axis, places in enumerate((columns, rows))
+        boxes(footprints, reach, axis, places) for axis, places in enumerate((columns, rows))
     )
     pairs = wide * tall  # (n,)
     some = np.flatnonzero(pairs > 0)
@@ -616,7 +618,7 @@ def meet(
         down, across = np.divmod(number, np.repeat(wide[start:end], count))
         across += left.take(own)
         down += top.take(own)
-        squared = _squared(footprints, own, columns.take(across), rows.take(down))
+        squared = mahalanobis(footprints, own, columns.take(across), rows.take(down))
         met = np.flatnonzero(squared < reach.take(own))
         own = own[met]
         alpha = gaussians.alphas.take(footprints.index[own]) * np.exp(squared[met] / -2.0)
@@ -637,7 +639,7 @@ def meet(
     )
 
 
-def _held(
+def boxes(
     footprints: Footprints, reach: NDArray[np.float32], axis: int, places: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first of some columns or rows that lies in each footprint's box, and how many do.
@@ -667,7 +669,7 @@ def _before(places: NDArray[np.int64], edges: NDArray[np.float32]) -> NDArray[np
     return np.asarray(table.take(edges.clip(0.0, size).astype(np.int64)))
 
 
-def _squared(
+def mahalanobis(
     footprints: Footprints,
     own: NDArray[np.int64],
     column: NDArray[np.int64],
@@ -693,7 +695,7 @@ def _squared(
     return squared
 
 
-def _reach(alphas: NDArray[np.float32]) -> NDArray[np.float32]:
+def reaches(alphas: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the squared Mahalanobis distance at which alpha falls to `ALPHA_CUT`, (n,)."""
     ratio = alphas * np.float32(1.0 / ALPHA_CUT)
     return np.asarray(np.float32(2.0) * np.log(np.maximum(ratio, np.float32(1.0))))

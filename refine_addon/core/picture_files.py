@@ -1,0 +1,159 @@
+"""Files of pictures before and after a prune: ``NAME-CAMERA-before.png`` and so on."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from .errors import RefineError
+from .pictures import AMPLIFIED, CAMERAS, compare
+from .png import png
+from .whole_file import refuse_existing, whole_file
+from .work import Progress, silent
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from .splats import Splats
+    from .views import ViewSet
+
+KINDS = ("before", "after", "difference")
+"""The pictures of a view, as the ends of their names."""
+
+_IMAGE = re.compile(r"\.(png|jpe?g|webp|tiff?|exr|bmp)$", re.IGNORECASE)
+"""The suffix of a photo, after which imported cameras are named."""
+
+_LONGEST = 80  # characters of a camera's name; systems take names of 255 bytes
+
+
+@dataclass(frozen=True)
+class PictureFiles:
+    """Where the pictures of one prune go.
+
+    Attributes
+    ----------
+    folder : Path
+        It is there.
+    name : str
+        Of the splats: the first part of the files' names.
+    overwrite : bool
+        Whether files may be replaced.
+    """
+
+    folder: Path
+    name: str
+    overwrite: bool = False
+
+    def refuse_existing(self, views: ViewSet) -> None:
+        """Refuse what could not be written, before the work.
+
+        Raises
+        ------
+        RefineError
+            See `refine_addon.core.whole_file.refuse_existing`.
+        """
+        for paths in self._paths(chosen(views)):
+            for path in paths.values():
+                refuse_existing(path, overwrite=self.overwrite)
+
+    def write(
+        self,
+        before: Splats,
+        after: Splats,
+        views: ViewSet,
+        *,
+        progress: Progress = silent,
+        threads: int | None = None,
+    ) -> dict[str, Any]:
+        """Draw some of the views and write their pictures.
+
+        Parameters
+        ----------
+        before, after, progress, threads
+            See `refine_addon.core.pictures.compare`.
+        views : ViewSet
+            Those that decided; `chosen` of them are drawn.
+
+        Returns
+        -------
+        dict
+            What the report says: the mean PSNR that was measured, and of each view its camera, its
+            size, its PSNR and its files.
+
+        Raises
+        ------
+        RefineError
+            If a file cannot be written; by then the prune is done.
+        Cancelled
+            If `progress` answers ``False``.
+        """
+        some = chosen(views)
+        found = compare(before, after, some, progress=progress, threads=threads)
+        told = []
+        for one, paths in zip(found, self._paths(some), strict=True):
+            for kind, path in paths.items():
+                self._write(path, png(getattr(one, kind)))
+            size = [one.view.width, one.view.height]
+            names = {kind: str(path) for kind, path in paths.items()}
+            told.append({"camera": one.view.name, "size": size, "psnr": round(one.psnr, 2)} | names)
+        mean = sum(one.psnr for one in found) / len(found)
+        return {"psnr": round(mean, 2), "amplified": AMPLIFIED, "views": told}
+
+    def _write(self, path: Path, data: bytes) -> None:
+        try:
+            with whole_file(path, overwrite=self.overwrite) as stream:
+                stream.write(data)
+        except RefineError as error:
+            msg = f"{error}; the pruning itself is done"
+            raise RefineError(msg) from error
+
+    def _paths(self, views: ViewSet) -> list[dict[str, Path]]:
+        """Return the files of each view, by `KINDS`."""
+        name = _plain(self.name)
+        return [
+            {kind: self.folder / f"{name}-{label}-{kind}.png" for kind in KINDS}
+            for label in _labels([view.name for view in views])
+        ]
+
+
+def chosen(views: ViewSet) -> ViewSet:
+    """Return the views that are drawn: a few that are spread evenly over all."""
+    return views.spread(CAMERAS)
+
+
+def in_words(facts: dict[str, Any]) -> str:
+    """Return what was measured in pictures, as one sentence.
+
+    >>> views = [{"psnr": 38.0}, {"psnr": 36.0}]
+    >>> in_words({"psnr": 37.0, "amplified": 8, "views": views})
+    '37.0 dB measured in 2 views (36.0 to 38.0); differences are shown 8 times as large'
+    """
+    values = [view["psnr"] for view in facts["views"]]
+    many = f"{len(values)} views ({min(values):.1f} to {max(values):.1f})"
+    where = many if len(values) > 1 else "one view"
+    return (
+        f"{facts['psnr']:.1f} dB measured in {where}; differences are shown {facts['amplified']} "
+        "times as large"
+    )
+
+
+def _labels(names: list[str]) -> list[str]:
+    """Return a different part of a file name for each camera.
+
+    >>> _labels(["left/0.png", "left/0.png", ""])
+    ['left_0', 'left_0_2', 'view']
+    """
+    found: list[str] = []
+    for name in names:
+        label = new = _plain(_IMAGE.sub("", name))[-_LONGEST:] or "view"
+        number = 2
+        while new in found:
+            new, number = f"{label}_{number}", number + 1
+        found.append(new)
+    return found
+
+
+def _plain(name: str) -> str:
+    """Return a name with only what every system takes within the name of a file."""
+    return re.sub(r"[^\w.() -]", "_", name)

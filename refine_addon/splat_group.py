@@ -1,0 +1,375 @@
+"""Several splat objects as one scene: scored against one another, and under one budget.
+
+What panel operators do to the selection goes through here. A single object is handed on to
+`splat_object` as it is.
+"""
+
+from __future__ import annotations
+
+import uuid
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import numpy as np
+
+from . import demands, splat_object
+from .core.errors import RefineError
+from .core.quality import Quality
+from .core.selection import rank
+from .core.splats import Splats, above_constant
+from .core.task import DEFAULTS, Task
+from .demands import Demands
+from .mesh import edit as mesh_edit
+from .mesh import layout as mesh_layout
+from .mesh import scores as mesh_scores
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from .core.absorbing.absorb import Absorbed
+    from .core.scores import Scores
+    from .core.selection import Budget
+    from .core.task import Result, Settings
+    from .core.views import ViewSet
+    from .core.volumes import Forced
+    from .mesh.layout import SplatObject
+    from .splat_object import Plan
+
+Members = list["SplatObject"]
+"""The objects, by name; one at least."""
+
+
+def chosen(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return the splat objects that are worked on, by name: the selected ones.
+
+    Only the active one where it is alone, or not selected itself; quick enough for drawing.
+    """
+    selected = [obj for obj in layer.objects.selected if mesh_layout.looks_like_splats(obj)]
+    if active not in selected:
+        return [active]
+    return sorted(selected, key=lambda obj: obj.name)
+
+
+def members(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> Members:
+    """Return the objects of `chosen`, found to hold splats.
+
+    Raises
+    ------
+    RefineError
+        See `mesh.layout.check`; also if two of them share their data.
+    """
+    found = [mesh_layout.check(obj) for obj in chosen(layer, active)]
+    owners: dict[bpy.types.Mesh, str] = {}
+    for member in found:
+        other = owners.setdefault(member.mesh, member.obj.name)
+        if other != member.obj.name:
+            msg = (
+                f"objects '{other}' and '{member.obj.name}' share their data '{member.mesh.name}', "
+                "which can hold the scores of one; make it single-user first (Object > Relations), "
+                "or select only one"
+            )
+            raise RefineError(msg)
+    return found
+
+
+def active_first(layer: bpy.types.ViewLayer, active: SplatObject | None) -> Members:
+    """Return the objects of `members`, the active one first; none without it."""
+    if active is None:
+        return []
+    return sorted(members(layer, active.obj), key=lambda member: member.obj != active.obj)
+
+
+def uids_of(group: Members) -> tuple[int, ...]:
+    """Return what Blender knows the objects by in this session, whatever they are called."""
+    return tuple(member.obj.session_uid for member in group)
+
+
+def by_uids(uids: tuple[int, ...]) -> Members:
+    """Return the objects again, in that order; see `mesh.layout.check`."""
+    there = {obj.session_uid: obj for obj in bpy.data.objects}
+    return [mesh_layout.check(there.get(uid)) for uid in uids]
+
+
+def forced(scene: bpy.types.Scene, group: Members) -> list[Forced]:
+    """Return what must stay and what must go of each object, as a scene says it.
+
+    A name protects in the objects that have it.
+
+    Raises
+    ------
+    RefineError
+        See `Demands`; also if no object has a name that protects.
+    """
+    wanted = Demands.of_scene(scene)
+    if len(group) == 1:
+        return [wanted.forced(group[0])]
+    owners = [(name, _protecting(group, name)) for name in wanted.names]
+    return [
+        replace(wanted, names=tuple(n for n, has in owners if has[place])).forced(member)
+        for place, member in enumerate(group)
+    ]
+
+
+def refresh(scene: bpy.types.Scene, group: Members) -> list[Forced]:
+    """Mark what a scene demands of each object, and return it; see `demands.refresh`."""
+    if len(group) == 1:
+        return [demands.refresh(scene, group[0])]
+    found = forced(scene, group)
+    for member, own in zip(group, found, strict=True):
+        demands.mark(member, own)
+    return found
+
+
+def removed_of(found: Sequence[Forced], group: Members) -> NDArray[np.bool_] | None:
+    """Return which splats of all objects must go, (N,); None where there are none."""
+    masks = [own.removed for own in found]
+    if all(mask is None for mask in masks):
+        return None
+    return _joined_masks(masks, [len(member) for member in group])
+
+
+def gather(group: Members, *, whole: bool | None = False) -> Splats:
+    """Return the splats of all objects as they stand in the world; see `splat_object.gather`."""
+    return _joined([splat_object.gather(member, whole=whole) for member in group])
+
+
+@dataclass(frozen=True, eq=False)
+class Noted:
+    """How scores came to be; see `mesh.scores.store`.
+
+    Attributes
+    ----------
+    settings, cameras, asked
+        See there.
+    origins : sequence of dict
+        Of each object.
+    removed : (N,) bool or None
+        Splats of all objects that had to go.
+    """
+
+    settings: Settings
+    origins: Sequence[dict[str, Any]]
+    cameras: list[tuple[str, int]] | None = None
+    removed: NDArray[np.bool_] | None = None
+    asked: Settings | None = None
+
+
+def store(group: Members, scores: Scores, noted: Noted) -> None:
+    """Write scores of all objects' splats to their meshes; see `mesh.scores.store`.
+
+    Parameters
+    ----------
+    group : list of SplatObject
+    scores : Scores
+        Of the splats of `gather`.
+    noted : Noted
+    """
+    _check_counts(group, len(scores.values))
+    ranks, scoring = rank(scores.values), uuid.uuid4().hex
+    for member, rows, origin in zip(group, _rows(group), noted.origins, strict=True):
+        values, own, together = scores.values[rows], scores, None
+        gone = 0 if noted.removed is None else int(np.count_nonzero(noted.removed[rows]))
+        if len(group) > 1:
+            undrawable = int(np.count_nonzero(values == 0.0)) - gone
+            own = replace(scores, values=values, seen=scores.seen[rows], undrawable=undrawable)
+            together = mesh_scores.Together(scoring, len(scores.values), ranks[rows])
+        mesh_scores.store(
+            member, own, noted.settings, origin, noted.cameras,
+            forced=gone, asked=noted.asked, together=together,
+        )  # fmt: skip
+
+
+def stored_task(
+    group: Members,
+    budget: Budget,
+    found: Sequence[Forced],
+    *,
+    settings: Settings = DEFAULTS,
+    views: ViewSet | None = None,
+) -> Task:
+    """Return what Apply has to decide of all objects; see `splat_object.stored_task`.
+
+    Parameters
+    ----------
+    group, budget, settings, views
+        See there.
+    found : sequence of Forced
+        What must stay and what must go of each object.
+
+    Raises
+    ------
+    RefineError
+        Also if the objects were not scored together.
+    """
+    if len(group) > 1:
+        _check_scored_together(group)
+    tasks = [
+        splat_object.stored_task(member, budget, own, settings=settings, views=views)
+        for member, own in zip(group, found, strict=True)
+    ]
+    if len(tasks) == 1:
+        return tasks[0]
+    counts = [len(member) for member in group]
+    masks: dict[str, Any] = {
+        name: _joined_masks([getattr(task, name) for task in tasks], counts)
+        for name in ("protected", "removed")
+        if any(getattr(task, name) is not None for task in tasks)
+    }
+    return replace(
+        tasks[0],
+        splats=None if views is None else _joined([task.splats for task in tasks if task.splats]),
+        scores=_scores(group, [task.scores for task in tasks if task.scores], masks),
+        # Of rows of several lengths the longest counts: a size is never exceeded.
+        row_bytes=max(float(task.row_bytes) for task in tasks),
+        fixed_bytes=sum(task.fixed_bytes for task in tasks),
+        **masks,
+    )
+
+
+def mark_removed(group: Members, keep: NDArray[np.bool_]) -> None:
+    """Mark the splats that do not stay, (N,) of all objects."""
+    for member, rows in zip(group, _rows(group), strict=True):
+        mesh_edit.mark_removed(member.obj, ~keep[rows])
+
+
+def apply(group: Members, result: Result) -> Plan:
+    """Delete the splats that do not stay, and set what the others became: of all objects or none.
+
+    Raises
+    ------
+    RefineError
+        See `splat_object.apply_object`; also if an object would be left without splats.
+    """
+    if len(group) == 1:
+        return splat_object.apply_object(group[0], result)
+    _check_counts(group, len(result.keep))
+    parts = list(zip(group, _split(group, result), strict=True))
+    for member, own in parts:
+        if not own.keep.any():
+            msg = (
+                f"no splat of object '{member.obj.name}' would be left; nothing was removed: "
+                "delete the object, or let more stay"
+            )
+            raise RefineError(msg)
+    plans = splat_object.apply_objects(parts)
+    totals = {
+        field.name: sum(getattr(plan, field.name) for plan in plans)
+        for field in fields(splat_object.Plan)
+    }
+    return splat_object.Plan(**totals)
+
+
+def _rows(group: Members) -> list[slice]:
+    """Return which of all splats are those of each object."""
+    ends = np.cumsum([len(member) for member in group]).tolist()
+    return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
+
+
+def _check_counts(group: Members, count: int) -> None:
+    found = sum(len(member) for member in group)
+    if found != count:
+        names = ", ".join(repr(member.obj.name) for member in group)
+        msg = (
+            f"objects {names}: have {found} splats together and had {count} when the work began; "
+            "do it again"
+        )
+        raise RefineError(msg)
+
+
+def _check_scored_together(group: Members) -> None:
+    """Refuse objects of several scorings: their scores mean something else each."""
+    marks = {
+        ((mesh_scores.record(member.mesh) or {}).get("together") or {}).get("id")
+        for member in group
+    }
+    if len(marks) > 1 or None in marks:
+        msg = (
+            f"the {len(group)} selected objects were not scored together: score them as they are "
+            "selected, or select only one"
+        )
+        raise RefineError(msg)
+
+
+def _scores(group: Members, parts: list[Scores], masks: dict[str, Any]) -> Scores:
+    """Return the scores of all objects as one; their curve, if all that were scored are there."""
+    records = [mesh_scores.record(member.mesh) or {} for member in group]
+    noted, removed = records[0], masks.get("removed")
+    whole = noted["together"]["splats"] == sum(len(part.values) for part in parts)
+    gone = 0 if removed is None else int(np.count_nonzero(removed))
+    whole = whole and gone == sum(record.get("forced", 0) for record in records)
+    return replace(
+        parts[0],
+        values=np.concatenate([part.values for part in parts]),
+        seen=np.concatenate([part.seen for part in parts]),
+        undrawable=sum(part.undrawable for part in parts),
+        quality=Quality.from_facts(noted.get("quality")) if whole else None,
+    )
+
+
+def _protecting(group: Members, name: str) -> list[bool]:
+    """Return which objects have something of that name that protects.
+
+    Raises
+    ------
+    RefineError
+        If none has.
+    """
+    found, errors = [], []
+    for member in group:
+        try:
+            mesh_edit.protected_mask(member.obj, name)
+            found.append(True)
+        except RefineError as error:
+            found.append(False)
+            errors.append(error)
+    if not any(found):
+        raise errors[0]
+    return found
+
+
+def _joined_masks(parts: list[Any], counts: list[int]) -> NDArray[np.bool_]:
+    """Return masks of several objects as one; none means that nothing is marked."""
+    return np.concatenate([
+        np.zeros(count, np.bool_) if part is None else part
+        for part, count in zip(parts, counts, strict=True)
+    ])  # fmt: skip
+
+
+def _joined(parts: list[Splats]) -> Splats:
+    """Return the splats of several objects as one; harmonics that one lacks are 0."""
+    if len(parts) == 1:
+        return parts[0]
+    most = max(part.sh_rest.shape[1] for part in parts)
+    padded = [
+        np.pad(part.sh_rest, ((0, 0), (0, most - part.sh_rest.shape[1]), (0, 0))) for part in parts
+    ]
+    joined = {
+        field.name: np.concatenate([getattr(part, field.name) for part in parts])
+        for field in fields(Splats)
+        if field.name != "sh_rest"
+    }
+    return Splats(**joined, sh_rest=np.concatenate(padded))
+
+
+def _split(group: Members, result: Result) -> list[Result]:
+    """Return what was decided of each object."""
+    parts = []
+    for member, rows in zip(group, _rows(group), strict=True):
+        own = None
+        if result.absorbed is not None:
+            own = _part(result.absorbed, rows, mesh_layout.sh_degree(member.mesh))
+        parts.append(replace(result, keep=result.keep[rows], absorbed=own))
+    return parts
+
+
+def _part(absorbed: Absorbed, rows: slice, degree: int) -> Absorbed:
+    """Return the survivors of one object, with as many harmonics as it has."""
+    first = int(np.count_nonzero(absorbed.keep[: rows.start]))
+    keep = absorbed.keep[rows]
+    here = slice(first, first + int(np.count_nonzero(keep)))
+    splats = absorbed.splats.take(here)
+    splats = replace(splats, sh_rest=splats.sh_rest[:, : above_constant(degree)])
+    return replace(absorbed, keep=keep, splats=splats, changed=absorbed.changed[here])

@@ -1,0 +1,51 @@
+"""What of *Apply* can be adjusted afterwards, in the box *Adjust Last Operation* (F9)."""
+
+# ruff: noqa: TC002 - Blender runs the annotations
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import bpy
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
+
+from .properties import AMOUNTS
+
+
+class Adjustable:
+    """An operator that works by the budget of the panel, and can be done again by another one.
+
+    To adjust it Blender undoes it and calls it again with the other values. These go into the
+    panel, which then says what was done. Nothing is remembered for the next click.
+    """
+
+    budget: EnumProperty(**AMOUNTS["budget"], options={"SKIP_SAVE"})
+    percent: FloatProperty(**AMOUNTS["percent"], options={"SKIP_SAVE"})
+    keep: IntProperty(**AMOUNTS["keep"], options={"SKIP_SAVE"})
+    max_mb: FloatProperty(**AMOUNTS["max_mb"], options={"SKIP_SAVE"})
+    threshold: FloatProperty(**AMOUNTS["threshold"], options={"SKIP_SAVE"})
+    min_seen: FloatProperty(**AMOUNTS["min_seen"], options={"SKIP_SAVE"})
+    psnr: FloatProperty(**AMOUNTS["psnr"], options={"SKIP_SAVE"})
+    absorb: BoolProperty(**AMOUNTS["absorb"], options={"SKIP_SAVE"})
+
+    if TYPE_CHECKING:  # of every operator
+        properties: Any
+        layout: Any
+
+    def adjust(self, context: bpy.types.Context) -> None:
+        """Bring the values that were given into the panel, and take all others from there."""
+        settings, given = context.scene.refine, self.properties.is_property_set
+        for name in AMOUNTS:
+            here, there = getattr(self, name), getattr(settings, name)
+            if not given(name):
+                setattr(self, name, there)
+            elif here != there:
+                setattr(settings, name, here)
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        """Draw the budget, as the panel does."""
+        layout = self.layout
+        layout.use_property_split = True
+        layout.use_property_decorate = False
+        layout.prop(self, "budget")
+        layout.prop(self, "percent" if self.budget == "ratio" else self.budget)
+        layout.prop(self, "absorb")

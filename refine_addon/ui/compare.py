@@ -1,0 +1,164 @@
+"""*Compare*: what the active camera sees now, what it would see after *Apply*, and what differs."""
+
+# ruff: noqa: D400, N801, RUF012 - Blender's names and tooltips
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import bpy
+import numpy as np
+
+from .. import splat_group
+from ..cameras.sets import Choice
+from ..core import pipeline
+from ..core.picture_files import KINDS
+from ..core.pictures import AMPLIFIED, Comparison, compare
+from ..core.quality import in_words
+from ..core.views import ViewSet
+from ..core.work import part
+from .on_thread import Answer, OnThread
+from .operators import OnScored, apply_task
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..core.splats import Splats
+    from ..core.task import Task
+    from ..core.work import Progress
+    from ..mesh.layout import SplatObject
+
+NAMES = {kind: f"Compare: {kind}" for kind in KINDS}
+"""The pictures as images of the file, made anew by each comparison."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What is to be decided of which splats, and from where it is looked at."""
+
+    task: Task
+    splats: Splats
+    view: ViewSet
+
+
+class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
+    """Draw what the active camera sees before and after Apply, and say how close both are in dB"""
+
+    bl_idname = "refine.compare"
+    bl_label = "Compare"
+    bl_options = {"REGISTER"}
+    doing = "Comparing"
+
+    def written(
+        self, _context: bpy.types.Context, _checked: SplatObject | None
+    ) -> list[SplatObject]:
+        """Return nothing: the splats are not changed."""
+        return []
+
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Look:
+        """Gather what Apply would decide by, the splats and the view of the active camera."""
+        view = Choice("ACTIVE").views(context, checked.obj)[0]
+        group = splat_group.members(context.view_layer, checked.obj)
+        task = apply_task(context, group)
+        splats = task.splats or splat_group.gather(group, whole=None)
+        return _Look(task, splats, ViewSet((replace(view, weight=1.0),)))
+
+    @staticmethod
+    def work(job: _Look, progress: Progress) -> tuple[Comparison, float | None]:
+        """Decide which splats stay, draw both states; return them and the estimated PSNR, dB."""
+        decided = 0.6 if job.task.absorb else 0.1
+        result = pipeline.decide(job.task, progress=part(progress, 0.0, decided))
+        ahead = part(progress, decided, 1.0)
+        (found,) = compare(job.splats, result.survivors(job.splats), job.view, progress=ahead)
+        return found, result.report["estimated_psnr"]
+
+    def finish(
+        self,
+        context: bpy.types.Context,
+        _checked: SplatObject,
+        _job: _Look,
+        found: tuple[Comparison, float | None],
+    ) -> Answer:
+        """Put the pictures into images, show them, and say how close they are."""
+        pictures, estimated = found
+        images = [_image(NAMES[kind], getattr(pictures, kind)) for kind in KINDS]
+        if not bpy.app.background and context.window is not None:
+            _show(context, images)
+        about = "" if estimated is None else f"; {in_words(estimated)} estimated in all views"
+        self.report(
+            {"INFO"},
+            f"{pictures.psnr:.1f} dB measured in '{pictures.view.name}'{about}. The difference is "
+            f"shown {AMPLIFIED} times as large",
+        )
+        return {"FINISHED"}
+
+
+def _image(name: str, pixels: NDArray[np.uint8]) -> bpy.types.Image:
+    """Return an image of the file that holds pixels, (H, W, 3), in place of the one before."""
+    height, width = pixels.shape[:2]
+    old = bpy.data.images.get((name, None))
+    image = bpy.data.images.new(name, width, height)
+    rgba = np.ones((height, width, 4), np.float32)
+    rgba[..., :3] = pixels[::-1] / np.float32(255.0)  # Blender's first row is the lowest
+    image.pixels.foreach_set(rgba.ravel())
+    image.pack()  # or Blender asks on leaving whether to save it
+    if old is not None:
+        old.user_remap(image)
+        bpy.data.images.remove(old)
+        image.name = name
+    return image
+
+
+def _show(context: bpy.types.Context, images: list[bpy.types.Image]) -> None:
+    """Show images side by side in a window of their own, as renders are; or where they are shown.
+
+    Parameters
+    ----------
+    context : bpy.types.Context
+    images : list of bpy.types.Image
+    """
+    manager = context.window_manager
+    shown = [
+        area.spaces.active.image
+        for window in manager.windows
+        for area in window.screen.areas
+        if area.type == "IMAGE_EDITOR"
+    ]
+    if all(image in shown for image in images):
+        return
+    before = set(manager.windows)
+    bpy.ops.wm.window_new()
+    (window,) = set(manager.windows) - before
+    for area, image in zip(_split(context, window, len(images)), images, strict=True):
+        area.type = "IMAGE_EDITOR"
+        space = area.spaces.active
+        space.image = image
+        space.show_region_toolbar = space.show_region_ui = False
+    # Until Blender has drawn them, areas have the size from before they were split.
+    bpy.app.timers.register(partial(_fit, [image.name for image in images]), first_interval=0.2)
+
+
+def _split(
+    context: bpy.types.Context, window: bpy.types.Window, count: int
+) -> list[bpy.types.Area]:
+    """Split a window of one area into several of one width; return them from left to right."""
+    (rest,) = window.screen.areas
+    areas: list[bpy.types.Area] = []
+    for left in range(count, 1, -1):
+        with context.temp_override(window=window, screen=window.screen, area=rest):
+            bpy.ops.screen.area_split(direction="VERTICAL", factor=1.0 / left)
+        areas += [area for area in window.screen.areas if area != rest and area not in areas]
+    return [*areas, rest]
+
+
+def _fit(names: list[str]) -> None:
+    """Show the whole of images wherever they are shown; Blender's timer calls it once."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            space = area.spaces.active
+            if area.type != "IMAGE_EDITOR" or not space.image or space.image.name not in names:
+                continue
+            region = next(each for each in area.regions if each.type == "WINDOW")
+            with bpy.context.temp_override(window=window, area=area, region=region):
+                bpy.ops.image.view_all(fit_view=True)
