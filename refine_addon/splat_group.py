@@ -53,7 +53,7 @@ def chosen(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> list[bpy.typ
     return sorted(selected, key=lambda obj: obj.name)
 
 
-def members(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> Members:
+def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
     """Return the objects of `chosen`, found to hold splats.
 
     Raises
@@ -61,7 +61,7 @@ def members(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> Members:
     RefineError
         See `mesh.layout.check`; also if two of them share their data.
     """
-    found = [mesh_layout.check(obj) for obj in chosen(layer, active)]
+    found = [_checked(obj, active) for obj in chosen(layer, active.obj)]
     owners: dict[bpy.types.Mesh, str] = {}
     for member in found:
         other = owners.setdefault(member.mesh, member.obj.name)
@@ -79,7 +79,7 @@ def active_first(layer: bpy.types.ViewLayer, active: SplatObject | None) -> Memb
     """Return the objects of `members`, the active one first; none without it."""
     if active is None:
         return []
-    return sorted(members(layer, active.obj), key=lambda member: member.obj != active.obj)
+    return sorted(members(layer, active), key=lambda member: member.obj != active.obj)
 
 
 def uids_of(group: Members) -> tuple[int, ...]:
@@ -87,10 +87,14 @@ def uids_of(group: Members) -> tuple[int, ...]:
     return tuple(member.obj.session_uid for member in group)
 
 
-def by_uids(uids: tuple[int, ...]) -> Members:
-    """Return the objects again, in that order; see `mesh.layout.check`."""
+def by_uids(uids: tuple[int, ...], known: SplatObject) -> Members:
+    """Return the objects again, in that order; see `mesh.layout.check`. One is known already."""
     there = {obj.session_uid: obj for obj in bpy.data.objects}
-    return [mesh_layout.check(there.get(uid)) for uid in uids]
+    return [_checked(there.get(uid), known) for uid in uids]
+
+
+def _checked(obj: bpy.types.Object | None, known: SplatObject) -> SplatObject:
+    return known if obj == known.obj else mesh_layout.check(obj)
 
 
 def forced(scene: bpy.types.Scene, group: Members) -> list[Forced]:

@@ -59,7 +59,7 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Look:
         """Gather what Apply would decide by, the splats and the view of the active camera."""
         view = Choice("ACTIVE").views(context, checked.obj)[0]
-        group = splat_group.members(context.view_layer, checked.obj)
+        group = splat_group.members(context.view_layer, checked)
         task = apply_task(context, group)
         splats = task.splats or splat_group.gather(group, whole=None)
         return _Look(task, splats, ViewSet((replace(view, weight=1.0),)))

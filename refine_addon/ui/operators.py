@@ -153,7 +153,7 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Scoring:
         """Gather splats, views and settings."""
         settings, views = context.scene.refine.to_settings(), chosen_views(context)
-        group = splat_group.members(context.view_layer, checked.obj)
+        group = splat_group.members(context.view_layer, checked)
         for member in group:
             mesh_edit.check_writable(member.obj)
         quality = settings.estimates or context.scene.refine.budget == "psnr"
@@ -177,10 +177,10 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
 
     @staticmethod
     def show(
-        context: bpy.types.Context, _checked: SplatObject, job: _Scoring, scores: Scores
+        context: bpy.types.Context, checked: SplatObject, job: _Scoring, scores: Scores
     ) -> None:
         """Store the closed form's scores, to be looked at until those asked for are there."""
-        group = splat_group.by_uids(job.uids)
+        group = splat_group.by_uids(job.uids, checked)
         noted = splat_group.Noted(_rough(job), job.origins, removed=job.removed, asked=job.settings)
         splat_group.store(group, scores, noted)
         plans.refresh(context)
@@ -200,7 +200,7 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     def finish(
         self,
         context: bpy.types.Context,
-        _checked: SplatObject,
+        checked: SplatObject,
         job: _Scoring,
         found: tuple[Scores, NDArray[np.int64]],
     ) -> Answer:
@@ -208,7 +208,7 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         scores, counts = found
         pairs = zip(job.views, counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
-        group, forced = splat_group.by_uids(job.uids), _forced(job)
+        group, forced = splat_group.by_uids(job.uids, checked), _forced(job)
         noted = splat_group.Noted(job.settings, job.origins, cameras, job.removed)
         splat_group.store(group, scores, noted)
         plans.refresh(context)
@@ -298,7 +298,7 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Applying:
         """Gather the scores that decide; to absorb, splats and views besides."""
-        group = splat_group.members(context.view_layer, checked.obj)
+        group = splat_group.members(context.view_layer, checked)
         for member in group:
             mesh_edit.check_deletable(member.obj)
         return _Applying(apply_task(context, group), splat_group.uids_of(group))
@@ -313,11 +313,11 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         return pipeline.decide(job.task, progress=progress)
 
     def finish(
-        self, context: bpy.types.Context, _checked: SplatObject, job: _Applying, result: Result
+        self, context: bpy.types.Context, checked: SplatObject, job: _Applying, result: Result
     ) -> Answer:
         """Delete what does not stay, and change what absorbed it."""
         context.view_layer.update()
-        group = splat_group.by_uids(job.uids)
+        group = splat_group.by_uids(job.uids, checked)
         changed = staleness.changes_of(context, [member.obj for member in group])
         if result.absorbed and not job.task.budget.needs_scores:
             changed = []  # nothing went by the scores

@@ -312,7 +312,7 @@ def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     own: dict[str, Any] = {"key": _key(settings, objects), "splats": count}
     plan = own
     try:
-        group = splat_group.members(bpy.context.view_layer, obj)
+        group = splat_group.members(bpy.context.view_layer, mesh_layout.check(obj))
         found = splat_group.refresh(scene, group)
         task = splat_group.stored_task(group, settings.to_budget(), found)
         known = _know(task, _state(objects, settings))

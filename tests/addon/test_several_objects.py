@@ -124,7 +124,7 @@ def test_the_curve_is_that_of_all_and_of_no_part(addon, halves):
     settings.method, settings.views = "occlusion", 8
     bpy.ops.refine.score()
     group, scores = addon.splat_group, addon.mesh.scores
-    members = group.members(bpy.context.view_layer, halves[1])
+    members = group.members(bpy.context.view_layer, addon.mesh.layout.check(halves[1]))
 
     found = group.forced(bpy.context.scene, members)
     task = group.stored_task(members, settings.to_budget(), found)
