@@ -6,7 +6,7 @@ open scene (`scene_cameras`), need Blender; they are imported where they are use
 In the order in which they work: `signals` listens for Ctrl-C, `flow` goes from arguments to exit
 code, `options` parses, `checks` refuses what cannot go together, `runs` does the work (for ``info``
 with `info`) by the views that `cameras` returns, `report` writes down what was done. `terminal` is
-all that prints, in `words` where several subcommands say the same; `pace` tells the time left.
+all that prints, in `words` where several subcommands say the same.
 """
 
 from __future__ import annotations

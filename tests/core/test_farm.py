@@ -45,7 +45,7 @@ def openjd(action, template, folder, **parameters):
     }  # fmt: skip
     words = [f"--job-param={name}={value}" for name, value in given.items()]
     return subprocess.run(
-        [OPENJD, action, ROOT / "farm" / template, *(words if action == "run" else [])],
+        [OPENJD, action, ROOT / "docs" / "farm" / template, *(words if action == "run" else [])],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True, text=True, check=False, timeout=120,
     )  # fmt: skip

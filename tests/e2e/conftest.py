@@ -91,10 +91,18 @@ def binary(blender: Blender) -> Blender:
     return blender
 
 
+@pytest.fixture
+def same_binary(blender: Blender) -> Blender:
+    """Give the real Blender that stays the same from day to day, for pictures of its window."""
+    return blender
+
+
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run each test on all Blenders of the kind that it asks for."""
     if "fresh_binary" in metafunc.fixturenames:
         metafunc.parametrize("fresh_binary", BINARIES, indirect=True)
+    elif "same_binary" in metafunc.fixturenames:
+        metafunc.parametrize("blender", BINARIES[:1], indirect=True)
     elif "binary" in metafunc.fixturenames:
         metafunc.parametrize("blender", BINARIES, indirect=True)
     elif "blender" in metafunc.fixturenames:

@@ -1,0 +1,42 @@
+"""What the recipes tell to run in Blender is understood by the command."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+
+from refine_addon.command import checks
+from refine_addon.command.options import make_parser
+from tests.examples import blocks
+
+ROOT = Path(__file__).parents[2]
+ROOM = ROOT / "tests/data/room_small"
+LINES = [
+    (document.name, line.split("#")[0].partition("--command refine ")[2])
+    for document in (ROOT / "README.md", ROOT / "docs" / "recipes.md")
+    for block in blocks(document)
+    for line in block.text.splitlines()
+    if line.startswith("blender") and "--command refine " in line and "--help" not in line
+]
+
+
+@pytest.mark.parametrize("line", [line for _, line in LINES], ids=str)
+def test_a_recipe_for_blender_is_understood_and_refused_by_no_check(line, tmp_path, monkeypatch):
+    """Wrong usage would leave with code 2; whether objects are in the scene only Blender knows."""
+    shutil.copy(ROOM / "point_cloud.ply", tmp_path / "in.ply")
+    shutil.copy(ROOM / "cameras.json", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(checks, "open_blend", lambda: "scene.blend")
+    words = shlex.split(line.replace("*.ply", "in.ply"))
+    parser = make_parser()
+
+    checks.check(parser, parser.parse_args(words, argparse.Namespace(scene=True)))
+
+
+def test_there_are_recipes_for_blender():
+    """In both documents."""
+    assert {name for name, _ in LINES} == {"README.md", "recipes.md"}
