@@ -224,6 +224,22 @@ def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
     raise RefineError(msg)
 
 
+def mark_protected(obj: bpy.types.Object, marked: NDArray[np.bool_]) -> None:
+    """Mark the splats of `marked`, (N,), with `PROTECT`, and no others.
+
+    Raises
+    ------
+    RefineError
+        See `check_writable`.
+    """
+    check_writable(obj)
+    mesh = obj.data
+    mesh_attributes.remove_attribute(mesh, PROTECT)  # it may be of another type
+    if marked.any():
+        mesh_attributes.write_attribute(mesh, PROTECT, "BOOLEAN", marked)
+    mesh_attributes.updated(mesh)
+
+
 def marking(obj: bpy.types.Object) -> tuple[str, ...]:
     """Return the types of point attributes that can mark splats of an object."""
     return ("BOOLEAN", "FLOAT") if obj.type == "POINTCLOUD" else ("BOOLEAN",)

@@ -406,12 +406,12 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
 
 def _tell_cameras(scores: Scores, plan: dict[str, Any], settings: Any) -> None:  # noqa: ANN401
     """Have the list of the cameras say how much of each picture a plan changes."""
-    curve = None if "error" in plan else scores.quality
-    if curve is None:
+    curve, place = scores.quality, _place(plan, settings)
+    if curve is None or place is None:
         camera_list.tell({})
         return
     absorb = settings.absorb and curve.foretold
-    camera_list.tell(curve.of_views(plan["removed"] / plan["splats"], absorb=absorb))
+    camera_list.tell(curve.of_views(place.share, absorb=absorb))
 
 
 def _place(plan: dict[str, Any], settings: Any) -> Place | None:  # noqa: ANN401

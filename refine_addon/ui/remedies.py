@@ -11,6 +11,7 @@ import mathutils
 import numpy as np
 from bpy.props import EnumProperty, IntProperty
 
+from .. import splat_group
 from ..cameras.objects import UPRIGHT, WEIGHT, world_matrix
 from ..cameras.sets import chosen_cameras
 from ..core.errors import RefineError
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-KEEP = "refine_keep"
-"""Boolean point attribute: what was protected and, with it, what no view saw."""
+    from ..core.volumes import Forced
+    from ..mesh.layout import SplatObject
 
 _INNER = (5.0, 95.0)  # percentiles of the splats' positions that a ring frames
 _ELEVATIONS = (15.0, 40.0)  # degrees, by turns
@@ -134,31 +135,35 @@ class REFINE_OT_leave_out(OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_keep_unseen(OnSplats, bpy.types.Operator):
-    """Protect the splats that lie in no view, with those that are protected"""
+    """Mark the splats that lie in no view to stay, with those that are marked"""
 
     bl_idname = "refine.keep_unseen"
     bl_label = "Keep What Is Unseen"
     bl_options = {"REGISTER", "UNDO"}
 
     def execute(self, context: bpy.types.Context) -> Answer:
-        """Mark them, and protect what is marked."""
-        obj, settings = context.object, context.scene.refine
+        """Mark them."""
         try:
-            checked = mesh_layout.check(obj)
-            mesh_edit.check_writable(obj)
-            keep = mesh_scores.stored_scores(checked).seen == 0  # (N,)
-            count = int(np.count_nonzero(keep))
-            protected = mesh_edit.protected_mask(obj, settings.protect)
+            group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
+            found = splat_group.forced(context.scene, group)
+            masks = [_unseen(*pair) for pair in zip(group, found, strict=True)]
+            for member in group:
+                mesh_edit.check_writable(member.obj)
+            for member, unseen in zip(group, masks, strict=True):
+                marked = mesh_edit.protected_mask(member.obj, "")
+                mesh_edit.mark_protected(member.obj, unseen if marked is None else unseen | marked)
         except FAILURES as error:
             return fail(self, error)
-        if protected is not None:
-            keep |= protected
-        mesh_attributes.write_attribute(obj.data, KEEP, "BOOLEAN", keep)
-        mesh_attributes.updated(obj.data)
-        settings.protect = KEEP
         plans.refresh(context)
+        count = sum(int(np.count_nonzero(unseen)) for unseen in masks)
         self.report({"INFO"}, f"{count:,} splats that lie in no view stay")
         return {"FINISHED"}
+
+
+def _unseen(checked: SplatObject, found: Forced) -> NDArray[np.bool_]:
+    """Return which splats lie in no view, (N,), and need not go for another reason."""
+    unseen = mesh_scores.stored_scores(checked, found.removed).seen == 0
+    return unseen if found.removed is None else unseen & ~found.removed
 
 
 def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:

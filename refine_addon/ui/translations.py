@@ -229,15 +229,15 @@ GERMAN = {
     "Place in the list": "Platz in der Liste",
     "Points": "Punkte",
     "Preview": "Vorschau",
+    "Mark the splats that lie in no view to stay, with those that are marked": (
+        "Die Splats, die in keiner Ansicht liegen, zu den bleibenden nehmen"
+    ),
     "Price": "Preis",
     "Protect": "Schützen",
     "Protect Inside": "Inneres schützen",
     "Protect Selected": "Auswahl schützen",
     "Protect Splats": "Splats schützen",
     "Protect and Crop": "Schützen und beschneiden",
-    "Protect the splats that lie in no view, with those that are protected": (
-        "Die Splats schützen, die in keiner Ansicht liegen, zusammen mit den geschützten"
-    ),
     "Published Constants": "Veröffentlichte Konstanten",
     "Quality": "Qualität",
     "Rank of each splat: dark goes first, yellow last": (

@@ -202,17 +202,12 @@ def _mark(obj: bpy.types.Object, mode: str) -> None:
     """Change the marks by what is selected."""
     mesh, marked = obj.data, mesh_edit.protected_mask(obj, "")
     if marked is None:
-        mesh_attributes.remove_attribute(mesh, mesh_edit.PROTECT)  # of another type, if any
         marked = np.zeros(mesh_layout.splat_count(mesh), np.bool_)
     if mode == "CLEAR":
         marked[:] = False
     else:
         marked[_selection(obj)] = mode == "ADD"
-    if marked.any():
-        mesh_attributes.write_attribute(mesh, mesh_edit.PROTECT, "BOOLEAN", marked)
-    else:
-        mesh_attributes.remove_attribute(mesh, mesh_edit.PROTECT)
-    mesh_attributes.updated(mesh)
+    mesh_edit.mark_protected(obj, marked)
 
 
 def _selection(obj: bpy.types.Object) -> NDArray[np.bool_]:

@@ -337,11 +337,38 @@ def test_what_is_unseen_stays_with_what_was_protected(addon, room, room_cameras,
     assert "refine.keep_unseen" in remedies(found)
     assert unseen.mean() > 0.5
     assert (before & unseen).any()
-    assert np.array_equal(read(addon, obj, settings.protect), unseen | marks)
+    assert np.array_equal(read(addon, obj, addon.mesh.edit.PROTECT), unseen)
     assert not (gone & (unseen | marks)).any()
     assert gone.sum() == before.sum() == 3975
     assert after[0].remedy == ""
     assert "0% of these go" in after[0].text
+
+
+def test_what_must_go_is_not_kept_and_pictures_are_without_it(addon, room, room_cameras):
+    """A box forces some out: they lie in no view, and their share is none that the curve is of."""
+    for camera in list(room_cameras.objects)[4:]:
+        room_cameras.objects.unlink(camera)
+    settings, manager = bpy.context.scene.refine, bpy.context.window_manager
+    settings.method, settings.percent = "occlusion", 60.0
+    bpy.ops.refine.add_volume(shape="BOX", role="REMOVE")
+    bpy.context.view_layer.objects.active = room
+    bpy.context.view_layer.update()
+    bpy.ops.refine.score()
+    checked = addon.mesh.layout.check(room)
+    gone = addon.demands.Demands.of_scene(bpy.context.scene).forced(checked).removed
+    curve = addon.mesh.scores.stored_scores(checked, gone).quality
+    removed = np.count_nonzero(read(addon, room, "refine_remove"))
+    share = (removed - gone.sum()) / (len(gone) - gone.sum())
+    expected = curve.of_views(share)
+    listed = {item.name: item.psnr for item in manager.refine_cameras if item.psnr >= 0.0}
+    bpy.ops.refine.keep_unseen()
+
+    assert 1000 < gone.sum() < 0.5 * len(gone)
+    assert listed == pytest.approx({name: expected[name] for name in listed}, abs=0.02)
+    assert len(listed) == 4
+    kept = read(addon, room, addon.mesh.edit.PROTECT)
+    assert kept.any()
+    assert not (kept & gone).any()
 
 
 def test_unseen_splats_are_known_of_scores_alone(room, unchanged):  # noqa: ARG001
@@ -367,7 +394,7 @@ def test_each_remedy_goes_with_one_undo(room, room_cameras):
     room, camera = (bpy.data.objects[name] for name in names)
 
     assert np.array_equal(np.array(camera.matrix_world), matrix)
-    assert "refine_keep" not in room.data.attributes
+    assert "refine_protect" not in room.data.attributes
     assert "Ring of Cameras" not in bpy.data.collections
     assert bpy.context.scene.refine.protect == ""
     for name in ("turn_cameras", "add_ring", "leave_out", "keep_unseen"):

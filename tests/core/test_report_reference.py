@@ -16,7 +16,11 @@ SECTIONS = (Path(__file__).parents[2] / "docs/report.md").read_text("utf-8").spl
 CAMERAS = ["--cameras", "."]
 ABSORBING = ["--absorb", "--clean", "--ratio", ".3"]
 RUNS = {
-    "prune": [["-o", "a.splat", *ABSORBING, *CAMERAS], ["--dry-run", "--max-mb", "9", *CAMERAS]],
+    "prune": [
+        ["-o", "a.splat", *ABSORBING, *CAMERAS],
+        ["--dry-run", "--max-mb", "9", "--pictures", "shots", *CAMERAS],
+        ["--together", "--dry-run", "--method", "closed-form", *CAMERAS],
+    ],
     "score": [["-o", "scored.ply", *CAMERAS]],
     "clean": [["--reasons", "front,isolated,giant,needle,transparent", *CAMERAS]],
     "convert": [["b.splat"]],
