@@ -17,7 +17,7 @@ from . import demands, splat_object
 from .core.errors import RefineError
 from .core.quality import Quality
 from .core.selection import rank
-from .core.splats import Splats, above_constant
+from .core.splats import Splats
 from .core.task import DEFAULTS, Task
 from .demands import Demands
 from .mesh import edit as mesh_edit
@@ -374,6 +374,5 @@ def _part(absorbed: Absorbed, rows: slice, degree: int) -> Absorbed:
     first = int(np.count_nonzero(absorbed.keep[: rows.start]))
     keep = absorbed.keep[rows]
     here = slice(first, first + int(np.count_nonzero(keep)))
-    splats = absorbed.splats.take(here)
-    splats = replace(splats, sh_rest=splats.sh_rest[:, : above_constant(degree)])
+    splats = absorbed.splats.take(here).up_to_degree(degree)
     return replace(absorbed, keep=keep, splats=splats, changed=absorbed.changed[here])

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from ..core import METHODS, REASONS, Budget, Cleaning, ClosedForm, Levels, RefineError, Settings
+from ..core.errors import printable
 from ..core.formats.registry import SUFFIXES
 from ..core.levels.files import GOAL
 from ..core.whole_file import expanded
 from ..version import VERSION
 from . import zones
-from .terminal import shown
 
 DEFAULT_RATIO = 0.5
 
@@ -65,7 +65,7 @@ class _Parser(argparse.ArgumentParser):
     """A parser whose complaints can be shown, whatever the arguments hold."""
 
     def error(self, message: str) -> NoReturn:
-        super().error(shown(message))
+        super().error(printable(message))
 
 
 def make_parser() -> argparse.ArgumentParser:

@@ -4,30 +4,14 @@ from __future__ import annotations
 
 import os
 import sys
-import unicodedata
 from typing import TYPE_CHECKING, Literal, TextIO
+
+from ..core.errors import printable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
 
-_OBEYED = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-"""Categories of characters that a terminal obeys, or cannot show, and nobody reads."""
-
 _CLEAR = "\r\x1b[K"
-
-
-def shown(text: str) -> str:
-    r"""Return `text` on one line, as a terminal can show it.
-
-    A name of a file can hold anything, such as an escape sequence that renames the window.
-
-    >>> print(shown("a\x1b[2J\nb"))
-    a\x1b[2J\nb
-    """
-    return "".join(
-        char.encode("unicode_escape").decode() if unicodedata.category(char) in _OBEYED else char
-        for char in text
-    )
 
 
 def described(error: OSError | MemoryError) -> str:
@@ -40,7 +24,7 @@ def described(error: OSError | MemoryError) -> str:
 def complain(text: str) -> None:
     """Print an error, in place of the progress that may stand there."""
     start = _CLEAR if _is_terminal(sys.stderr) else ""
-    _write("stderr", f"{start}refine: error: {shown(text)}\n")
+    _write("stderr", f"{start}refine: error: {printable(text)}\n")
 
 
 def flush() -> None:
@@ -64,7 +48,7 @@ class Terminal:
     def say(self, text: str) -> None:
         """Print a line, unless quiet."""
         if not self._quiet:
-            _write("stdout", f"{shown(text)}\n")
+            _write("stdout", f"{printable(text)}\n")
 
     def notes(self, notes: Iterable[str]) -> None:
         """Print what else the user should know of a result, a line each."""
@@ -85,7 +69,7 @@ class Terminal:
         """
         if not self._draws:
             return lambda _fraction, _what: None
-        label = shown(label)
+        label = printable(label)
 
         def draw(fraction: float, what: str) -> None:
             rest = left(fraction)

@@ -525,10 +525,11 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
     filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
     suffix: EnumProperty(
         name="Format",
-        description="Of the file that is picked here; what the suffix of a file name says holds",
+        description="Of the file that is picked here; a suffix that is typed chooses it",
         items=_FORMATS,
         options={"SKIP_SAVE"},
     )
+    settled: StringProperty(default=_FORMATS[0][0], options={"HIDDEN", "SKIP_SAVE"})
     apply_transform: BoolProperty(
         name="Apply Transform",
         description="Write the splats as they stand in the world: positions, rotations, scales "
@@ -548,10 +549,15 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
         return ExportHelper.invoke(self, context, event)
 
     def check(self, _context: bpy.types.Context) -> bool:
-        """Give the file name the suffix of the format that is chosen; return whether it changed."""
-        before = self.filepath
-        self.filepath = without_suffix(before) + self.suffix
-        return before != self.filepath
+        """Bring name and format together, whichever was changed; return whether either changed."""
+        before = self.filepath, self.suffix
+        name = without_suffix(self.filepath)
+        typed = self.filepath[len(name) :].lower()
+        if typed and self.suffix == self.settled:
+            self.suffix = typed
+        self.filepath = name + self.suffix
+        self.settled = self.suffix
+        return before != (self.filepath, self.suffix)
 
     def written(
         self, _context: bpy.types.Context, _checked: SplatObject | None

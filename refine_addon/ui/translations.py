@@ -212,8 +212,8 @@ GERMAN = {
     "Occlusion with no more views than the pictures need": (
         "Verdeckung mit nicht mehr Ansichten, als die Bilder brauchen"
     ),
-    "Of the file that is picked here; what the suffix of a file name says holds": (
-        "Der Datei, die hier gewählt wird; es gilt, was die Endung des Dateinamens sagt"
+    "Of the file that is picked here; a suffix that is typed chooses it": (
+        "Der Datei, die hier gewählt wird; eine getippte Endung wählt es"
     ),
     "Off": "Aus",
     (

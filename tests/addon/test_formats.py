@@ -47,22 +47,29 @@ def test_every_format_is_exported_and_imported(addon, small, tmp_path):
 
 
 def test_the_file_name_follows_the_format_that_is_chosen(addon):
-    """The suffix of another format is replaced, also one with two dots; a name of its own is not.
+    """The suffix of another format is replaced, also one with two dots; one that is typed chooses.
 
-    `check` is what the file browser calls when an option changes.
+    `check` is what the file browser calls when an option or the name changes.
     """
 
     class Browser:
         check = addon.ui.operators.REFINE_OT_export_ply.check
 
     browser = Browser()
-    browser.filepath, browser.suffix = "a.compressed.ply", ".spz"
+    browser.filepath, browser.suffix, browser.settled = "a.compressed.ply", ".spz", ".ply"
     changed = browser.check(None), browser.filepath, browser.check(None)
     browser.suffix = ".compressed.ply"
     browser.check(None)
+    chosen = browser.filepath
+    browser.filepath = "b.SPLAT"
+    typed = browser.check(None), browser.filepath, browser.suffix
+    browser.filepath = "c"
+    browser.check(None)
 
     assert changed == (True, "a.spz", False)
-    assert browser.filepath == "a.compressed.ply"
+    assert chosen == "a.compressed.ply"
+    assert typed == (True, "b.splat", ".splat")
+    assert browser.filepath == "c.splat"
 
 
 def test_all_formats_can_be_dropped_and_picked(addon):
