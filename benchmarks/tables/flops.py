@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, get_args, get_type_hints
 
 import numpy as np
 
-from refine_addon.core import pipeline
-from refine_addon.core.pipeline import Settings
+from refine_addon.core.scoring import closed_form, occlusion
 from refine_addon.core.scoring.closed_form import ClosedForm
 from refine_addon.core.splats import Splats
+from refine_addon.core.task import Settings
 
 from ..renderer import rasterizer
 
@@ -160,11 +160,15 @@ def measure(splats: Splats, views: ViewSet) -> Counts:
 
 
 def count(splats: Splats, views: ViewSet, settings: Settings) -> int:
-    """Return how many operations scoring takes."""
+    """Return how many operations the method takes, without what is said of the views besides."""
     arrays = {name: np.asarray(value).view(Counting) for name, value in vars(splats).items()}
     with _counted():
         Counting.total = 0
-        pipeline.score(Splats(**arrays), views, settings, threads=1)
+        with np.errstate(under="ignore"):
+            if settings.method == "occlusion":
+                occlusion.score(Splats(**arrays), views, settings.occlusion, threads=1)
+            else:
+                closed_form.score(Splats(**arrays), views, settings.closed_form, threads=1)
         return Counting.total
 
 

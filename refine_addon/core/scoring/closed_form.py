@@ -280,14 +280,15 @@ def _powers(
         for _ in crowds:
             pass
         return None, 0.0
-    powers, count = np.zeros(CELLS**3), np.zeros(CELLS**3, np.int64)
+    powers, count, end = np.zeros(CELLS**3), np.zeros(CELLS**3, np.int64), 0
     for crowd in crowds:
         assert crowd is not None  # noqa: S101 - as blocks are told
         cells, sums, counts = crowd
         powers[cells] += sums
         count[cells] += counts
-    # Up to the last that occurs: zeros behind it would change how NumPy pairs what it sums.
-    end = int(np.flatnonzero(count)[-1]) + 1
+        end = max(end, int(cells[-1]) + 1)
+    # Up to the last that occurs, be it of splats that cannot be drawn: zeros behind it would change
+    # how NumPy pairs what it sums.
     powers, count = powers[:end], count[:end]
     overall = float(powers.sum() / count.sum())
     # Sums, means and logarithms in turn, in place.
