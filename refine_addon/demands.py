@@ -67,8 +67,7 @@ class Demands:
             See `zone`.
         """
         settings = scene.refine
-        listed = [item for item in settings.volumes if item.object is not None]
-        zones = (zone(item.role.lower(), item.object, idle=True) for item in listed)
+        zones = (zone(item.role.lower(), item.object, idle=True) for item in listed(scene))
         return cls((settings.protect,) if settings.protect else (), tuple(zones))
 
     def __add__(self, other: Demands) -> Demands:
@@ -97,6 +96,18 @@ class Demands:
 
 
 NONE = Demands()
+
+
+def listed(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
+    """Return the volumes that the panel lists, but for those that are in the scene no more.
+
+    The list holds on to an object that was deleted, which nobody sees.
+    """
+    return [
+        item
+        for item in scene.refine.volumes
+        if item.object is not None and scene in item.object.users_scene
+    ]
 
 
 def world_means(checked: SplatObject) -> NDArray[np.float64]:

@@ -184,7 +184,8 @@ def _turn(
 
     It is known where splats and at least half of the cameras were imported, and stand alike.
     """
-    if splats is None or not (LAYOUT in splats.data or is_native(splats.data)):
+    data = None if splats is None else splats.data
+    if splats is None or data is None or not (LAYOUT in data or is_native(data)):
         return None
     linear = world_matrix(splats, depsgraph)[:3, :3]
     scale = np.cbrt(np.linalg.det(linear))

@@ -141,7 +141,7 @@ def words(done: dict[str, Any]) -> str:
         f"{volume['role']} {volume['name'].removeprefix('object ')}: {volume['splats']:,}"
         for volume in done.get("volumes", ())
     ]
-    return ", ".join(parts) + (f" ({'; '.join(volumes)})" if volumes else "")
+    return " ".join([", ".join(parts), f"({'; '.join(volumes)})" if volumes else ""]).strip()
 
 
 def _items(options: argparse.Namespace) -> list[tuple[Role, Given]]:
@@ -151,7 +151,7 @@ def _items(options: argparse.Namespace) -> list[tuple[Role, Given]]:
 
 
 def _marks(obj: Any, name: str) -> bool:  # noqa: ANN401 - an object of Blender
-    return name in obj.vertex_groups or name in obj.data.attributes
+    return name in obj.vertex_groups or name in getattr(obj.data, "attributes", ())
 
 
 def _zone(role: Role, item: Given, also: str) -> Zone:

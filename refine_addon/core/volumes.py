@@ -96,7 +96,9 @@ class Sphere:
         """Return which points, (N, 3), lie inside, (N,)."""
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):
             away: NDArray[np.float64] = points - np.asarray(self.center, np.float64)
-            return np.asarray(np.einsum("ij,ij->i", away, away) <= self.radius**2)
+            return np.asarray(
+                np.einsum("ij,ij->i", away, away) <= np.square(np.float64(self.radius))
+            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -245,3 +245,21 @@ def test_two_choices_are_one_too_many(addon, animated, capsys, options, expected
 
     assert addon.command.main(words, scene=True) == 2
     assert expected in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("room_cameras")
+@pytest.mark.parametrize("kind", ["EMPTY", "CAMERA", "protected CAMERA"])
+def test_an_object_without_splats_is_refused_in_a_sentence(addon, tmp_path, kind):
+    """It may have no data, or data without attributes."""
+    obj = bpy.data.objects.new("Odd", None if kind == "EMPTY" else bpy.data.cameras.new("Odd"))
+    bpy.context.scene.collection.objects.link(obj)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+    told = tmp_path / "report.json"
+    words = ["prune", "--object", "Odd", "--dry-run", *CLOSED, "--report", str(told)]
+    if kind.startswith("protected"):
+        words += ["--protect", "statue"]
+
+    assert addon.command.main(words, scene=True) == 1
+    error = json.loads(told.read_text())["results"][0]["error"]
+    assert "Odd" in error or "statue" in error
+    assert "Traceback" not in error

@@ -426,6 +426,22 @@ def test_a_new_volume_lies_about_the_splats_and_can_be_moved(addon, room, shape,
     assert "refine_remove" not in room.data.attributes
 
 
+def test_a_volume_that_was_deleted_counts_no_more(addon, room):
+    """The list holds on to the object; it is in no scene, and nobody sees it crop."""
+    center, upper = middle(addon, room)
+    box = cube(center, upper - center, "Cube")
+    box.select_set(True)
+    bpy.ops.refine.add_volume(shape="SELECTED", role="REMOVE")
+    checked = addon.mesh.layout.check(room)
+    before = addon.demands.Demands.of_scene(bpy.context.scene).forced(checked)
+    for collection in list(box.users_collection):
+        collection.objects.unlink(box)
+    after = addon.demands.Demands.of_scene(bpy.context.scene).forced(checked)
+
+    assert before.removed.any()
+    assert after.removed is None
+
+
 def test_selected_objects_become_volumes(addon, room):
     """Two meshes at once, each listed once."""
     center, upper = middle(addon, room)

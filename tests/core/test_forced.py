@@ -192,6 +192,17 @@ def test_levels_hold_nothing_of_it_and_are_those_of_the_rest(splats, views, remo
     assert [level.keep.sum() for level in found] == [288, 58]
 
 
+@pytest.mark.parametrize("absorb", [False, True])
+def test_levels_where_all_that_had_to_go_is_protected(splats, views, removed, absorb):
+    """Nothing is forced out then, and each level is made from the one before."""
+    levels = lod(
+        splats, views, Levels((0.5, 0.3), absorb=absorb), protected=removed, removed=removed
+    )
+
+    assert len(levels) == 2
+    assert all(level.keep[removed].all() for level in levels)
+
+
 def test_cleaning_takes_what_is_forced_out_as_gone():
     """The wall before the floater is no surface then: of what no view sees past, nothing floats."""
     splats = joined(wall(), FLOATER)

@@ -205,6 +205,11 @@ def test_a_placed_sphere_is_an_ellipsoid():
     assert volume.inside(points).tolist() == [True, False] * 3
 
 
+def test_a_vast_sphere_holds_all():
+    """The square of its radius is no float64."""
+    assert Sphere((0, 0, 0), 1e200).inside(np.array([[1e30, 0.0, 0.0]])).tolist() == [True]
+
+
 def test_a_sphere_holds_its_surface():
     """A point at the distance of the radius, exactly."""
     points = np.array([[3.0, 4.0, 0.0], [3.0, 4.0, 1e-6]])

@@ -269,7 +269,7 @@ def each_level(
         See `lod`.
     """
     total, forced = len(scene.scene()[0]), scene.forced()
-    scene = scene if forced is None else scene.without(forced)
+    scene = replace(scene, removed=None) if forced is None else scene.without(forced)
     splats, views = scene.scene()
     lookout = Lookout(splats, views, progress=part(progress, 0.0, 0.05), threads=threads)
     budgets, ahead = levels.budgets(total), part(progress, 0.05, 1.0)
