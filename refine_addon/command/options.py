@@ -320,9 +320,9 @@ def _add_views(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--views",
         type=int,
-        default=64,
+        default=Settings.views,
         metavar="N",
-        help="use at most N views, spread out evenly; 0 uses all (default 64)",
+        help=f"use at most N views, spread out evenly; 0 uses all (default {Settings.views})",
     )
 
 

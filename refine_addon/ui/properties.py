@@ -58,7 +58,7 @@ UPRIGHT_TEXT = (
 VIEWS: dict[str, Any] = {
     "name": "Views",
     "description": "Use at most this many views, spread out evenly; 0 uses all",
-    "default": 64,
+    "default": Settings.views,
     "min": 0,
 }
 

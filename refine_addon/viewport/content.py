@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..core.errors import RefineError
-from ..core.formats.ply import REQUIRED
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
@@ -189,11 +187,7 @@ class Content:
         held.rank = _attribute(mesh, mesh_scores.RANK, "FLOAT")
         held.remove = _attribute(mesh, mesh_edit.REMOVE, "BOOLEAN")
         held.force = _attribute(mesh, mesh_edit.FORCE, "INT")
-        columns = mesh_attributes.stored_columns(checked)
-        checksum = 1
-        for name in REQUIRED:
-            checksum = zlib.adler32(np.ascontiguousarray(columns[name]).data, checksum)
-        signature = (len(checked), held.degree, checksum)
+        signature = (len(checked), held.degree, mesh_attributes.digest(checked))
         if signature != held.signature:
             held.signature = signature
             held.future = background.start(pack, mesh_attributes.splats_from_object(checked))

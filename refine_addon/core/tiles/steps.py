@@ -20,7 +20,7 @@ from ..formats.ply_write import write_rows
 from ..scoring.closed_form_block import STEPS, Block
 from ..selection import lowest
 from ..whole_file import whole_file
-from ..work import Progress, report, silent
+from ..work import Progress, silent
 from .units import reopened, rows_of, splats_of
 
 if TYPE_CHECKING:
@@ -163,9 +163,7 @@ class Job:
             ]
         )
 
-    def write(
-        self, tile: Tile, units: list[Unit], kept: int, *, progress: Progress = silent
-    ) -> int:
+    def write(self, tile: Tile, units: list[Unit], kept: int) -> int:
         """Write what stays of a tile into the folder of the job, and return its bytes.
 
         Parameters
@@ -175,7 +173,6 @@ class Job:
             Those in which it lies.
         kept : int
             How many of its splats stay.
-        progress : callable, optional
         """
         name = f"{Path(tile.path).name}.written"
         made = self.folder.tiles / Path(tile.path).name
@@ -187,7 +184,6 @@ class Job:
             stream.write(with_count(file.header, kept))
             stream.write(file.before.data)
             for unit in units:
-                report(progress, (unit.index - units[0].index) / len(units), "writing")
                 keep = self.folder.load(unit.index, ["keep"])["keep"]
                 for part, piece in zip(unit.parts, unit.slices(), strict=True):
                     if part.tile == tile:
