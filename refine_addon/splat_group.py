@@ -117,6 +117,31 @@ def forced(scene: bpy.types.Scene, group: Members) -> list[Forced]:
     ]
 
 
+def check_forced(scene: bpy.types.Scene, group: Members, before: Sequence[Forced]) -> None:
+    """Check that of each object the same must stay and go as before.
+
+    Raises
+    ------
+    RefineError
+        If not; also see `forced`.
+    """
+    for member, was, now in zip(group, before, forced(scene, group), strict=True):
+        pairs = ((was.protected, now.protected), (was.removed, now.removed))
+        if any(not _same_mask(*pair) for pair in pairs):
+            msg = (
+                f"object '{member.obj.name}': what must stay or go has changed meanwhile; nothing "
+                "was removed: apply again"
+            )
+            raise RefineError(msg)
+
+
+def _same_mask(one: NDArray[np.bool_] | None, other: NDArray[np.bool_] | None) -> bool:
+    """Tell whether both mark the same; none means that nothing is marked."""
+    if one is None or other is None:
+        return not any(mask is not None and mask.any() for mask in (one, other))
+    return np.array_equal(one, other)
+
+
 def refresh(scene: bpy.types.Scene, group: Members) -> list[Forced]:
     """Mark what a scene demands of each object, and return it; see `demands.refresh`."""
     if len(group) == 1:

@@ -27,6 +27,9 @@ PROTECT = "refine_protect"
 FORCE = "refine_force"
 """Integer point attribute, for display: 1 what stays in any case, 2 what goes, 0 the rest."""
 
+MARKING = ("BOOLEAN", "FLOAT")
+"""Types of the point attributes that can be named to mark splats."""
+
 _GROUP_VALUES = "refine_group_values"
 
 
@@ -179,8 +182,8 @@ def mark_forced(
 def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
     """Return which splats are marked by `PROTECT`, and by an attribute or a vertex group.
 
-    A point cloud has no vertex groups; a float attribute marks there, which is what `convert` makes
-    of one.
+    A point cloud has no vertex groups; `convert` makes float attributes of them, which stay that
+    when it makes a mesh again.
 
     Parameters
     ----------
@@ -212,14 +215,16 @@ def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None
 def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
     """Return which splats an attribute or a vertex group marks, (N,)."""
     attribute = obj.data.attributes.get(name)
-    if attribute and attribute.data_type in marking(obj) and attribute.domain == "POINT":
+    if attribute and attribute.data_type in MARKING and attribute.domain == "POINT":
         return mesh_attributes.read_attribute(obj.data, name) > 0
     if name in obj.vertex_groups:
         return group_weights(obj, name) > 0.0
     found = f" ('{name}' is {attribute.data_type} on {attribute.domain})" if attribute else ""
-    expected = "a vertex group or a boolean attribute on points"
+    expected = "a boolean or float attribute on points"
     if obj.type == "POINTCLOUD":
-        expected = "a boolean or float attribute on points (a point cloud has no vertex groups)"
+        expected += " (a point cloud has no vertex groups)"
+    else:
+        expected = f"a vertex group, or {expected}"
     msg = f"object '{obj.name}': nothing to protect is named '{name}'{found}; expected {expected}"
     raise RefineError(msg)
 
@@ -238,11 +243,6 @@ def mark_protected(obj: bpy.types.Object, marked: NDArray[np.bool_]) -> None:
     if marked.any():
         mesh_attributes.write_attribute(mesh, PROTECT, "BOOLEAN", marked)
     mesh_attributes.updated(mesh)
-
-
-def marking(obj: bpy.types.Object) -> tuple[str, ...]:
-    """Return the types of point attributes that can mark splats of an object."""
-    return ("BOOLEAN", "FLOAT") if obj.type == "POINTCLOUD" else ("BOOLEAN",)
 
 
 def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:

@@ -10,6 +10,11 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
 from .properties import AMOUNTS
 
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from .properties import RefineSettings
+
 
 class Adjustable:
     """An operator that works by the budget of the panel, and can be done again by another one.
@@ -31,9 +36,26 @@ class Adjustable:
         properties: Any
         layout: Any
 
-    def adjust(self, context: bpy.types.Context) -> None:
-        """Bring the values that were given into the panel, and take all others from there."""
-        settings, given = context.scene.refine, self.properties.is_property_set
+    def adjusted(self, context: bpy.types.Context, call: Callable[[], set[str]]) -> set[str]:
+        """Return what a call answers by the values that were given, which go into the panel.
+
+        All others come from there. Where nothing is done, the panel is left as it was.
+        """
+        settings = context.scene.refine
+        before = {name: getattr(settings, name) for name in AMOUNTS}
+        self._adjust(settings)
+        answer = {"CANCELLED"}
+        try:
+            answer = call()
+        finally:
+            if answer == {"CANCELLED"}:
+                for name, value in before.items():
+                    if getattr(settings, name) != value:
+                        setattr(settings, name, value)
+        return answer
+
+    def _adjust(self, settings: RefineSettings) -> None:
+        given = self.properties.is_property_set
         for name in AMOUNTS:
             here, there = getattr(self, name), getattr(settings, name)
             if not given(name):

@@ -32,6 +32,9 @@ if TYPE_CHECKING:
 NAMES = {kind: f"Compare: {kind}" for kind in KINDS}
 """The pictures as images of the file, made anew by each comparison."""
 
+_OURS = "refine_compare"
+"""Custom property of these images: the name; whatever has none is the user's."""
+
 
 @dataclass(frozen=True, eq=False)
 class _Look:
@@ -60,7 +63,7 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
         """Gather what Apply would decide by, the splats and the view of the active camera."""
         view = Choice("ACTIVE").views(context, checked.obj)[0]
         group = splat_group.members(context.view_layer, checked)
-        task = apply_task(context, group)
+        task = apply_task(context, group, splat_group.forced(context.scene, group))
         splats = task.splats or splat_group.gather(group, whole=None)
         return _Look(task, splats, ViewSet((replace(view, weight=1.0),)))
 
@@ -97,14 +100,17 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
 def _image(name: str, pixels: NDArray[np.uint8]) -> bpy.types.Image:
     """Return an image of the file that holds pixels, (H, W, 3), in place of the one before."""
     height, width = pixels.shape[:2]
-    old = bpy.data.images.get((name, None))
+    ours = (each for each in bpy.data.images if not each.library and each.get(_OURS) == name)
+    old = next(ours, None)
     image = bpy.data.images.new(name, width, height)
+    image[_OURS] = name
     rgba = np.ones((height, width, 4), np.float32)
     rgba[..., :3] = pixels[::-1] / np.float32(255.0)  # Blender's first row is the lowest
     image.pixels.foreach_set(rgba.ravel())
     image.pack()  # or Blender asks on leaving whether to save it
     if old is not None:
         old.user_remap(image)
+        name = old.name
         bpy.data.images.remove(old)
         image.name = name
     return image

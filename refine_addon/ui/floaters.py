@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import bpy
+import numpy as np
 
 from .. import splat_object
 from ..core.cleaning.clean import Cleaned, Cleaning, clean
@@ -91,14 +92,24 @@ class REFINE_OT_delete_floaters(OnSplats, bpy.types.Operator):
         return True
 
     def execute(self, context: bpy.types.Context) -> Answer:
-        """Delete them."""
+        """Delete them, but for those that must stay by now."""
         try:
             checked = mesh_layout.check(context.object)
-            keep = ~floaters.mask(checked, context.scene.refine.reasons)
-            done = splat_object.delete_splats(checked, keep)
+            goes = floaters.mask(checked, context.scene.refine.reasons)
+            protected = Demands.of_scene(context.scene).forced(checked).protected
+            spared = ""
+            if protected is not None and (stays := int(np.count_nonzero(goes & protected))):
+                goes &= ~protected
+                spared = f"; {stays:,} more are protected by now"
+            if not goes.any():
+                self.report({"INFO"}, f"There are no floaters to delete{spared}")
+                return {"CANCELLED"}
+            done = splat_object.delete_splats(checked, ~goes)
         except FAILURES as error:
             return fail(self, error)
         plans.forget(checked.mesh)
         plans.refresh(context)
-        self.report({"INFO"}, f"Deleted {done.removed:,} floaters, {done.kept:,} splats stay")
+        self.report(
+            {"INFO"}, f"Deleted {done.removed:,} floaters, {done.kept:,} splats stay{spared}"
+        )
         return {"FINISHED"}

@@ -117,8 +117,13 @@ class OnThread:
         if running is None:
             return {"CANCELLED"}
         if event.type == "TIMER":
-            main_thread.serve()
-            return self._looked(context, running)
+            try:
+                main_thread.serve()
+                return self._looked(context, running)
+            except Exception:  # a fault of the program, which Blender prints
+                running.worker.cancel()
+                self._over(context, running)
+                raise
         if event.type == "ESC" and event.value == "PRESS":
             running.worker.cancel()
         elif why := at_work.refused(event):

@@ -99,13 +99,16 @@ def chosen_views(context: bpy.types.Context) -> ViewSet:
     return Choice.of_scene(context.scene).views(context, context.object)
 
 
-def apply_task(context: bpy.types.Context, group: splat_group.Members) -> Task:
-    """Return what *Apply* has to decide of the selected objects by the settings of the panel."""
+def apply_task(context: bpy.types.Context, group: splat_group.Members, found: list[Forced]) -> Task:
+    """Return what *Apply* has to decide of the selected objects by the settings of the panel.
+
+    `found` is what must stay and what must go of each.
+    """
     settings = context.scene.refine
     return splat_group.stored_task(
         group,
         settings.to_budget(),
-        splat_group.forced(context.scene, group),
+        found,
         settings=settings.to_settings(),
         views=chosen_views(context) if settings.absorb else None,
     )
@@ -256,10 +259,11 @@ class REFINE_OT_plan(OnScored, bpy.types.Operator):
 
 @dataclass(frozen=True, eq=False)
 class _Applying:
-    """What is to be decided, and of which objects."""
+    """What is to be decided, of which objects, and what must stay and go of each."""
 
     task: Task
     uids: tuple[int, ...]
+    forced: list[Forced]
 
 
 class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
@@ -286,22 +290,26 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Do all of it at once; adjusted, by another budget than that of the panel."""
-        self.adjust(context)
-        return super().execute(context)
+        return self.adjusted(context, partial(super().execute, context))
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Delete at once; absorb on a thread."""
-        self.adjust(context)
-        if not context.scene.refine.absorb:
-            return self.execute(context)
-        return super().invoke(context, event)
+        start = super().invoke
+
+        def call() -> Answer:
+            """Go by what the panel says by now."""
+            absorbs = context.scene.refine.absorb
+            return start(context, event) if absorbs else self.execute(context)
+
+        return self.adjusted(context, call)
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Applying:
         """Gather the scores that decide; to absorb, splats and views besides."""
         group = splat_group.members(context.view_layer, checked)
         for member in group:
             mesh_edit.check_deletable(member.obj)
-        return _Applying(apply_task(context, group), splat_group.uids_of(group))
+        found = splat_group.forced(context.scene, group)
+        return _Applying(apply_task(context, group, found), splat_group.uids_of(group), found)
 
     def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
         """Return the objects that lose splats, the active one first."""
@@ -318,6 +326,8 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         """Delete what does not stay, and change what absorbed it."""
         context.view_layer.update()
         group = splat_group.by_uids(job.uids, checked)
+        if job.task.absorb:  # on a thread, while volumes can be moved
+            splat_group.check_forced(context.scene, group, job.forced)
         changed = staleness.changes_of(context, [member.obj for member in group])
         if result.absorbed and not job.task.budget.needs_scores:
             changed = []  # nothing went by the scores

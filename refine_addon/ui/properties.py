@@ -20,13 +20,14 @@ from bpy.props import (
 
 from ..core.cleaning.clean import DEFAULT_REASONS
 from ..core.errors import RefineError
+from ..core.formats.ply import REQUIRED
 from ..core.levels.lod import Levels
 from ..core.scoring.closed_form import ClosedForm
 from ..core.selection import Budget
 from ..core.task import Settings
 from ..mesh import floaters
 from ..mesh import layout as mesh_layout
-from ..mesh.edit import marking
+from ..mesh.edit import MARKING
 from . import plans
 from .volumes import RefineVolume
 
@@ -168,8 +169,9 @@ def _protectable(
     if mesh_layout.looks_like_splats(obj):
         yield from (group.name for group in obj.vertex_groups)
         for attribute in obj.data.attributes:
-            own = attribute.name.startswith((".", "refine_"))
-            if attribute.data_type in marking(obj) and attribute.domain == "POINT" and not own:
+            own = attribute.name.startswith((".", "refine_", "f_rest_"))
+            own = own or attribute.name in {*REQUIRED, "radius"}
+            if attribute.data_type in MARKING and attribute.domain == "POINT" and not own:
                 yield attribute.name
 
 
@@ -253,7 +255,7 @@ class RefineSettings(bpy.types.PropertyGroup):
     absorb: BoolProperty(**AMOUNTS["absorb"], update=_plan_again)
     protect: StringProperty(
         name="Protect",
-        description="Vertex group or boolean point attribute: the splats in it stay",
+        description="Vertex group, or boolean or float point attribute: the splats in it stay",
         search=_protectable,
         search_options={"SORT", "SUGGESTION"},
         update=_plan_again,

@@ -372,8 +372,8 @@ GERMAN = {
         "setzen eine Szene in Metern voraus und zählen Splats außerhalb des Bildes mit"
     ),
     "Use the frame range of the scene": "Den Framebereich der Szene nutzen",
-    "Vertex group or boolean point attribute: the splats in it stay": (
-        "Vertexgruppe oder boolesches Punktattribut: die Splats darin bleiben"
+    "Vertex group, or boolean or float point attribute: the splats in it stay": (
+        "Vertexgruppe, oder boolesches oder Gleitkomma-Punktattribut: die Splats darin bleiben"
     ),
     "Views": "Ansichten",
     "Visible": "Sichtbare",

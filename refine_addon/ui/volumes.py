@@ -139,12 +139,26 @@ def unregister() -> None:
     _edited.clear()
 
 
-class _OnSplats(bpy.types.Operator):
+class _Waiting(bpy.types.Operator):
+    """An operator that waits until work on a thread is over: that goes by what it read."""
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        """Tell whether the operator can run, and if not, why."""
+        if why := running.refusal():
+            cls.poll_message_set(why)
+            return False
+        return True
+
+
+class _OnSplats(_Waiting):
     """An operator on the active object, which must hold splats, in object or edit mode."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
         """Tell whether the operator can run, and if not, why."""
+        if not super().poll(context):
+            return False
         if not mesh_layout.looks_like_splats(context.object):
             cls.poll_message_set("Select an object that holds splats: import a file of splats")
             return False
@@ -340,7 +354,7 @@ def _new_empty(
     return obj
 
 
-class REFINE_OT_drop_volume(bpy.types.Operator):
+class REFINE_OT_drop_volume(_Waiting):
     """Take the volume off the list; the object stays"""
 
     bl_idname = "refine.drop_volume"
@@ -367,9 +381,6 @@ class REFINE_OT_crop(_OnSplats):
     def poll(cls, context: bpy.types.Context) -> bool:
         """Tell whether the operator can run, and if not, why."""
         if not super().poll(context):
-            return False
-        if why := running.refusal():
-            cls.poll_message_set(why)
             return False
         if context.object.mode == "EDIT":
             cls.poll_message_set("Leave edit mode first")

@@ -136,6 +136,70 @@ def test_only_one_operation_works_at_a_time(start, gate, addon):  # noqa: ARG001
     assert looks == [True, True]
 
 
+def test_what_stays_and_goes_is_not_changed_while_a_thread_works(start, gate):  # noqa: ARG001
+    """Else marks would come too late for what was read already; they can be set again after it."""
+    bpy.context.scene.refine.volumes.add()
+    names = ("protect", "add_volume", "drop_volume")
+
+    def polls():
+        return [getattr(bpy.ops.refine, name).poll() for name in names]
+
+    before = polls()
+    operator, context, _ = start()
+    during = polls()
+    operator.modal(context, event("ESC"))
+    until_over(operator, context)
+
+    assert (before, during, polls()) == ([True] * 3, [False] * 3, [True] * 3)
+
+
+@pytest.mark.parametrize("change", ["marks", "volume"])
+def test_an_absorption_is_refused_when_other_splats_must_stay_since(addon, few, start, change):
+    """By a mark from a script or a volume that moved: each deletes or keeps what it must not."""
+    bpy.ops.refine.score()
+    settings = bpy.context.scene.refine
+    settings.absorb, settings.percent = True, 80.0
+    volume = bpy.data.objects.new("volume", None)
+    volume.empty_display_type, volume.location = "CUBE", (1000.0, 0.0, 0.0)
+    bpy.context.scene.collection.objects.link(volume)
+    item = settings.volumes.add()
+    item.role, item.object = "PROTECT", volume
+    bpy.context.view_layer.update()
+    count = len(few.data.vertices)
+    operator, context, said = start(addon.ui.operators.REFINE_OT_apply)
+    if change == "marks":
+        addon.mesh.edit.mark_protected(few, np.arange(count) < 200)
+    else:
+        volume.location, volume.scale = (0.0, 0.0, 0.0), (100.0, 100.0, 100.0)
+
+    assert until_over(operator, context) == {"CANCELLED"}
+
+    assert "what must stay or go has changed meanwhile" in said[-1]
+    assert len(few.data.vertices) == count
+    assert noted(addon, few) is not None
+
+
+@pytest.mark.parametrize("stage", ["sketch", "work"])
+def test_a_fault_on_the_thread_is_raised_and_locks_nothing(addon, start, gate, monkeypatch, stage):
+    """Blender prints what is raised; the buttons come back and the timer ends."""
+    gate.error = ValueError("a fault")
+    gate.open.set()
+    if stage == "sketch":
+
+        def fault(*_arguments, **_options):
+            raise gate.error
+
+        monkeypatch.setattr(addon.core.pipeline, "score", fault)
+    operator, context, _ = start()
+
+    with pytest.raises(ValueError, match="a fault"):
+        until_over(operator, context)
+
+    assert bpy.ops.refine.score.poll()
+    assert context.timers == 0
+    assert operator.modal(context, event("TIMER")) == {"CANCELLED"}
+
+
 def test_only_sidebars_are_drawn_again(start, gate):  # noqa: ARG001
     """A 3D view with a million splats is not; the status bar says phase and share, .4 of 97 %."""
     operator, context, _ = start()

@@ -58,6 +58,21 @@ def test_a_second_comparison_replaces_the_first(room, room_cameras):
     assert len(room.data.vertices) == 39_755
 
 
+def test_images_of_the_user_stay_whatever_they_are_called(room, room_cameras):  # noqa: ARG001
+    """One of such a name is not replaced, by a second comparison neither."""
+    bpy.context.scene.camera = room_cameras.objects[0]
+    mine = bpy.data.images.new(NAMES[0], 4, 4)
+    bpy.ops.refine.score()
+
+    for _ in range(2):
+        bpy.ops.refine.compare()
+
+    assert bpy.data.images[NAMES[0]] == mine
+    assert tuple(mine.size) == (4, 4)
+    names = sorted(image.name for image in bpy.data.images)
+    assert names == sorted([*NAMES, f"{NAMES[0]}.001"])
+
+
 @pytest.mark.usefixtures("room", "room_cameras")
 def test_without_an_active_camera_it_says_so():
     bpy.ops.refine.score()

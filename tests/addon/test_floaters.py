@@ -116,6 +116,36 @@ def test_protected_splats_are_no_floaters(addon, polluted):
     assert not marked(addon, room)[moved].any()
 
 
+def test_floaters_that_were_protected_after_the_search_stay(addon, polluted):
+    """Half of what was found is marked to stay: the other half goes, and nothing else."""
+    room, _ = polluted
+    bpy.ops.refine.find_floaters()
+    goes = marked(addon, room)
+    spared = goes & (np.cumsum(goes) % 2 == 0)
+    opacities = addon.mesh.attributes.read_attribute(room.data, "opacity")
+    addon.mesh.edit.mark_protected(room, spared)
+
+    assert bpy.ops.refine.delete_floaters() == {"FINISHED"}
+
+    left = addon.mesh.attributes.read_attribute(room.data, "opacity")
+    assert spared.sum() > 10
+    np.testing.assert_array_equal(left, opacities[~goes | spared])
+
+
+def test_with_no_floaters_to_delete_scores_and_findings_stay(addon, polluted):
+    """All that was found is protected by now, so nothing is touched."""
+    room, _ = polluted
+    bpy.ops.refine.score()
+    bpy.ops.refine.find_floaters()
+    addon.mesh.edit.mark_protected(room, marked(addon, room))
+
+    assert bpy.ops.refine.delete_floaters() == {"CANCELLED"}
+
+    assert len(room.data.vertices) == 39_755
+    assert addon.mesh.scores.record(room.data) is not None
+    assert addon.mesh.floaters.counts(room.data) is not None
+
+
 def test_what_was_found_is_of_no_use_once_splats_were_added(addon, polluted):
     """The note says of how many splats it is; one more, and it is to be looked for again."""
     room, _ = polluted

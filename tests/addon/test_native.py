@@ -411,6 +411,19 @@ def test_a_conversion_keeps_what_belongs_to_the_object(addon, core, room, room_c
     assert max(found.values()) < 1e-6
 
 
+def test_a_vertex_group_protects_on_after_conversions_there_and_back(addon, room):
+    """It is a float attribute then, which counts where it is above 0, as the weight did."""
+    room.vertex_groups.new(name="some").add([3, 5], 0.25, "REPLACE")
+    protected = []
+
+    for _ in range(3):
+        mask = addon.mesh.edit.protected_mask(bpy.data.objects["room"], "some")
+        protected.append(np.flatnonzero(mask).tolist())
+        bpy.ops.refine.convert()
+
+    assert protected == [[3, 5]] * 3
+
+
 def test_a_conversion_names_what_stays_behind(addon, room):
     """Modifiers and edges have no place on a point cloud."""
     room.modifiers.new("Bend", "SIMPLE_DEFORM")

@@ -597,3 +597,18 @@ def test_apply_takes_another_budget_and_leaves_it_in_the_panel(room, room_camera
     bpy.ops.refine.apply(budget="keep", keep=1000)
     assert len(room.data.vertices) == 1000
     assert settings.budget == "keep"
+
+
+def test_an_apply_that_fails_leaves_the_budget_of_the_panel(room, room_cameras):  # noqa: ARG001
+    """Nothing of the name is there to protect: no splat goes, and the next click is as before."""
+    settings = bpy.context.scene.refine
+    settings.ratio = 0.9
+    bpy.ops.refine.score()
+    settings.protect = "none"
+
+    with pytest.raises(RuntimeError, match="nothing to protect is named 'none'"):
+        bpy.ops.refine.apply(budget="keep", keep=1000, percent=30.0)
+
+    assert len(room.data.vertices) == 39_755
+    assert settings.budget == "ratio"
+    assert settings.ratio == pytest.approx(0.9)
