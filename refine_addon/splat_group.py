@@ -19,6 +19,7 @@ from .core.quality import Quality
 from .core.selection import rank
 from .core.splats import Splats
 from .core.task import DEFAULTS, Task
+from .core.volumes import FREE, Forced
 from .demands import Demands
 from .mesh import edit as mesh_edit
 from .mesh import layout as mesh_layout
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from .core.selection import Budget
     from .core.task import Result, Settings
     from .core.views import ViewSet
-    from .core.volumes import Forced
     from .mesh.layout import SplatObject
     from .splat_object import Plan
 
@@ -152,12 +152,20 @@ def refresh(scene: bpy.types.Scene, group: Members) -> list[Forced]:
     return found
 
 
-def removed_of(found: Sequence[Forced], group: Members) -> NDArray[np.bool_] | None:
-    """Return which splats of all objects must go, (N,); None where there are none."""
-    masks = [own.removed for own in found]
-    if all(mask is None for mask in masks):
-        return None
-    return _joined_masks(masks, [len(member) for member in group])
+def forced_of(found: Sequence[Forced], group: Members) -> Forced:
+    """Return which splats of all objects must stay and must go, without facts."""
+    counts = [len(member) for member in group]
+    protected, removed = (
+        None if all(mask is None for mask in masks) else _joined_masks(masks, counts)
+        for masks in ([own.protected for own in found], [own.removed for own in found])
+    )
+    return Forced(protected, removed)
+
+
+def parts_of(mask: NDArray[np.bool_] | None, group: Members) -> list[NDArray[np.bool_]]:
+    """Return what a mask of all objects' splats, (N,), says of each object's; None marks none."""
+    whole = np.zeros(sum(map(len, group)), np.bool_) if mask is None else mask
+    return [whole[rows] for rows in _rows(group)]
 
 
 def gather(group: Members, *, whole: bool | None = False) -> Splats:
@@ -175,14 +183,14 @@ class Noted:
         See there.
     origins : sequence of dict
         Of each object.
-    removed : (N,) bool or None
-        Splats of all objects that had to go.
+    forced : Forced
+        Which splats of all objects had to stay and to go.
     """
 
     settings: Settings
     origins: Sequence[dict[str, Any]]
     cameras: list[tuple[str, int]] | None = None
-    removed: NDArray[np.bool_] | None = None
+    forced: Forced = FREE
     asked: Settings | None = None
 
 
@@ -198,16 +206,20 @@ def store(group: Members, scores: Scores, noted: Noted) -> None:
     """
     _check_counts(group, len(scores.values))
     ranks, scoring = rank(scores.values), uuid.uuid4().hex
-    for member, rows, origin in zip(group, _rows(group), noted.origins, strict=True):
+    stay, go = (parts_of(mask, group) for mask in (noted.forced.protected, noted.forced.removed))
+    pairs = zip(group, noted.origins, strict=True)
+    for (member, origin), rows, protected, removed in zip(
+        pairs, _rows(group), stay, go, strict=True
+    ):
         values, own, together = scores.values[rows], scores, None
-        gone = 0 if noted.removed is None else int(np.count_nonzero(noted.removed[rows]))
+        gone = int(np.count_nonzero(removed))
         if len(group) > 1:
             undrawable = int(np.count_nonzero(values == 0.0)) - gone
             own = replace(scores, values=values, seen=scores.seen[rows], undrawable=undrawable)
             together = mesh_scores.Together(scoring, len(scores.values), ranks[rows])
         mesh_scores.store(
             member, own, noted.settings, origin, noted.cameras,
-            forced=gone, asked=noted.asked, together=together,
+            forced=gone, protected=protected, asked=noted.asked, together=together,
         )  # fmt: skip
 
 

@@ -375,8 +375,9 @@ def score_object(
     checked = check(find(name))
     found = demands.forced(checked)
     scores = pipeline.score(
-        gather(checked), views, settings, removed=found.removed, progress=progress
-    )
+        gather(checked), views, settings,
+        protected=found.protected, removed=found.removed, progress=progress,
+    )  # fmt: skip
     return mesh_attributes.file_from_object(checked), scores, found, modifier_notes(checked.obj)
 
 

@@ -327,8 +327,9 @@ def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
     splats = file.splats()
     found = forced(zones.of_files(options), splats.means)
     scores = score(
-        splats, views, settings(options), removed=found.removed, progress=run.progress(source.name)
-    )
+        splats, views, settings(options),
+        protected=found.protected, removed=found.removed, progress=run.progress(source.name),
+    )  # fmt: skip
     return _write_scores(run, str(source), file, scores, found)
 
 

@@ -63,6 +63,7 @@ def score(  # noqa: PLR0913 - as `prune`
     views: ViewSet,
     settings: Settings = DEFAULTS,
     *,
+    protected: NDArray[np.bool_] | None = None,
     removed: NDArray[np.bool_] | None = None,
     quality: bool = False,
     progress: Progress = silent,
@@ -76,6 +77,9 @@ def score(  # noqa: PLR0913 - as `prune`
         In the frame of the views.
     views : ViewSet
     settings : Settings
+    protected : (N,) bool, optional
+        Splats that are not removed: no score depends on them, the estimate of the pictures' quality
+        does.
     removed : (N,) bool, optional
         Splats that are to go in any case: the others are scored as if they had gone, and they
         score 0; see `Task`.
@@ -101,8 +105,10 @@ def score(  # noqa: PLR0913 - as `prune`
         refuse_all(removed)
         rest = ~removed
         found = score(
-            splats.take(rest), views, settings, quality=quality, progress=progress, threads=threads
-        )
+            splats.take(rest), views, settings,
+            protected=None if protected is None else protected[rest],
+            quality=quality, progress=progress, threads=threads,
+        )  # fmt: skip
         return found.for_all(rest)
     whole, estimates = progress, quality or settings.estimates
     progress = part(progress, 0.0, 0.9 if estimates else 1.0)
@@ -127,7 +133,8 @@ def score(  # noqa: PLR0913 - as `prune`
             lines = sight_lines.sights(splats, used, progress=ahead, threads=threads)
             scores = replace(scores, sights=lines)
     scores = _with_views(scores, splats, views, used, part(whole, 0.95, 0.95), threads)
-    return with_quality(scores, progress=part(whole, 0.95, 1.0), threads=threads)
+    ahead = part(whole, 0.95, 1.0)
+    return with_quality(scores, protected=protected, progress=ahead, threads=threads)
 
 
 def with_quality(
@@ -279,7 +286,8 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     """Decide on a task from which nothing has to go in any case."""
     scored = 0.2 if task.absorb else 0.95
     scores, known = _scores_of(task, part(progress, 0.0, scored), threads)
-    if task.budget.psnr is not None and task.protected is not None:
+    if not (task.scores is None or task.budget.psnr is None or task.protected is None):
+        # Others may have been protected when these were scored.
         scores = with_quality(scores, protected=task.protected, threads=threads)
     clock.lap("score_s")
     report(progress, scored, "selecting")
@@ -331,7 +339,7 @@ def _remark(task: Task, keep: NDArray[np.bool_], psnr: float | None) -> str:
 
 def nothing_removed(size: int) -> str:
     """Return the remark on a file that is no larger than it may be; `size` is its bytes."""
-    return f"already {size_in_words(size)}: nothing was removed"
+    return f"already {size_in_words(size)}: the budget removes nothing"
 
 
 def quality_facts(
@@ -399,7 +407,7 @@ def _absorbed(
     known = known or _score_once(splats, views, task.settings, part(progress, 0.0, start), threads)
     scores, goal = known[0], task.budget.psnr
     if goal is not None and scores.quality is None:
-        scores = with_quality(scores, threads=threads)
+        scores = with_quality(scores, protected=task.protected, threads=threads)
     used, origin = views.spread(task.settings.views), task.origin
     sights = scores.sights if origin is None else origin.sights
     best: tuple[Absorbed, float | None] | None = None
@@ -453,7 +461,8 @@ def _scores_of(
         # The number of survivors does not depend on scores, so the scores for absorbing are enough.
         known = _score_once(splats, views, task.settings, progress, threads)
         if task.budget.psnr is not None:
-            known = with_quality(known[0], threads=threads), known[1]
+            curve = with_quality(known[0], protected=task.protected, threads=threads)
+            known = curve, known[1]
         return known[0], known
     # `select` checks this too, but only after the work.
     task.budget.refuse_meaningless(task.settings.method, frustum=task.settings.frustum)
@@ -461,6 +470,7 @@ def _scores_of(
         splats,
         views,
         task.settings,
+        protected=task.protected,
         quality=task.budget.psnr is not None,
         progress=progress,
         threads=threads,

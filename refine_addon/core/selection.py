@@ -254,6 +254,11 @@ class Tally:
         self._values = np.sort(scores.values[free])
         self._seen = np.sort(scores.seen[free])
 
+    @property
+    def free(self) -> int:
+        """How many splats are not protected."""
+        return len(self._values)
+
     def is_of(self, scores: Scores, protected: NDArray[np.bool_] | None = None) -> bool:
         """Tell whether scores and what is protected are equal to those it was made of."""
         pairs = (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -57,6 +58,7 @@ def store(  # noqa: PLR0913 - all that a note holds
     cameras: list[tuple[str, int]] | None = None,
     *,
     forced: int = 0,
+    protected: NDArray[np.bool_] | None = None,
     asked: Settings | None = None,
     together: Together | None = None,
 ) -> None:
@@ -73,6 +75,8 @@ def store(  # noqa: PLR0913 - all that a note holds
         Name of each view given, and how many splats lie in it.
     forced : int
         How many splats had to go, and have the score 0.
+    protected : (N,) bool, optional
+        Which splats the curve takes to stay.
     asked : Settings, optional
         What the scores are to be refined by, if that is still to come.
     together : Together, optional
@@ -108,6 +112,7 @@ def store(  # noqa: PLR0913 - all that a note holds
             "origin": origin,
             "cameras": cameras,
             "forced": forced,
+            "protected": digest(protected),
             "asked": asdict(asked) if asked else None,
             "together": together and {"id": together.id, "splats": together.splats},
         }
@@ -119,6 +124,13 @@ def store(  # noqa: PLR0913 - all that a note holds
     mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
     mesh[RECORD] = note
     mesh_attributes.updated(mesh)
+
+
+def digest(mask: NDArray[np.bool_] | None) -> list[int]:
+    """Return how many splats a mask, (N,) bool, marks, and a checksum of which; [0, 0] if none."""
+    if mask is None or not mask.any():
+        return [0, 0]
+    return [int(np.count_nonzero(mask)), zlib.crc32(np.packbits(mask).tobytes())]
 
 
 def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:

@@ -133,11 +133,11 @@ def _new_name(obj: bpy.types.Object) -> str:
 class _Scoring:
     """What is to be scored, by which views and how; where all of it stood (`staleness.origin`).
 
-    What has to go, (N,) bool, is left out.
+    What has to go is left out.
     """
 
     splats: Splats
-    removed: NDArray[np.bool_] | None
+    forced: Forced
     views: ViewSet
     settings: Settings
     quality: bool
@@ -162,9 +162,9 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         quality = settings.estimates or context.scene.refine.budget == "psnr"
         splats = splat_group.gather(group, whole=None if quality else False)
         origins = [staleness.origin(context, member.obj) for member in group]
-        removed = splat_group.removed_of(splat_group.forced(context.scene, group), group)
+        forced = splat_group.forced_of(splat_group.forced(context.scene, group), group)
         uids = splat_group.uids_of(group)
-        return _Scoring(splats, removed, views, settings, quality, uids, origins)
+        return _Scoring(splats, forced, views, settings, quality, uids, origins)
 
     def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
         """Return the objects that are scored, the active one first."""
@@ -184,7 +184,7 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     ) -> None:
         """Store the closed form's scores, to be looked at until those asked for are there."""
         group = splat_group.by_uids(job.uids, checked)
-        noted = splat_group.Noted(_rough(job), job.origins, removed=job.removed, asked=job.settings)
+        noted = splat_group.Noted(_rough(job), job.origins, forced=job.forced, asked=job.settings)
         splat_group.store(group, scores, noted)
         plans.refresh(context)
 
@@ -194,10 +194,12 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         ahead = part(progress, 0.0, 0.97)
         scores = pipeline.score(
             job.splats, job.views, job.settings,
-            removed=job.removed, quality=job.quality, progress=ahead,
+            protected=job.forced.protected, removed=job.forced.removed,
+            quality=job.quality, progress=ahead,
         )  # fmt: skip
         ahead = part(progress, 0.97, 1.0)
-        means = job.splats.means if job.removed is None else job.splats.means[~job.removed]
+        gone, means = job.forced.removed, job.splats.means
+        means = means if gone is None else means[~gone]
         return scores, frustum.census(means, job.views, progress=ahead)
 
     def finish(
@@ -211,8 +213,9 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         scores, counts = found
         pairs = zip(job.views, counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
-        group, forced = splat_group.by_uids(job.uids, checked), _forced(job)
-        noted = splat_group.Noted(job.settings, job.origins, cameras, job.removed)
+        group = splat_group.by_uids(job.uids, checked)
+        forced = job.forced.counts()["forced"]
+        noted = splat_group.Noted(job.settings, job.origins, cameras, job.forced)
         splat_group.store(group, scores, noted)
         plans.refresh(context)
         unseen = int((scores.seen == 0).sum()) - forced
@@ -228,10 +231,6 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _forced(job: _Scoring) -> int:
-    return 0 if job.removed is None else int(np.count_nonzero(job.removed))
-
-
 def _rough(job: _Scoring) -> Settings:
     """Return the settings of a sketch of the scores that a job asks for."""
     return replace(job.settings, method="closed-form")
@@ -239,7 +238,7 @@ def _rough(job: _Scoring) -> Settings:
 
 def _sketched(job: _Scoring, progress: Progress) -> Scores:
     return pipeline.score(
-        job.splats, job.views, _rough(job), removed=job.removed, progress=progress
+        job.splats, job.views, _rough(job), removed=job.forced.removed, progress=progress
     )
 
 
@@ -328,7 +327,9 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         group = splat_group.by_uids(job.uids, checked)
         if job.task.absorb:  # on a thread, while volumes can be moved
             splat_group.check_forced(context.scene, group, job.forced)
-        changed = staleness.changes_of(context, [member.obj for member in group])
+        stay = splat_group.parts_of(job.task.protected, group)
+        pairs = zip((member.obj for member in group), stay, strict=True)
+        changed = staleness.changes_of(context, dict(pairs))
         if result.absorbed and not job.task.budget.needs_scores:
             changed = []  # nothing went by the scores
         done = splat_group.apply(group, result)

@@ -297,7 +297,8 @@ def _changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
     """Return what changed since the objects that are worked on were scored."""
     objects = splat_group.chosen(context.view_layer, obj)
     question = ("changes", tuple(each.data.get(mesh_scores.RECORD) for each in objects))
-    return kept.answer(question, context, lambda: staleness.changes_of(context, objects))
+    marked = dict.fromkeys(objects)  # what is protected of them is marked
+    return kept.answer(question, context, lambda: staleness.changes_of(context, marked))
 
 
 def _draw_plan(

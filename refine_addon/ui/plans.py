@@ -30,6 +30,8 @@ from . import camera_list, price
 from .chart import Place
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ..core.scores import Scores
     from ..core.task import Task
     from .chart import Histogram
@@ -80,7 +82,7 @@ _known: list[_Known] = []
 """One at most: that of the object that was looked at last."""
 
 _waiting: list[tuple[str, str]] = []
-"""Names of scene and object whose plan is to be made as soon as the slider rests; one at most."""
+"""Names of scene and objects whose plans are to be made as soon as the slider rests."""
 
 _tried: list[tuple[Any, ...]] = []
 """For what the panel last asked to have a plan made; one at most. Not each draw asks again."""
@@ -107,7 +109,7 @@ def changed(context: bpy.types.Context) -> None:
         refresh(context)
     elif obj is not None and _can_have(obj):
         at_once(context.scene, obj)
-        wait(context.scene, obj, REST)
+        wait(context.scene, [obj], REST)
 
 
 def at_once(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
@@ -138,6 +140,18 @@ def refresh_object(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
             demands.refresh(scene, mesh_layout.check(obj))
 
 
+def refresh_objects(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object]) -> None:
+    """Do the same for several objects; the first is the one looked at, so it is done last."""
+    done: set[bpy.types.Object] = set()
+    first_of = []
+    for obj in objects:
+        if obj not in done:
+            first_of.append(obj)
+            done.update(_objects(obj) if _can_have(obj) else [obj])
+    for obj in reversed(first_of):
+        refresh_object(scene, obj)
+
+
 def ask(context: bpy.types.Context, obj: bpy.types.Object) -> None:
     """Have a plan and its chart made soon where they are missing; to be called when drawn."""
     settings, mesh = context.scene.refine, obj.data
@@ -153,12 +167,13 @@ def ask(context: bpy.types.Context, obj: bpy.types.Object) -> None:
     )
     if _tried != [state] and not _waiting:
         _tried[:] = [state]
-        wait(context.scene, obj, 0.0)
+        wait(context.scene, [obj], 0.0)
 
 
-def wait(scene: bpy.types.Scene, obj: bpy.types.Object, seconds: float) -> None:
-    """Have the plan of an object made after so long, unless another is asked for meanwhile."""
-    _waiting[:] = [(scene.name, obj.name)]
+def wait(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object], seconds: float) -> None:
+    """Have `refresh_objects` done after so long, or later if it is asked for others meanwhile."""
+    asked = [(scene.name, obj.name) for obj in objects]
+    _waiting[:] = [*asked, *(pair for pair in _waiting if pair not in asked)]
     if bpy.app.timers.is_registered(_rested):
         bpy.app.timers.unregister(_rested)
     bpy.app.timers.register(_rested, first_interval=seconds)
@@ -294,10 +309,10 @@ def _is_ours(obj: bpy.types.Object) -> bool:
 
 def _rested() -> None:
     """Make the plan that is waited for; Blender's timer calls it once."""
-    for scene_name, name in _waiting:
-        scene, obj = bpy.data.scenes.get(scene_name), bpy.data.objects.get(name)
-        if scene is not None and obj is not None:
-            refresh_object(scene, obj)
+    pairs = [(bpy.data.scenes.get(scene), bpy.data.objects.get(name)) for scene, name in _waiting]
+    objects = [obj for scene, obj in pairs if scene is not None and obj is not None]
+    if objects:
+        refresh_objects(pairs[0][0], objects)
     _waiting.clear()
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
@@ -307,6 +322,7 @@ def _rested() -> None:
 
 def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     settings, mesh, objects = scene.refine, obj.data, _objects(obj)
+    bpy.context.view_layer.update()  # or volumes that a script moved are not yet there
     camera_list.fill(mesh_scores.record(mesh) or {})
     count = sum(mesh_layout.splat_count(each.data) for each in objects)
     own: dict[str, Any] = {"key": _key(settings, objects), "splats": count}
@@ -370,9 +386,15 @@ def _state(objects: list[bpy.types.Object], settings: Any) -> tuple[Any, ...]:  
 
 
 def _demanded(settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
-    """Return what the settings name as to stay or to go; volumes that move are heard of."""
+    """Return what the settings name as to stay or to go, and where volumes stand."""
     listed = [item for item in settings.volumes if item.object is not None]
-    return (settings.protect, *((item.role, item.object.session_uid) for item in listed))
+    return (
+        settings.protect,
+        *(
+            (item.role, item.object.session_uid, *map(tuple, item.object.matrix_world))
+            for item in listed
+        ),
+    )
 
 
 def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
@@ -384,6 +406,7 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
         budget = settings.to_budget()
         if budget.psnr is not None and settings.absorb:
             gone = math.floor(quality_of(scores).share(budget.psnr, absorb=True) * rest)
+            gone = min(gone, known.tally.free)
             noted["about"] = True
         else:
             left = budget.after(forced, count)

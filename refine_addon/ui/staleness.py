@@ -9,16 +9,19 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+import bpy
 import numpy as np
 
 from ..cameras.objects import SOURCE, WEIGHT, render_size
 from ..cameras.sets import chosen_cameras
+from ..mesh import attributes as mesh_attributes
+from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Mapping
 
-    import bpy
+    from numpy.typing import NDArray
 
 _NOISE = 1e-6
 """Relative: what another machine or version of Blender may make of the same matrices."""
@@ -37,8 +40,12 @@ def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
     }
 
 
-def changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
-    """Return what changed since an object was scored, in two words each.
+def changes(
+    context: bpy.types.Context,
+    obj: bpy.types.Object,
+    protected: NDArray[np.bool_] | None = None,
+) -> list[str]:
+    """Return what changed since an object was scored, in a few words each.
 
     Parameters
     ----------
@@ -46,6 +53,8 @@ def changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
         Evaluated: matrices are read as they stand.
     obj : bpy.types.Object
         Without scores, or scored by a script that noted no origin, it has no changes.
+    protected : (N,) bool, optional
+        Which of its splats stay in any case; by default those that are marked so for the views.
     """
     record = mesh_scores.record(obj.data) or {}
     try:
@@ -56,29 +65,62 @@ def changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
             "volumes changed": _other_volumes(then, context.scene),
             "settings changed": _deciding(settings)
             != _deciding(asdict(context.scene.refine.to_settings())),
+            "what is protected changed": bool(record.get("quality"))
+            and record.get("protected", [0, 0]) != _protected(obj, protected),
         }
     except (KeyError, TypeError, ValueError):  # whoever wrote there, these are no scores of ours
         return []
     return [words for words, so in found.items() if so]
 
 
-def changes_of(context: bpy.types.Context, objects: Iterable[bpy.types.Object]) -> list[str]:
-    """Return what changed since any of several objects was scored; see `changes`."""
-    return list(dict.fromkeys(words for obj in objects for words in changes(context, obj)))
+def changes_of(
+    context: bpy.types.Context, objects: Mapping[bpy.types.Object, NDArray[np.bool_] | None]
+) -> list[str]:
+    """Return what changed since any of several objects was scored; see `changes`.
+
+    Parameters
+    ----------
+    context : bpy.types.Context
+    objects : dict of bpy.types.Object to (N,) bool or None
+        With what is protected of each.
+    """
+    found = (words for obj, mask in objects.items() for words in changes(context, obj, mask))
+    return list(dict.fromkeys(found))
+
+
+def _protected(obj: bpy.types.Object, mask: NDArray[np.bool_] | None) -> list[int]:
+    if mask is None and mesh_edit.FORCE in obj.data.attributes:
+        mask = mesh_attributes.read_attribute(obj.data, mesh_edit.FORCE) == 1
+    return mesh_scores.digest(mask)
 
 
 def _volumes(scene: bpy.types.Scene) -> list[Any]:
-    """Return the volumes that decide what has to go, if any: who, where and how large they are."""
+    """Return the volumes that decide what has to go, if any: who, where, and of which shape."""
     listed = [item for item in scene.refine.volumes if item.object is not None]
     if all(item.role == "PROTECT" for item in listed):
-        return []  # what is protected is scored like the rest
-    found = []
+        return []  # what is protected is scored like the rest; see `_protected`
+    found, depsgraph = [], bpy.context.evaluated_depsgraph_get()
     for item in listed:
         obj = item.object
         kind = obj.empty_display_type if obj.type == "EMPTY" else obj.type
         size = [obj.empty_display_size] * 3 if obj.type == "EMPTY" else list(obj.dimensions)
-        found.append([item.role, kind, np.array(obj.matrix_world).ravel().tolist() + size])
+        shape = _shape(obj, depsgraph) if obj.type == "MESH" else []
+        numbers = [*np.array(obj.matrix_world).ravel().tolist(), *size, *shape]
+        found.append([item.role, kind, numbers])
     return found
+
+
+def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> list[float]:
+    """Return numbers that change with the shape of a mesh, modifiers and all.
+
+    A sum over the vertices with fixed uneven weights: any vertex that moves changes it, and noise
+    of another machine hardly does.
+    """
+    mesh = obj.evaluated_get(depsgraph).data
+    places = np.empty(3 * len(mesh.vertices), np.float32)
+    mesh.vertices.foreach_get("co", places)
+    weights = np.cos(np.arange(len(mesh.vertices)))
+    return [float(value) for value in weights @ places.reshape(-1, 3)]
 
 
 def _other_volumes(then: dict[str, Any], scene: bpy.types.Scene) -> bool:

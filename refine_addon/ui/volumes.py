@@ -15,6 +15,7 @@ from ..core.errors import RefineError
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
+from ..mesh import scores as mesh_scores
 from . import plans, running, wrapped
 from .on_thread import FAILURES, Answer, fail
 
@@ -70,20 +71,28 @@ class RefineVolume(bpy.types.PropertyGroup):
 
 def again(context: bpy.types.Context) -> None:
     """Mark soon what must stay and go of the splats, which may be otherwise now."""
-    for obj in _splats(context):
-        if bpy.app.background:
-            plans.refresh_object(context.scene, obj)
-        else:
-            plans.wait(context.scene, obj, plans.REST)
+    objects = _splats(context)
+    if bpy.app.background:
+        plans.refresh_objects(context.scene, objects)
+    elif objects:
+        plans.wait(context.scene, objects, plans.REST)
 
 
 def _splats(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Return the object whose splats are looked at: the active one, or else the first there is."""
-    obj = getattr(context, "object", None)
-    if mesh_layout.looks_like_splats(obj):
-        return [obj]
-    objects = (o for o in context.scene.objects if mesh_layout.looks_like_splats(o))
-    return [o for o in objects if o.visible_get()][:1]
+    """Return the objects whose splats are marked, or are to be: the one looked at comes first.
+
+    That is the active one, or else the first there is; also all that are selected, and all that
+    bear marks or scores.
+    """
+    active = getattr(context, "object", None)
+    objects = [o for o in context.scene.objects if mesh_layout.looks_like_splats(o)]
+    looked_at = [active] if active in objects else [o for o in objects if o.visible_get()][:1]
+    others = (
+        obj
+        for obj in objects
+        if obj.select_get() or demands.FACTS in obj.data or mesh_scores.RECORD in obj.data
+    )
+    return list(dict.fromkeys([*looked_at, *others]))
 
 
 _edited: set[str] = set()

@@ -128,7 +128,7 @@ def test_a_limit_that_is_met_already_says_so(files, capsys):  # noqa: F811
     out = ["-o", str(files / "out.ply"), *QUICK]
 
     assert call(files, "prune", "--max-mb", "1", *out) == 0
-    assert f"note: already {size:.1f} kB: nothing was removed" in capsys.readouterr().out
+    assert f"note: already {size:.1f} kB: the budget removes nothing" in capsys.readouterr().out
     assert call(files, "prune", "--max-mb", ".02", *out, "--overwrite") == 0
     assert "already" not in capsys.readouterr().out
 
