@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import RefineError
+from ..core.formats.ply import REQUIRED
 from . import attributes as mesh_attributes
 from .layout import splat_count
 from .node_trees import chain, named_attribute, new_tree
@@ -215,7 +216,8 @@ def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None
 def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
     """Return which splats an attribute or a vertex group marks, (N,)."""
     attribute = obj.data.attributes.get(name)
-    if attribute and attribute.data_type in MARKING and attribute.domain == "POINT":
+    fits = attribute and attribute.data_type in MARKING and attribute.domain == "POINT"
+    if fits and name not in REQUIRED:  # what a splat is made of marks nothing
         return mesh_attributes.read_attribute(obj.data, name) > 0
     if name in obj.vertex_groups:
         return group_weights(obj, name) > 0.0
