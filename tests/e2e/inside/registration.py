@@ -48,8 +48,10 @@ def registered(commands: dict[object, str]) -> list[str]:
         lines.append(f"type {name}")
         if isinstance(kind, type) and issubclass(kind, bpy.types.ID):
             lines += [f"property {name}.{key}" for key in kind.bl_rna.properties.keys()]  # noqa: SIM118
-        # A menu or panel that others append to keeps their functions here.
+        # A menu or panel that others append to keeps their functions here, and then its own.
         for function in getattr(getattr(kind, "draw", None), "_draw_funcs", ()):
+            if function.__module__ == kind.__module__:
+                continue
             lines.append(f"entry {name} {function.__module__}.{function.__qualname__}")
     for module in dir(bpy.ops):
         lines += [f"operator {module}.{name}" for name in dir(getattr(bpy.ops, module))]
