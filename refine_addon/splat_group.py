@@ -17,7 +17,7 @@ from . import demands, splat_object
 from .core.errors import RefineError
 from .core.quality import Quality
 from .core.selection import rank
-from .core.splats import Splats
+from .core.splats import joined
 from .core.task import DEFAULTS, Task
 from .core.volumes import FREE, Forced
 from .demands import Demands
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from .core.absorbing.absorb import Absorbed
     from .core.scores import Scores
     from .core.selection import Budget
+    from .core.splats import Splats
     from .core.task import Result, Settings
     from .core.views import ViewSet
     from .mesh.layout import SplatObject
@@ -170,7 +171,7 @@ def parts_of(mask: NDArray[np.bool_] | None, group: Members) -> list[NDArray[np.
 
 def gather(group: Members, *, whole: bool | None = False) -> Splats:
     """Return the splats of all objects as they stand in the world; see `splat_object.gather`."""
-    return _joined([splat_object.gather(member, whole=whole) for member in group])
+    return joined([splat_object.gather(member, whole=whole) for member in group])
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +262,7 @@ def stored_task(
     }
     return replace(
         tasks[0],
-        splats=None if views is None else _joined([task.splats for task in tasks if task.splats]),
+        splats=None if views is None else joined([task.splats for task in tasks if task.splats]),
         scores=_scores(group, [task.scores for task in tasks if task.scores], masks),
         # Of rows of several lengths the longest counts: a size is never exceeded.
         row_bytes=max(float(task.row_bytes) for task in tasks),
@@ -377,22 +378,6 @@ def _joined_masks(parts: list[Any], counts: list[int]) -> NDArray[np.bool_]:
         np.zeros(count, np.bool_) if part is None else part
         for part, count in zip(parts, counts, strict=True)
     ])  # fmt: skip
-
-
-def _joined(parts: list[Splats]) -> Splats:
-    """Return the splats of several objects as one; harmonics that one lacks are 0."""
-    if len(parts) == 1:
-        return parts[0]
-    most = max(part.sh_rest.shape[1] for part in parts)
-    padded = [
-        np.pad(part.sh_rest, ((0, 0), (0, most - part.sh_rest.shape[1]), (0, 0))) for part in parts
-    ]
-    joined = {
-        field.name: np.concatenate([getattr(part, field.name) for part in parts])
-        for field in fields(Splats)
-        if field.name != "sh_rest"
-    }
-    return Splats(**joined, sh_rest=np.concatenate(padded))
 
 
 def _split(group: Members, result: Result) -> list[Result]:

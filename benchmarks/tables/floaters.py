@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +22,7 @@ import numpy as np
 
 from refine_addon.core.cleaning.clean import clean
 from refine_addon.core.scoring import projection, sight_lines
-from refine_addon.core.splats import SH_C0, Splats
+from refine_addon.core.splats import SH_C0, Splats, joined
 
 from .evaluate import Evaluator, read_scene
 
@@ -136,12 +135,6 @@ def _veils(random: np.random.Generator, free: Places) -> tuple[NDArray[np.float6
     return means, scales, random.uniform(0.01, 0.1, count), random.uniform(0.0, 1.0, (count, 3))
 
 
-def joined(first: Splats, second: Splats) -> Splats:
-    """Return all splats of both."""
-    pairs = {f.name: (getattr(first, f.name), getattr(second, f.name)) for f in fields(Splats)}
-    return Splats(**{name: np.concatenate(pair) for name, pair in pairs.items()})
-
-
 def main() -> int:
     """Print a line for each scene."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
@@ -152,7 +145,7 @@ def main() -> int:
     for folder in options.scenes:
         scene = read_scene(folder)
         made, kinds = floaters(scene.splats, scene.train, options.seed)
-        dirty, count = joined(scene.splats, made), len(scene.splats)
+        dirty, count = joined([scene.splats, made]), len(scene.splats)
         start = time.process_time()
         found = clean(dirty, scene.train)
         seconds = time.process_time() - start

@@ -20,7 +20,7 @@ from plyfile import PlyData, PlyElement
 
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.formats.ply_columns import columns_from_splats
-from refine_addon.core.splats import SH_C0, Splats, drawable, opacity, rotation_matrices
+from refine_addon.core.splats import SH_C0, Splats, drawable, joined, opacity, rotation_matrices
 from refine_addon.core.task import METHODS
 
 from ..baselines import splat_transform
@@ -114,7 +114,7 @@ def split(splats: Splats, count: int) -> Splats:
         order = np.argsort(-areas, kind="stable")
         chosen, rest = np.split(order, [min(count - len(now), len(now))])
         one, other = _halves(now.take(chosen), random)
-        now = _joined([now.take(rest), one, other])
+        now = joined([now.take(rest), one, other])
     return now
 
 
@@ -146,11 +146,6 @@ def _halves(splats: Splats, random: np.random.Generator) -> tuple[Splats, Splats
 def _logit(values: NDArray[np.float64]) -> NDArray[np.float64]:
     inside = np.maximum(values, 1e-30)
     return np.asarray(np.log(inside) - np.log1p(-inside))
-
-
-def _joined(parts: Sequence[Splats]) -> Splats:
-    names = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
-    return Splats(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def write_ply(path: Path, splats: Splats) -> None:

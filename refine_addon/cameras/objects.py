@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from ..core.affine import QUARTER, quaternion
+from ..core.affine import QUARTER, QUARTERS, quaternion
 from ..core.errors import RefineError
 from ..core.views import View
 
@@ -196,7 +196,7 @@ def quarter_turn(obj: bpy.types.Object, view: View, axes: NDArray[np.float64]) -
         return None
     in_file = np.array(source["rotation"]) @ (QUARTER if source["upright"] else np.eye(3))
     turn = axes @ in_file.T @ view.rotation  # from where the camera looks to where its file says
-    for number, quarter in ((0, np.eye(3)), (1, QUARTER), (-1, QUARTER.T)):
+    for number, quarter in QUARTERS.items():
         if np.abs(turn - quarter).max() < SHEAR:
             return number
     return None

@@ -27,7 +27,7 @@ from ..core.pace import Pace
 from ..core.picture_files import PictureFiles
 from ..core.quality import UNSEEN, in_words
 from ..core.report import held, kept_and_removed, scoring_notes, seen_by, what_was_seen
-from ..core.whole_file import refuse_existing, refuse_mapped
+from ..core.whole_file import make_folder, refuse_existing, refuse_mapped
 from . import report, zones
 from .cameras import deciding
 from .checks import open_blend
@@ -159,7 +159,7 @@ def _each(run: _Run, work: Callable[[_Run, Path, Path | None, ViewSet], dict[str
     """Do the work of every input: with its output, if there is to be one, and the views."""
     options, views = run.options, run.views()
     if options.output_dir and not getattr(options, "dry_run", False):
-        _make_folder(options.output_dir)
+        make_folder(options.output_dir)
     for source in options.inputs:
         output = options.output_dir / source.name if options.output_dir else options.output
         run.attempt(
@@ -167,19 +167,11 @@ def _each(run: _Run, work: Callable[[_Run, Path, Path | None, ViewSet], dict[str
         )
 
 
-def _make_folder(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        msg = f"{folder}: cannot be made ({error.strerror or error})"
-        raise RefineError(msg) from error
-
-
 def _pictures(options: argparse.Namespace, name: str) -> PictureFiles | None:
     """Return where the pictures of an input go, if they are wanted; makes the folder."""
     if options.pictures is None:
         return None
-    _make_folder(options.pictures)
+    make_folder(options.pictures)
     return PictureFiles(options.pictures, name, options.overwrite)
 
 

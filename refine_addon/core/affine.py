@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 """A quarter turn about x: the y-down world of COLMAP to the z-up world of Blender."""
 
+QUARTERS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T}
+"""No turn, a quarter turn about x and one back, by how many quarters they are."""
+
 UNIFORM_TOLERANCE = 1e-4
 """Relative difference between the scales of a matrix that still counts as uniform scaling."""
 

@@ -11,6 +11,8 @@ import numpy as np
 from .errors import RefineError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
 SH_C0 = 0.28209479177387814
@@ -63,6 +65,24 @@ class Splats:
     def take(self, index: NDArray[Any] | slice) -> Splats:
         """Return the splats at `index` (a mask, integers or a slice), in that order."""
         return Splats(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
+
+
+def joined(parts: Sequence[Splats]) -> Splats:
+    """Return all splats of several sets, one at least, in that order.
+
+    The result has the highest degree among them; coefficients that a part lacks are 0.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    most = max(part.sh_rest.shape[1] for part in parts)
+    columns = {
+        field.name: [getattr(part, field.name) for part in parts] for field in fields(Splats)
+    }
+    columns["sh_rest"] = [
+        np.pad(rest, ((0, 0), (0, most - rest.shape[1]), (0, 0))) for rest in columns["sh_rest"]
+    ]
+    with np.errstate(invalid="ignore"):  # signalling NaN converted to float64
+        return Splats(**{name: np.concatenate(arrays) for name, arrays in columns.items()})
 
 
 def above_constant(degree: int) -> int:

@@ -81,6 +81,17 @@ def mode_of(path: Path) -> int:
         return 0
 
 
+def make_folder(path: Path) -> bool:
+    """Make a folder and those above it; return whether it was there, or raise `RefineError`."""
+    try:
+        there = bool(mode_of(path))
+        path.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:
+        msg = f"{path}: cannot be made ({getattr(error, 'strerror', None) or error})"
+        raise RefineError(msg) from error
+    return there
+
+
 def refuse_mapped(path: Path, source: Path) -> None:
     """Raise `RefineError` if `path` is the mapped file `source`, which cannot be replaced."""
     if REPLACES_MAPPED:

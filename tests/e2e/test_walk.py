@@ -9,10 +9,11 @@ import numpy as np
 from blenders import PROJECT
 from PIL import Image
 
-from benchmarks.tables.floaters import floaters, joined
+from benchmarks.tables.floaters import floaters
 from benchmarks.tables.million import write_ply
 from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.formats.ply import read_ply
+from refine_addon.core.splats import joined
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -36,7 +37,7 @@ def test_the_guides_walk_and_its_pictures(same_binary: Binary, cloud: Path, came
     room = read_ply(cloud).splats()
     made, kinds = floaters(room, read_cameras(cameras), seed=1)
     few = made.take(kinds < 2)  # a hundred veils would leave nothing to see
-    write_ply(raw, joined(room, few))
+    write_ply(raw, joined([room, few]))
 
     found = same_binary.window_step(
         "walk",

@@ -16,7 +16,7 @@ from ..selection import Budget
 from ..survivors import survivor_columns
 from ..task import DEFAULTS, Task
 from ..volumes import forced
-from ..whole_file import expanded, mode_of, refuse_existing, refuse_mapped, whole_file
+from ..whole_file import expanded, make_folder, mode_of, refuse_existing, refuse_mapped, whole_file
 from ..work import Progress, silent
 from .lod import Levels, each_level, short
 
@@ -232,12 +232,7 @@ def _new_files(folder: Path, paths: list[Path], *, overwrite: bool) -> Iterator[
         If the folder cannot be made, or a file exists and may not be replaced.
     """
     written: list[Path] = []
-    try:
-        there = mode_of(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        msg = f"{folder}: cannot be made ({getattr(error, 'strerror', None) or error})"
-        raise RefineError(msg) from error
+    there = make_folder(folder)
     try:
         for path in paths:
             refuse_existing(path, overwrite=overwrite)

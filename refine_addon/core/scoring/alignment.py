@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .. import frustum
-from ..affine import QUARTER
+from ..affine import QUARTERS
 from ..work import Progress, for_chunks, part, report, silent
 from . import projection
 from .sight_lines import SightLines, meet
@@ -74,8 +74,6 @@ SMALL = 0.02
 """Share of a picture's width and of its height that the splats in it fill, but for a tenth of them
 to each side, below which they are far away."""
 
-_TURNS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T}
-
 
 @dataclass(frozen=True)
 class Alignment:
@@ -111,7 +109,7 @@ class Alignment:
                 "cameras and splats do not share an up axis: only one of them was imported "
                 "upright; turn the cameras a quarter about X"
             )
-        now, turned = self.fineness[0], self.fineness[list(_TURNS).index(self.turn)]
+        now, turned = self.fineness[0], self.fineness[list(QUARTERS).index(self.turn)]
         return (
             "cameras and splats do not seem to share an up axis: turned a quarter about X, the "
             f"cameras would see pictures {min(turned / max(now, 1e-9), 99.0):.1f} times as fine"
@@ -145,7 +143,7 @@ class Alignment:
             far = tuple(str(name) for name in found.get("far", ()))
         except (AttributeError, TypeError, ValueError):
             return cls()
-        told = turn in _TURNS and len(fineness) in {0, len(_TURNS)} and (known or fineness)
+        told = turn in QUARTERS and len(fineness) in {0, len(QUARTERS)} and (known or fineness)
         return cls(turn if told else 0, known, fineness, far)
 
 
@@ -192,7 +190,7 @@ def alignment(
             return found
         rows = _some(splats, SAMPLE)
         fineness = _fineness(splats, rows, used.spread(VIEWS), progress, threads)
-    best = list(_TURNS)[int(np.argmax(fineness))]
+    best = list(QUARTERS)[int(np.argmax(fineness))]
     turn = best if max(fineness) > max(BETTER * fineness[0], LEAST) else 0
     return replace(found, turn=turn, fineness=fineness)
 
@@ -231,7 +229,7 @@ def _fineness(
     progress: Progress,
     threads: int | None,
 ) -> tuple[float, ...]:
-    """Return the fineness of the pictures of views, turned by each of `_TURNS`.
+    """Return the fineness of the pictures of views, turned by each of `QUARTERS`.
 
     Parameters
     ----------
@@ -250,7 +248,7 @@ def _fineness(
         some, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
     sights = SightLines(views.by_distance(), gaussians, some)
-    count, rotations = len(sights.views), list(_TURNS.values())
+    count, rotations = len(sights.views), list(QUARTERS.values())
 
     def work(piece: slice) -> float:
         turn, number = divmod(piece.start, count)
@@ -259,10 +257,10 @@ def _fineness(
         return _fineness_of(gaussians, scene, view, (columns, rows), crowd)
 
     found = for_chunks(
-        work, len(_TURNS) * count, 1,
+        work, len(QUARTERS) * count, 1,
         progress=part(progress, 0.2, 1.0), what="checking", threads=threads,
     )  # fmt: skip
-    return tuple(np.reshape(found, (len(_TURNS), count)).mean(axis=1).tolist())
+    return tuple(np.reshape(found, (len(QUARTERS), count)).mean(axis=1).tolist())
 
 
 def _fineness_of(

@@ -181,12 +181,7 @@ class Cluster:
 def _do(packed: bytes, group: Sequence[Call]) -> list[Any]:
     """Do steps of a job one after the other, in a worker."""
     job = _unpacked(packed)
-    return [
-        getattr(job, call.step)(
-            *call.arguments, **call.options, **({"threads": 1} if call.chunked else {})
-        )
-        for call in group
-    ]
+    return [call.do(job, threads=1) for call in group]
 
 
 @functools.lru_cache(maxsize=2)

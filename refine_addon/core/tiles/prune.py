@@ -22,7 +22,7 @@ from ..scoring import closed_form
 from ..scoring.closed_form_block import ROWS
 from ..selection import least_seen, refuse_none_left, single
 from ..task import DEFAULTS, Settings
-from ..whole_file import expanded, publish, refuse_existing
+from ..whole_file import expanded, make_folder, publish, refuse_existing
 from ..work import Progress, part, silent
 from .folder import Folder
 from .steps import Job, Rule, Shared
@@ -330,11 +330,7 @@ def _targets(tiles: Sequence[Tile], folder: Path, *, overwrite: bool) -> list[Pa
     RefineError
         If two tiles have one name, or a file could not be made, or may not be replaced.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        msg = f"{folder}: cannot be made ({error.strerror or error})"
-        raise RefineError(msg) from error
+    make_folder(folder)
     targets = [folder / Path(tile.path).name for tile in tiles]
     read = {Path(tile.path).resolve() for tile in tiles}
     for place, target in enumerate(targets):

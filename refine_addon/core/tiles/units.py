@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -13,16 +13,17 @@ from ..errors import RefineError
 from ..formats.ply_columns import splats_from_columns
 from ..formats.registry import read_splats
 from ..scoring.closed_form_block import ROWS
-from ..splats import Splats
+from ..splats import joined
 from ..whole_file import expanded
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Sequence
     from typing import Any
 
     from numpy.typing import NDArray
 
     from ..formats.ply import SplatFile
+    from ..splats import Splats
 
 
 class Tile(NamedTuple):
@@ -194,23 +195,4 @@ def splats_of(unit: Unit) -> Splats:
     Splats
         Of the highest degree among its parts: coefficients that a part lacks are 0.
     """
-    parts = [splats_from_columns(rows_of(part)) for part in unit.parts]
-    if len(parts) == 1:
-        return parts[0]
-    most = max(part.sh_rest.shape[1] for part in parts)
-    columns = {
-        field.name: _joined(getattr(part, field.name) for part in parts)
-        for field in fields(Splats)
-        if field.name != "sh_rest"
-    }
-    return Splats(**columns, sh_rest=_joined(_padded(part.sh_rest, most) for part in parts))
-
-
-def _joined(arrays: Iterable[NDArray[Any]]) -> NDArray[Any]:
-    with np.errstate(invalid="ignore"):  # signalling NaN converted to float64
-        return np.concatenate([*arrays])
-
-
-def _padded(rest: NDArray[Any], most: int) -> NDArray[Any]:
-    """Return harmonics (n, K, 3) with zeros up to K = `most`."""
-    return np.pad(rest, ((0, 0), (0, most - rest.shape[1]), (0, 0)))
+    return joined([splats_from_columns(rows_of(part)) for part in unit.parts])

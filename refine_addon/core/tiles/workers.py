@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 from ..errors import RefineError
-from ..work import Progress, part, report
+from ..work import Progress, part, report, silent
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -52,6 +52,11 @@ class Call(NamedTuple):
     chunked: bool = False
     options: Mapping[str, Any] = {}
 
+    def do(self, job: Job, *, progress: Progress = silent, threads: int | None = None) -> Any:  # noqa: ANN401 - of each step its own
+        """Return what the step returns."""
+        more = {"progress": progress, "threads": threads} if self.chunked else {}
+        return getattr(job, self.step)(*self.arguments, **self.options, **more)
+
 
 class Here:
     """Does all steps in this process.
@@ -76,6 +81,5 @@ class Here:
         for call in calls:
             report(progress, done, what)
             ahead = part(progress, done, done + call.share)
-            more = {"progress": ahead, "threads": self._threads} if call.chunked else {}
-            yield getattr(job, call.step)(*call.arguments, **call.options, **more)
+            yield call.do(job, progress=ahead, threads=self._threads)
             done += call.share
