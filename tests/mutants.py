@@ -266,7 +266,6 @@ MUTANTS = {
     "scoring/occlusion.py": [
         ("return 0.25 + 0.5 * gone", "return 0.25", "what has gone forgotten"),
         ("        self._turn += count\n", "", "the same views in every round"),
-        ("block.error[:] *= error", "pass", "errors before what hid them went"),
         (
             "LEAST ** (number / (rounds - 1))",
             "LEAST ** ((number - 1) / (rounds - 1))",
@@ -291,10 +290,11 @@ MUTANTS = {
             "the same views in every block",
         ),
         (
-            "total.contribution[footprints.index] += weight * (mass * visible)",
-            "total.contribution[footprints.index] += mass * visible",
+            "self.contribution[footprints.index] += weight * contribution",
+            "self.contribution[footprints.index] += contribution",
             "weight of views forgotten",
         ),
+        ("self.error * error", "self.error", "errors before what hid them went"),
         ("footprints.index[footprints.inside]", "footprints.index", "seen beside the image"),
         ("            seen *= seen\n", "", "transmittance not squared"),
     ],

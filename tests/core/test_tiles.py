@@ -302,8 +302,8 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views,
     budget = Budget(ratio=0.5)
     prune_tiles(tiles, tmp_path / "once", views, budget, CLOSED)
     done = []
-    read, write_rows = steps.splats_of, steps.write_rows
-    monkeypatch.setattr(steps, "splats_of", lambda unit: done.append(unit.index) or read(unit))
+    read, write_rows = units.Unit.splats, steps.write_rows
+    monkeypatch.setattr(units.Unit, "splats", lambda unit: done.append(unit.index) or read(unit))
     monkeypatch.setattr(
         steps, "write_rows", lambda *rows: done.append(len(rows[1])) or write_rows(*rows)
     )

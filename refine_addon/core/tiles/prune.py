@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import tempfile
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,19 +18,19 @@ from ..formats.ply_header import with_count
 from ..pipeline import nothing_removed, quality_facts
 from ..report import Clock, Files, complete_report, make_report
 from ..scores import Scores
-from ..scoring import closed_form
 from ..scoring.closed_form_block import ROWS
 from ..selection import least_seen, refuse_none_left, single
 from ..task import DEFAULTS, Settings
 from ..whole_file import expanded, make_folder, publish, refuse_existing
 from ..work import Progress, part, silent
 from .folder import Folder
-from .steps import Job, Rule, Shared
+from .scoring import by_closed_form, by_occlusion
+from .steps import Job, Rule
 from .units import reopened, tile_at, units_of
 from .workers import Call, Here, Interrupted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -39,27 +39,8 @@ if TYPE_CHECKING:
     from .units import Tile
     from .workers import Workers
 
-SHARES = {
-    "read": (0.0, 0.2),
-    "count": (0.2, 0.2),
-    "sum_views": (0.2, 0.75),
-    "add": (0.75, 0.78),
-    "compare": (0.78, 0.82),
-    "select": (0.82, 0.82),
-    "write": (0.82, 1.0),
-}
-"""Step -> the part of the progress that is its own."""
-
-STEP_NAMES = {
-    "read": "reading",
-    "count": "reading",
-    "sum_views": "scoring",
-    "add": "scoring",
-    "compare": "scoring",
-}
-
-_SMALL = 1 << 16
-"""Bytes of an argument that travels with each step; larger ones lie in the folder."""
+SCORED = 0.82
+"""Part of the progress that scoring is; the rest is writing."""
 
 
 def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
@@ -173,7 +154,6 @@ class _Run:
         self.total = sum(tile.splats for tile in tiles)
         self.counts = np.zeros((len(tiles), 2), np.int64)
         self._workers, self._progress = workers, progress
-        self._shared = 0
         job.folder.note("begun", None)
         workers.check(job, tiles)
 
@@ -181,11 +161,20 @@ class _Run:
         self, budget: Budget, settings: Settings, views: ViewSet, clock: Clock
     ) -> dict[str, Any]:
         """Score the tiles and decide what stays; return the report as far as it is known."""
-        job = self.job
-        with np.errstate(under="ignore"):  # as in `pipeline.score`
-            found = closed_form.steps(
-                self._each, self.total, job.views, job.settings, remember=self._remember
+        job, ahead = self.job, part(self._progress, 0.0, SCORED)
+        if settings.method == "closed-form":
+            found = by_closed_form(job, self.units, self._workers, ahead)
+            scores = Scores(
+                np.empty(0, np.float32), np.empty(0, np.int32), len(job.views), found.undrawable,
+                found.facts, (), "closed-form", job.settings.frustum,
+            )  # fmt: skip
+        else:
+            scores, _, _ = by_occlusion(job, self.units, settings.occlusion, self._workers, ahead)
+            scores = replace(
+                scores, values=scores.values[:0], seen=scores.seen[:0], method=settings.method
             )
+        notes = (*scores.notes, views.note) if views.note else scores.notes
+        scores = replace(scores, notes=notes, views_given=len(views))
         clock.lap("score_s")
         rule = self._rule(budget)
         places = {tile: place for place, tile in enumerate(self.tiles)}
@@ -195,12 +184,7 @@ class _Run:
         kept, unseen = self.counts.sum(axis=0).tolist()
         refuse_none_left(budget, self.total, kept)
         clock.lap("select_s")
-        nothing = Scores(
-            np.empty(0, np.float32), np.empty(0, np.int32), len(job.views), found.undrawable,
-            found.facts, (views.note,) if views.note else (), "closed-form",
-            job.settings.frustum, len(views),
-        )  # fmt: skip
-        facts = make_report(nothing, np.empty(0, np.bool_), budget, settings, clock)
+        facts = make_report(scores, np.empty(0, np.bool_), budget, settings, clock)
         facts["splats"] |= {
             "before": self.total,
             "kept": kept,
@@ -214,7 +198,7 @@ class _Run:
         if budget.max_mb is not None and kept == self.total:
             facts["budget_remark"] = nothing_removed(sum(tile.size for tile in self.tiles))
             facts["notes"].append(facts["budget_remark"])
-        return facts | quality_facts(nothing, np.empty(0, np.bool_), None, absorbed=False)
+        return facts | quality_facts(scores, np.empty(0, np.bool_), None, absorbed=False)
 
     def write(self) -> list[int]:
         """Write each tile into the folder of the job; return their bytes."""
@@ -226,7 +210,7 @@ class _Run:
             )
             for tile, (kept, _) in zip(self.tiles, self.counts.tolist(), strict=True)
         ]
-        return [*self._workers(self.job, calls, part(self._progress, *SHARES["write"]), "writing")]
+        return [*self._workers(self.job, calls, part(self._progress, SCORED, 1.0), "writing")]
 
     def sizes(self) -> list[int]:
         """Return the bytes that `write` would write of each tile."""
@@ -237,40 +221,14 @@ class _Run:
             found.append(tile.fixed_bytes - shorter + kept * tile.row_bytes)
         return found
 
-    def _each(self, step: str, *arguments: Any) -> Iterator[Any]:  # noqa: ANN401 - of each step its own
-        """Do a step of the closed form with each unit."""
-        given = tuple(self._small(argument) for argument in arguments)
-        calls = [
-            Call("score", (unit, step, given), len(unit) / self.total, chunked=True)
-            for unit in self.units
-        ]
-        return self._workers(self.job, calls, part(self._progress, *SHARES[step]), STEP_NAMES[step])
-
     def _map(self, step: str, *arguments: Any, **options: Any) -> Iterator[Any]:  # noqa: ANN401 - of each its own
         """Do a step of `Job` with each unit."""
         calls = [
             Call(step, (unit, *arguments), len(unit) / self.total, options=options)
             for unit in self.units
         ]
-        ahead = part(self._progress, *SHARES["select"])
+        ahead = part(self._progress, SCORED, SCORED)
         return self._workers(self.job, calls, ahead, "selecting")
-
-    def _small(self, argument: Any) -> Any:  # noqa: ANN401 - as given
-        """Return an argument, or where it lies if it is large."""
-        if not isinstance(argument, np.ndarray) or argument.nbytes <= _SMALL:
-            return argument
-        self._shared += 1
-        name = f"shared-{self._shared}"
-        self.job.folder.note(name, argument)
-        return Shared(name)
-
-    def _remember(self, name: str, make: Callable[[], Any]) -> Any:  # noqa: ANN401 - as made
-        """Return what was made of the name, even by a run before this one."""
-        done, found = self.job.folder.noted(name)
-        if not done:
-            found = make()
-            self.job.folder.note(name, found)
-        return found
 
     def _rule(self, budget: Budget) -> Rule:
         """Return which splats a budget removes."""
@@ -309,13 +267,7 @@ def _amount(budget: Budget, tiles: Sequence[Tile]) -> tuple[int, bool]:
 
 
 def _refuse_what_needs_all(budget: Budget, settings: Settings) -> None:
-    """Raise `RefineError` for methods and budgets that need all splats at once."""
-    if settings.method != "closed-form":
-        msg = (
-            f"method is {settings.method}, which needs all splats in memory: over tiles together "
-            "only closed-form works so far"
-        )
-        raise RefineError(msg)
+    """Raise `RefineError` for budgets that need all splats at once."""
     if budget.psnr is not None:
         msg = "a PSNR needs all splats in memory: over tiles together choose another budget"
         raise RefineError(msg)
