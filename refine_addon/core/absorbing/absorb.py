@@ -46,8 +46,35 @@ PATIENCE = 2.0
 _CHUNK = 1 << 14
 
 
+class Counts:
+    """How many splats absorbing changed, merged and deleted.
+
+    Attributes
+    ----------
+    changed : (K,) bool
+        Which survivors absorbed others.
+    merged, deleted : int
+        How many splats were absorbed by a survivor, and how many were deleted.
+    """
+
+    changed: NDArray[np.bool_]
+    merged: int
+    deleted: int
+
+    def facts(self) -> dict[str, int]:
+        """Return the counts, for a report."""
+        changed = int(np.count_nonzero(self.changed))
+        return {"changed": changed, "merged": self.merged, "deleted": self.deleted}
+
+    def note(self) -> str:
+        """Return the counts as a sentence, for the user."""
+        return "{changed:,} survivors absorbed {merged:,} splats; {deleted:,} were deleted".format(
+            **self.facts()
+        )
+
+
 @dataclass(frozen=True, eq=False)
-class Absorbed:
+class Absorbed(Counts):
     """The result of absorbing N splats.
 
     Attributes
@@ -67,17 +94,6 @@ class Absorbed:
     changed: NDArray[np.bool_]
     merged: int
     deleted: int
-
-    def facts(self) -> dict[str, int]:
-        """Return the counts, for a report."""
-        changed = int(np.count_nonzero(self.changed))
-        return {"changed": changed, "merged": self.merged, "deleted": self.deleted}
-
-    def note(self) -> str:
-        """Return the counts as a sentence, for the user."""
-        return "{changed:,} survivors absorbed {merged:,} splats; {deleted:,} were deleted".format(
-            **self.facts()
-        )
 
 
 def patience(share: float) -> float:
@@ -158,14 +174,13 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     # Of each splat left: its row among the N, and how many of the N it stands for.
     origin, members = np.arange(count), np.ones(count, np.int64)
     factor = patience(1.0 - goal / max(began or count, 1))
-    stages = math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE)) if goal < count else 0
+    left_after = stages(count, goal)
     sums: ViewSums | None = None
-    for stage in range(stages):
-        ahead = part(progress, stage / stages, (stage + 1) / stages)
-        left = round(count * (goal / count) ** ((stage + 1) / stages))
+    for stage, left in enumerate(left_after):
+        ahead = part(progress, stage / len(left_after), (stage + 1) / len(left_after))
         sums = measure(splats, sums, part(ahead, 0.0, 0.5))
-        splats, kept, taken, sums = _absorb_once(
-            splats, views, scene, sums, max(left, goal), protected=spared[origin],
+        splats, kept, taken, sums = absorb_once(
+            splats, views, scene, sums, left, protected=spared[origin],
             factor=factor, progress=part(ahead, 0.5, 1.0), threads=threads,
         )  # fmt: skip
         # A survivor now also stands for all that the splats it absorbed stood for.
@@ -177,7 +192,18 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     return Absorbed(splats, keep, members > 1, merged, count - len(origin) - merged)
 
 
-def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
+def stages(count: int, goal: int) -> list[int]:
+    """Return how many of `count` splats are left after each stage; `goal` after the last."""
+    if goal >= count:
+        return []
+    number = math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE))
+    return [
+        max(round(count * (goal / count) ** ((stage + 1) / number)), goal)
+        for stage in range(number)
+    ]
+
+
+def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     splats: Splats,
     views: ViewSet,
     scene: Scene,
@@ -243,7 +269,7 @@ def _written(
     graph: MergeGraph,
     progress: Progress,
 ) -> tuple[Splats, NDArray[np.bool_], Index, ViewSums]:
-    """Return the results of `_absorb_once`, with the merged splats in place of the survivors.
+    """Return the results of `absorb_once`, with the merged splats in place of the survivors.
 
     Parameters
     ----------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import tempfile
 from dataclasses import fields, replace
 from pathlib import Path
@@ -15,17 +16,18 @@ from ...version import VERSION
 from .. import radix
 from ..errors import RefineError
 from ..formats.ply_header import with_count
-from ..pipeline import nothing_removed, quality_facts
+from ..pipeline import FIRST, nothing_removed, quality_facts
 from ..report import Clock, Files, complete_report, make_report
 from ..scores import Scores
 from ..scoring.closed_form_block import ROWS
-from ..selection import least_seen, refuse_none_left, single
+from ..selection import Budget, least_seen, refuse_none_left, select, single
 from ..task import DEFAULTS, Settings
 from ..whole_file import expanded, make_folder, publish, refuse_existing
 from ..work import Progress, part, silent
+from . import absorbing
 from .folder import Folder
 from .scoring import by_closed_form, by_occlusion
-from .steps import Job, Rule
+from .steps import SURVIVORS, Job, Rule
 from .units import reopened, tile_at, units_of
 from .workers import Call, Here, Interrupted
 
@@ -34,8 +36,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..selection import Budget
     from ..views import ViewSet
+    from .absorbing import Survivors
+    from .scoring import Seen
     from .units import Tile
     from .workers import Workers
 
@@ -50,6 +53,7 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     budget: Budget,
     settings: Settings = DEFAULTS,
     *,
+    absorb: bool = False,
     overwrite: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
@@ -59,8 +63,9 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
 
     The same splats stay as if all files were one, in the order in which they are given: of equal
     scores, those of the first file go first. All files are written, or none. What stands between
-    the steps, 50 bytes a splat, lies in a folder beside the outputs until the job is done. If the
-    process is killed, the same call later goes on from there.
+    the steps lies in a folder beside the outputs until the job is done: 50 bytes a splat for the
+    closed form, 400 for occlusion. If the process is killed, the same call later goes on from
+    there.
 
     Parameters
     ----------
@@ -69,7 +74,10 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     folder : path-like or None
         Where each goes under its own name; made if it is not there. None writes nothing.
     views, budget, settings, progress, threads
-        See `pipeline.prune`; the method is the closed form.
+        See `pipeline.prune`. Here "auto" measures by all views.
+    absorb : bool
+        See `pipeline.prune`. A region of up to a million splats is absorbed at a time
+        (`absorbing`), so survivors are not exactly those of one file.
     overwrite : bool
         Whether files may be replaced.
     workers : callable, optional
@@ -87,7 +95,7 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
         over tiles, or two files have one name. Then nothing is written.
     """
     clock = Clock()
-    _refuse_what_needs_all(budget, settings)
+    _refuse_what_needs_all(budget, settings, absorb=absorb)
     tiles = [tile_at(path) for path in sources]
     output = None if folder is None else expanded(folder)
     targets = [] if output is None else _targets(tiles, output, overwrite=overwrite)
@@ -96,12 +104,13 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
         if output is None:
             place = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="refine-")))
         else:
-            place = output.absolute() / f".refine-{_digest(tiles, used, budget, settings)}"
+            digest = _digest(tiles, used, budget, settings, absorb=absorb)
+            place = output.absolute() / f".refine-{digest}"
         job = Job(Folder(place), used, settings.closed_form, used.middle())
         held.enter_context(job.folder.opened())
         try:
             run = _Run(job, tiles, workers or Here(threads), progress)
-            facts = run.prune(budget, settings, views, clock)
+            facts = run.prune(budget, settings, views, clock, absorb=absorb)
             sizes = run.write() if targets else run.sizes()
             for target in targets:
                 publish(job.folder.tiles / target.name, target, overwrite=overwrite)
@@ -154,36 +163,39 @@ class _Run:
         self.total = sum(tile.splats for tile in tiles)
         self.counts = np.zeros((len(tiles), 2), np.int64)
         self._workers, self._progress = workers, progress
+        self._absorbed = False
         job.folder.note("begun", None)
         workers.check(job, tiles)
 
     def prune(
-        self, budget: Budget, settings: Settings, views: ViewSet, clock: Clock
+        self, budget: Budget, settings: Settings, views: ViewSet, clock: Clock, *, absorb: bool
     ) -> dict[str, Any]:
         """Score the tiles and decide what stays; return the report as far as it is known."""
-        job, ahead = self.job, part(self._progress, 0.0, SCORED)
-        if settings.method == "closed-form":
+        job, ahead = self.job, part(self._progress, 0.0, SCORED * (0.3 if absorb else 1.0))
+        seen: Seen | None = None
+        if settings.method == "closed-form" and not absorb:
             found = by_closed_form(job, self.units, self._workers, ahead)
             scores = Scores(
                 np.empty(0, np.float32), np.empty(0, np.int32), len(job.views), found.undrawable,
                 found.facts, (), "closed-form", job.settings.frustum,
             )  # fmt: skip
         else:
-            scores, _, _ = by_occlusion(job, self.units, settings.occlusion, self._workers, ahead)
-            scores = replace(
-                scores, values=scores.values[:0], seen=scores.seen[:0], method=settings.method
-            )
+            how = replace(settings.occlusion, rounds=1) if absorb else settings.occlusion
+            seen = by_occlusion(job, self.units, how, self._workers, ahead)
+            scores = replace(seen.scores, values=seen.scores.values[:0], seen=seen.scores.seen[:0])
         notes = (*scores.notes, views.note) if views.note else scores.notes
         scores = replace(scores, notes=notes, views_given=len(views))
         clock.lap("score_s")
         rule = self._rule(budget)
-        places = {tile: place for place, tile in enumerate(self.tiles)}
-        for unit, each in zip(self.units, self._map("choose", rule), strict=True):
-            for (tile, _, _), pair in zip(unit.parts, each, strict=True):
-                self.counts[places[tile]] += pair
+        self._count(self._map("choose", rule))
         kept, unseen = self.counts.sum(axis=0).tolist()
         refuse_none_left(budget, self.total, kept)
         clock.lap("select_s")
+        survivors = None
+        if absorb and seen is not None:
+            survivors = self._absorb(seen, kept)
+            kept = int(self.counts[:, 0].sum())
+            clock.lap("absorb_s")
         facts = make_report(scores, np.empty(0, np.bool_), budget, settings, clock)
         facts["splats"] |= {
             "before": self.total,
@@ -198,15 +210,50 @@ class _Run:
         if budget.max_mb is not None and kept == self.total:
             facts["budget_remark"] = nothing_removed(sum(tile.size for tile in self.tiles))
             facts["notes"].append(facts["budget_remark"])
-        return facts | quality_facts(scores, np.empty(0, np.bool_), None, absorbed=False)
+        if survivors is not None:
+            facts["absorbed"] = survivors.facts()
+            facts["notes"].append(survivors.note())
+        return facts | quality_facts(
+            scores, np.empty(0, np.bool_), None, absorbed=survivors is not None
+        )
+
+    def _absorb(self, seen: Seen, goal: int) -> Survivors:
+        """Absorb to `goal` survivors; the units then say which stay, and as what."""
+        scores, total = seen.scores, self.total
+        first = min(math.floor(FIRST * total), total - goal)
+        rest = select(scores, Budget(keep=total - first))
+        ahead = part(self._progress, 0.3 * SCORED, SCORED)
+        found = absorbing.absorb(seen, rest, goal, workers=self._workers, progress=ahead)
+        order = np.argsort(found.origin)
+        for name, array in zip(
+            SURVIVORS, (found.origin[order], order, found.changed[order]), strict=True
+        ):
+            self.job.folder.note(name, array)
+        begins = np.cumsum([0, *map(len, self.units)])
+        self._count(self._map("settle", begins, found.regions))
+        self._absorbed = True
+        return found
+
+    def _count(self, kept: Iterator[NDArray[np.int64]]) -> None:
+        """Note what each unit says of its parts, see `Job.choose`."""
+        places = {tile: place for place, tile in enumerate(self.tiles)}
+        self.counts[:] = 0
+        for unit, each in zip(self.units, kept, strict=True):
+            for (tile, _, _), pair in zip(unit.parts, each, strict=True):
+                self.counts[places[tile]] += pair
 
     def write(self) -> list[int]:
         """Write each tile into the folder of the job; return their bytes."""
         calls = [
             Call(
                 "write",
-                (tile, [u for u in self.units if any(tile == part.tile for part in u.parts)], kept),
+                (
+                    tile,
+                    [u for u in self.units if any(tile == part.tile for part in u.parts)],
+                    kept,
+                ),
                 tile.splats / self.total,
+                options={"absorbed": self._absorbed},
             )
             for tile, (kept, _) in zip(self.tiles, self.counts.tolist(), strict=True)
         ]
@@ -266,8 +313,11 @@ def _amount(budget: Budget, tiles: Sequence[Tile]) -> tuple[int, bool]:
     return max(excess, 0), True
 
 
-def _refuse_what_needs_all(budget: Budget, settings: Settings) -> None:
+def _refuse_what_needs_all(budget: Budget, settings: Settings, *, absorb: bool) -> None:
     """Raise `RefineError` for budgets that need all splats at once."""
+    if absorb and budget.threshold is not None:
+        msg = "absorbing over tiles together goes by a number of splats, not by a threshold"
+        raise RefineError(msg)
     if budget.psnr is not None:
         msg = "a PSNR needs all splats in memory: over tiles together choose another budget"
         raise RefineError(msg)
@@ -296,10 +346,12 @@ def _targets(tiles: Sequence[Tile], folder: Path, *, overwrite: bool) -> list[Pa
     return targets
 
 
-def _digest(tiles: Sequence[Tile], views: ViewSet, budget: Budget, settings: Settings) -> str:
+def _digest(
+    tiles: Sequence[Tile], views: ViewSet, budget: Budget, settings: Settings, *, absorb: bool
+) -> str:
     """Return a name for a job: that of the same job again, and of no other."""
     told = hashlib.blake2b(digest_size=8)
-    for fact in (VERSION, ROWS, [*tiles], budget, settings):
+    for fact in (VERSION, ROWS, [*tiles], budget, settings, absorb):
         told.update(repr(fact).encode("utf-8", "surrogateescape"))
     for view in views:
         for field in fields(view):

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..scene import Scene, principal_axes
-from ..scoring import closed_form
-from ..scoring.occlusion import FIRST_END, PRIOR, Rounds
+from ..scoring import closed_form, coverage
+from ..scoring.occlusion import FIRST_END, PRIOR, Rounds, combined, exponent
 from ..work import Progress, part
 from .seen import MeasuringTiles, SceneJob, place
 from .steps import Job, Shared
@@ -112,13 +112,52 @@ def by_closed_form(
         )
 
 
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What views see of N splats, hidden by one another.
+
+    Attributes
+    ----------
+    job : SceneJob
+    sources : sequence of Unit
+        The splats.
+    scores : Scores
+    measured : Measured
+        Of all N.
+    prior : (N,) float32
+        See `occlusion.Rounds`.
+    """
+
+    job: SceneJob
+    sources: Sequence[Unit]
+    scores: Scores
+    measured: Measured
+    prior: NDArray[np.float32]
+
+    def worth(self, now: Measured, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return what n splats are worth, (n,), as occlusion ranks them.
+
+        Parameters
+        ----------
+        now : Measured
+            Of these splats, as they are by now.
+        rows : (n,) int64
+            Which of the N they were.
+        """
+        prior, seen = self.prior[rows].astype(np.float64), self.measured.seen[rows]
+        weight = self.scores.facts["floor"][len(coverage.SHARES) // 2]
+        with np.errstate(under="ignore"):
+            floors = coverage.floor(prior, seen, 1.0 + exponent(0.0))
+            return coverage.with_floor(combined(now, 0.0), floors, weight)
+
+
 def by_occlusion(
     job: Job,
     units: Sequence[Unit],
     settings: Occlusion,
     workers: Workers,
     progress: Progress,
-) -> tuple[Scores, Measured, Scene]:
+) -> Seen:
     """Score units by occlusion; the same as in memory, but that nothing is estimated.
 
     The folder has ``values`` and ``seen`` of each unit afterwards.
@@ -130,13 +169,6 @@ def by_occlusion(
     settings : Occlusion
     workers, progress : callable
         See `prune.prune_tiles`.
-
-    Returns
-    -------
-    scores : Scores
-    measured : Measured
-        Of all N splats.
-    scene : Scene
 
     Raises
     ------
@@ -167,7 +199,8 @@ def by_occlusion(
         rows = slice(start, start + len(unit))
         job.folder.save(unit.index, {"values": scores.values[rows], "seen": scores.seen[rows]})
         start = rows.stop
-    return scores, measured.for_all(gaussians.index, len(values)), scene
+    every = measured.for_all(gaussians.index, len(values))
+    return Seen(seen, units, scores, every, values)
 
 
 def _all_of(folder: Folder, units: Sequence[Unit], name: str) -> NDArray[Any]:
