@@ -224,7 +224,7 @@ class Measuring:
                 before = total.error[sample]  # (m,)
                 footprints = measure_view(gaussians, self.scene, view, weight, self.sampling, total)
                 if sights is not None:
-                    sights.look(number, gaussians, footprints)
+                    sights.look(number, footprints)
                 errors.append(total.error[sample] - before)
             return total, np.array(errors)
 
@@ -246,17 +246,14 @@ def measure_view(
     """Add what one view sees to `total`; return the footprints in it."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
-    index = footprints.index
-    contribution, error = of_view(
-        footprints, gaussians.alphas[index], gaussians.colors[index], view, sampling
-    )
+    colors = gaussians.colors[footprints.index]  # (n, 3)
+    contribution, error = of_view(footprints, colors, view, sampling)
     total.add_view(footprints, weight, contribution, error)
     return footprints
 
 
 def of_view(
     footprints: Footprints,
-    alphas: NDArray[np.float32],
     colors: NDArray[np.float32],
     view: View,
     sampling: Sampling,
@@ -266,8 +263,6 @@ def of_view(
     Parameters
     ----------
     footprints : Footprints
-    alphas : (n,) float32
-        Opacity, 0..1.
     colors : (n, 3) float32
     view : View
     sampling : Sampling
@@ -277,8 +272,8 @@ def of_view(
     with np.errstate(under="ignore"):
         side = froxels.cell_size(footprints, view, sampling.cell, sampling.density)
         points = froxels.scatter(footprints, view, side, sampling.density)
-        mass, mass_squared = froxels.masses(footprints, alphas)  # (n,) each
-        traits = froxels.traits(footprints, alphas, mass, colors, points.area)  # (n, 6)
+        mass, mass_squared = froxels.masses(footprints)  # (n,) each
+        traits = froxels.traits(footprints, mass, colors, points.area)  # (n, 6)
         visible, errors = np.empty((2, len(points.owners)))  # (m,) each
         for cells, place in points.pieces():
             shares, mine = points.shares[place], traits.take(points.owners[place], axis=0)

@@ -93,6 +93,8 @@ class Footprints:
         Their lengths, the longer first.
     inside : (n,) bool
         Which centres lie in the view's frustum; see `frustum`.
+    alphas : (n,) float32
+        Of the Gaussians.
     """
 
     index: NDArray[np.int64]
@@ -101,6 +103,7 @@ class Footprints:
     minor: NDArray[np.float32]
     sigmas: NDArray[np.float32]
     inside: NDArray[np.bool_]
+    alphas: NDArray[np.float32]
 
     def take(self, rows: NDArray[np.int64]) -> Footprints:
         """Return some footprints, in that order."""
@@ -231,6 +234,7 @@ class Reaching(NamedTuple):
         Along the view's axis, scene sizes.
     centers, major, minor, sigmas : (2, n) float32
     inside : (n,) bool
+    alphas : (n,) float32
     """
 
     rows: NDArray[np.int64]
@@ -240,11 +244,12 @@ class Reaching(NamedTuple):
     minor: NDArray[np.float32]
     sigmas: NDArray[np.float32]
     inside: NDArray[np.bool_]
+    alphas: NDArray[np.float32]
 
 
 _NONE = np.empty((2, 0), np.float32)
 _NOTHING = Reaching(
-    np.empty(0, np.int64), _NONE[0], _NONE, _NONE, _NONE, _NONE, np.empty(0, np.bool_)
+    np.empty(0, np.int64), _NONE[0], _NONE, _NONE, _NONE, _NONE, np.empty(0, np.bool_), _NONE[0]
 )
 
 
@@ -266,7 +271,8 @@ def reaching(gaussians: Gaussians, scene: Scene, view: View) -> Reaching:
             inside = frustum.contains(view, local, planes)
             centers, major, minor, sigmas = _ellipses(local, shape, view)
             rows = touching + start
-            pieces.append(Reaching(rows, local[2], centers, major, minor, sigmas, inside))
+            alphas = gaussians.alphas.take(rows)
+            pieces.append(Reaching(rows, local[2], centers, major, minor, sigmas, inside, alphas))
     return _together(pieces)
 
 

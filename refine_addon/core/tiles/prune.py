@@ -16,17 +16,17 @@ from ...version import VERSION
 from .. import radix
 from ..errors import RefineError
 from ..formats.ply_header import with_count
-from ..pipeline import FIRST, nothing_removed, quality_facts
+from ..pipeline import FIRST, MEASURES, UNSEEN, nothing_removed, quality_facts
+from ..quality import out_of_reach
 from ..report import Clock, Files, complete_report, make_report
-from ..scores import Scores
 from ..scoring.closed_form_block import ROWS
-from ..selection import Budget, least_seen, refuse_none_left, select, single
+from ..selection import Budget, least_seen, quality_of, refuse_none_left, select, single
 from ..task import DEFAULTS, Settings
 from ..whole_file import expanded, make_folder, publish, refuse_existing
 from ..work import Progress, part, silent
 from . import absorbing
 from .folder import Folder
-from .scoring import by_closed_form, by_occlusion
+from .scoring import by_closed_form, by_occlusion, to_absorb
 from .steps import SURVIVORS, Job, Rule
 from .units import reopened, tile_at, units_of
 from .workers import Call, Here, Interrupted
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..scores import Scores
     from ..views import ViewSet
     from .absorbing import Survivors
     from .scoring import Seen
@@ -44,6 +45,9 @@ if TYPE_CHECKING:
 
 SCORED = 0.82
 """Part of the progress that scoring is; the rest is writing."""
+
+FORETOLD = "over tiles nothing measures what absorbing reached; it is foretold"
+"""Why there is no estimate for the result: a note of the report."""
 
 
 def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
@@ -171,32 +175,28 @@ class _Run:
         self, budget: Budget, settings: Settings, views: ViewSet, clock: Clock, *, absorb: bool
     ) -> dict[str, Any]:
         """Score the tiles and decide what stays; return the report as far as it is known."""
-        job, ahead = self.job, part(self._progress, 0.0, SCORED * (0.3 if absorb else 1.0))
+        ahead = part(self._progress, 0.0, SCORED * (0.3 if absorb else 1.0))
         seen: Seen | None = None
-        if settings.method == "closed-form" and not absorb:
-            found = by_closed_form(job, self.units, self._workers, ahead)
-            scores = Scores(
-                np.empty(0, np.float32), np.empty(0, np.int32), len(job.views), found.undrawable,
-                found.facts, (), "closed-form", job.settings.frustum,
-            )  # fmt: skip
+        if absorb:
+            seen = to_absorb(self.job, self.units, settings, self._workers, ahead)
+            scores = seen.scores
+        elif settings.method == "closed-form":
+            scores = by_closed_form(self.job, self.units, self._workers, ahead)[0]
         else:
-            how = replace(settings.occlusion, rounds=1) if absorb else settings.occlusion
-            seen = by_occlusion(job, self.units, how, self._workers, ahead)
-            scores = replace(seen.scores, values=seen.scores.values[:0], seen=seen.scores.seen[:0])
+            scores = by_occlusion(self.job, self.units, settings, self._workers, ahead)
         notes = (*scores.notes, views.note) if views.note else scores.notes
         scores = replace(scores, notes=notes, views_given=len(views))
         clock.lap("score_s")
-        rule = self._rule(budget)
-        self._count(self._map("choose", rule))
+        self._count(self._map("choose", self._rule(budget, scores)))
         kept, unseen = self.counts.sum(axis=0).tolist()
         refuse_none_left(budget, self.total, kept)
         clock.lap("select_s")
         survivors = None
-        if absorb and seen is not None:
+        if seen is not None:
             survivors = self._absorb(seen, kept)
             kept = int(self.counts[:, 0].sum())
             clock.lap("absorb_s")
-        facts = make_report(scores, np.empty(0, np.bool_), budget, settings, clock)
+        facts = self._report(scores, budget, settings, clock, survivors)
         facts["splats"] |= {
             "before": self.total,
             "kept": kept,
@@ -206,32 +206,60 @@ class _Run:
             "protected": 0,
             "forced": 0,
         }
-        facts["budget_remark"] = ""
-        if budget.max_mb is not None and kept == self.total:
-            facts["budget_remark"] = nothing_removed(sum(tile.size for tile in self.tiles))
-            facts["notes"].append(facts["budget_remark"])
+        return facts
+
+    def _report(
+        self,
+        scores: Scores,
+        budget: Budget,
+        settings: Settings,
+        clock: Clock,
+        survivors: Survivors | None,
+    ) -> dict[str, Any]:
+        """Return the report as far as it is known, but for the numbers of splats."""
+        keep, psnr = np.empty(0, np.bool_), None
+        if scores.sights is not None:
+            keep = np.concatenate(
+                [self.job.folder.load(unit.index, ["keep"])["keep"] for unit in self.units]
+            )
+        if scores.sights is not None and survivors is None:
+            psnr = scores.sights.psnr(keep)
+        facts = make_report(scores, keep, budget, settings, clock)
+        facts |= quality_facts(scores, keep, psnr, absorbed=False)
         if survivors is not None:
             facts["absorbed"] = survivors.facts()
-            facts["notes"].append(survivors.note())
-        return facts | quality_facts(
-            scores, np.empty(0, np.bool_), None, absorbed=survivors is not None
-        )
+            facts["estimated_psnr_note"] = FORETOLD
+            facts["notes"] += [survivors.note(), FORETOLD]
+            if settings.method == "closed-form":
+                facts["notes"].append(MEASURES)
+        elif psnr is None and scores.sights is not None:
+            facts["notes"].append(UNSEEN)
+        facts["budget_remark"] = ""
+        if budget.max_mb is not None and keep.all() and self.counts[:, 0].sum() == self.total:
+            facts["budget_remark"] = nothing_removed(sum(tile.size for tile in self.tiles))
+        elif budget.psnr is not None:
+            gone = len(keep) - int(np.count_nonzero(keep))
+            facts["budget_remark"] = out_of_reach(budget.psnr, gone, len(keep), psnr)
+        if facts["budget_remark"]:
+            facts["notes"].append(facts["budget_remark"])
+        return facts
 
-    def _absorb(self, seen: Seen, goal: int) -> Survivors:
-        """Absorb to `goal` survivors; the units then say which stay, and as what."""
-        scores, total = seen.scores, self.total
-        first = min(math.floor(FIRST * total), total - goal)
-        rest = select(scores, Budget(keep=total - first))
+    def _absorb(self, seen: Seen, goal: int) -> Survivors | None:
+        """Absorb to `goal` survivors; the units then say which stay, and as what.
+
+        None if no more splats go than are deleted before any are merged.
+        """
+        first = min(math.floor(FIRST * self.total), self.total - goal)
+        rest = select(seen.scores, Budget(keep=self.total - first))
         ahead = part(self._progress, 0.3 * SCORED, SCORED)
         found = absorbing.absorb(seen, rest, goal, workers=self._workers, progress=ahead)
         order = np.argsort(found.origin)
-        for name, array in zip(
-            SURVIVORS, (found.origin[order], order, found.changed[order]), strict=True
-        ):
+        arrays = found.origin[order], order, found.changed[order]
+        for name, array in zip(SURVIVORS, arrays, strict=True):
             self.job.folder.note(name, array)
         begins = np.cumsum([0, *map(len, self.units)])
         self._count(self._map("settle", begins, found.regions))
-        self._absorbed = True
+        self._absorbed = bool(found.regions)
         return found
 
     def _count(self, kept: Iterator[NDArray[np.int64]]) -> None:
@@ -277,13 +305,17 @@ class _Run:
         ahead = part(self._progress, SCORED, SCORED)
         return self._workers(self.job, calls, ahead, "selecting")
 
-    def _rule(self, budget: Budget) -> Rule:
-        """Return which splats a budget removes."""
+    def _rule(self, budget: Budget, scores: Scores) -> Rule:
+        """Return which splats a budget removes by scores."""
         if budget.threshold is not None:
             return Rule(threshold=float(single(budget.threshold)))
         if budget.min_seen is not None:
             return Rule(least_seen=least_seen(budget.min_seen, len(self.job.views)))
-        amount, by_bytes = _amount(budget, self.tiles)
+        if budget.psnr is not None:
+            share = quality_of(scores).share(budget.psnr)
+            amount, by_bytes = math.floor(share * self.total), False
+        else:
+            amount, by_bytes = _amount(budget, self.tiles)
         if not amount:
             return Rule(left=(0,) * len(self.units))
 
@@ -315,11 +347,12 @@ def _amount(budget: Budget, tiles: Sequence[Tile]) -> tuple[int, bool]:
 
 def _refuse_what_needs_all(budget: Budget, settings: Settings, *, absorb: bool) -> None:
     """Raise `RefineError` for budgets that need all splats at once."""
-    if absorb and budget.threshold is not None:
-        msg = "absorbing over tiles together goes by a number of splats, not by a threshold"
+    if absorb and (budget.threshold is not None or budget.psnr is not None):
+        what = "a threshold" if budget.psnr is None else "a PSNR"
+        msg = f"{what} needs all splats in memory to absorb: over tiles choose another budget"
         raise RefineError(msg)
-    if budget.psnr is not None:
-        msg = "a PSNR needs all splats in memory: over tiles together choose another budget"
+    if budget.psnr is not None and not settings.estimates:
+        msg = f"over tiles {settings.method} estimates no PSNR: choose auto or occlusion"
         raise RefineError(msg)
     budget.refuse_meaningless(settings.method, frustum=settings.frustum)
 

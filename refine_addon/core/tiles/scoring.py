@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..pipeline import with_quality
 from ..scene import Scene, principal_axes
-from ..scoring import closed_form, coverage
+from ..scores import Scores
+from ..scoring import auto, closed_form, coverage
 from ..scoring.occlusion import FIRST_END, PRIOR, Rounds, combined, exponent
 from ..work import Progress, part
-from .seen import MeasuringTiles, SceneJob, place
+from .seen import MeasuringTiles, SceneJob, StoredLines, place
 from .steps import Job, Shared
 from .workers import Call
 
@@ -20,10 +22,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scores import Scores
     from ..scoring.measuring import Measured
     from ..scoring.occlusion import Occlusion
-    from .folder import Folder
+    from ..task import Settings
     from .units import Unit
     from .workers import Workers
 
@@ -89,8 +90,15 @@ class _Steps:
 
 def by_closed_form(
     job: Job, units: Sequence[Unit], workers: Workers, progress: Progress
-) -> closed_form.Found:
+) -> tuple[Scores, float]:
     """Score units by the closed form; the folder has ``values`` and ``seen`` of each afterwards.
+
+    Returns
+    -------
+    scores : Scores
+        Without the values and numbers of views of any splat.
+    size : float
+        Of the scene.
 
     Parameters
     ----------
@@ -107,9 +115,15 @@ def by_closed_form(
     steps = _Steps(job, units, workers, progress)
     total = sum(map(len, units))
     with np.errstate(under="ignore"):  # as in `pipeline.score`
-        return closed_form.steps(
+        found = closed_form.steps(
             steps.each, total, job.views, job.settings, remember=steps.remember
         )
+    nothing = np.empty(0)
+    scores = Scores(
+        nothing.astype(np.float32), nothing.astype(np.int32), len(job.views), found.undrawable,
+        found.facts, method="closed-form", frustum=job.settings.frustum,
+    )  # fmt: skip
+    return scores, found.size
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,13 +166,9 @@ class Seen:
 
 
 def by_occlusion(
-    job: Job,
-    units: Sequence[Unit],
-    settings: Occlusion,
-    workers: Workers,
-    progress: Progress,
-) -> Seen:
-    """Score units by occlusion; the same as in memory, but that nothing is estimated.
+    job: Job, units: Sequence[Unit], settings: Settings, workers: Workers, progress: Progress
+) -> Scores:
+    """Score units by occlusion or auto: the same as in memory.
 
     The folder has ``values`` and ``seen`` of each unit afterwards.
 
@@ -166,7 +176,7 @@ def by_occlusion(
     ----------
     job : Job
     units : sequence of Unit
-    settings : Occlusion
+    settings : Settings
     workers, progress : callable
         See `prune.prune_tiles`.
 
@@ -180,32 +190,89 @@ def by_occlusion(
     Memory of this process: about 120 bytes a splat. A worker needs 20 bytes a splat, and for each
     view at work what it shows: about 160 bytes a splat, and its points, see `occlusion.score`.
     """
-    prior = replace(job, folder=job.folder.inner("prior"), settings=PRIOR)
-    found = by_closed_form(prior, units, workers, part(progress, 0.0, 0.1))
-    values = _all_of(prior.folder, units, "values")
-    unturned = Scene(job.middle[0], found.size, np.eye(3))
-    seen = SceneJob(job.folder.inner("seen"), job.views, settings, unturned)
-    scene = _scene(seen, units, workers, part(progress, 0.1, 0.12))
-    seen = replace(seen, scene=scene)
-    gaussians, good = place(seen, units, workers, part(progress, 0.12, 0.2))
-    # It stands for Gaussians in memory: it has what `Rounds` asks of them.
-    run = Rounds(gaussians, MeasuringTiles(seen, workers), settings.rounds, values, ~good)  # type: ignore[arg-type]
-    end = 0.2 + 0.8 * FIRST_END if settings.rounds > 1 else 1.0
+    by_auto = settings.method == "auto"
+    members = auto.blocks_of(job.views) if by_auto else None
+    how = settings.occlusion
+    run = _Scoring(job, units, how, workers, members, part(progress, 0.0, 0.2))
+    ahead = part(progress, 0.2, 0.98)
     with np.errstate(under="ignore"):
-        measured = run.measure(range(run.measuring.count), part(progress, 0.2, end))
-        scores = run.rank(part(progress, end, 1.0))
-    start = 0
-    for unit in units:
-        rows = slice(start, start + len(unit))
-        job.folder.save(unit.index, {"values": scores.values[rows], "seen": scores.seen[rows]})
-        start = rows.stop
-    every = measured.for_all(gaussians.index, len(values))
-    return Seen(seen, units, scores, every, values)
+        scores = auto.scored(run, settings.tolerance, progress=ahead) if by_auto else run.all(ahead)
+    return run.estimated(scores, part(progress, 0.98, 1.0))
 
 
-def _all_of(folder: Folder, units: Sequence[Unit], name: str) -> NDArray[Any]:
-    """Return an array of all units, (N,)."""
-    return np.concatenate([folder.load(unit.index, [name])[name] for unit in units])
+def to_absorb(
+    job: Job, units: Sequence[Unit], settings: Settings, workers: Workers, progress: Progress
+) -> Seen:
+    """Score units by occlusion in one round; see `by_occlusion`."""
+    how = replace(settings.occlusion, rounds=1)
+    run = _Scoring(job, units, how, workers, None, part(progress, 0.0, 0.2))
+    with np.errstate(under="ignore"):
+        scores = run.all(part(progress, 0.2, 0.98))
+        measured = run.measured().for_all(run.gaussians.index, len(run.prior))
+    return Seen(
+        run.job, units, run.estimated(scores, part(progress, 0.98, 1.0)), measured, run.prior
+    )
+
+
+class _Scoring(Rounds):
+    """A scoring of units.
+
+    Parameters
+    ----------
+    job : Job
+    units : sequence of Unit
+    settings : Occlusion
+    workers : callable
+    members : list of list of int, optional
+        See `measuring.Measuring`.
+    progress : callable
+        Of getting ready to measure.
+    """
+
+    sights: StoredLines
+
+    def __init__(
+        self,
+        job: Job,
+        units: Sequence[Unit],
+        settings: Occlusion,
+        workers: Workers,
+        members: list[list[int]] | None,
+        progress: Progress,
+    ) -> None:
+        prior = replace(job, folder=job.folder.inner("prior"), settings=PRIOR)
+        _, size = by_closed_form(prior, units, workers, part(progress, 0.0, 0.5))
+        values = np.concatenate(
+            [prior.folder.load(unit.index, ["values"])["values"] for unit in units]
+        )
+        unturned = Scene(job.middle[0], size, np.eye(3))
+        self.job = SceneJob(job.folder.inner("seen"), job.views, settings, unturned)
+        scene = _scene(self.job, units, workers, part(progress, 0.5, 0.6))
+        self.job = replace(self.job, scene=scene)
+        gaussians, good = place(self.job, units, workers, part(progress, 0.6, 1.0))
+        sights = StoredLines(self.job, workers, units, gaussians)
+        measuring = MeasuringTiles(self.job, workers, members)
+        # Those in the folder have what `Rounds` asks of Gaussians in memory.
+        super().__init__(gaussians, measuring, settings.rounds, values, ~good, sights)  # type: ignore[arg-type]
+        self._folder, self._units = job.folder, units
+
+    def all(self, progress: Progress) -> Scores:
+        """Measure all blocks of views, and return the scores."""
+        end = FIRST_END if self.rounds > 1 else 1.0
+        self.measure(range(self.measuring.count), part(progress, 0.0, end))
+        return self.rank(part(progress, end, 1.0))
+
+    def estimated(self, scores: Scores, progress: Progress) -> Scores:
+        """Return scores with the curve of the estimated PSNR, and write those of each unit."""
+        self.sights.load()
+        start = 0
+        for unit in self._units:
+            rows = slice(start, start + len(unit))
+            arrays = {"values": scores.values[rows], "seen": scores.seen[rows]}
+            self._folder.save(unit.index, arrays)
+            start = rows.stop
+        with np.errstate(under="ignore"):
+            return with_quality(scores, progress=progress)
 
 
 def _scene(seen: SceneJob, units: Sequence[Unit], workers: Workers, progress: Progress) -> Scene:

@@ -7,6 +7,7 @@ together, as in memory: what it finds is the same to the bit, wherever the tiles
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, MutableMapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
@@ -17,7 +18,8 @@ from ..scene import code_order, moments, spatial_code, splat_fingerprint
 from ..scoring import projection
 from ..scoring.measuring import Measured, Measuring, of_view
 from ..scoring.projection import Gaussians
-from ..splats import drawable
+from ..scoring.sight_lines import Lines, SightLines, met
+from ..splats import drawable, joined
 from ..work import Progress, default_threads, for_chunks, part, silent
 from .workers import Call
 
@@ -28,7 +30,6 @@ if TYPE_CHECKING:
 
     from ..scene import Scene
     from ..scoring.measuring import Sampling
-    from ..scoring.sight_lines import SightLines
     from ..splats import Splats
     from ..views import View, ViewSet
     from .folder import Folder
@@ -172,8 +173,10 @@ class SceneJob:
 
             def work(piece: slice, some: list[int] = some) -> Any:  # noqa: ANN401 - a tuple
                 view, weight = views[some[piece.start]]
-                footprints, alphas, colors = self._footprints(view, boxes, left)
-                return footprints, weight, *of_view(footprints, alphas, colors, view, self.sampling)
+                footprints, colors = self._footprints(view, boxes, left)
+                if turn == 0:
+                    self._note_lines(some[piece.start], footprints)
+                return footprints, weight, *of_view(footprints, colors, view, self.sampling)
 
             ahead = part(progress, start / len(numbers), (start + len(some)) / len(numbers))
             found = for_chunks(work, len(some), 1, progress=ahead, what="scoring", threads=step)
@@ -184,11 +187,28 @@ class SceneJob:
             del found
         self.folder.note(name, (total.contribution, total.error, total.seen, np.array(errors)))
 
+    def meet(self, number: int) -> None:
+        """Note what the lines of sight of a view meet, before any splats are removed."""
+        boxes, left = self.folder.noted("boxes")[1], self.folder.mapped("left-0")
+        view, _ = self.views.by_distance()[number]
+        self._note_lines(number, self._footprints(view, boxes, left)[0])
+
+    def _note_lines(self, number: int, footprints: projection.Footprints) -> None:
+        name = lines_name(number)
+        if not self.folder.has(name):
+            with np.errstate(under="ignore"):
+                lines = met(self.views.by_distance(), number, footprints)
+            self.folder.note(name, tuple(vars(lines).values()))
+
+    def pick(self, source: Source, rows: NDArray[np.int64]) -> Splats:
+        """Return some splats of a source."""
+        return source.splats().take(rows)
+
     def _footprints(
         self, view: View, boxes: NDArray[np.float32], left: NDArray[np.int64]
-    ) -> tuple[projection.Footprints, NDArray[np.float32], NDArray[np.float32]]:
-        """Return the n footprints in a view, front to back, and their opacities and colours."""
-        found, alphas, colors = [], [np.empty(0, np.float32)], [np.empty((0, 3), np.float32)]
+    ) -> tuple[projection.Footprints, NDArray[np.float32]]:
+        """Return the n footprints in a view, front to back, and their colours, (n, 3)."""
+        found, colors = [], [np.empty((0, 3), np.float32)]
         with np.errstate(under="ignore"):
             for number in np.flatnonzero(projection.boxes_touch(boxes, self.scene, view)).tolist():
                 edges = np.array([number, number + 1]) * CHUNK
@@ -196,12 +216,11 @@ class SceneJob:
                 chunk = self._chunk(number, np.asarray(left[start:stop]) - edges[0])
                 some = projection.reaching(chunk, self.scene, view)
                 found.append(some._replace(rows=some.rows + start))
-                alphas.append(chunk.alphas[some.rows])
                 colors.append(chunk.colors[some.rows])
             footprints = projection.front_to_back(found)
         rows = np.concatenate([np.empty(0, np.int64), *(some.rows for some in found)])  # ascending
         at = np.searchsorted(rows, footprints.index)
-        return footprints, np.concatenate(alphas)[at], np.concatenate(colors)[at]
+        return footprints, np.concatenate(colors)[at]
 
     def _chunk(self, number: int, rows: NDArray[np.int64]) -> Gaussians:
         """Return some of the Gaussians of a chunk."""
@@ -211,6 +230,11 @@ class SceneJob:
             rows, some[_MEANS], some[_COVARIANCES], some[_LARGEST], some[_ALPHAS],
             np.ascontiguousarray(some[_COLORS].T),
         )  # fmt: skip
+
+
+def lines_name(number: int) -> str:
+    """Return under which name the lines of sight of a view are noted."""
+    return f"lines-{number:06d}"
 
 
 def seen_name(turn: int, block: int) -> str:
@@ -320,10 +344,14 @@ class MeasuringTiles(Measuring):
     job : SceneJob
     workers : callable
         See `workers.Workers`.
+    members : list of list of int, optional
+        See `Measuring`.
     """
 
-    def __init__(self, job: SceneJob, workers: Workers) -> None:
-        super().__init__(job.scene, job.views, job.sampling, None)
+    def __init__(
+        self, job: SceneJob, workers: Workers, members: list[list[int]] | None = None
+    ) -> None:
+        super().__init__(job.scene, job.views, job.sampling, None, members)
         self._job, self._workers = job, workers
 
     def none(self) -> Stored:
@@ -336,7 +364,7 @@ class MeasuringTiles(Measuring):
         sample: NDArray[np.int64],
         progress: Progress,
         which: Sequence[int] | None = None,
-        sights: SightLines | None = None,  # noqa: ARG002 - nothing is estimated
+        sights: SightLines | None = None,
     ) -> tuple[Stored, dict[int, NDArray[np.float64]]]:
         """Return the sums over each block of views, and the errors of a sample in each view."""
         folder, turn = self._job.folder, gaussians.turn
@@ -349,9 +377,75 @@ class MeasuringTiles(Measuring):
         ]
         for _ in self._workers(self._job, calls, progress, "scoring"):
             pass
+        if isinstance(sights, StoredLines):
+            sights.noted.update(itertools.chain(*(self.members[block] for block in chosen)))
         names = {block: seen_name(turn, block) for block in chosen}
         errors = {block: folder.noted(name)[1][3] for block, name in names.items()}
         return Stored(folder, names), errors
+
+
+class StoredLines(SightLines):
+    """The lines of sight of all views into one scene, and the splats that they meet.
+
+    Parameters
+    ----------
+    job : SceneJob
+    workers : callable
+        See `workers.Workers`.
+    sources : sequence of Source
+        All splats.
+    gaussians : Placed
+
+    Attributes
+    ----------
+    noted : set of int
+        Views whose lines lie in the folder.
+    """
+
+    def __init__(
+        self, job: SceneJob, workers: Workers, sources: Sequence[Source], gaussians: Placed
+    ) -> None:
+        self.views = job.views.by_distance()
+        self.index = self.rows = gaussians.index
+        self.lines = [None] * len(self.views)
+        self.noted: set[int] = set()
+        self._job, self._workers, self._sources = job, workers, sources
+
+    def look_from(
+        self,
+        numbers: Sequence[int],
+        gaussians: Gaussians,  # noqa: ARG002 - as for splats in memory
+        scene: Scene,  # noqa: ARG002
+        progress: Progress,
+        threads: int | None,  # noqa: ARG002
+    ) -> None:
+        """Project all splats into some views, and load what their lines meet."""
+        calls = [Call("meet", (number,), 1 / len(numbers)) for number in numbers]
+        for _ in self._workers(self._job, calls, progress, "looking"):
+            pass
+        self.noted.update(numbers)
+        self.load()
+
+    def load(self) -> None:
+        """Load the lines that were noted, and what they meet."""
+        folder = self._job.folder
+        for number in sorted(self.noted):
+            columns, rows, line, owner, alpha, dark, owners = folder.noted(lines_name(number))[1]
+            self.lines[number] = Lines(columns, rows, line, owner, alpha, dark, owners)
+        some = [lines.met for lines in self.lines if lines is not None]
+        rows = np.unique(np.concatenate([np.empty(0, np.int64), *(self.index[m] for m in some)]))
+        begins = np.cumsum([0, *map(len, self._sources)])
+        edges = itertools.pairwise(np.searchsorted(rows, begins).tolist())
+        calls = [
+            Call("pick", (source, rows[start:stop] - begin), 1 / len(rows))
+            for source, begin, (start, stop) in zip(self._sources, begins, edges, strict=False)
+            if stop > start
+        ]
+        picked = [*self._workers(self._job, calls, silent, "looking")]
+        if picked:
+            self.splats = joined(picked)
+        # Of Gaussians that no line meets it is any number.
+        self.rows = np.searchsorted(rows, self.index)
 
 
 def place(

@@ -194,7 +194,7 @@ class Job:
         starts = np.cumsum([0, *map(len, regions)])
         at = place[some][mine]
         which = np.searchsorted(starts, at, side="right") - 1
-        values = np.empty((len(at), regions[0].table().shape[1]))
+        values = np.empty((len(at), regions[0].table().shape[1] if regions else 0))
         for index in np.unique(which).tolist():
             here = which == index
             values[here] = regions[index].table()[at[here] - starts[index]]
