@@ -191,8 +191,7 @@ def test_a_size_that_no_splat_fits_in_is_refused(tmp_path, tiles, views):
 @pytest.mark.parametrize(
     ("settings", "budget", "words"),
     [
-        (Settings(), Budget(ratio=0.5), "method is auto.*only closed-form"),
-        (CLOSED, Budget(psnr=40.0), "PSNR needs all splats"),
+        (CLOSED, Budget(psnr=40.0), "closed-form estimates no PSNR"),
         (CLOSED, Budget(threshold=1e30), "would remove all 5000 splats"),
     ],
 )

@@ -404,8 +404,17 @@ class SightLines:
                 whole = lines.colors(self.colors(lines, view))
             return np.array([psnr_of(seen, whole, view)])
 
+        return self._mean_of(compare, part(progress, 0.2, 1.0), threads)
+
+    def _mean_of(
+        self,
+        compare: Callable[[int, Lines], NDArray[np.float64]],
+        progress: Progress = silent,
+        threads: int | None = None,
+    ) -> float | None:
+        """Return the mean of what `compare` returns, (1,), for each of the judges."""
         judges = self._judges()
-        found = self._of_each(compare, judges, part(progress, 0.2, 1.0), threads)
+        found = self._of_each(compare, judges, progress, threads)
         return None if found is None else float(self._mean(found, judges)[0])
 
     def _removing(

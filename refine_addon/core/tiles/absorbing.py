@@ -19,7 +19,7 @@ from ..pipeline import PARTS
 from ..scoring.measuring import Measured
 from ..splats import Splats
 from ..work import Progress, part, silent
-from .seen import MeasuringTiles, place
+from .seen import MeasuringTiles, StoredLines, place
 from .workers import Call
 
 if TYPE_CHECKING:
@@ -253,6 +253,18 @@ def absorb(
         rows = np.arange(len(origin))
     merged = int(members.sum()) - len(origin)
     return Survivors(regions_left, origin, members > 1, merged, total - len(origin) - merged)
+
+
+def estimated(
+    found: Seen, survivors: Survivors, workers: Workers, progress: Progress
+) -> float | None:
+    """Return the estimated PSNR of survivors, dB; None if too little is seen."""
+    sights, last = found.scores.sights, survivors.regions[0].folder
+    assert isinstance(sights, StoredLines)  # noqa: S101 - as `Seen` has
+    job = replace(found.job, folder=last.inner("after"))
+    gaussians, _ = place(job, survivors.regions, workers, part(progress, 0.0, 0.5))
+    after = StoredLines(job, workers, survivors.regions, gaussians)
+    return sights.against_stored(after, part(progress, 0.5, 1.0))
 
 
 def _measure(

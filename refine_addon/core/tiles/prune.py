@@ -46,9 +46,6 @@ if TYPE_CHECKING:
 SCORED = 0.82
 """Part of the progress that scoring is; the rest is writing."""
 
-FORETOLD = "over tiles nothing measures what absorbing reached; it is foretold"
-"""Why there is no estimate for the result: a note of the report."""
-
 
 def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     sources: Sequence[Path | str],
@@ -191,12 +188,28 @@ class _Run:
         kept, unseen = self.counts.sum(axis=0).tolist()
         refuse_none_left(budget, self.total, kept)
         clock.lap("select_s")
-        survivors = None
+        keep, psnr, survivors = np.empty(0, np.bool_), None, None
         if seen is not None:
-            survivors = self._absorb(seen, kept)
+            survivors, psnr = self._absorb(seen, kept)
             kept = int(self.counts[:, 0].sum())
             clock.lap("absorb_s")
-        facts = self._report(scores, budget, settings, clock, survivors)
+        if scores.sights is not None:
+            keep = np.concatenate(
+                [self.job.folder.load(unit.index, ["keep"])["keep"] for unit in self.units]
+            )
+            psnr = scores.sights.psnr(keep) if not self._absorbed else psnr
+        facts = make_report(scores, keep, budget, settings, clock)
+        facts |= quality_facts(scores, keep, psnr, absorbed=survivors is not None)
+        if psnr is None and scores.sights is not None:
+            facts["notes"].append(UNSEEN)
+        facts["budget_remark"] = self._remark(budget, psnr)
+        if facts["budget_remark"]:
+            facts["notes"].append(facts["budget_remark"])
+        if survivors is not None:
+            facts["absorbed"] = survivors.facts()
+            facts["notes"].append(survivors.note())
+            if settings.method == "closed-form":
+                facts["notes"].append(MEASURES)
         facts["splats"] |= {
             "before": self.total,
             "kept": kept,
@@ -208,50 +221,27 @@ class _Run:
         }
         return facts
 
-    def _report(
-        self,
-        scores: Scores,
-        budget: Budget,
-        settings: Settings,
-        clock: Clock,
-        survivors: Survivors | None,
-    ) -> dict[str, Any]:
-        """Return the report as far as it is known, but for the numbers of splats."""
-        keep, psnr = np.empty(0, np.bool_), None
-        if scores.sights is not None:
-            keep = np.concatenate(
-                [self.job.folder.load(unit.index, ["keep"])["keep"] for unit in self.units]
-            )
-        if scores.sights is not None and survivors is None:
-            psnr = scores.sights.psnr(keep)
-        facts = make_report(scores, keep, budget, settings, clock)
-        facts |= quality_facts(scores, keep, psnr, absorbed=False)
-        if survivors is not None:
-            facts["absorbed"] = survivors.facts()
-            facts["estimated_psnr_note"] = FORETOLD
-            facts["notes"] += [survivors.note(), FORETOLD]
-            if settings.method == "closed-form":
-                facts["notes"].append(MEASURES)
-        elif psnr is None and scores.sights is not None:
-            facts["notes"].append(UNSEEN)
-        facts["budget_remark"] = ""
-        if budget.max_mb is not None and keep.all() and self.counts[:, 0].sum() == self.total:
-            facts["budget_remark"] = nothing_removed(sum(tile.size for tile in self.tiles))
-        elif budget.psnr is not None:
-            gone = len(keep) - int(np.count_nonzero(keep))
-            facts["budget_remark"] = out_of_reach(budget.psnr, gone, len(keep), psnr)
-        if facts["budget_remark"]:
-            facts["notes"].append(facts["budget_remark"])
-        return facts
+    def _remark(self, budget: Budget, psnr: float | None) -> str:
+        """Return why a budget is out of reach or removes nothing, or ""."""
+        gone = self.total - int(self.counts[:, 0].sum())
+        if budget.psnr is not None:
+            return out_of_reach(budget.psnr, gone, self.total, psnr)
+        if budget.max_mb is not None and not gone:
+            return nothing_removed(sum(tile.size for tile in self.tiles))
+        return ""
 
-    def _absorb(self, seen: Seen, goal: int) -> Survivors | None:
+    def _absorb(self, seen: Seen, goal: int) -> tuple[Survivors, float | None]:
         """Absorb to `goal` survivors; the units then say which stay, and as what.
 
-        None if no more splats go than are deleted before any are merged.
+        Returns
+        -------
+        survivors : Survivors
+        psnr : float or None
+            The estimate for them, dB, if some of them changed.
         """
         first = min(math.floor(FIRST * self.total), self.total - goal)
         rest = select(seen.scores, Budget(keep=self.total - first))
-        ahead = part(self._progress, 0.3 * SCORED, SCORED)
+        ahead = part(self._progress, 0.3 * SCORED, 0.95 * SCORED)
         found = absorbing.absorb(seen, rest, goal, workers=self._workers, progress=ahead)
         order = np.argsort(found.origin)
         arrays = found.origin[order], order, found.changed[order]
@@ -260,7 +250,10 @@ class _Run:
         begins = np.cumsum([0, *map(len, self.units)])
         self._count(self._map("settle", begins, found.regions))
         self._absorbed = bool(found.regions)
-        return found
+        if not self._absorbed:
+            return found, None
+        ahead = part(self._progress, 0.95 * SCORED, SCORED)
+        return found, absorbing.estimated(seen, found, self._workers, ahead)
 
     def _count(self, kept: Iterator[NDArray[np.int64]]) -> None:
         """Note what each unit says of its parts, see `Job.choose`."""

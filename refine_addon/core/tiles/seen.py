@@ -18,7 +18,7 @@ from ..scene import code_order, moments, spatial_code, splat_fingerprint
 from ..scoring import projection
 from ..scoring.measuring import Measured, Measuring, of_view
 from ..scoring.projection import Gaussians
-from ..scoring.sight_lines import Lines, SightLines, met
+from ..scoring.sight_lines import Lines, SightLines, meet, met, psnr_of
 from ..splats import drawable, joined
 from ..work import Progress, default_threads, for_chunks, part, silent
 from .workers import Call
@@ -187,18 +187,35 @@ class SceneJob:
             del found
         self.folder.note(name, (total.contribution, total.error, total.seen, np.array(errors)))
 
-    def meet(self, number: int) -> None:
-        """Note what the lines of sight of a view meet, before any splats are removed."""
+    def meet(self, number: int, pixels: tuple[NDArray[np.int64], ...] | None = None) -> None:
+        """Note what the lines of sight of a view meet, before any splats are removed.
+
+        Parameters
+        ----------
+        number : int
+            Of the view.
+        pixels : (C,), (R,) int64, optional
+            Columns and rows that the lines go through, if they are not to be chosen.
+        """
         boxes, left = self.folder.noted("boxes")[1], self.folder.mapped("left-0")
         view, _ = self.views.by_distance()[number]
-        self._note_lines(number, self._footprints(view, boxes, left)[0])
+        self._note_lines(number, self._footprints(view, boxes, left)[0], pixels)
 
-    def _note_lines(self, number: int, footprints: projection.Footprints) -> None:
+    def _note_lines(
+        self,
+        number: int,
+        footprints: projection.Footprints,
+        pixels: tuple[NDArray[np.int64], ...] | None = None,
+    ) -> None:
         name = lines_name(number)
-        if not self.folder.has(name):
-            with np.errstate(under="ignore"):
+        if self.folder.has(name):
+            return
+        with np.errstate(under="ignore"):
+            if pixels is None:
                 lines = met(self.views.by_distance(), number, footprints)
-            self.folder.note(name, tuple(vars(lines).values()))
+            else:
+                lines = meet(footprints, *pixels)
+        self.folder.note(name, tuple(vars(lines).values()))
 
     def pick(self, source: Source, rows: NDArray[np.int64]) -> Splats:
         """Return some splats of a source."""
@@ -420,11 +437,38 @@ class StoredLines(SightLines):
         threads: int | None,  # noqa: ARG002
     ) -> None:
         """Project all splats into some views, and load what their lines meet."""
-        calls = [Call("meet", (number,), 1 / len(numbers)) for number in numbers]
+        self._look([(number,) for number in numbers], progress)
+
+    def _look(self, given: Sequence[tuple[Any, ...]], progress: Progress) -> None:
+        calls = [Call("meet", arguments, 1 / len(given)) for arguments in given]
         for _ in self._workers(self._job, calls, progress, "looking"):
             pass
-        self.noted.update(numbers)
+        self.noted.update(number for number, *_ in given)
         self.load()
+
+    def against_stored(self, other: StoredLines, progress: Progress) -> float | None:
+        """Return the estimated PSNR with other splats instead; see `SightLines.against`.
+
+        Parameters
+        ----------
+        other : StoredLines
+            Into those, by the same views; its lines have not been noted.
+        progress : callable
+        """
+        judges = self._judges()
+        lines = {number: self.lines[number] for number in judges}
+        other._look(
+            [(k, (own.columns, own.rows)) for k, own in lines.items() if own is not None], progress
+        )
+
+        def compare(number: int, lines: Lines) -> NDArray[np.float64]:
+            view, others = self.views[number][0], other.lines[number]
+            assert others is not None  # noqa: S101 - just noted
+            with np.errstate(under="ignore"):
+                seen = others.colors(other.colors(others, view))
+                return np.array([psnr_of(seen, lines.colors(self.colors(lines, view)), view)])
+
+        return self._mean_of(compare)
 
     def load(self) -> None:
         """Load the lines that were noted, and what they meet."""
