@@ -111,6 +111,42 @@ MUTANTS = {
         ("if target.resolve() in read:", "if False:", "tiles replaced while read"),
         ("if target in targets[:place]:", "if False:", "one output for two tiles"),
     ],
+    "tiles/seen.py": [
+        ("rows=some.rows + start", "rows=some.rows", "rows of the first chunk"),
+        (
+            "np.concatenate(colors)[at]",
+            "np.concatenate(colors)",
+            "colours in the order of the curve",
+        ),
+        (
+            "at = np.searchsorted(rows, footprints.index)",
+            "at = np.argsort(footprints.index)",
+            "colours of others",
+        ),
+        (
+            "        if self.folder.has(name):\n            return\n        views",
+            "        views",
+            "measured again",
+        ),
+    ],
+    "tiles/scoring.py": [
+        ("for moments in found:", "for moments in found[:1]:", "axes of a part of each unit"),
+        (
+            "coverage.floor(prior, seen, 1.0 + exponent(0.0))",
+            "0.0 * prior",
+            "regions unseen are worth nothing",
+        ),
+    ],
+    "tiles/absorbing.py": [
+        ("others * expected.error", "0.0 * expected.error", "the other views forgotten"),
+        ("_ASKEW if stage % 2 else", "_ASKEW if stage < 0 else", "the same planes in each stage"),
+        ("mine + self.starts[number]", "mine", "rows of the first source"),
+        (
+            "total = np.bincount(taken[stands], members[stands]",
+            "total = np.bincount(taken[stands], None",
+            "members forgotten",
+        ),
+    ],
     "scoring/closed_form_block.py": [
         ("total *= self.alpha[piece]", "total *= self.alpha[piece] ** 2", "opacity twice"),
         ("LUMA = (0.299, 0.587, 0.114)", "LUMA = (0.114, 0.587, 0.299)", "BGR"),
@@ -306,8 +342,8 @@ MUTANTS = {
             "thickness of a thin point",
         ),
         (
-            "np.minimum(alphas, np.float32(ALPHA_MAX), out",
-            "np.maximum(alphas, 1.0, out",
+            "np.minimum(footprints.alphas, np.float32(ALPHA_MAX), out",
+            "np.maximum(footprints.alphas, 1.0, out",
             "covers more",
         ),
         ("    sums -= values\n", "", "a splat hides itself"),
@@ -348,8 +384,8 @@ MUTANTS = {
         ("max(near / scene.size, 1e-5)", "max(near, 1e-5)", "near plane in another unit"),
         ("(z >= planes[0]) & (z <= planes[1])", "(z >= planes[0])", "far plane ignored"),
         (
-            "np.abs(focal * coordinate + offset * z) <=",
-            "np.abs(focal * coordinate - offset * z) <=",
+            "np.abs(side.focal * coordinate + side.offset * z) <=",
+            "np.abs(side.focal * coordinate - side.offset * z) <=",
             "principal point mirrored",
         ),
         (
@@ -370,8 +406,8 @@ MUTANTS = {
             "low-pass forgotten",
         ),
         (
-            "REACH * focal * float(np.hypot(1.0, slope)) * largest",
-            "0.0 * largest",
+            "reach = _reach(side) * largest",
+            "reach = 0.0 * largest",
             "size forgotten at the edge",
         ),
         ("known and away <=", "known or away <=", "farther than float32 holds"),
@@ -403,10 +439,10 @@ MUTANTS = {
             "protected=spared[: len(origin)]",
             "protection of another row",
         ),
-        ("((stage + 1) / stages))", "(stage / stages))", "a stage late"),
+        ("((stage + 1) / number))", "(stage / number))", "a stage late"),
         (
-            "math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE)) if",
-            "1 if",
+            "math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE))",
+            "1",
             "measured only once",
         ),
         (
@@ -643,6 +679,7 @@ TESTS = {
     "viewport_arrays": ["../viewport/arrays.py"],
     "command_counts": ["report.py"],
     "tiles": ["tiles/units.py", "tiles/steps.py", "tiles/folder.py", "tiles/prune.py"],
+    "tiles_seen": ["tiles/seen.py", "tiles/scoring.py", "tiles/absorbing.py"],
     "levels": ["levels/lod.py", "levels/distance.py", "levels/files.py"],
     "pictures": ["png.py", "picture_files.py"],
 }
