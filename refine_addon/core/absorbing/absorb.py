@@ -239,26 +239,60 @@ def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
         Of the K survivors, as far as these sums and the costs of the merges tell.
     """
     sums = ViewSums(np.asarray(sums.contribution, np.float64), np.asarray(sums.error, np.float64))
-    good, free = drawable(splats), ~protected
-    keep = np.ones(len(splats), np.bool_)
-    excess = max(len(splats) - keep_count, 0)
-    hopeless = np.flatnonzero(free & ~good)[:excess]
-    keep[hopeless] = False
-    excess -= len(hopeless)
-    rows = np.flatnonzero(keep & good & free)
-    excess = min(excess, len(rows))
+    rows = mergeable(splats, scene, protected)
     report(progress, 0.0, "absorbing")
+
+    def graph() -> MergeGraph:
+        ahead = part(progress, 0.0, 0.1)
+        found = merge_field.field(splats, rows, views, scene, sums, progress=ahead, threads=threads)
+        return MergeGraph(found, scene, factor, threads=threads)
+
+    ahead = part(progress, 0.1, 1.0)
+    return reduced(splats, sums, rows, graph, keep_count, protected=protected, progress=ahead)
+
+
+def mergeable(splats: Splats, scene: Scene, protected: NDArray[np.bool_]) -> Index:
+    """Return the rows of the splats that may merge, (M,), by their place in the scene.
+
+    So ties do not depend on the order of the file.
+    """
+    rows = np.flatnonzero(drawable(splats) & ~protected)
+    place = scene.place(splats.means[rows])
+    return rows[spatial_order(place, lambda some: splat_fingerprint(splats, rows[some]))]
+
+
+def reduced(  # noqa: PLR0913 - as `absorb_once`
+    splats: Splats,
+    sums: ViewSums,
+    rows: Index,
+    graph: Callable[[], MergeGraph],
+    keep_count: int,
+    *,
+    protected: NDArray[np.bool_],
+    progress: Progress = silent,
+) -> tuple[Splats, NDArray[np.bool_], Index, ViewSums]:
+    """Reduce splats by a graph; parameters and results as `absorb_once`.
+
+    Parameters
+    ----------
+    rows : (M,) int64
+        Rows of the splats that the graph holds, see `mergeable`.
+    graph : callable
+        Returns the graph; called only if some of these go.
+    """
+    excess = max(len(splats) - keep_count, 0)
+    may = np.zeros(len(splats), np.bool_)
+    may[rows] = True
+    keep = np.ones(len(splats), np.bool_)
+    hopeless = np.flatnonzero(~protected & ~may)[:excess]
+    keep[hopeless] = False
+    excess = min(excess - len(hopeless), len(rows))
     if excess <= 0:
         return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1), sums.take(keep)
-    # Sorted by place in the scene, so that ties do not depend on the order of the file.
-    place = scene.place(splats.means[rows])
-    rows = rows[spatial_order(place, lambda some: splat_fingerprint(splats, rows[some]))]
-    ahead = part(progress, 0.0, 0.1)
-    found = merge_field.field(splats, rows, views, scene, sums, progress=ahead, threads=threads)
-    graph = MergeGraph(found, scene, factor, threads=threads)
-    graph.reduce(len(rows) - excess, part(progress, 0.1, 0.95))
-    keep[rows[~graph.alive]] = False
-    return _written(splats, sums, keep, rows, graph, part(progress, 0.95, 1.0))
+    found = graph()
+    found.reduce(len(rows) - excess, part(progress, 0.0, 0.95))
+    keep[rows[~found.alive]] = False
+    return _written(splats, sums, keep, rows, found, part(progress, 0.95, 1.0))
 
 
 def _written(

@@ -425,7 +425,7 @@ class Rounds:
         """
         prior, count, gone = self.prior[left.index], len(removal.values), removal.gone
         share = gone / count
-        floors = coverage.floor(prior.astype(np.float64), measured.seen, 1.0 + exponent(share))
+        floors = coverage.floor(prior.astype(np.float64), measured.seen, 1.0 + _exponent(share))
         # How many of these splats have been removed when each of the shares is reached.
         stops = np.clip(np.rint(np.multiply(coverage.SHARES, count)) - gone, 0, go).astype(int)
         stops[-1] = go
@@ -456,7 +456,7 @@ class Rounds:
                     np.maximum(measured.error[sample] - block.error[sample], 0.0),
                     measured.seen[sample] - block.seen[sample],
                 )
-                floors = coverage.floor(worth, others.seen, 1.0 + exponent(0.0))
+                floors = coverage.floor(worth, others.seen, 1.0 + _exponent(0.0))
                 yield combined(others, 0.0), floors, errors
 
         if blocks not in self._weights:
@@ -540,7 +540,7 @@ def combined(measured: Measured, gone: float) -> NDArray[np.float64]:
     The error is exact for one splat. The more of its neighbours go too, the more it matters how
     much of the picture the splat covers, whatever lies behind it.
     """
-    return np.asarray(measured.error * measured.contribution ** exponent(gone))
+    return np.asarray(measured.error * measured.contribution ** _exponent(gone))
 
 
 def _growth(
@@ -563,6 +563,6 @@ def _growth(
     return np.divide(now + prior * common, before + prior, out=np.ones_like(now), where=prior > 0.0)
 
 
-def exponent(gone: float) -> float:
+def _exponent(gone: float) -> float:
     """Return the exponent of the contribution, given the share that went before."""
     return 0.25 + 0.5 * gone

@@ -8,13 +8,15 @@ neighbours that a plane kept apart meet in the next stage. A splat is in one reg
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..absorbing.absorb import Counts, absorb_once, patience, stages
-from ..absorbing.merging import ViewSums
+from ..absorbing import merge_field
+from ..absorbing.absorb import Counts, mergeable, patience, reduced, stages
+from ..absorbing.merge_field import Field, ViewSums
+from ..absorbing.merge_graph import MergeGraph
 from ..pipeline import PARTS
 from ..scoring.measuring import Measured
 from ..splats import Splats
@@ -24,6 +26,7 @@ from .workers import Call
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from typing import Any
 
     from numpy.typing import NDArray
 
@@ -37,6 +40,9 @@ if TYPE_CHECKING:
 REGION = 1 << 20
 """Splats of a region at most; absorbing takes about 900 bytes of each."""
 
+_FIELD = tuple(item.name for item in fields(Field))
+_PRICED = ("allowed", "allowed_error", "first", "second", "cost")
+_OVER = (*_FIELD, *_PRICED, "gathered", "whence", "stood", "may", "mass", "looks")
 _SAMPLE = 1 << 14  # splats that decide along which axis a box is divided
 _ASKEW = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]], np.float32) / np.float32(3.0)
 
@@ -100,43 +106,107 @@ class AbsorbJob:
         """Write where the splats of a source are."""
         self.folder.save(source.index, {"means": np.asarray(source.splats().means, np.float32)})
 
-    def absorb(
-        self, index: int, count: int, *, progress: Progress = silent, threads: int | None = 1
-    ) -> int:
-        """Absorb a region, and write it.
+    def gather(
+        self, index: int, *, progress: Progress = silent, threads: int | None = 1
+    ) -> NDArray[np.float64]:
+        """Get a region ready to merge, but for the allowance, and write it.
 
         Parameters
         ----------
         index : int
             Which one. The folder has the rows of its splats among those of all sources, and what
             the views see of them.
-        count : int
-            How many are to survive.
         progress, threads
 
         Returns
         -------
-        int
-            How many survived.
+        (2, 2) float64
+            See `merge_field.Unallowed.seen_and_whole`.
         """
-        name = f"{index:06d}.absorb"
+        name = f"{index:06d}.gather"
         done, result = self.folder.noted(name)
         if not done:
             rows, sums = self.folder.load(index, ("rows", "sums")).values()
             splats, origin, members = self._gathered(rows)
+            may = mergeable(splats, self.scene, np.zeros(len(rows), np.bool_))
+            found = merge_field.unallowed(
+                splats, may, self.views, self.scene, ViewSums(*sums),
+                progress=progress, threads=threads,
+            )  # fmt: skip
+            arrays = {"gathered": packed(splats), "whence": origin, "stood": members, "may": may}
+            arrays |= {"mass": found.mass, "looks": found.seen}
+            self.folder.save(index, arrays | vars(found.field))
+            result = found.seen_and_whole()
+            self.folder.note(name, result)
+        return np.asarray(result)
+
+    def price(
+        self,
+        index: int,
+        whole: NDArray[np.float64],
+        *,
+        progress: Progress = silent,
+        threads: int | None = 1,
+    ) -> None:
+        """Find what merging and deleting the splats of a region costs, and write it.
+
+        Parameters
+        ----------
+        index : int
+            Which one.
+        whole : (2, 2) float64
+            `seen_and_whole` of all regions together.
+        progress, threads
+        """
+        name = f"{index:06d}.price"
+        if self.folder.has(name):
+            return
+        own = self.folder.load(index, (*_FIELD, "mass", "looks"))
+        field = Field(*(own[item] for item in _FIELD))
+        bare = merge_field.Unallowed(field, own["mass"], own["looks"])
+        graph = MergeGraph(bare.with_allowance(whole), self.scene, self.factor, threads=threads)
+        graph.connect(progress)
+        best, merges = graph.best()
+        rows, may = (self.folder.load(index, [name])[name] for name in ("rows", "may"))
+        costs, weights = np.full(len(rows), -1.0), np.ones(len(rows), np.float32)
+        # What cannot be drawn goes first; of two splats that merge, one goes.
+        costs[may], weights[may] = best, np.where(merges, np.float32(0.5), np.float32(1.0))
+        arrays: dict[str, NDArray[Any]] = {"first": graph.first, "second": graph.second}
+        arrays |= {"cost": graph.cost, "allowed": graph.field.contribution}
+        arrays |= {"allowed_error": graph.field.error}
+        self.folder.save(index, arrays | {"costs": costs, "weights": weights})
+        self.folder.note(name, None)
+
+    def absorb(
+        self, index: int, count: int, *, progress: Progress = silent, threads: int | None = 1
+    ) -> int:
+        """Absorb a region down to `count` splats, and write it; return how many survived."""
+        name = f"{index:06d}.absorb"
+        done, result = self.folder.noted(name)
+        if not done:
+            own = self.folder.load(index, ("gathered", "whence", "stood", "may", "sums"))
+
+            def graph() -> MergeGraph:
+                made = self.folder.load(index, (*_FIELD, *_PRICED)).values()
+                *field, contribution, error, first, second, cost = made
+                return MergeGraph.connected_by(
+                    replace(Field(*field), contribution=contribution, error=error),
+                    self.scene, self.factor, (first, second, cost), threads=threads,
+                )  # fmt: skip
+
             with np.errstate(under="ignore"):
-                left, keep, taken, expected = absorb_once(
-                    splats, self.views, self.scene, ViewSums(*sums), count,
-                    protected=np.zeros(len(rows), np.bool_), factor=self.factor,
-                    progress=progress, threads=threads,
+                left, keep, taken, expected = reduced(
+                    unpacked(own["gathered"]), ViewSums(*own["sums"]), own["may"], graph, count,
+                    protected=np.zeros(len(own["whence"]), np.bool_), progress=progress,
                 )  # fmt: skip
             stands = taken >= 0
-            total = np.bincount(taken[stands], members[stands], len(left)).astype(np.int64)
-            made = {"splats": _packed(left), "origin": origin[keep], "members": total}
+            total = np.bincount(taken[stands], own["stood"][stands], len(left)).astype(np.int64)
+            made = {"splats": packed(left), "origin": own["whence"][keep], "members": total}
             made["expected"] = np.array([expected.contribution, expected.error])
             self.folder.save(index, made)
             result = np.array(len(left))
             self.folder.note(name, result)
+            self.folder.drop(index, _OVER)
         return int(result)
 
     def _gathered(
@@ -149,7 +219,7 @@ class AbsorbJob:
             mine = rows[edges[number] : edges[number + 1]] - self.starts[number]
             if not len(mine):
                 continue
-            parts.append(_packed(source.splats().take(mine)))
+            parts.append(packed(source.splats().take(mine)))
             if isinstance(source, Region):
                 found = source.folder.load(source.index, ("origin", "members"))
                 origins.append(found["origin"][mine])
@@ -233,16 +303,15 @@ def absorb(
             pass
         means = np.concatenate([own.map(source.index, "means")[:] for source in sources])[rows]
         pieces = regions(means, REGION, stage)
-        go = np.argsort(found.worth(now, origin), kind="stable")[: len(rows) - left]
-        gone = np.zeros(len(rows), np.bool_)
-        gone[go] = True
-        calls = []
         for index, piece in enumerate(pieces):
             sums = np.array([now.contribution[piece], now.error[piece]])
             own.save(index, {"rows": rows[piece], "sums": sums})
-            stay = len(piece) - int(np.count_nonzero(gone[piece]))
-            calls.append(Call("absorb", (index, stay), len(piece) / len(rows), chunked=True))
-        sizes = workers(job, calls, part(ahead, 0.5, 1.0), "absorbing")
+        stay = _staying(job, [len(piece) for piece in pieces], left, workers, part(ahead, 0.5, 0.8))
+        calls = [
+            Call("absorb", (index, count), count / left, chunked=True)
+            for index, count in enumerate(stay)
+        ]
+        sizes = workers(job, calls, part(ahead, 0.8, 1.0), "absorbing")
         sources = regions_left = [Region(index, size, own) for index, size in enumerate(sizes)]
         origin, members = (
             np.concatenate([own.load(source.index, [name])[name] for source in sources])
@@ -253,6 +322,40 @@ def absorb(
         rows = np.arange(len(origin))
     merged = int(members.sum()) - len(origin)
     return Survivors(regions_left, origin, members > 1, merged, total - len(origin) - merged)
+
+
+def _staying(
+    job: AbsorbJob, sizes: Sequence[int], left: int, workers: Workers, progress: Progress
+) -> list[int]:
+    """Return how many splats of each region stay, of `left` that do of all.
+
+    As many go as a region has among the cheapest merges and deletions of all.
+
+    Parameters
+    ----------
+    job : AbsorbJob
+    sizes : sequence of int
+        Splats of each region.
+    left : int
+    workers, progress : callable
+    """
+    total = sum(sizes)
+    calls = [Call("gather", (k,), n / total, chunked=True) for k, n in enumerate(sizes)]
+    whole = np.sum([*workers(job, calls, part(progress, 0.0, 0.4), "absorbing")], axis=0)
+    calls = [Call("price", (k, whole), n / total, chunked=True) for k, n in enumerate(sizes)]
+    for _ in workers(job, calls, part(progress, 0.4, 1.0), "absorbing"):
+        pass
+    own = [job.folder.load(k, ("costs", "weights")) for k in range(len(sizes))]
+    costs = np.concatenate([arrays["costs"] for arrays in own])
+    weights = np.concatenate([arrays["weights"] for arrays in own])
+    order = np.argsort(costs, kind="stable")
+    last = int(np.searchsorted(np.cumsum(weights[order], dtype=np.float64), total - left))
+    weights[order[last + 1 :]] = 0.0
+    ends = np.cumsum(sizes)
+    gone = np.cumsum([piece.sum(dtype=np.float64) for piece in np.split(weights, ends[:-1])])
+    # Rounded so that the sum is exact: each gets what is added up to its end.
+    gone = np.rint(gone * ((total - left) / gone[-1])).astype(np.int64)
+    return [size - int(go) for size, go in zip(sizes, np.diff(gone, prepend=0), strict=True)]
 
 
 def estimated(
@@ -338,7 +441,7 @@ def _divided(
     return _divided(place, one, less) + _divided(place, other, count - less)
 
 
-def _packed(splats: Splats) -> NDArray[np.float64]:
+def packed(splats: Splats) -> NDArray[np.float64]:
     """Return splats as one table, (n, 14 + 3 K)."""
     count = len(splats)
     columns = [splats.means, splats.log_scales, splats.quaternions]

@@ -10,8 +10,8 @@ import numpy as np
 from ..pipeline import with_quality
 from ..scene import Scene, principal_axes
 from ..scores import Scores
-from ..scoring import auto, closed_form, coverage
-from ..scoring.occlusion import FIRST_END, PRIOR, Rounds, combined, exponent
+from ..scoring import auto, closed_form
+from ..scoring.occlusion import FIRST_END, PRIOR, Rounds
 from ..work import Progress, part
 from .seen import MeasuringTiles, SceneJob, StoredLines, place
 from .steps import Job, Shared
@@ -19,8 +19,6 @@ from .workers import Call
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
 
     from ..scoring.measuring import Measured
     from ..scoring.occlusion import Occlusion
@@ -138,31 +136,12 @@ class Seen:
     scores : Scores
     measured : Measured
         Of all N.
-    prior : (N,) float32
-        See `occlusion.Rounds`.
     """
 
     job: SceneJob
     sources: Sequence[Unit]
     scores: Scores
     measured: Measured
-    prior: NDArray[np.float32]
-
-    def worth(self, now: Measured, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return what n splats are worth, (n,), as occlusion ranks them.
-
-        Parameters
-        ----------
-        now : Measured
-            Of these splats, as they are by now.
-        rows : (n,) int64
-            Which of the N they were.
-        """
-        prior, seen = self.prior[rows].astype(np.float64), self.measured.seen[rows]
-        weight = self.scores.facts["floor"][len(coverage.SHARES) // 2]
-        with np.errstate(under="ignore"):
-            floors = coverage.floor(prior, seen, 1.0 + exponent(0.0))
-            return coverage.with_floor(combined(now, 0.0), floors, weight)
 
 
 def by_occlusion(
@@ -209,9 +188,7 @@ def to_absorb(
     with np.errstate(under="ignore"):
         scores = run.all(part(progress, 0.2, 0.98))
         measured = run.measured().for_all(run.gaussians.index, len(run.prior))
-    return Seen(
-        run.job, units, run.estimated(scores, part(progress, 0.98, 1.0)), measured, run.prior
-    )
+    return Seen(run.job, units, run.estimated(scores, part(progress, 0.98, 1.0)), measured)
 
 
 class _Scoring(Rounds):
