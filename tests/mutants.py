@@ -130,22 +130,19 @@ MUTANTS = {
         ),
     ],
     "tiles/scoring.py": [
-        ("for moments in found:", "for moments in found[:1]:", "axes of a part of each unit"),
         (
-            "coverage.floor(prior, seen, 1.0 + exponent(0.0))",
-            "0.0 * prior",
-            "regions unseen are worth nothing",
+            "rows = slice(start, start + len(unit))",
+            "rows = slice(0, len(unit))",
+            "scores of others",
         ),
     ],
     "tiles/absorbing.py": [
         ("others * expected.error", "0.0 * expected.error", "the other views forgotten"),
         ("_ASKEW if stage % 2 else", "_ASKEW if stage < 0 else", "the same planes in each stage"),
         ("mine + self.starts[number]", "mine", "rows of the first source"),
-        (
-            "total = np.bincount(taken[stands], members[stands]",
-            "total = np.bincount(taken[stands], None",
-            "members forgotten",
-        ),
+        ('own["stood"][stands], len(left)', "None, len(left)", "members forgotten"),
+        ("(k, whole), n / total", "(k, 0.0 * whole), n / total", "no allowance in any region"),
+        ("weights[order[last + 1 :]] = 0.0", "weights[:] = 1.0", "the same share of each region"),
     ],
     "scoring/closed_form_block.py": [
         ("total *= self.alpha[piece]", "total *= self.alpha[piece] ** 2", "opacity twice"),
@@ -433,7 +430,11 @@ MUTANTS = {
             "shares of harmonics swapped",
         ),
         ("reversed(graph.merges)", "graph.merges", "merges followed forwards"),
-        ("np.flatnonzero(keep & good & free)", "np.flatnonzero(keep & good)", "unprotected"),
+        (
+            "np.flatnonzero(drawable(splats) & ~protected)",
+            "np.flatnonzero(drawable(splats))",
+            "unprotected",
+        ),
         (
             "protected=spared[origin]",
             "protected=spared[: len(origin)]",
@@ -452,8 +453,8 @@ MUTANTS = {
         ),
     ],
     "absorbing/merge_field.py": [
-        ("/ (1.0 + seen)\n", "\n", "as likely after many views"),
-        ("unhidden = seen @ worth", "unhidden = worth.sum()", "all seen once"),
+        ("worth * second / (1.0 + self.seen)", "worth * second", "as likely after many views"),
+        ("self.seen @ worth", "worth.sum()", "all seen once"),
         ("np.where(inside, counts, counts * BESIDE)", "counts", "views beside count"),
         (
             "np.where(inside, counts, counts * BESIDE) / squared",
@@ -510,7 +511,7 @@ MUTANTS = {
         ),
         ("        touched[into] = True\n", "", "costs not renewed"),
         ("self.cost[mine] = self.patience * cost", "self.cost[mine] = cost", "patience ignored"),
-        ("count < connected / 2", "count < 0", "never connected anew"),
+        ("count < self.connected / 2", "count < 0", "never connected anew"),
         ("self.alive & ~np.isnan(self.field.error)", "self.alive", "a round that does nothing"),
     ],
     "scoring/auto.py": [

@@ -177,6 +177,28 @@ def test_absorbing_tiles_is_as_good_as_absorbing_one_file(tmp_path, views, monke
     assert told["estimated_psnr"] == pytest.approx(sights.against(made, views.spread(64)), abs=0.1)
 
 
+@pytest.mark.slow
+def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views, monkeypatch):
+    """Three of 72 views show a quarter of the room; half of it goes, and 16 other views judge.
+
+    Regions that no view shows are merged like others, and keep what they would keep of one file.
+    """
+    monkeypatch.setattr(absorbing, "REGION", 10_000)
+    few, others = ViewSet(views.views[:3]), ViewSet(views.views[10::4])
+    splats = read_ply(ROOM / "point_cloud.ply").splats()
+    sights = sight_lines.sights(splats, others)
+    whole = prune(splats, few, Budget(ratio=0.5), OCCLUSION, absorb=True)
+
+    prune_tiles(
+        [ROOM / "point_cloud.ply"], tmp_path, few, Budget(ratio=0.5), OCCLUSION, absorb=True
+    )
+
+    made = read_ply(tmp_path / "point_cloud.ply").splats()
+    assert np.count_nonzero(whole.scores.seen) < 0.3 * len(splats)
+    one = sights.against(whole.absorbed.splats, others)
+    assert sights.against(made, others) > one - 0.3
+
+
 def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, rows, views):
     """Kept, merged and deleted add up to all; survivors that did not change are their old bytes.
 
