@@ -15,8 +15,9 @@ import numpy as np
 from .. import radix
 from ..frustum import Frustums
 from ..splats import base_color, drawable, opacity
-from ..work import for_chunks, silent
+from ..work import for_chunks, part, silent
 from . import adaptive
+from .nearness import near_order
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -49,6 +50,10 @@ ROWS = 1 << 18
 """Splats of a block: its numbers take 18 MB. Sums over cells depend on it in their last bits."""
 
 _CHUNK = 4096
+_RUN = 1000
+"""Splats that are looked at together: so few that what is known of them in 64 views stays in the
+second cache, and no multiple of a page, at which a processor takes reads for writes."""
+
 _VIEW_BLOCK = 64
 _SMALLEST_AREA = -300.0  # natural logarithm
 _SMALLEST_SQUARE = 1e-300
@@ -300,44 +305,95 @@ class Block:
         self.axes, self.eta = frame.axes, frame.eta
         self.frustums = Frustums(self.views, self.origin, frame.near)
         self.visibility = np.empty(count)
-        self.seen = np.zeros(count, np.int32)
+        self.seen = np.empty(count, np.int32)
         self.cells = np.zeros(count, np.int32)
+        look, sums = part(self.progress, 0.0, 0.9), part(self.progress, 0.9, 1.0)
+        for_chunks(
+            partial(self._look, near_order(self.means)), count, 4 * _CHUNK,
+            progress=look, what="scoring", threads=self.threads,
+        )  # fmt: skip
         return np.array(
             for_chunks(
-                self._sum_views, count, _CHUNK,
-                progress=self.progress, what="scoring", threads=self.threads,
+                self._sum, count, _CHUNK, progress=sums, what="scoring", threads=self.threads
             )
-        )  # fmt: skip
+        )
 
-    def _sum_views(self, piece: slice) -> list[float]:
-        points = np.ones((4, piece.stop - piece.start))  # x, y, z, 1
-        points[:3] = (self.means[piece] - self.origin).T
-        total = np.zeros(points.shape[1])  # (n,), H before alpha
-        seen = np.zeros(points.shape[1], np.int32)
+    def _look(self, order: NDArray[np.int64], piece: slice) -> None:
+        """Set H before alpha, and in how many views each splat lies, of a slice of an order.
+
+        Splats of a run lie near each other, so most views see none of them, and many see all.
+        """
+        rows = order[piece]
+        points = np.ones((4, len(rows)))  # x, y, z, 1
+        for axis in range(3):
+            points[axis] = self.means[:, axis][rows]
+            points[axis] -= self.origin[axis]
+        reach = self.reach[rows]
+        starts = np.arange(0, len(rows), _RUN)
+        low, high = (each.reduceat(points[:3], starts, axis=1) for each in (np.minimum, np.maximum))
+        visibility, seen = np.empty(len(rows)), np.empty(len(rows), np.int32)
         with np.errstate(under="ignore"):
-            for start in range(0, len(self.weights), _VIEW_BLOCK):
-                block = slice(start, start + _VIEW_BLOCK)
-                depth, beyond, inside = self.frustums.project(points, block)  # (V, n) each
-                fringe = None
-                if self.settings.frustum:
-                    between, inside = inside, beyond <= 0.0
-                    inside &= between
-                    fringe = self._fringe(depth, beyond, between > inside, piece, block)
-                else:
-                    inside[:] = True
+            some, whole = self.frustums.look(low, high, np.maximum.reduceat(reach, starts))
+            if not self.settings.frustum:
+                some[:] = whole[:] = True
+            for run, start in enumerate(starts.tolist()):
+                here = slice(start, start + _RUN)
+                partly = np.flatnonzero(some[:, run] & ~whole[:, run])
+                views = np.concatenate([partly, np.flatnonzero(whole[:, run])])
+                visibility[here], seen[here] = self._run(
+                    points[:, here], reach[here], views, len(partly)
+                )
+        self.visibility[rows] = visibility
+        self.seen[rows] = seen
+
+    def _run(
+        self,
+        points: NDArray[np.float64],
+        reach: NDArray[np.float64],
+        views: NDArray[np.int64],
+        partly: int,
+    ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """Return H before alpha of n splats, and in how many views each lies, (n,) each.
+
+        Parameters
+        ----------
+        points : (4, n) float64
+        reach : (n,) float64
+        views : (v,) int64
+            Those that see some of them; of these, the first `partly` may not see all.
+        partly : int
+        """
+        total = np.zeros(points.shape[1])  # (n,), H before alpha
+        seen = np.full(points.shape[1], len(views) - partly, np.int32)
+        for start in range(0, len(views), _VIEW_BLOCK):
+            block = views[start : start + _VIEW_BLOCK]
+            count = min(max(partly - start, 0), len(block))
+            depth, beyond, between = self.frustums.project(points, block, count)
+            inside = fringe = None
+            if count:
+                inside = beyond <= 0.0  # (c, n)
+                inside &= between
+                fringe = self._fringe(depth, beyond, between > inside, reach, block[:count])
                 # A byte can count the at most 64 views of a block.
                 seen += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.uint8)
-                total += self._block(points, depth, inside, fringe, block)
-            if not total.all():
+            total += self._block(points, depth, inside, fringe, block)
+        return total, seen
+
+    def _sum(self, piece: slice) -> list[float]:
+        """Make H of what `_look` left, and return its sums; see `sum_views`."""
+        points = (self.means[piece] - self.origin).T  # (3, n)
+        visibility, good = self.visibility[piece], self.good[piece]
+        with np.errstate(under="ignore"):
+            if not visibility.all():
                 near = self.squared[piece] + self.eta if self.settings.projection else 1.0
-                total = np.where(total == 0.0, UNSEEN / near, total)
+                visibility[:] = np.where(visibility == 0.0, UNSEEN / near, visibility)
             if self.settings.visibility:
-                total *= self.alpha[piece]
-            visibility = self.visibility[piece] = total * self.good[piece]
+                visibility *= self.alpha[piece]
+            visibility *= good
             sums = [float(np.sum(visibility * content)) for content in self._contents(piece)]
             if self.settings.local:
                 self.cells[piece] = self._cells(points)
-        self.seen[piece] = seen * self.good[piece]
+        self.seen[piece] *= good
         return [*sums, float(np.sum(self.seen[piece]))]
 
     def _cells(self, points: NDArray[np.float64]) -> NDArray[np.int32]:
@@ -352,23 +408,27 @@ class Block:
         self,
         points: NDArray[np.float64],
         depth: NDArray[np.float64],
-        inside: NDArray[np.bool_],
+        inside: NDArray[np.bool_] | None,
         fringe: _Fringe | None,
-        block: slice,
+        views: NDArray[np.int64],
     ) -> NDArray[np.float64]:
         """Return H before alpha of n splats from a block of views, (n,); `depth` is overwritten."""
-        weights = self.weights[block]
-        counted = inside
+        weights = self.weights[views]
         share = fringe.share if fringe else None
         if self.settings.projection:
-            squared = self._squared(points, depth, block)
+            squared = self._squared(points, depth, views)
             if fringe:
                 at = np.square(fringe.across)
                 if self.settings.depth == "distance":
                     at = squared[fringe.view, fringe.splat]
                 share = fringe.share / (at + self.eta)
             squared += self.eta
-            counted = np.divide(inside, squared, out=squared)
+            counted = np.divide(1.0, squared, out=squared)
+        else:
+            depth[:] = 1.0
+            counted = depth
+        if inside is not None:
+            counted[: len(inside)] *= inside
         total: NDArray[np.float64] = np.einsum("v,vn->n", weights, counted)
         if fringe and share is not None:
             total += np.bincount(fringe.splat, weights[fringe.view] * share, len(total))
@@ -379,18 +439,18 @@ class Block:
         depth: NDArray[np.float64],
         beyond: NDArray[np.float64],
         outside: NDArray[np.bool_],
-        piece: slice,
-        block: slice,
+        reach: NDArray[np.float64],
+        views: NDArray[np.int64],
     ) -> _Fringe:
         """Return which splats reach into which views from outside, and how far."""
-        steepness = self.frustums.steepness[block]
-        limit = self.reach[piece] * (steepness if np.ptp(steepness) > 0.0 else steepness[:1])
-        outside &= beyond < limit  # (b, n)
+        steepness = self.frustums.steepness[views]
+        limit = reach * (steepness if np.ptp(steepness) > 0.0 else steepness[:1])
+        outside &= beyond < limit  # (c, n)
         index = np.flatnonzero(outside)  # of few; everything else is done for all of them
         view = index // outside.shape[1]
         splat = index - view * outside.shape[1]
         away = beyond.ravel()[index]
-        share = 1.0 - away / (limit[0, splat] if len(limit) == 1 else limit[view, splat])
+        share = 1.0 - away / (limit[0, splat] if len(limit) == 1 else limit.ravel()[index])
         return _Fringe(view, splat, share, depth.ravel()[index] + away)
 
     def _contents(self, piece: slice) -> tuple[NDArray[np.float64], ...]:
@@ -399,14 +459,14 @@ class Block:
         return self.area[piece], luma * luma, alpha * alpha
 
     def _squared(
-        self, points: NDArray[np.float64], depth: NDArray[np.float64], block: slice
+        self, points: NDArray[np.float64], depth: NDArray[np.float64], views: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """Return d^2, (V, n); `depth` is overwritten by it."""
         if self.settings.depth == "z":
             return np.multiply(depth, depth, out=depth)
         depth[:] = 0.0
         for axis in range(3):
-            step = points[axis] - self.frustums.centers[block, axis, None]
+            step = points[axis] - self.frustums.centers[views, axis, None]
             depth += np.multiply(step, step, out=step)
         return depth
 
