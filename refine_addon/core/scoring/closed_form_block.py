@@ -7,6 +7,7 @@ the other, with their numbers on disk in between, or on several machines.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -249,17 +250,25 @@ class Block:
             Over the drawable splats, weighted by 1 / `squared`: the sums of the products of their
             coordinates from the origin, and of the coordinates.
         """
-        chunk = self.splats.take(piece)  # type: ignore[union-attr]
+        chunk = self.splats.take(piece).by_columns()  # type: ignore[union-attr]
         good = self.good[piece] = drawable(chunk)  # (n,)
-        means = self.means[piece] = np.where(good[:, None], chunk.means, 0.0)  # (n, 3)
-        offset = means - self.origin
+        if not good.all():
+            chunk = replace(
+                chunk,
+                means=np.where(good[:, None], chunk.means, 0.0),
+                log_scales=np.where(good[:, None], chunk.log_scales, 0.0),
+                opacity_logits=np.where(good, chunk.opacity_logits, -np.inf),
+                sh_dc=np.where(good[:, None], chunk.sh_dc, 0.0),
+            )
+        self.means[piece] = chunk.means
+        offset = chunk.means - self.origin  # (n, 3)
         # Values that underflow to 0 are negligible in the sums.
         with np.errstate(under="ignore"):
             self.squared[piece] = np.einsum("ij,ij->i", offset, offset) + self.view_variance
-            alpha = self.alpha[piece] = opacity(np.where(good, chunk.opacity_logits, -np.inf))
-            red, green, blue = base_color(np.where(good[:, None], chunk.sh_dc, 0.0)).T
+            alpha = self.alpha[piece] = opacity(chunk.opacity_logits)
+            red, green, blue = base_color(chunk.sh_dc).T
             self.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
-            logs = np.where(good[:, None], chunk.log_scales, 0.0).astype(np.float64)
+            logs = chunk.log_scales.astype(np.float64)
             self.area[piece], ratio, longest = self._axes(logs)
             self.reach[piece] = REACH * longest
             alpha, luma = alpha[good], self.luma[piece][good].astype(np.float64)
@@ -325,9 +334,8 @@ class Block:
         """
         rows = order[piece]
         points = np.ones((4, len(rows)))  # x, y, z, 1
-        for axis in range(3):
-            points[axis] = self.means[:, axis][rows]
-            points[axis] -= self.origin[axis]
+        near = np.take(self.means, rows, axis=0)
+        np.subtract(near.T, self.origin[:, None], out=points[:3])
         reach = self.reach[rows]
         starts = np.arange(0, len(rows), _RUN)
         low, high = (each.reduceat(points[:3], starts, axis=1) for each in (np.minimum, np.maximum))
@@ -381,7 +389,8 @@ class Block:
 
     def _sum(self, piece: slice) -> list[float]:
         """Make H of what `_look` left, and return its sums; see `sum_views`."""
-        points = (self.means[piece] - self.origin).T  # (3, n)
+        points = np.empty((3, piece.stop - piece.start))
+        np.subtract(self.means[piece].T, self.origin[:, None], out=points)
         visibility, good = self.visibility[piece], self.good[piece]
         with np.errstate(under="ignore"):
             if not visibility.all():
@@ -398,7 +407,7 @@ class Block:
 
     def _cells(self, points: NDArray[np.float64]) -> NDArray[np.int32]:
         """Return which neighbourhood each of n points lies in, (n,)."""
-        place = self.axes @ points[:3]  # (3, n), scene sizes
+        place = self.axes @ points  # (3, n), scene sizes
         # All of space is mapped into a ball, so cells grow with the distance.
         place *= CELLS / 2 / (1.0 + np.sqrt(np.einsum("in,in->n", place, place)))
         x, y, z = np.minimum((place + CELLS / 2).astype(np.int32), CELLS - 1)
