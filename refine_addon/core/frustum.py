@@ -115,6 +115,7 @@ class Frustums:
         self.steepness = np.hypot(1.0, slope)
         planes = np.array([clip_planes(view, near) for view in views])
         self._near, self._far = planes[:, :1], planes[:, 1:]
+        self._ends = bool(np.isfinite(self._far).any())
         # One buffer a thread is reused, since allocating one costs as much as the product.
         self._own = threading.local()
 
@@ -194,10 +195,9 @@ class Frustums:
         np.abs(across, out=across)
         beyond = np.maximum(across[:count], across[count:], out=across[:count])
         beyond -= depth[:count]
-        near, far = self._near[views[:count]], self._far[views[:count]]
-        between = depth[:count] >= near
-        if np.isfinite(far).any():
-            between &= depth[:count] <= far
+        between = depth[:count] >= self._near[views[:count]]
+        if self._ends:
+            between &= depth[:count] <= self._far[views[:count]]
         return depth, beyond, between
 
     def _memory(self, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -42,7 +42,8 @@ def near_order(means: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
     cell = np.zeros(len(means), np.uint16)
     with np.errstate(under="ignore"):
         for values, least in zip(means.T, low, strict=True):
-            place = (values - least) * scale  # (N,) float64
+            place = np.subtract(values, least, dtype=np.float64)  # (N,)
+            place *= scale
             cell <<= _BITS
             cell |= np.clip(place, 0, (1 << _BITS) - 1, out=place).astype(np.uint16)
     return np.argsort(_places()[cell], kind="stable")
