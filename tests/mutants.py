@@ -90,6 +90,8 @@ MUTANTS = {
     ],
     "tiles/units.py": [
         ("room -= stop - start", "room = room", "units beyond their rows"),
+        ("begin + start, begin + stop", "start, stop", "rows of another place of the tile"),
+        ("[*kinds.values()] if len(kinds) > 1 else []", "[]", "types of a few rows"),
         ("tile.begin + part.start", "tile.begin + 0 * part.start", "always the first rows"),
         ("!= (tile.size, tile.changed)", "!= (tile.size, found.st_mtime_ns)", "time not compared"),
     ],

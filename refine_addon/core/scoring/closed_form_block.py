@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -137,6 +137,16 @@ STEPS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = 
 """Step -> arrays that it needs, that it makes, and that nobody needs after it."""
 
 
+class Source(Protocol):
+    """Splats, be they in memory or read when they are taken."""
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+
+    def take(self, piece: slice, /) -> Splats:
+        """Return some of them; of an empty slice too the types are those of all."""
+
+
 class Block:
     """What the formula needs of n splats, filled step by step, chunk by chunk.
 
@@ -144,7 +154,7 @@ class Block:
 
     Parameters
     ----------
-    splats : Splats or None
+    splats : Splats, Source or None
         Needed for `read` alone.
     views : ViewSet
     settings : ClosedForm
@@ -193,7 +203,7 @@ class Block:
 
     def __init__(
         self,
-        splats: Splats | None,
+        splats: Source | None,
         views: ViewSet,
         settings: ClosedForm,
         middle: tuple[NDArray[np.float64], float],
@@ -227,7 +237,8 @@ class Block:
         assert self.splats is not None  # noqa: S101 - whoever calls this gave them
         count = len(self.splats)
         self.good = np.empty(count, np.bool_)
-        self.means = np.empty((count, 3), self.splats.means.dtype.newbyteorder("="))
+        kind = self.splats.take(slice(0, 0)).means.dtype.newbyteorder("=")
+        self.means = np.empty((count, 3), kind)
         self.squared, self.alpha, self.area, self.reach = (np.empty(count) for _ in range(4))
         self.luma = np.empty(count, np.float32)
         found = for_chunks(
@@ -318,7 +329,7 @@ class Block:
         self.cells = np.zeros(count, np.int32)
         look, sums = part(self.progress, 0.0, 0.9), part(self.progress, 0.9, 1.0)
         for_chunks(
-            partial(self._look, near_order(self.means)), count, 4 * _CHUNK,
+            partial(self._look, near_order(self.means)), count, 8 * _CHUNK,
             progress=look, what="scoring", threads=self.threads,
         )  # fmt: skip
         return np.array(
@@ -493,8 +504,10 @@ class Block:
         if not self.settings.local:
             return None
         sums = np.bincount(self.cells, self.plain).astype(np.float64, copy=False)
-        counts = np.bincount(self.cells, self.good).astype(np.int64)
-        there = np.flatnonzero(np.bincount(self.cells)).astype(np.int32)
+        counts = np.bincount(self.cells)
+        there = np.flatnonzero(counts).astype(np.int32)
+        if not self.good.all():
+            counts = np.bincount(self.cells, self.good).astype(np.int64)
         return Crowds(there, sums[there], counts[there])
 
     def _add(self, factors: NDArray[np.float64], piece: slice) -> None:

@@ -21,7 +21,7 @@ from ..scoring.closed_form_block import STEPS, Block
 from ..selection import lowest
 from ..whole_file import whole_file
 from ..work import Progress, silent
-from .units import reopened, rows_of, splats_of
+from .units import Unread, reopened, rows_of
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -114,7 +114,7 @@ class Job:
             if done:
                 return result
             raise
-        splats = splats_of(unit) if step == "read" else None
+        splats = Unread(unit) if step == "read" else None
         block = Block(
             splats, self.views, self.settings, self.middle, threads=threads, arrays=arrays
         )
