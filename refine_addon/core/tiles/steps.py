@@ -24,7 +24,7 @@ from ..survivors import columns_with
 from ..whole_file import whole_file
 from ..work import Progress, silent
 from .absorbing import unpacked
-from .units import reopened, rows_of
+from .units import Unread, reopened, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -125,7 +125,7 @@ class Job:
             if done:
                 return result
             raise
-        splats = unit.splats() if step == "read" else None
+        splats = Unread(unit) if step == "read" else None
         block = Block(
             splats, self.views, self.settings, self.middle, threads=threads, arrays=arrays
         )
