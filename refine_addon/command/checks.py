@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from ..core import RefineError
 from ..core.formats.registry import format_named, without_suffix
 from ..core.levels.files import MANIFEST, check_goal, is_manifest, level_paths
+from ..core.urls import Url, refuse_url
 from . import options, zones
 from .report import is_report
 from .zones import ROLES
@@ -29,6 +30,8 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     RefineError
         If a file that would be replaced cannot be looked into.
     """
+    if given.command == "prune" and not given.together:
+        _refuse_urls(parser, given)
     _check_report(parser, given)
     for path in _outputs(given):
         _check_output(parser, path)
@@ -49,6 +52,15 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
         _check_score(parser, given)
     if given.cameras is None and not (given.scene and open_blend()):
         parser.error("no cameras: give --cameras, or open a .blend that has some")
+
+
+def _refuse_urls(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+    """Refuse URLs where each input is pruned by itself."""
+    try:
+        for path in filter(None, [*given.inputs, given.output_dir]):
+            refuse_url(path)
+    except RefineError as error:
+        parser.error(str(error))
 
 
 def _check_settings(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
@@ -79,7 +91,7 @@ def open_blend() -> str:
     return str(bpy.data.filepath)
 
 
-def _outputs(given: argparse.Namespace) -> list[Path]:
+def _outputs(given: argparse.Namespace) -> Sequence[Path | Url]:
     """Return the splat files to be made."""
     if given.command == "lod":
         count = len(given.psnr or given.levels or options.DEFAULT_LEVELS)
@@ -108,13 +120,15 @@ def _check_report(parser: argparse.ArgumentParser, given: argparse.Namespace) ->
         parser.error(f"{given.report} exists and is no report: write to another name")
 
 
-def _check_output(parser: argparse.ArgumentParser, path: Path) -> None:
+def _check_output(parser: argparse.ArgumentParser, path: Path | Url) -> None:
     """Refuse an output that would replace something other than splats, cameras above all."""
     try:
         if format_named(path) or path.suffix.lower() == ".ply":
             return
     except RefineError as error:
         parser.error(str(error))
+    if isinstance(path, Url):
+        parser.error(f"{path}: expected a name that ends in .ply")
     beginning = _beginning(path)
     if beginning is not None and not beginning.startswith(b"ply"):
         parser.error(f"{path} exists and is no PLY: write to another name")

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..core import METHODS, REASONS, Budget, Cleaning, ClosedForm, Levels, RefineError, Settings
 from ..core.errors import printable
 from ..core.formats.registry import SUFFIXES
 from ..core.levels.files import GOAL
+from ..core.urls import Url, is_url, refuse_url
 from ..core.whole_file import expanded
 from ..version import VERSION
 from . import zones
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 DEFAULT_RATIO = 0.5
 
@@ -105,12 +109,12 @@ def _add(commands: Any, name: str, purpose: str) -> argparse.ArgumentParser:  # 
 
 def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     prune = _add(commands, "prune", "remove the splats the cameras would miss least")
-    prune.add_argument("inputs", nargs="*", type=_given, metavar="INPUT", help=f"files: {FORMATS}")
+    prune.add_argument("inputs", nargs="*", type=_tile, metavar="INPUT", help=f"files: {FORMATS}")
     _add_object(prune)
     prune.add_argument(
         "--save", action="store_true", help="with --object: delete the splats there and save"
     )
-    _add_outputs(prune)
+    _add_outputs(prune, folder=_folder)
     amount = prune.add_mutually_exclusive_group()
     amount.add_argument(
         "--ratio",
@@ -158,7 +162,8 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "--together",
         action="store_true",
         help="the inputs are tiles of one scene: one budget over all of them, and never all of "
-        "them in memory; for plain PLY; all are written or none",
+        "them in memory; for plain PLY; all are written or none; INPUT and DIR may be URLs such as "
+        "s3://bucket/a.ply (needs the extra distributed)",
     )
     prune.add_argument(
         "--workers",
@@ -293,7 +298,9 @@ def _add_object(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _add_outputs(parser: argparse.ArgumentParser, more: str = "") -> None:
+def _add_outputs(
+    parser: argparse.ArgumentParser, more: str = "", folder: Callable[[str], Any] | None = None
+) -> None:
     parser.add_argument(
         "-o",
         "--output",
@@ -302,7 +309,10 @@ def _add_outputs(parser: argparse.ArgumentParser, more: str = "") -> None:
         help=f"for a single input; written in the format of its suffix{more}",
     )
     parser.add_argument(
-        "--output-dir", type=_path, metavar="DIR", help="for many inputs; made if it is not there"
+        "--output-dir",
+        type=folder or _path,
+        metavar="DIR",
+        help="for many inputs; made if it is not there",
     )
 
 
@@ -422,7 +432,21 @@ def _given(text: str) -> Path:
     if "\0" in text:
         msg = "a path holds no zero byte"
         raise argparse.ArgumentTypeError(msg)
+    try:
+        refuse_url(text)
+    except RefineError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
     return Path(_name(text))
+
+
+def _tile(text: str) -> Path | Url:
+    """Return a URL, or what `_given` does."""
+    return Url(text) if is_url(text) else _given(text)
+
+
+def _folder(text: str) -> Path | Url:
+    """Return a URL, or what `_path` does."""
+    return Url(text) if is_url(text) else _path(text)
 
 
 def _path(text: str) -> Path:

@@ -27,6 +27,8 @@ from ..core.pace import Pace
 from ..core.picture_files import PictureFiles
 from ..core.quality import UNSEEN, in_words
 from ..core.report import held, kept_and_removed, scoring_notes, seen_by, what_was_seen
+from ..core.tiles.storage import located
+from ..core.urls import Url
 from ..core.whole_file import make_folder, refuse_existing, refuse_mapped
 from . import report, zones
 from .cameras import deciding
@@ -221,7 +223,7 @@ def _prune_together(run: _Run, label: str, views: ViewSet) -> dict[str, Any]:
     for tile in done["tiles"]:
         share = (tile["before"] - tile["kept"]) / max(tile["before"], 1)
         run.terminal.say(
-            f"  {Path(tile['input']).name}: {tile['kept']:,} of {tile['before']:,} splats "
+            f"  {located(tile['input']).name}: {tile['kept']:,} of {tile['before']:,} splats "
             f"({share:.1%} removed), {sizes(tile['input_bytes'], tile['output_bytes'])}"
         )
     return done
@@ -480,8 +482,10 @@ def _info_one(run: _Run, source: Path) -> dict[str, Any]:
     return {"input": str(source), **facts}
 
 
-def _size(path: Path) -> int:
-    """Return the bytes of a file, 0 where reading it will fail anyway."""
+def _size(path: Path | Url) -> int:
+    """Return the bytes of a file, 0 where reading it will fail anyway, or a URL is not asked."""
+    if isinstance(path, Url):
+        return 0
     try:
         return path.stat().st_size
     except (OSError, ValueError):

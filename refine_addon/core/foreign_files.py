@@ -12,6 +12,8 @@ from .errors import RefineError
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from .urls import Url
+
 _POINTER = b"version https://git-lfs.github.com/spec/"
 GZIP = b"\x1f\x8b"
 """The first bytes of a gzip file."""
@@ -24,12 +26,12 @@ _UNSIGNED = {".splat": _READ, ".ksplat": _CONVERT}
 """Formats that only the file's name tells, since the files have no signature, and what to do."""
 
 
-def refuse_pointer(path: Path, head: bytes) -> None:
+def refuse_pointer(path: Path | Url, head: bytes) -> None:
     """Refuse a Git LFS pointer, which Git leaves in place of a large file.
 
     Parameters
     ----------
-    path : Path
+    path : Path or Url
         For the message.
     head : bytes
         The first bytes of the file.
@@ -44,7 +46,7 @@ def refuse_pointer(path: Path, head: bytes) -> None:
         raise RefineError(msg)
 
 
-def refuse_foreign_splats(path: Path, head: bytes) -> None:
+def refuse_foreign_splats(path: Path | Url, head: bytes) -> None:
     """Refuse splats in another format than PLY, and archives, by the name of their format.
 
     Parameters
@@ -64,7 +66,7 @@ def refuse_foreign_splats(path: Path, head: bytes) -> None:
         raise RefineError(msg)
 
 
-def foreign_kind(path: Path, head: bytes) -> str:
+def foreign_kind(path: Path | Url, head: bytes) -> str:
     """Return what a file in another format is and what to do with it; "" if it is not known.
 
     Parameters
@@ -87,7 +89,7 @@ def foreign_kind(path: Path, head: bytes) -> str:
     return ""
 
 
-def _lists_sog(path: Path) -> bool:
+def _lists_sog(path: Path | Url) -> bool:
     """Return whether a ZIP archive lists what SOG is made of: meta.json and images."""
     try:
         with zipfile.ZipFile(path) as archive:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 from .errors import RefineError
+from .urls import refuse_url
 from .work import checkpoint
 
 try:
@@ -34,8 +35,9 @@ def expanded(path: Path | str) -> Path:
     Raises
     ------
     RefineError
-        If there is no such user.
+        If there is no such user, or it is a URL.
     """
+    refuse_url(path)
     try:
         return Path(path).expanduser()
     except RuntimeError as error:

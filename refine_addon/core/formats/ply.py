@@ -9,7 +9,7 @@ from __future__ import annotations
 import mmap
 import stat
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 import plyfile
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..splats import Splats
+    from ..urls import Url
 
 __all__ = [
     "REQUIRED",
@@ -245,9 +246,7 @@ def read_ply(path: Path | str) -> SplatFile:
             msg = f"{path}: is a {'folder' if path.is_dir() else 'device'}, expected a PLY file"
             raise RefineError(msg)
         with path.open("rb") as stream:
-            header = read_header(path, stream)
-            vertex = _vertex_index(header)
-            _check_properties(header, vertex)
+            header, vertex = splat_header(path, stream)
             whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
         msg = f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
@@ -263,6 +262,20 @@ def read_ply(path: Path | str) -> SplatFile:
     start, end = vertex_range(header, vertex, body)
     rows = body[start:end].view(header.elements[vertex].dtype(header.order))
     return SplatFile(path, rows, header.raw, body[:start], body[end:], indexing=indexing)
+
+
+def splat_header(path: Path | Url, stream: BinaryIO) -> tuple[Header, int]:
+    """Read the header of an open file of splats, and say which element they are.
+
+    Raises
+    ------
+    RefineError
+        See `read_ply`.
+    """
+    header = read_header(path, stream)
+    vertex = _vertex_index(header)
+    _check_properties(header, vertex)
+    return header, vertex
 
 
 def _vertex_index(header: Header) -> int:

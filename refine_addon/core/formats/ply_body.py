@@ -59,6 +59,11 @@ def _least_bytes(element: Any, *, text: bool) -> int:  # noqa: ANN401 - plyfile 
     )
 
 
+def has_lists(element: Any) -> bool:  # noqa: ANN401 - plyfile has no types
+    """Return whether the rows of an element have lists, and so lengths of their own."""
+    return any(isinstance(prop, plyfile.PlyListProperty) for prop in element.properties)
+
+
 def vertex_range(header: Header, vertex: int, body: NDArray[np.uint8]) -> tuple[int, int]:
     """Return where in a binary body the vertex rows begin and end.
 
@@ -77,7 +82,7 @@ def vertex_range(header: Header, vertex: int, body: NDArray[np.uint8]) -> tuple[
     """
     start = 0
     for element, count in zip(header.elements[:vertex], header.counts[:vertex], strict=True):
-        if any(isinstance(prop, plyfile.PlyListProperty) for prop in element.properties):
+        if has_lists(element):
             start = _behind_lists(header, element, count, body, start)
         else:
             start += count * element.dtype(header.order).itemsize

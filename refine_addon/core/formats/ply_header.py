@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
+    from ..urls import Url
+
 HEADER_LIMIT = 1 << 20
 """Longest header that is read, bytes."""
 
@@ -41,7 +43,7 @@ class Header:
 
     Attributes
     ----------
-    path : Path
+    path : Path or Url
         The file, for messages.
     raw : bytes
         The bytes of the header, with ``end_header`` and its line end.
@@ -53,14 +55,14 @@ class Header:
         Byte order of the body; `TEXT` for ASCII files.
     """
 
-    path: Path
+    path: Path | Url
     raw: bytes
     elements: tuple[Any, ...]
     counts: tuple[int, ...]
     order: str
 
 
-def read_header(path: Path, stream: BinaryIO) -> Header:
+def read_header(path: Path | Url, stream: BinaryIO) -> Header:
     """Read the header of an open file.
 
     Raises
@@ -161,7 +163,7 @@ def _vertex_line(lines: Sequence[bytes]) -> int:
     )
 
 
-def _plain(path: Path, raw: bytes) -> tuple[bytes, list[int]]:
+def _plain(path: Path | Url, raw: bytes) -> tuple[bytes, list[int]]:
     """Return the header as plyfile gets it, see the top of this file, and the counts of rows."""
     lines: list[bytes] = []
     counts: list[int] = []
@@ -186,7 +188,7 @@ def _plain(path: Path, raw: bytes) -> tuple[bytes, list[int]]:
     return b"\n".join([*lines[:-1], b""]), counts
 
 
-def _count(path: Path, number: int, word: bytes) -> int:
+def _count(path: Path | Url, number: int, word: bytes) -> int:
     """Return the number of rows in a word of header line `number`."""
     if not re.fullmatch(rb"[0-9]{1,30}", word):
         msg = f"{path}: header line {number}: expected a number of rows, got {shown(word)}"
@@ -194,7 +196,7 @@ def _count(path: Path, number: int, word: bytes) -> int:
     return int(word)
 
 
-def _refuse_double(path: Path, number: int, name: bytes, known: set[bytes]) -> None:
+def _refuse_double(path: Path | Url, number: int, name: bytes, known: set[bytes]) -> None:
     """Refuse a name that is in `known`; add it otherwise."""
     if name in known:
         msg = f"{path}: header line {number}: {shown(name)} is declared twice, expected once"

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..splats import Splats
+    from ..urls import Url
     from .format import Format, Sizes
 
 FORMATS: tuple[Format, ...] = (
@@ -94,7 +95,7 @@ def _beginning(path: Path) -> bytes:
         return b""
 
 
-def format_named(path: Path) -> Format | None:
+def format_named(path: Path | Url) -> Format | None:
     """Return the format that an output of this name is written in; None for a plain PLY.
 
     Raises

@@ -159,7 +159,7 @@ class Cluster:
                     done += call.share
                     yield result
         except (KilledWorker, CancelledError, CommClosedError) as error:
-            msg = f"workers were lost ({error}); the same command goes on where this one was"
+            msg = f"workers were lost ({error})"
             raise Interrupted(msg) from error
         finally:
             self._client.cancel([*waiting])

@@ -22,13 +22,14 @@ from ..report import Clock, Files, complete_report, make_report
 from ..scoring.closed_form_block import ROWS
 from ..selection import Budget, least_seen, quality_of, refuse_none_left, select, single
 from ..task import DEFAULTS, Settings
-from ..whole_file import expanded, make_folder, publish, refuse_existing
+from ..urls import Url
 from ..work import Progress, part, silent
 from . import absorbing
 from .folder import Folder
 from .scoring import by_closed_form, by_occlusion, to_absorb
 from .steps import SURVIVORS, Job, Rule
-from .units import reopened, tile_at, units_of
+from .storage import discard, identity, located, make_folder, publish, refuse_existing
+from .units import header_of, tile_at, units_of
 from .workers import Call, Here, Interrupted
 
 if TYPE_CHECKING:
@@ -71,9 +72,11 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     Parameters
     ----------
     sources : sequence of path-like
-        Plain binary PLY files in one frame and unit.
+        Plain binary PLY files in one frame and unit, or URLs of such, which fsspec opens.
     folder : path-like or None
-        Where each goes under its own name; made if it is not there. None writes nothing.
+        Where each goes under its own name; made if it is not there. None writes nothing. If it is a
+        URL, the folder of the job is in the current directory, files are copied to the URL under
+        other names, and renamed at the end.
     views, budget, settings, progress, threads
         See `pipeline.prune`. Here "auto" measures by all views.
     absorb : bool
@@ -98,7 +101,7 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     clock = Clock()
     _refuse_what_needs_all(budget, settings, absorb=absorb)
     tiles = [tile_at(path) for path in sources]
-    output = None if folder is None else expanded(folder)
+    output = None if folder is None else located(folder)
     targets = [] if output is None else _targets(tiles, output, overwrite=overwrite)
     used = views.spread(settings.views)
     with contextlib.ExitStack() as held:
@@ -106,26 +109,38 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
             place = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="refine-")))
         else:
             digest = _digest(tiles, used, budget, settings, absorb=absorb)
-            place = output.absolute() / f".refine-{digest}"
+            near = Path.cwd() if isinstance(output, Url) else output.absolute()
+            place = near / f".refine-{digest}"
+        urls: list[Url] = []
+        if isinstance(output, Url):
+            urls = [output / f"{place.name}-{number:06d}" for number in range(len(tiles))]
         job = Job(Folder(place), used, settings.closed_form, used.middle())
         held.enter_context(job.folder.opened())
         try:
             run = _Run(job, tiles, workers or Here(threads), progress)
             facts = run.prune(budget, settings, views, clock, absorb=absorb)
-            sizes = run.write() if targets else run.sizes()
-            for target in targets:
-                publish(job.folder.tiles / target.name, target, overwrite=overwrite)
-        except Interrupted:
-            raise
+            sizes = run.write(urls) if targets else run.sizes()
+            made: Sequence[Path | Url] = urls or [
+                job.folder.tiles / target.name for target in targets
+            ]
+            for waiting, target in zip(made, targets, strict=True):
+                publish(waiting, target, overwrite=overwrite)
+        except Interrupted as error:
+            if output is None:
+                raise
+            msg = f"{error}; the same command goes on where this one was"
+            raise Interrupted(msg) from error
         except Exception:
             job.folder.remove()
+            for url in urls:
+                discard(url)
             raise
         job.folder.remove()
     clock.lap("write_s")
     facts["splats"]["written"] = facts["splats"]["kept"] if targets else None
     before = sum(tile.size for tile in tiles)
     complete_report(facts, clock, Files(f"{len(tiles)} tiles", _shown(output), before, sum(sizes)))
-    names: list[Path | None] = [*targets] or [None] * len(tiles)
+    names: list[Path | Url | None] = [*targets] or [None] * len(tiles)
     facts["tiles"] = [
         {
             "input": tile.path,
@@ -263,8 +278,15 @@ class _Run:
             for (tile, _, _), pair in zip(unit.parts, each, strict=True):
                 self.counts[places[tile]] += pair
 
-    def write(self) -> list[int]:
-        """Write each tile into the folder of the job; return their bytes."""
+    def write(self, urls: Sequence[Url]) -> list[int]:
+        """Write each tile into the folder of the job, and to its URL if there are some.
+
+        Returns
+        -------
+        list of int
+            Their bytes.
+        """
+        places: Sequence[Url | None] = urls or [None] * len(self.tiles)
         calls = [
             Call(
                 "write",
@@ -274,9 +296,9 @@ class _Run:
                     kept,
                 ),
                 tile.splats / self.total,
-                options={"absorbed": self._absorbed},
+                options={"absorbed": self._absorbed, "url": url},
             )
-            for tile, (kept, _) in zip(self.tiles, self.counts.tolist(), strict=True)
+            for tile, (kept, _), url in zip(self.tiles, self.counts.tolist(), places, strict=True)
         ]
         return [*self._workers(self.job, calls, part(self._progress, SCORED, 1.0), "writing")]
 
@@ -284,7 +306,7 @@ class _Run:
         """Return the bytes that `write` would write of each tile."""
         found = []
         for tile, (kept, _) in zip(self.tiles, self.counts.tolist(), strict=True):
-            header = reopened(tile).header
+            header = header_of(tile)
             shorter = len(header) - len(with_count(header, kept))
             found.append(tile.fixed_bytes - shorter + kept * tile.row_bytes)
         return found
@@ -350,7 +372,7 @@ def _refuse_what_needs_all(budget: Budget, settings: Settings, *, absorb: bool) 
     budget.refuse_meaningless(settings.method, frustum=settings.frustum)
 
 
-def _targets(tiles: Sequence[Tile], folder: Path, *, overwrite: bool) -> list[Path]:
+def _targets(tiles: Sequence[Tile], folder: Path | Url, *, overwrite: bool) -> Sequence[Path | Url]:
     """Return where each tile goes, and make the folder.
 
     Raises
@@ -359,13 +381,13 @@ def _targets(tiles: Sequence[Tile], folder: Path, *, overwrite: bool) -> list[Pa
         If two tiles have one name, or a file could not be made, or may not be replaced.
     """
     make_folder(folder)
-    targets = [folder / Path(tile.path).name for tile in tiles]
-    read = {Path(tile.path).resolve() for tile in tiles}
+    targets = [folder / tile.name for tile in tiles]
+    read = {identity(tile.place) for tile in tiles}
     for place, target in enumerate(targets):
         if target in targets[:place]:
             msg = f"{tiles[place].path}: another tile is called {target.name} too"
             raise RefineError(msg)
-        if target.resolve() in read:
+        if identity(target) in read:
             msg = f"{target}: is read until all tiles are written; write to another folder"
             raise RefineError(msg)
         refuse_existing(target, overwrite=overwrite)
@@ -386,5 +408,5 @@ def _digest(
     return told.hexdigest()
 
 
-def _shown(path: Path | None) -> str | None:
+def _shown(path: Path | Url | None) -> str | None:
     return None if path is None else str(path)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,15 +22,18 @@ from ..selection import lowest
 from ..survivors import columns_with
 from ..whole_file import whole_file
 from ..work import Progress, silent
+from . import storage
 from .absorbing import unpacked
-from .units import Unread, reopened, rows_of
+from .units import Unread, bytes_of, header_of, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
     from ..scoring.closed_form import ClosedForm
+    from ..urls import Url
     from ..views import ViewSet
     from .absorbing import Region
     from .folder import Folder
@@ -125,7 +127,10 @@ class Job:
             if done:
                 return result
             raise
-        splats = Unread(unit) if step == "read" else None
+        splats = None
+        if step == "read":
+            # A request takes about as long as sending a unit, and a chunk is a part of that.
+            splats = unit.splats() if unit.remote else Unread(unit)
         block = Block(
             splats, self.views, self.settings, self.middle, threads=threads, arrays=arrays
         )
@@ -212,7 +217,9 @@ class Job:
             ]
         )
 
-    def write(self, tile: Tile, units: list[Unit], kept: int, *, absorbed: bool) -> int:
+    def write(
+        self, tile: Tile, units: list[Unit], kept: int, *, absorbed: bool, url: Url | None = None
+    ) -> int:
         """Write what stays of a tile into the folder of the job, and return its bytes.
 
         Parameters
@@ -224,16 +231,27 @@ class Job:
             How many of its splats stay.
         absorbed : bool
             Whether some of them changed.
+        url : Url, optional
+            Where to copy the file.
         """
-        name = f"{Path(tile.path).name}.written"
-        made = self.folder.tiles / Path(tile.path).name
+        made = self.folder.tiles / tile.name
+        size = self._written(tile, units, kept, made, absorbed=absorbed)
+        if url is not None:
+            storage.upload(made, url)
+        return size
+
+    def _written(
+        self, tile: Tile, units: list[Unit], kept: int, made: Path, *, absorbed: bool
+    ) -> int:
+        """Write a file, see `write`."""
+        name = f"{tile.name}.written"
         done, result = self.folder.noted(name)
         if done and made.exists():  # it may have been renamed, just before a kill
             return int(result)
-        file = reopened(tile)
         with whole_file(made, overwrite=True) as stream:
-            stream.write(with_count(file.header, kept))
-            stream.write(file.before.data)
+            stream.write(with_count(header_of(tile), kept))
+            for beside in bytes_of(tile, tile.header, tile.begin):
+                stream.write(beside.data)
             for unit in units:
                 keep = self.folder.load(unit.index, ["keep"])["keep"]
                 for part, piece in zip(unit.parts, unit.slices(), strict=True):
@@ -241,7 +259,8 @@ class Job:
                         rows = rows_of(part)
                         changed = self._changed(unit, rows, piece) if absorbed else {}
                         write_rows(stream, rows, keep[piece], changed)
-            stream.write(file.after.data)
+            for beside in bytes_of(tile, tile.end, tile.size):
+                stream.write(beside.data)
             size = stream.tell()
         self.folder.note(name, np.array(size))
         return size
@@ -270,7 +289,7 @@ def unseen_files(job: Job, tiles: list[Tile]) -> str:
         return f"{job.folder.path} is not there"
     for tile in tiles:
         with contextlib.suppress(RefineError, OSError):
-            reopened(tile)
+            header_of(tile)
             continue
         return f"{tile.path} is not there, or another file"
     return ""

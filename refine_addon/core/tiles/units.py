@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..errors import RefineError
+from ..formats.ply import splat_header
+from ..formats.ply_body import check_counts, has_lists, vertex_range
 from ..formats.ply_columns import splats_from_columns
+from ..formats.ply_header import HEADER_LIMIT, TEXT, format_of
 from ..formats.registry import read_splats
 from ..scoring.closed_form_block import ROWS
 from ..splats import joined
-from ..whole_file import expanded
+from ..urls import Url
+from . import storage
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
     from typing import Any
 
     from numpy.typing import NDArray
 
-    from ..formats.ply import SplatFile
     from ..splats import Splats
+
+_HEADER = 1 << 16
+"""Bytes that are fetched of a tile behind a URL for its header, which hardly ever has more."""
+
+_PIECE = 1 << 24
+"""Bytes beside the rows that are copied at a time."""
 
 
 class Tile(NamedTuple):
@@ -32,26 +42,48 @@ class Tile(NamedTuple):
     Attributes
     ----------
     path : str
-        Absolute.
+        Absolute, or a URL.
     splats : int
         How many it holds.
     dtype : structured
         Of a row.
+    header : int
+        Bytes of the header.
     begin : int
         Bytes before the first row.
-    fixed_bytes : int
-        Bytes of everything but the rows.
-    size, changed : int
-        Bytes of the file, and when it was changed last, ns.
+    size : int
+        Bytes of the file.
+    changed : int or str
+        See `storage.state`.
     """
 
     path: str
     splats: int
     dtype: np.dtype[Any]
+    header: int
     begin: int
-    fixed_bytes: int
     size: int
-    changed: int
+    changed: int | str
+
+    @property
+    def place(self) -> Path | Url:
+        """Where it is."""
+        return storage.located(self.path)
+
+    @property
+    def name(self) -> str:
+        """The name of the file."""
+        return self.place.name
+
+    @property
+    def end(self) -> int:
+        """Bytes up to the end of the last row."""
+        return self.begin + self.splats * self.row_bytes
+
+    @property
+    def fixed_bytes(self) -> int:
+        """Bytes of everything but the rows."""
+        return self.size - self.end + self.begin
 
     @property
     def row_bytes(self) -> int:
@@ -97,6 +129,11 @@ class Unit:
         """Return the number of rows."""
         return sum(part.rows for part in self.parts)
 
+    @property
+    def remote(self) -> bool:
+        """Whether any of it is behind a URL."""
+        return any(isinstance(part.tile.place, Url) for part in self.parts)
+
     def splats(self) -> Splats:
         """Return its splats.
 
@@ -116,36 +153,59 @@ class Unit:
 def tile_at(path: Path | str) -> Tile:
     """Look at a file of splats.
 
+    Parameters
+    ----------
+    path : path-like
+        Or a URL, of which only the header is fetched.
+
     Raises
     ------
     RefineError
-        See `read_splats`; also if it is no plain binary PLY.
+        See `read_splats` and `storage.state`; also if it is no plain binary PLY.
     """
-    path = expanded(path)
-    file = read_splats(path)
+    place = storage.located(path)
+    if isinstance(place, Url):
+        return _tile_behind(place)
+    file = read_splats(place)
     if file.origin is not None or file.lines is not None:
-        msg = (
-            f"{path}: is {file.format}, expected a plain binary PLY as a tile, which 'refine "
-            "convert IN OUT.ply' makes of other formats"
-        )
-        raise RefineError(msg)
-    found = path.stat()
+        raise _no_tile(place, file.format)
+    size, changed = storage.state(place)
+    header = len(file.header)
     return Tile(
-        str(path.absolute()), len(file), file.rows.dtype, len(file.header) + len(file.before),
-        file.fixed_bytes, found.st_size, found.st_mtime_ns,
+        str(place.absolute()), len(file), file.rows.dtype, header, header + len(file.before),
+        size, changed,
     )  # fmt: skip
 
 
-def reopened(tile: Tile) -> SplatFile:
-    """Open a tile again.
+def _tile_behind(url: Url) -> Tile:
+    """Look at a file of splats behind a URL."""
+    size, changed = storage.state(url)
+    if url.name in ("", ".", ".."):
+        msg = f"{url}: names no file"
+        raise RefineError(msg)
+    head = storage.beginning(url, _HEADER, size)
+    if b"end_header" not in head:
+        head = storage.beginning(url, HEADER_LIMIT, size)
+    header, vertex = splat_header(url, io.BytesIO(head))
+    if header.order == TEXT:
+        raise _no_tile(url, format_of(header.raw))
+    before = zip(header.elements[:vertex], header.counts, strict=False)
+    if any(count and has_lists(element) for element, count in before):
+        msg = f"{url}: has lists before the splats, expected none in a tile behind a URL"
+        raise RefineError(msg)
+    body = np.broadcast_to(np.uint8(0), size - len(header.raw))  # only its length matters
+    check_counts(header, len(body))
+    start, _ = vertex_range(header, vertex, body)
+    begin = len(header.raw) + start
+    dtype = header.elements[vertex].dtype(header.order)
+    return Tile(str(url), header.counts[vertex], dtype, len(header.raw), begin, size, changed)
 
-    Raises
-    ------
-    RefineError
-        If it cannot be read, or is another file than it was.
-    """
-    _refuse_changed(tile)
-    return read_splats(tile.path)
+
+def _no_tile(path: Path | Url, form: str) -> RefineError:
+    return RefineError(
+        f"{path}: is {form}, expected a plain binary PLY as a tile, which 'refine convert IN "
+        "OUT.ply' makes of other formats"
+    )
 
 
 def rows_of(part: Part) -> NDArray[Any]:
@@ -156,27 +216,36 @@ def rows_of(part: Part) -> NDArray[Any]:
     Raises
     ------
     RefineError
-        See `reopened`.
+        If the tile cannot be read, or is another file than it was.
     """
     tile = part.tile
-    _refuse_changed(tile)
-    rows = np.fromfile(
-        tile.path, tile.dtype, part.rows, offset=tile.begin + part.start * tile.row_bytes
-    )
-    _refuse_changed(tile)
-    return rows
+    return _read(tile, tile.dtype, part.rows, tile.begin + part.start * tile.row_bytes)
 
 
-def _refuse_changed(tile: Tile) -> None:
-    """Raise `RefineError` if a tile is another file than it was when the job began."""
-    try:
-        found = Path(tile.path).stat()
-    except OSError as error:
-        msg = f"{tile.path}: cannot be read ({error.strerror or error})"
-        raise RefineError(msg) from error
-    if (found.st_size, found.st_mtime_ns) != (tile.size, tile.changed):
+def header_of(tile: Tile) -> bytes:
+    """Read the header of a tile; see `rows_of` for errors."""
+    return _read(tile, np.dtype(np.uint8), tile.header, 0).tobytes()
+
+
+def bytes_of(tile: Tile, start: int, stop: int) -> Iterator[NDArray[np.uint8]]:
+    """Read bytes of a tile, some at a time; see `rows_of` for errors."""
+    for begin in range(start, stop, _PIECE):
+        yield _read(tile, np.dtype(np.uint8), min(_PIECE, stop - begin), begin)
+
+
+def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[Any]:
+    """Read an array from a tile; see `storage.array`."""
+    found = storage.array(tile.place, dtype, count, begin)
+    if storage.state(tile.place) != (tile.size, tile.changed):
         msg = f"{tile.path}: was changed while it was worked on; nothing was written"
         raise RefineError(msg)
+    if len(found) != count:
+        msg = (
+            f"{tile.path}: {found.nbytes} bytes were sent, expected the {count * dtype.itemsize} "
+            f"from {begin} on"
+        )
+        raise RefineError(msg)
+    return found
 
 
 def units_of(tiles: Sequence[Tile]) -> list[Unit]:

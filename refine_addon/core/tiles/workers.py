@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Interrupted(RefineError):  # noqa: N818 - the job is not at fault
-    """Raised where workers were lost: what is done stays for the next run."""
+    """Raised where workers or a storage were lost: what is done stays for the next run."""
 
 
 class Workers(Protocol):

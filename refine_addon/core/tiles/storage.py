@@ -1,0 +1,220 @@
+"""Where tiles lie: on disks that this machine sees, or behind URLs, which fsspec opens."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .. import whole_file
+from ..errors import RefineError
+from ..urls import Url, is_url
+from ..whole_file import expanded
+from .workers import Interrupted
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+_FLEETING = ("url", "access")
+"""Parts of the names of facts about a file that change though it does not: where a server sends
+whoever asks for it, and when it was read."""
+
+_NO_SUCH = "there is no such file"
+
+
+def located(path: Path | str) -> Path | Url:
+    """Return a URL, or a path with ``~`` replaced; raise `RefineError` if there is no such user."""
+    return Url(path) if is_url(path) else expanded(path)
+
+
+def identity(path: Path | Url) -> str:
+    """Return a name of a file that is the same however the file is named."""
+    if isinstance(path, Url):
+        with _explained(path, "cannot be looked for"):
+            system, inner = _opened(path)
+            name: str = system.unstrip_protocol(inner)
+        if not name.startswith("file://"):
+            return name
+        path = Path(name.removeprefix("file://"))
+    return f"file://{path.resolve()}"
+
+
+def state(path: Path | Url) -> tuple[int, int | str]:
+    """Return the bytes of a file and what changes with its content: a time in ns, or facts.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be read.
+    """
+    with _explained(path, "cannot be read"):
+        if not isinstance(path, Url):
+            found = path.stat()
+            return found.st_size, found.st_mtime_ns
+        system, inner = _opened(path)
+        system.invalidate_cache()
+        facts = system.info(inner)
+        if facts.get("type") == "directory":
+            msg = f"{path}: is a folder, expected a PLY file"
+            raise RefineError(msg)
+        if facts.get("size") is None:
+            msg = f"{path}: the server does not say how long it is, which a tile needs"
+            raise RefineError(msg)
+        told = {
+            name: str(fact)
+            for name, fact in facts.items()
+            if not any(word in name.lower() for word in _FLEETING)
+        }
+        return int(facts["size"]), repr(sorted(told.items()))
+
+
+def beginning(url: Url, size: int, whole: int) -> bytes:
+    """Return the first `size` bytes of a file of `whole` bytes, or all.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be read, or only from its beginning: `array` would be sent all of it.
+    """
+    with _explained(url, "cannot be read"):
+        system, inner = _opened(url)
+        with system.open(inner, "rb", cache_type="none") as stream:
+            found: bytes = stream.read(size)
+            stream.seek(max(whole - 1, 0))
+            stream.read(1)
+            return found
+
+
+def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[Any]:
+    """Read an array, and nothing else of the file; it is shorter where the file ends.
+
+    Parameters
+    ----------
+    path : Path or Url
+    dtype : dtype
+    count : int
+        How many elements.
+    begin : int
+        Bytes before the first.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be read.
+    """
+    with _explained(path, "cannot be read"):
+        if not isinstance(path, Url):
+            return np.fromfile(path, dtype, count, offset=begin)
+        if not count:
+            return np.empty(0, dtype)
+        system, inner = _opened(path)
+        found = system.cat_file(inner, begin, begin + count * dtype.itemsize)
+        return np.frombuffer(found, dtype, len(found) // dtype.itemsize)
+
+
+def make_folder(folder: Path | Url) -> None:
+    """Make a folder, if it is not there.
+
+    Behind a URL an empty file is written there, moved and removed, so that a storage that does not
+    let us is known before long work starts.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be made, or no file be written there.
+    """
+    if not isinstance(folder, Url):
+        whole_file.make_folder(folder)
+        return
+    with _explained(folder, "cannot be written to"):
+        system, inner = _opened(folder)
+        system.makedirs(inner, exist_ok=True)
+        here, there = (_opened(folder / f".refine-trial-{n}")[1] for n in "ab")
+        system.pipe_file(here, b"")
+        system.mv(here, there)
+        system.rm_file(there)
+
+
+def refuse_existing(path: Path | Url, *, overwrite: bool) -> None:
+    """Do what `whole_file.refuse_existing` does, for URLs too."""
+    if not isinstance(path, Url):
+        whole_file.refuse_existing(path, overwrite=overwrite)
+        return
+    with _explained(path, "cannot be written"):
+        system, inner = _opened(path)
+        system.invalidate_cache()
+        if system.isdir(inner):
+            msg = f"{path}: is a folder, expected a file name to write to"
+            raise RefineError(msg)
+        if not overwrite and system.exists(inner):
+            msg = f"{path}: exists already; choose another name or overwrite it (--overwrite)"
+            raise RefineError(msg)
+
+
+def upload(made: Path, url: Url) -> None:
+    """Copy a file to a URL, unless one of that size is there.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be written.
+    """
+    with _explained(url, "cannot be written"):
+        system, inner = _opened(url)
+        system.invalidate_cache()
+        if not system.exists(inner) or system.size(inner) != made.stat().st_size:
+            system.put_file(str(made), inner)
+
+
+def publish(made: Path | Url, path: Path | Url, *, overwrite: bool) -> None:
+    """Rename a finished file in the same storage, as `whole_file.publish` does.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be renamed, or there is a file of that name that may not be replaced.
+    """
+    if isinstance(made, Path) and isinstance(path, Path):
+        whole_file.publish(made, path, overwrite=overwrite)
+        return
+    assert isinstance(path, Url)  # noqa: S101 - both are
+    refuse_existing(path, overwrite=overwrite)
+    with _explained(path, "cannot be written"):
+        system, inner = _opened(path)
+        system.mv(_opened(Url(made))[1], inner)
+
+
+def discard(url: Url) -> None:
+    """Remove a file if it is there."""
+    with contextlib.suppress(RefineError), _explained(url, ""):
+        system, inner = _opened(url)
+        system.rm_file(inner)
+
+
+def _opened(url: Url) -> tuple[Any, str]:
+    """Return the file system of a URL, and its path there."""
+    try:
+        from fsspec.core import url_to_fs  # noqa: PLC0415 - an optional extra
+    except ImportError as error:
+        msg = f"{url}: URLs need fsspec: pip install 'refine-addon[distributed]'"
+        raise RefineError(msg) from error
+    system, inner = url_to_fs(url)
+    return system, inner
+
+
+@contextlib.contextmanager
+def _explained(path: Path | Url, problem: str) -> Iterator[None]:
+    """Raise `RefineError` for whatever the storage raises; for a URL `Interrupted`: it may pass."""
+    try:
+        yield
+    except (RefineError, MemoryError):
+        raise
+    except Exception as error:  # each storage has errors of its own
+        missing = isinstance(error, FileNotFoundError)
+        said = getattr(error, "strerror", None) or (_NO_SUCH if missing else str(error))
+        msg = f"{path}: {problem} ({said or type(error).__name__})"
+        raise (Interrupted if isinstance(path, Url) else RefineError)(msg) from error
