@@ -93,7 +93,7 @@ MUTANTS = {
         ("begin + start, begin + stop", "start, stop", "rows of another place of the tile"),
         ("[*kinds.values()] if len(kinds) > 1 else []", "[]", "types of a few rows"),
         ("tile.begin + part.start", "tile.begin + 0 * part.start", "always the first rows"),
-        ("!= (tile.size, tile.changed)", "!= (tile.size, found.st_mtime_ns)", "time not compared"),
+        ("!= (tile.size, tile.changed)", "[0] != tile.size", "time not compared"),
     ],
     "tiles/steps.py": [
         (
@@ -109,6 +109,18 @@ MUTANTS = {
             "nothing is done for good",
         ),
     ],
+    "tiles/storage.py": [
+        ("if not any(word in name", 'if name == "size" and not any(word in name', "only the size"),
+        ("begin + count * dtype.itemsize)", "begin + count)", "ranges of too few bytes"),
+        ("stream.seek(max(whole - 1, 0))", "stream.seek(0)", "whole files sent for each range"),
+        ('if not name.startswith("file://"):', "if True:", "tiles replaced by another name"),
+        ("if not overwrite and system.exists(inner):", "if False:", "replaced unasked"),
+        ("Interrupted if isinstance(path, Url) else RefineError", "RefineError", "all lost"),
+    ],
+    "urls.py": [
+        ("[A-Za-z0-9+.:-]+://", "[A-Za-z0-9+.:-]*://", "drives of Windows as URLs"),
+        ("isinstance(text, str) and _URL", "False and _URL", "URLs as paths"),
+    ],
     "tiles/folder.py": [
         ("result or ()]", "()]", "results forgotten"),
         ("fcntl.LOCK_EX | fcntl.LOCK_NB", "fcntl.LOCK_SH | fcntl.LOCK_NB", "two runs at once"),
@@ -117,7 +129,7 @@ MUTANTS = {
         ("(amount - below - before)", "(amount - below - 0 * before)", "ties in each unit"),
         ("except Exception:\n            job.folder.remove()", "except Exception:", "leavings"),
         ("kept * tile.row_bytes)", "kept * tile.row_bytes + shorter)", "size of another header"),
-        ("if target.resolve() in read:", "if False:", "tiles replaced while read"),
+        ("if identity(target) in read:", "if False:", "tiles replaced while read"),
         ("if target in targets[:place]:", "if False:", "one output for two tiles"),
     ],
     "tiles/seen.py": [
@@ -698,6 +710,7 @@ TESTS = {
     "viewport_arrays": ["../viewport/arrays.py"],
     "command_counts": ["report.py"],
     "tiles": ["tiles/units.py", "tiles/steps.py", "tiles/folder.py", "tiles/prune.py"],
+    "storage": ["tiles/storage.py", "urls.py"],
     "tiles_seen": ["tiles/seen.py", "tiles/scoring.py", "tiles/absorbing.py"],
     "levels": ["levels/lod.py", "levels/distance.py", "levels/files.py"],
     "pictures": ["png.py", "picture_files.py"],

@@ -109,6 +109,31 @@ def test_what_workers_began_one_process_ends(tmp_path, tiles, workers):
 
 
 @needs_dask
+@pytest.mark.parametrize("moment", [0.5, 0.9], ids=["scoring", "writing"])
+def test_workers_read_and_write_behind_urls(tmp_path, tiles, workers, monkeypatch, moment):
+    """A killed worker changes no byte of them, and leaves nothing there or here."""
+    monkeypatch.chdir(tmp_path)
+    killed = []
+
+    def progress(fraction, _what):
+        if fraction >= moment and not killed:
+            killed.append(next(iter(workers._client.run(os.getpid).values())))
+            os.kill(killed[0], signal.SIGKILL)
+
+    urls = [f"file://{path}" for path in tiles]
+    views = read_cameras(ROOM / "cameras.json")
+    prune_tiles(
+        urls, f"file://{tmp_path}/out", views, BUDGET, CLOSED, workers=workers, progress=progress
+    )
+
+    assert killed
+    found = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
+    names = [path.name for path in tiles]
+    assert found == dict(zip(names, prune(tiles, tmp_path / "here"), strict=True))
+    assert not list(tmp_path.glob(".refine*"))
+
+
+@needs_dask
 def test_workers_that_do_not_see_the_files_are_named(tmp_path, tiles, workers, monkeypatch):
     """The folder of the job, a tile, or refine itself is another one there."""
     views = read_cameras(ROOM / "cameras.json")
