@@ -43,5 +43,8 @@ def is_url(text: Path | str) -> bool:
 def refuse_url(text: Path | str) -> None:
     """Raise `RefineError` if a URL stands where only a path can."""
     if is_url(text):
-        msg = f"{text}: is a URL, expected a local path; only 'prune --together' takes URLs"
+        msg = (
+            f"{text}: is a URL, expected a local path; only the tiles and the folder of "
+            "'prune --together' can be URLs"
+        )
         raise RefineError(msg)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import sys
@@ -141,11 +142,12 @@ def test_files_there_are_replaced_only_when_told(memory, views):
 
 @pytest.mark.usefixtures("memory")
 def test_what_is_read_is_not_replaced(folder, views):
-    """However it is called: by the same URL, or as a path here and a URL there."""
+    """However it is called: by the same URL, or as a path here and a URL of a link there."""
+    (folder / "link").symlink_to(folder)
     with pytest.raises(RefineError, match=r"memory:///in/a\.ply: is read until all"):
         prune_tiles(URLS, "memory:///in", views, HALF, CLOSED, overwrite=True)
     with pytest.raises(RefineError, match=r"a\.ply: is read until all"):
-        prune_tiles(NAMES, f"file://{folder}", views, HALF, CLOSED, overwrite=True)
+        prune_tiles(NAMES, f"file://{folder}/link", views, HALF, CLOSED, overwrite=True)
 
 
 def test_a_tile_that_changes_meanwhile_stops_all(folder, memory, views):
@@ -230,6 +232,22 @@ def test_what_is_no_tile_is_named_by_its_url(memory, views, content, words):
 
     with pytest.raises(RefineError, match=rf"^memory://in/b\.ply: {words}"):
         prune_tiles(URLS, "memory://out", views, HALF, CLOSED)
+
+
+def test_a_storage_that_only_sends_whole_files_is_refused(memory, monkeypatch):
+    """As a server without ranges: what it sends can be read, but not from the middle."""
+
+    class Stream(io.BytesIO):
+        def seek(self, place, _whence=0):
+            if place:
+                msg = "no ranges"
+                raise ValueError(msg)
+
+    opened = Stream(memory.cat_file("/in/a.ply"))
+    monkeypatch.setattr(type(memory), "open", lambda *_given, **_options: opened)
+
+    with pytest.raises(RefineError, match=r"^memory://in/a\.ply: cannot be read \(no ranges\)$"):
+        units.tile_at(URLS[0])
 
 
 def test_a_long_header_is_read_whole(memory):

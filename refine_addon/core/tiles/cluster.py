@@ -7,6 +7,7 @@ a lost worker again elsewhere, and a step that is done twice writes the same byt
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import functools
 import pickle
@@ -189,8 +190,9 @@ def _unpacked(packed: bytes) -> object:
     return pickle.loads(packed)  # noqa: S301 - Dask itself sends pickles
 
 
-def _answer(version: str, job: Job, tiles: list[Tile]) -> str:
+async def _answer(version: str, job: Job, tiles: list[Tile]) -> str:
     """Say what is wrong with this worker; "" if nothing is."""
     if version != VERSION:
         return f"it has refine {VERSION}, this is {version}"
-    return unseen_files(job, tiles)
+    # Not on the worker's own thread: requests for many tiles would make it look dead.
+    return await asyncio.to_thread(unseen_files, job, tiles)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -133,7 +134,8 @@ def make_folder(folder: Path | Url) -> None:
     with _explained(folder, "cannot be written to"):
         system, inner = _opened(folder)
         system.makedirs(inner, exist_ok=True)
-        here, there = (_opened(folder / f".refine-trial-{n}")[1] for n in "ab")
+        name = f".refine-{secrets.token_hex(8)}"
+        here, there = (_opened(folder / f"{name}-{end}")[1] for end in "ab")
         system.pipe_file(here, b"")
         system.mv(here, there)
         system.rm_file(there)
