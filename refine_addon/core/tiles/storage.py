@@ -113,7 +113,8 @@ def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDA
         if not count:
             return np.empty(0, dtype)
         system, inner = _opened(path)
-        found = system.cat_file(inner, begin, begin + count * dtype.itemsize)
+        # By name: storages have other arguments between these.
+        found = system.cat_file(inner, start=begin, end=begin + count * dtype.itemsize)
         return np.frombuffer(found, dtype, len(found) // dtype.itemsize)
 
 
