@@ -95,7 +95,9 @@ def read(folder, paths):
 
 
 @pytest.mark.parametrize("settings", [OCCLUSION, AUTO], ids=["occlusion", "auto"])
-@pytest.mark.parametrize("budget", [Budget(ratio=0.7), Budget(psnr=36.0)], ids=str)
+@pytest.mark.parametrize(
+    "budget", [Budget(ratio=0.7), Budget(psnr=36.0), Budget(min_seen=60)], ids=str
+)
 def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budget, settings):
     """To the byte, and the estimates are the same but for how rounding adds up."""
     told = prune_tiles(tiles, tmp_path / "out", views, budget, settings)

@@ -303,7 +303,7 @@ class _Run:
         if budget.threshold is not None:
             return Rule(threshold=float(single(budget.threshold)))
         if budget.min_seen is not None:
-            return Rule(least_seen=least_seen(budget.min_seen, len(self.job.views)))
+            return Rule(least_seen=least_seen(budget.min_seen, scores.views_used))
         if budget.psnr is not None:
             share = quality_of(scores).share(budget.psnr)
             amount, by_bytes = math.floor(share * self.total), False
