@@ -224,6 +224,14 @@ def damaged(path, tiles):
     return [*tiles, again], f"another tile is called {again.name} too"
 
 
+@pytest.mark.parametrize("folder", ["out", None])
+def test_a_tile_that_is_given_twice_is_refused(tmp_path, tiles, views, folder):
+    """Also where nothing is written: its splats would count twice."""
+    output = None if folder is None else tmp_path / folder
+    with pytest.raises(RefineError, match="d.ply: is given twice"):
+        prune_tiles([*tiles, tiles[2]], output, views, Budget(ratio=0.5), CLOSED)
+
+
 @pytest.mark.parametrize("kind", ["missing", "short.ply", "text.ply", "same"])
 def test_one_tile_at_fault_stops_all(tmp_path, tiles, views, kind):
     """It is named, and no tile is written."""

@@ -98,6 +98,7 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     clock = Clock()
     _refuse_what_needs_all(budget, settings, absorb=absorb)
     tiles = [tile_at(path) for path in sources]
+    _refuse_twice(tiles)
     output = None if folder is None else expanded(folder)
     targets = [] if output is None else _targets(tiles, output, overwrite=overwrite)
     used = views.spread(settings.views)
@@ -348,6 +349,16 @@ def _refuse_what_needs_all(budget: Budget, settings: Settings, *, absorb: bool) 
         msg = f"over tiles {settings.method} estimates no PSNR: choose auto or occlusion"
         raise RefineError(msg)
     budget.refuse_meaningless(settings.method, frustum=settings.frustum)
+
+
+def _refuse_twice(tiles: Sequence[Tile]) -> None:
+    """Raise `RefineError` if a file is given twice: its splats would count twice."""
+    given: set[str] = set()
+    for tile in tiles:
+        if tile.path in given:
+            msg = f"{tile.path}: is given twice"
+            raise RefineError(msg)
+        given.add(tile.path)
 
 
 def _targets(tiles: Sequence[Tile], folder: Path, *, overwrite: bool) -> list[Path]:
