@@ -218,7 +218,7 @@ def test_a_splat_as_narrow_as_a_cell_is_half_even():
     """By its narrow side: sigma 4 px on cells of 16 px^2; a third of it is a tenth, thrice .9."""
     sigmas = np.array([[50.0, 5.0, 12.0], [4.0, 4 / 3, 12.0]], np.float32)
     footprints = projection.Footprints(
-        np.arange(3), sigmas, sigmas, sigmas, sigmas, np.ones(3, bool)
+        np.arange(3), sigmas, sigmas, sigmas, sigmas, np.ones(3, bool), np.ones(3, np.float32)
     )
 
     found = froxels.evenness(footprints, 16.0)
@@ -797,7 +797,7 @@ def test_cells_follow_the_footprints_not_the_pixels(count, scale):
     """
     sigmas = np.full((2, count), 1.0, np.float32)
     footprints = projection.Footprints(
-        np.arange(count), sigmas, sigmas, sigmas, sigmas, np.ones(count, bool)
+        np.arange(count), sigmas, sigmas, sigmas, sigmas, np.ones(count, bool), sigmas[0]
     )
     view = look_along_z(width=400 * scale, height=300 * scale)
 
@@ -870,7 +870,7 @@ def test_cells_stop_growing_where_each_footprint_needs_a_point_of_its_own(large,
     sigmas = np.where(np.arange(count) < large * count, 4.0, 0.5).astype(np.float32)
     both = np.broadcast_to(sigmas, (2, count))
     footprints = projection.Footprints(
-        np.arange(count), both, both, both, both, np.ones(count, bool)
+        np.arange(count), both, both, both, both, np.ones(count, bool), sigmas
     )
 
     side = froxels.cell_size(footprints, look_along_z(), 4.0, 2.0)

@@ -192,8 +192,7 @@ def test_a_size_that_no_splat_fits_in_is_refused(tmp_path, tiles, views):
 @pytest.mark.parametrize(
     ("settings", "budget", "words"),
     [
-        (Settings(), Budget(ratio=0.5), "method is auto.*only closed-form"),
-        (CLOSED, Budget(psnr=40.0), "PSNR needs all splats"),
+        (CLOSED, Budget(psnr=40.0), "closed-form estimates no PSNR"),
         (CLOSED, Budget(threshold=1e30), "would remove all 5000 splats"),
     ],
 )
@@ -224,6 +223,14 @@ def damaged(path, tiles):
     again = path.parent / "more" / tiles[1].name
     again.write_bytes(tiles[1].read_bytes())
     return [*tiles, again], f"another tile is called {again.name} too"
+
+
+@pytest.mark.parametrize("folder", ["out", None])
+def test_a_tile_that_is_given_twice_is_refused(tmp_path, tiles, views, folder):
+    """Also where nothing is written: its splats would count twice."""
+    output = None if folder is None else tmp_path / folder
+    with pytest.raises(RefineError, match=r"d\.ply: is given twice"):
+        prune_tiles([*tiles, tiles[2]], output, views, Budget(ratio=0.5), CLOSED)
 
 
 @pytest.mark.parametrize("kind", ["missing", "short.ply", "text.ply", "same"])
@@ -291,7 +298,7 @@ def test_a_tile_that_cannot_be_written_leaves_none(tmp_path, tiles, views, monke
     assert not list((tmp_path / "out").glob("*"))
 
 
-def test_splats_that_are_read_when_they_are_taken_are_those_of_the_tiles(tmp_path):
+def test_a_slice_of_a_unit_is_that_of_its_tiles(tmp_path):
     """Any slice of a unit, across its parts, in the types and the degree of all of them.
 
     Three tiles of 5, 4 and 6 splats, of degrees 0, 1 and 0, the last of doubles.
@@ -302,17 +309,16 @@ def test_splats_that_are_read_when_they_are_taken_are_those_of_the_tiles(tmp_pat
     (tmp_path / "c.ply").write_bytes(ply_of(doubles))
     cut = [units.tile_at(tmp_path / f"{name}.ply") for name in "abc"]
     unit = units.Unit(0, (units.Part(cut[0], 1, 5), *(units.Part(tile, 0, 4) for tile in cut[1:])))
-    unread = units.Unread(unit)
-    whole = unread.take(slice(0, 12))
+    whole = unit.splats()
 
-    assert len(unread) == len(whole) == 12
+    assert len(unit) == len(whole) == 12
     assert whole.means.dtype == np.float64
     assert whole.sh_rest.shape == (12, 3, 3)
     np.testing.assert_array_equal(whole.means[:4], read_ply(tmp_path / "a.ply").splats().means[1:])
     np.testing.assert_array_equal(whole.means[8:, 0], doubles["x"][:4])
     for start in range(13):
         for stop in range(start, 13):
-            some = unread.take(slice(start, stop))
+            some = unit.take(slice(start, stop))
             for field in fields(some):
                 expected = getattr(whole, field.name)[start:stop]
                 found = getattr(some, field.name)
@@ -338,8 +344,14 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views,
     budget = Budget(ratio=0.5)
     prune_tiles(tiles, tmp_path / "once", views, budget, CLOSED)
     done = []
-    read, write_rows = steps.Unread, steps.write_rows
-    monkeypatch.setattr(steps, "Unread", lambda unit: done.append(unit.index) or read(unit))
+    take, write_rows = units.Unit.take, steps.write_rows
+
+    def taken(unit, piece):
+        if not piece.stop:  # whoever reads a unit looks at its types first
+            done.append(unit.index)
+        return take(unit, piece)
+
+    monkeypatch.setattr(units.Unit, "take", taken)
     monkeypatch.setattr(
         steps, "write_rows", lambda *rows: done.append(len(rows[1])) or write_rows(*rows)
     )

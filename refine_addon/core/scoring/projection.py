@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from ..splats import SH_C0, drawable, opacity, rotation_matrices
 from ..work import Progress, checkpoint, for_chunks, part, report, silent
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from ..splats import Splats
@@ -90,6 +93,8 @@ class Footprints:
         Their lengths, the longer first.
     inside : (n,) bool
         Which centres lie in the view's frustum; see `frustum`.
+    alphas : (n,) float32
+        Of the Gaussians.
     """
 
     index: NDArray[np.int64]
@@ -98,6 +103,7 @@ class Footprints:
     minor: NDArray[np.float32]
     sigmas: NDArray[np.float32]
     inside: NDArray[np.bool_]
+    alphas: NDArray[np.float32]
 
     def take(self, rows: NDArray[np.int64]) -> Footprints:
         """Return some footprints, in that order."""
@@ -119,32 +125,48 @@ def prepare(
     good : (N,) bool
         Which splats can be drawn.
     """
-    good = np.empty(len(splats), np.bool_)
-    opaque = np.empty(len(splats), np.bool_)
+    good, opaque = judge(splats, progress=part(progress, 0.0, 0.4), threads=threads)
+    scene = scene_of(splats.means, good, views)
+    report(progress, 0.4, "reading")
+    index, place = near(splats, opaque, scene)
+    report(progress, 0.4, "reading")
+    order = spatial_order(place, lambda rows: splat_fingerprint(splats, index[rows]))
+    ahead = part(progress, 0.4, 1.0)
+    return activate(splats, index[order], place[order], scene, ahead, threads), scene, good
 
-    def judge(piece: slice) -> None:
+
+def judge(
+    splats: Splats, *, progress: Progress = silent, threads: int | None = None
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which splats can be drawn, and which of these exceed `ALPHA_CUT`, (N,) each."""
+    good, opaque = np.empty((2, len(splats)), np.bool_)
+
+    def look(piece: slice) -> None:
         chunk = splats.take(piece)
         good[piece] = drawable(chunk)
         logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
         opaque[piece] = opacity(logits) > ALPHA_CUT
 
     for_chunks(
-        judge, len(splats), 4 * _CHUNK,
-        progress=part(progress, 0.0, 0.4), what="reading", threads=threads,
+        look, len(splats), 4 * _CHUNK, progress=progress, what="reading", threads=threads
     )  # fmt: skip
-    scene = scene_of(splats.means, good, views)
-    report(progress, 0.4, "reading")
+    return good, opaque
+
+
+def near(
+    splats: Splats, opaque: NDArray[np.bool_], scene: Scene
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the rows of opaque splats that are not too far away, (M,), and their places, (M, 3).
+
+    Places are those that `Scene.place` returns.
+    """
     index = np.flatnonzero(opaque)
     place = scene.place(splats.means[index])
-    near = np.max(np.abs(place), axis=1, initial=0.0) <= _FARTHEST
-    index, place = index[near], place[near]
-    report(progress, 0.4, "reading")
-    order = spatial_order(place, lambda rows: splat_fingerprint(splats, index[rows]))
-    ahead = part(progress, 0.4, 1.0)
-    return _activate(splats, index[order], place[order], scene, ahead, threads), scene, good
+    close = np.max(np.abs(place), axis=1, initial=0.0) <= _FARTHEST
+    return index[close], place[close]
 
 
-def _activate(
+def activate(
     splats: Splats,
     index: NDArray[np.int64],
     place: NDArray[np.float64],
@@ -198,11 +220,46 @@ def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
     The footprint is the Gaussian of covariance ``J W S W' J' + 0.3 I`` (Zwicker et al., "EWA
     splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean.
     """
+    return front_to_back([reaching(gaussians, scene, view)])
+
+
+class Reaching(NamedTuple):
+    """The footprints that may reach into an image, as in `Footprints` but in no order.
+
+    Attributes
+    ----------
+    rows : (n,) int64
+        Of the `Gaussians`.
+    depth : (n,) float32
+        Along the view's axis, scene sizes.
+    centers, major, minor, sigmas : (2, n) float32
+    inside : (n,) bool
+    alphas : (n,) float32
+    """
+
+    rows: NDArray[np.int64]
+    depth: NDArray[np.float32]
+    centers: NDArray[np.float32]
+    major: NDArray[np.float32]
+    minor: NDArray[np.float32]
+    sigmas: NDArray[np.float32]
+    inside: NDArray[np.bool_]
+    alphas: NDArray[np.float32]
+
+
+_NONE = np.empty((2, 0), np.float32)
+_NOTHING = Reaching(
+    np.empty(0, np.int64), _NONE[0], _NONE, _NONE, _NONE, _NONE, np.empty(0, np.bool_), _NONE[0]
+)
+
+
+def reaching(gaussians: Gaussians, scene: Scene, view: View) -> Reaching:
+    """Return the footprints of `project`, before they are sorted."""
     if not _computable(scene, view):
-        return _nothing()
+        return _NOTHING
     planes = clip_planes(scene, view)
     rotation = _rotation6(view.rotation @ scene.axes.T)
-    pieces: list[tuple[NDArray[Any], ...]] = []
+    pieces: list[Reaching] = []
     for start in range(0, len(gaussians), _CHUNK):
         checkpoint()
         piece = slice(start, start + _CHUNK)
@@ -212,13 +269,27 @@ def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
             local = np.take(local, touching, axis=1)  # (3, n), as all that follows
             shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)  # (6, n)
             inside = frustum.contains(view, local, planes)
-            pieces.append((touching + start, local[2], *_ellipses(local, shape, view), inside))
-    if not pieces:
-        return _nothing()
-    index, depth, *rest = (np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True))
+            centers, major, minor, sigmas = _ellipses(local, shape, view)
+            rows = touching + start
+            alphas = gaussians.alphas.take(rows)
+            pieces.append(Reaching(rows, local[2], centers, major, minor, sigmas, inside, alphas))
+    return _together(pieces)
+
+
+def front_to_back(pieces: Sequence[Reaching]) -> Footprints:
+    """Return the footprints of some Gaussians by their depth; of equal depths the first first."""
+    found = _together(pieces)
     checkpoint()
-    order = _by_depth(depth)
-    return Footprints(index[order], *(np.take(values, order, axis=-1) for values in rest))
+    order = _by_depth(found.depth)
+    rows, _, *rest = found
+    return Footprints(rows[order], *(np.take(values, order, axis=-1) for values in rest))
+
+
+def _together(pieces: Sequence[Reaching]) -> Reaching:
+    if len(pieces) == 1:
+        return pieces[0]
+    every = zip(_NOTHING, *pieces, strict=True)
+    return Reaching(*(np.concatenate(arrays, axis=-1) for arrays in every))
 
 
 def in_camera(
@@ -227,11 +298,6 @@ def in_camera(
     """Return centres, (3, M), and covariances, (6, M), in camera coordinates, scene sizes."""
     turned = _rotation6(view.rotation @ scene.axes.T) @ gaussians.covariances
     return _local(gaussians.means, scene, view), turned
-
-
-def _nothing() -> Footprints:
-    empty = np.empty((2, 0), np.float32)
-    return Footprints(np.empty(0, np.int64), empty, empty, empty, empty, np.empty(0, np.bool_))
 
 
 def _computable(scene: Scene, view: View) -> bool:
@@ -269,13 +335,49 @@ def _touches(
     """
     x, y, z = local
     touching: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
-    for coordinate, (focal, offset, half) in zip((x, y), frustum.image_sides(view), strict=True):
-        # A footprint is longest where the ray is steepest; the projection is linearised no further.
-        slope = (abs(offset) + (1.0 + 2.0 * _BEYOND) * half) / focal
-        reach = REACH * focal * float(np.hypot(1.0, slope)) * largest  # (M,), px times depth
-        pixels = half + REACH * LOW_PASS**0.5
-        touching &= np.abs(focal * coordinate + offset * z) <= pixels * z + reach
+    for coordinate, side in zip((x, y), frustum.image_sides(view), strict=True):
+        reach = _reach(side) * largest  # (M,), px times depth
+        pixels = side.half + REACH * LOW_PASS**0.5
+        touching &= np.abs(side.focal * coordinate + side.offset * z) <= pixels * z + reach
     return touching
+
+
+def boxes_touch(boxes: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.bool_]:
+    """Return in which of B boxes a Gaussian may lie that reaches into the image of a view, (B,).
+
+    Parameters
+    ----------
+    boxes : (B, 7) float32
+        Least and greatest coordinates of the means, and the longest standard deviation, in the
+        scene's frame, in scene sizes.
+    scene, view
+        See `project`.
+    """
+    if not _computable(scene, view):
+        return np.zeros(len(boxes), np.bool_)
+    near, far = clip_planes(scene, view)
+    places = itertools.product((0, 3), (1, 4), (2, 5))
+    corners = np.stack([boxes[:, place] for place in places], axis=-1)  # (B, 3, 8)
+    local = _local(np.moveaxis(corners, 1, 0).reshape(3, -1), scene, view)
+    x, y, z = local.reshape(3, len(boxes), 8).astype(np.float64)
+    # Rounding moves a mean by far less than this.
+    slack = 1e-4 * (1.0 + np.abs(local).max(axis=0).reshape(len(boxes), 8).max(axis=1))
+    touching: NDArray[np.bool_] = (z.max(axis=1) + slack >= near) & (z.min(axis=1) - slack <= far)
+    for coordinate, side in zip((x, y), frustum.image_sides(view), strict=True):
+        reach = _reach(side) * (boxes[:, 6].astype(np.float64) + slack)
+        shown = (side.half + REACH * LOW_PASS**0.5) * z
+        across = side.focal * coordinate + side.offset * z
+        for way in (1.0, -1.0):
+            # It is linear in the place, so it is least in a corner.
+            touching &= (way * across - shown).min(axis=1) <= reach
+    return touching
+
+
+def _reach(side: frustum.Side) -> float:
+    """Return how far a footprint reaches, px times depth, for a longest standard deviation of 1."""
+    # A footprint is longest where the ray is steepest; the projection is linearised no further.
+    slope = (abs(side.offset) + (1.0 + 2.0 * _BEYOND) * side.half) / side.focal
+    return REACH * side.focal * float(np.hypot(1.0, slope))
 
 
 def _rotation6(rotation: NDArray[np.float64]) -> NDArray[np.float32]:
