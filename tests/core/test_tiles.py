@@ -18,32 +18,23 @@ from refine_addon.core import (
     read_ply,
     score,
 )
-from refine_addon.core.formats.ply_header import with_count
 from refine_addon.core.scoring import closed_form
 from refine_addon.core.selection import select
 from refine_addon.core.tiles import prune as together
 from refine_addon.core.tiles import steps, units
 from refine_addon.core.tiles.folder import Folder
 from tests.strategies import plain_ply, ply_of
+from tests.tiles import COUNT, ROOM, cut, joined, room_rows, write
 
-ROOM = Path(__file__).parents[2] / "tests/data/room_small"
 CLOSED = Settings(method="closed-form", views=8)
-COUNT = 5000
-CUTS = (0, 700, 700, 2600, COUNT)
-"""Rows at which the room is cut: a short tile, an empty one, and two that span units."""
 
 
 @pytest.fixture
 def rows(monkeypatch):
-    """Give rows of the room; some are equal, some cannot be drawn. A unit has 1000 of them."""
+    """Give rows of the room; a unit has 1000 of them."""
     monkeypatch.setattr(closed_form, "ROWS", 1000)
     monkeypatch.setattr(units, "ROWS", 1000)
-    rows = read_ply(ROOM / "point_cloud.ply").rows[::7][:COUNT].copy()
-    rows[900:1300] = rows[100]
-    rows["x"][[5, 2000]] = np.nan
-    rows["opacity"][10:400:7] = -np.inf
-    rows["scale_0"][4000] = np.inf
-    return rows
+    return room_rows()
 
 
 @pytest.fixture
@@ -56,21 +47,7 @@ def views():
 def tiles(tmp_path, rows):
     """Write the rows as four files, and as one."""
     write(tmp_path / "whole.ply", rows)
-    paths = [tmp_path / f"{name}.ply" for name in "badc"]
-    for path, start, stop in zip(paths, CUTS, CUTS[1:], strict=False):
-        write(path, rows[start:stop])
-    return paths
-
-
-def write(path, rows):
-    """Write rows of the room as a file."""
-    header = read_ply(ROOM / "point_cloud.ply").header
-    path.write_bytes(with_count(header, len(rows)) + rows.tobytes())
-
-
-def joined(paths):
-    """Return the rows of files as bytes."""
-    return b"".join(read_ply(path).rows.tobytes() for path in paths)
+    return cut(tmp_path, rows)
 
 
 BUDGETS = [
@@ -307,8 +284,8 @@ def test_a_slice_of_a_unit_is_that_of_its_tiles(tmp_path):
         (tmp_path / f"{name}.ply").write_bytes(plain_ply(count, degree, seed=count))
     doubles = {name: (1 / 3 + column).astype(float) for name, column in columns(tmp_path / "c.ply")}
     (tmp_path / "c.ply").write_bytes(ply_of(doubles))
-    cut = [units.tile_at(tmp_path / f"{name}.ply") for name in "abc"]
-    unit = units.Unit(0, (units.Part(cut[0], 1, 5), *(units.Part(tile, 0, 4) for tile in cut[1:])))
+    a, b, c = (units.tile_at(tmp_path / f"{name}.ply") for name in "abc")
+    unit = units.Unit(0, (units.Part(a, 1, 5), units.Part(b, 0, 4), units.Part(c, 0, 4)))
     whole = unit.splats()
 
     assert len(unit) == len(whole) == 12
