@@ -171,6 +171,7 @@ MUTANTS = {
             "visibility *= self.alpha[piece] ** 2",
             "opacity twice",
         ),
+        ("self.count([0], HIGHEST)", "self.count([0], 0)", "another digit counted first"),
         ("LUMA = (0.299, 0.587, 0.114)", "LUMA = (0.114, 0.587, 0.299)", "BGR"),
         ("largest + middle", "largest + smallest", "wrong two scales"),
         ("share = 1.0 - away", "share = 1.0 - 0.0 * away", "all that reaches inside counts whole"),

@@ -20,6 +20,7 @@ import contextlib
 import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -152,7 +153,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Time tiles that are pruned together.")
     parser.add_argument("--splats", type=int, default=10_000_000)
     parser.add_argument("--tiles", type=int, default=10)
-    parser.add_argument("--workers", type=int, nargs="*", default=[0], help="0: none of Dask's")
+    parser.add_argument(
+        "--workers", type=int, nargs="*", default=[0], help="0: none of Dask's; any again"
+    )
     parser.add_argument("--one-room", action="store_true", help="all cameras in the middle room")
     parser.add_argument("--folder", type=Path, help="on the disk to measure; default the system's")
     options = parser.parse_args(arguments)
@@ -167,12 +170,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         copy = ["sh", "-c", 'cat "$@" > "$0"', folder / "copy", *paths]
         prune = [sys.executable, "-m", "refine_addon", "prune", *paths, "--together", "--ratio"]
         prune += ["0.5", "--cameras", cameras, "--method", "closed-form"]
-        commands = {"copy": copy}
+        output = folder / "out"
+        commands = [("copy", copy)]
         for workers in options.workers:
             more = ["--workers", str(workers)] if workers else []
-            commands[f"{workers} workers"] = [*prune, "--output-dir", folder / f"w{workers}", *more]
-        for name, command in commands.items():
+            commands.append((f"{workers} workers", [*prune, "--output-dir", output, *more]))
+        for name, command in commands:
             cost = run(command)
+            shutil.rmtree(output, ignore_errors=True)
             print(
                 f"{name:10} {cost.seconds:7.1f} s, processor {cost.busy:7.1f} s, busiest process "
                 f"{cost.busiest:7.1f} s, {cost.peak:6.0f} MB",

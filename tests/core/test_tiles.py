@@ -18,32 +18,23 @@ from refine_addon.core import (
     read_ply,
     score,
 )
-from refine_addon.core.formats.ply_header import with_count
 from refine_addon.core.scoring import closed_form
 from refine_addon.core.selection import select
 from refine_addon.core.tiles import prune as together
 from refine_addon.core.tiles import steps, units
 from refine_addon.core.tiles.folder import Folder
 from tests.strategies import plain_ply, ply_of
+from tests.tiles import COUNT, ROOM, cut, joined, room_rows, write
 
-ROOM = Path(__file__).parents[2] / "tests/data/room_small"
 CLOSED = Settings(method="closed-form", views=8)
-COUNT = 5000
-CUTS = (0, 700, 700, 2600, COUNT)
-"""Rows at which the room is cut: a short tile, an empty one, and two that span units."""
 
 
 @pytest.fixture
 def rows(monkeypatch):
-    """Give rows of the room; some are equal, some cannot be drawn. A unit has 1000 of them."""
+    """Give rows of the room; a unit has 1000 of them."""
     monkeypatch.setattr(closed_form, "ROWS", 1000)
     monkeypatch.setattr(units, "ROWS", 1000)
-    rows = read_ply(ROOM / "point_cloud.ply").rows[::7][:COUNT].copy()
-    rows[900:1300] = rows[100]
-    rows["x"][[5, 2000]] = np.nan
-    rows["opacity"][10:400:7] = -np.inf
-    rows["scale_0"][4000] = np.inf
-    return rows
+    return room_rows()
 
 
 @pytest.fixture
@@ -56,21 +47,7 @@ def views():
 def tiles(tmp_path, rows):
     """Write the rows as four files, and as one."""
     write(tmp_path / "whole.ply", rows)
-    paths = [tmp_path / f"{name}.ply" for name in "badc"]
-    for path, start, stop in zip(paths, CUTS, CUTS[1:], strict=False):
-        write(path, rows[start:stop])
-    return paths
-
-
-def write(path, rows):
-    """Write rows of the room as a file."""
-    header = read_ply(ROOM / "point_cloud.ply").header
-    path.write_bytes(with_count(header, len(rows)) + rows.tobytes())
-
-
-def joined(paths):
-    """Return the rows of files as bytes."""
-    return b"".join(read_ply(path).rows.tobytes() for path in paths)
+    return cut(tmp_path, rows)
 
 
 BUDGETS = [
@@ -225,6 +202,14 @@ def damaged(path, tiles):
     return [*tiles, again], f"another tile is called {again.name} too"
 
 
+@pytest.mark.parametrize("folder", ["out", None])
+def test_a_tile_that_is_given_twice_is_refused(tmp_path, tiles, views, folder):
+    """Also where nothing is written: its splats would count twice."""
+    output = None if folder is None else tmp_path / folder
+    with pytest.raises(RefineError, match=r"d\.ply: is given twice"):
+        prune_tiles([*tiles, tiles[2]], output, views, Budget(ratio=0.5), CLOSED)
+
+
 @pytest.mark.parametrize("kind", ["missing", "short.ply", "text.ply", "same"])
 def test_one_tile_at_fault_stops_all(tmp_path, tiles, views, kind):
     """It is named, and no tile is written."""
@@ -290,7 +275,7 @@ def test_a_tile_that_cannot_be_written_leaves_none(tmp_path, tiles, views, monke
     assert not list((tmp_path / "out").glob("*"))
 
 
-def test_splats_that_are_read_when_they_are_taken_are_those_of_the_tiles(tmp_path):
+def test_a_slice_of_a_unit_is_that_of_its_tiles(tmp_path):
     """Any slice of a unit, across its parts, in the types and the degree of all of them.
 
     Three tiles of 5, 4 and 6 splats, of degrees 0, 1 and 0, the last of doubles.
@@ -299,19 +284,18 @@ def test_splats_that_are_read_when_they_are_taken_are_those_of_the_tiles(tmp_pat
         (tmp_path / f"{name}.ply").write_bytes(plain_ply(count, degree, seed=count))
     doubles = {name: (1 / 3 + column).astype(float) for name, column in columns(tmp_path / "c.ply")}
     (tmp_path / "c.ply").write_bytes(ply_of(doubles))
-    cut = [units.tile_at(tmp_path / f"{name}.ply") for name in "abc"]
-    unit = units.Unit(0, (units.Part(cut[0], 1, 5), *(units.Part(tile, 0, 4) for tile in cut[1:])))
-    unread = units.Unread(unit)
-    whole = unread.take(slice(0, 12))
+    a, b, c = (units.tile_at(tmp_path / f"{name}.ply") for name in "abc")
+    unit = units.Unit(0, (units.Part(a, 1, 5), units.Part(b, 0, 4), units.Part(c, 0, 4)))
+    whole = unit.splats()
 
-    assert len(unread) == len(whole) == 12
+    assert len(unit) == len(whole) == 12
     assert whole.means.dtype == np.float64
     assert whole.sh_rest.shape == (12, 3, 3)
     np.testing.assert_array_equal(whole.means[:4], read_ply(tmp_path / "a.ply").splats().means[1:])
     np.testing.assert_array_equal(whole.means[8:, 0], doubles["x"][:4])
     for start in range(13):
         for stop in range(start, 13):
-            some = unread.take(slice(start, stop))
+            some = unit.take(slice(start, stop))
             for field in fields(some):
                 expected = getattr(whole, field.name)[start:stop]
                 found = getattr(some, field.name)
@@ -337,8 +321,14 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views,
     budget = Budget(ratio=0.5)
     prune_tiles(tiles, tmp_path / "once", views, budget, CLOSED)
     done = []
-    read, write_rows = steps.Unread, steps.write_rows
-    monkeypatch.setattr(steps, "Unread", lambda unit: done.append(unit.index) or read(unit))
+    take, write_rows = units.Unit.take, steps.write_rows
+
+    def taken(unit, piece):
+        if not piece.stop:  # whoever reads a unit looks at its types first
+            done.append(unit.index)
+        return take(unit, piece)
+
+    monkeypatch.setattr(units.Unit, "take", taken)
     monkeypatch.setattr(
         steps, "write_rows", lambda *rows: done.append(len(rows[1])) or write_rows(*rows)
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,18 +20,13 @@ from refine_addon.core import (
     read_cameras,
     read_ply,
 )
-from refine_addon.core.formats.ply_header import with_count
 from refine_addon.core.scoring import closed_form, projection, sight_lines
 from refine_addon.core.splats import joined
 from refine_addon.core.tiles import absorbing, seen, units
 from refine_addon.core.tiles.seen import SceneJob
 from refine_addon.core.views import ViewSet
 from tests.strategies import plain_header, splat_names
-
-ROOM = Path(__file__).parents[2] / "tests/data/room_small"
-COUNT = 5000
-CUTS = (0, 700, 700, 2600, COUNT)
-"""Rows at which the room is cut: a short tile, an empty one, and two that span units."""
+from tests.tiles import COUNT, ROOM, cut, room_rows, write
 
 OCCLUSION = Settings(method="occlusion", views=12)
 AUTO = Settings(views=20)
@@ -49,13 +43,9 @@ def small(monkeypatch):
 
 @pytest.fixture
 def rows():
-    """Give rows of the room; some are equal, some cannot be drawn, one is far away."""
-    rows = read_ply(ROOM / "point_cloud.ply").rows[::7][:COUNT].copy()
-    rows[900:1300] = rows[100]
-    rows["x"][[5, 2000]] = np.nan
+    """Give rows of the room, and one far away."""
+    rows = room_rows()
     rows["x"][7] = 1e30
-    rows["opacity"][10:400:7] = -np.inf
-    rows["scale_0"][4000] = np.inf
     return rows
 
 
@@ -69,21 +59,7 @@ def views():
 def tiles(tmp_path, rows, small):  # noqa: ARG001 - set before
     """Write the rows as four files, and as one."""
     write(tmp_path / "whole.ply", rows)
-    return cut(tmp_path, rows, CUTS)
-
-
-def cut(folder, rows, cuts):
-    """Write rows as files that are cut at some of them."""
-    paths = [folder / f"{name}.ply" for name in "badcfehg"[: len(cuts) - 1]]
-    for path, start, stop in zip(paths, cuts, cuts[1:], strict=False):
-        write(path, rows[start:stop])
-    return paths
-
-
-def write(path, rows):
-    """Write rows of the room as a file."""
-    header = read_ply(ROOM / "point_cloud.ply").header
-    path.write_bytes(with_count(header, len(rows)) + rows.tobytes())
+    return cut(tmp_path, rows)
 
 
 def read(folder, paths):
@@ -95,7 +71,9 @@ def read(folder, paths):
 
 
 @pytest.mark.parametrize("settings", [OCCLUSION, AUTO], ids=["occlusion", "auto"])
-@pytest.mark.parametrize("budget", [Budget(ratio=0.7), Budget(psnr=36.0)], ids=str)
+@pytest.mark.parametrize(
+    "budget", [Budget(ratio=0.7), Budget(psnr=36.0), Budget(min_seen=60)], ids=str
+)
 def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budget, settings):
     """To the byte, and the estimates are the same but for how rounding adds up."""
     told = prune_tiles(tiles, tmp_path / "out", views, budget, settings)

@@ -50,6 +50,9 @@ CELLS = 64
 ROWS = 1 << 18
 """Splats of a block: its numbers take 18 MB. Sums over cells depend on it in their last bits."""
 
+HIGHEST = 64 - radix.DIGIT
+"""Bits below the highest digit of a squared distance."""
+
 _CHUNK = 4096
 _RUN = 2000
 """Splats that are looked at together: so few that what is known of them in 64 views stays in the
@@ -225,7 +228,7 @@ class Block:
             vars(self).pop(array, None)
         return result
 
-    def read(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def read(self) -> tuple[Any, ...]:
         """Activate the splats.
 
         Returns
@@ -233,6 +236,8 @@ class Block:
         tallies : (chunks, 5) float64
         moments : (chunks, 4, 3) float64
             See `_read`.
+        prefixes, places, counts
+            `count` of the highest digit, which the first pass needs anyway.
         """
         assert self.splats is not None  # noqa: S101 - whoever calls this gave them
         count = len(self.splats)
@@ -247,7 +252,7 @@ class Block:
         )  # fmt: skip
         self.splats = None
         tallies, moments = zip(*found, strict=True)
-        return np.array(tallies), np.array(moments)
+        return np.array(tallies), np.array(moments), *self.count([0], HIGHEST)
 
     def _read(self, piece: slice) -> tuple[tuple[float, ...], NDArray[np.float64]]:
         """Activate one slice of splats.

@@ -101,6 +101,7 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     clock = Clock()
     _refuse_what_needs_all(budget, settings, absorb=absorb)
     tiles = [tile_at(path) for path in sources]
+    _refuse_twice(tiles)
     output = None if folder is None else located(folder)
     targets = [] if output is None else _targets(tiles, output, overwrite=overwrite)
     used = views.spread(settings.views)
@@ -325,7 +326,7 @@ class _Run:
         if budget.threshold is not None:
             return Rule(threshold=float(single(budget.threshold)))
         if budget.min_seen is not None:
-            return Rule(least_seen=least_seen(budget.min_seen, len(self.job.views)))
+            return Rule(least_seen=least_seen(budget.min_seen, scores.views_used))
         if budget.psnr is not None:
             share = quality_of(scores).share(budget.psnr)
             amount, by_bytes = math.floor(share * self.total), False
@@ -370,6 +371,16 @@ def _refuse_what_needs_all(budget: Budget, settings: Settings, *, absorb: bool) 
         msg = f"over tiles {settings.method} estimates no PSNR: choose auto or occlusion"
         raise RefineError(msg)
     budget.refuse_meaningless(settings.method, frustum=settings.frustum)
+
+
+def _refuse_twice(tiles: Sequence[Tile]) -> None:
+    """Raise `RefineError` if a file is given twice: its splats would count twice."""
+    given: set[str] = set()
+    for tile in tiles:
+        if tile.path in given:
+            msg = f"{tile.path}: is given twice"
+            raise RefineError(msg)
+        given.add(tile.path)
 
 
 def _targets(tiles: Sequence[Tile], folder: Path | Url, *, overwrite: bool) -> Sequence[Path | Url]:

@@ -24,7 +24,7 @@ from ..whole_file import whole_file
 from ..work import Progress, silent
 from . import storage
 from .absorbing import unpacked
-from .units import Unread, bytes_of, header_of, rows_of
+from .units import bytes_of, header_of, rows_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -127,10 +127,8 @@ class Job:
             if done:
                 return result
             raise
-        splats = None
-        if step == "read":
-            # A request takes about as long as sending a unit, and a chunk is a part of that.
-            splats = unit.splats() if unit.remote else Unread(unit)
+        # From a disk a unit is read chunk by chunk; behind a URL each chunk would be a request.
+        splats = unit.splats() if step == "read" and unit.remote else unit
         block = Block(
             splats, self.views, self.settings, self.middle, threads=threads, arrays=arrays
         )
