@@ -348,8 +348,8 @@ MUTANTS = {
         ("max(near / scene.size, 1e-5)", "max(near, 1e-5)", "near plane in another unit"),
         ("(z >= planes[0]) & (z <= planes[1])", "(z >= planes[0])", "far plane ignored"),
         (
-            "np.abs(focal * coordinate + offset * z) <=",
-            "np.abs(focal * coordinate - offset * z) <=",
+            "np.abs(side.focal * coordinate + side.offset * z) <=",
+            "np.abs(side.focal * coordinate - side.offset * z) <=",
             "principal point mirrored",
         ),
         (
@@ -370,10 +370,13 @@ MUTANTS = {
             "low-pass forgotten",
         ),
         (
-            "REACH * focal * float(np.hypot(1.0, slope)) * largest",
-            "0.0 * largest",
+            "REACH * focal * float(np.hypot(1.0, slope))",
+            "0.0",
             "size forgotten at the edge",
         ),
+        ("sign * side.offset - side.pixels", "sign * side.offset", "boxes beside the axis lost"),
+        ("np.maximum.reduceat(self.largest", "np.minimum.reduceat(self.largest", "small boxes"),
+        ("touching &= least <= limit", "touching |= least <= limit", "no box is left out"),
         ("known and away <=", "known or away <=", "farther than float32 holds"),
     ],
     "scoring/coverage.py": [

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -380,6 +380,42 @@ def test_footprints_are_those_of_the_linearised_projection(seed):
     )
     assert abs(halves[:, 0] @ halves[:, 1]) < 1e-3 * covariance.max()
     np.testing.assert_allclose(found.sigmas[:, 0], np.linalg.norm(halves, axis=0), rtol=1e-5)
+
+
+@pytest.mark.parametrize("size", [1, 7, 64])
+def test_boxes_leave_out_no_splat_that_a_view_shows(monkeypatch, size):
+    """Views from within, of all directions and planes: with boxes and without, to the bit.
+
+    Some boxes lie in no view, so they are left out; boxes of one splat leave out most.
+    """
+    monkeypatch.setattr(projection, "_BOX", size)
+    rng = np.random.default_rng(size)
+    splats = cloud(400)
+    splats.means[:] *= rng.uniform(0.0, 30.0, (400, 1))
+    splats.log_scales[::9] += 2.0
+    views = [
+        replace(
+            look_along_z(rng.normal(size=3) * 5.0, cx=rng.uniform(-50, 130)),
+            rotation=np.linalg.qr(rng.normal(size=(3, 3)))[0],
+            near=rng.choice([0.0, 2.0]),
+            far=rng.choice([10.0, 1e6]),
+        )
+        for _ in range(40)
+    ]
+    gaussians, frame, _ = projection.prepare(splats, ViewSet(tuple(views)), threads=1)
+    boxed = [projection.project(gaussians, frame, view) for view in views]
+    looked = []
+    for view in views:
+        pieces = projection._pieces(gaussians, frame, view, projection.clip_planes(frame, view))
+        looked.append(sum(piece.stop - piece.start for piece in pieces))
+    monkeypatch.setattr(projection, "_boxes_touch", lambda boxes, *_: boxes.largest > 0.0)
+
+    for view, found in zip(views, boxed, strict=True):
+        every = projection.project(gaussians, frame, view)
+        for item in fields(projection.Footprints):
+            np.testing.assert_array_equal(getattr(found, item.name), getattr(every, item.name))
+    shown = np.mean([len(found.index) for found in boxed])
+    assert 0.0 < shown <= np.mean(looked) < len(gaussians)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e3])

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from ..splats import SH_C0, drawable, opacity, rotation_matrices
 from ..work import Progress, checkpoint, for_chunks, part, report, silent
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from numpy.typing import NDArray
 
     from ..splats import Splats
@@ -26,6 +29,8 @@ BRIGHTEST = 16.0
 """Brightest colour that is told apart, where white is 1; keeps sums finite."""
 
 _CHUNK = 1 << 14
+_BOX = 1 << 11  # Gaussians in one of `Boxes`
+_MARGIN = 1e-5  # of the numbers that are added up; far more than float32 rounds
 _FARTHEST = 1e6  # scene sizes; splats farther from the middle are in no view
 _LOG_SCALE_RANGE = (-16.0, 5.0)  # relative to the size of the scene; keeps float32 in range
 _LARGEST_VARIANCE = 1e12  # px^2; a footprint a million pixels wide is flat over any image
@@ -33,6 +38,22 @@ _FARTHEST_VIEW = 1e18  # scene sizes; a view farther away sees the scene as one 
 _LARGEST_LENS = 1e9  # px; beyond this or `_FARTHEST_VIEW` float32 would overflow
 _BEYOND = 0.15  # of the image's size; farther outside, the projection is linearised at this edge
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+class Boxes(NamedTuple):
+    """Boxes around every `_BOX` Gaussians in a row, C in all.
+
+    Attributes
+    ----------
+    middle, half : (3, C) float64
+        Of the box around the centres, scene sizes.
+    largest : (C,) float64
+        Longest standard deviation of any of them, scene sizes.
+    """
+
+    middle: NDArray[np.float64]
+    half: NDArray[np.float64]
+    largest: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +86,17 @@ class Gaussians:
     def __len__(self) -> int:
         """Return the number of splats."""
         return len(self.index)
+
+    @cached_property
+    def boxes(self) -> Boxes:
+        """The boxes around them. Neighbours are near each other, so the boxes are small."""
+        starts = np.arange(0, len(self), _BOX)
+        low, high = (
+            bound.reduceat(self.means, starts, axis=1).astype(np.float64)
+            for bound in (np.minimum, np.maximum)
+        )
+        largest = np.maximum.reduceat(self.largest, starts).astype(np.float64)
+        return Boxes((low + high) / 2, (high - low) / 2, largest)
 
     def take(self, keep: NDArray[Any]) -> Gaussians:
         """Return the splats at `keep` (a mask or integers)."""
@@ -200,25 +232,22 @@ def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
     """
     if not _computable(scene, view):
         return _nothing()
-    planes = clip_planes(scene, view)
+    index, local = _touching(gaussians, scene, view)
+    inside = frustum.contains(view, local, clip_planes(scene, view))
     rotation = _rotation6(view.rotation @ scene.axes.T)
     pieces: list[tuple[NDArray[Any], ...]] = []
-    for start in range(0, len(gaussians), _CHUNK):
+    for start in range(0, len(index), _CHUNK):
         checkpoint()
         piece = slice(start, start + _CHUNK)
-        local = _local(gaussians.means[:, piece], scene, view)  # (3, chunk)
-        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, planes))
-        if len(touching):
-            local = np.take(local, touching, axis=1)  # (3, n), as all that follows
-            shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)  # (6, n)
-            inside = frustum.contains(view, local, planes)
-            pieces.append((touching + start, local[2], *_ellipses(local, shape, view), inside))
+        shape = rotation @ np.take(gaussians.covariances, index[piece], axis=1)  # (6, n)
+        pieces.append(_ellipses(local[:, piece], shape, view))
     if not pieces:
         return _nothing()
-    index, depth, *rest = (np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True))
+    ellipses = [np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True)]
     checkpoint()
-    order = _by_depth(depth)
-    return Footprints(index[order], *(np.take(values, order, axis=-1) for values in rest))
+    centers, major, minor, sigmas = ellipses
+    found = Footprints(index, centers, major, minor, sigmas, inside)
+    return found.take(_by_depth(local[2]))
 
 
 def in_camera(
@@ -252,7 +281,11 @@ def clip_planes(scene: Scene, view: View) -> tuple[float, float]:
 def _local(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.float32]:
     """Return camera coordinates of centres, (3, M), scene sizes."""
     shift = (view.rotation @ ((view.center - scene.origin) / scene.size)).astype(np.float32)
-    local: NDArray[np.float32] = (view.rotation @ scene.axes.T).astype(np.float32) @ means
+    turn = (view.rotation @ scene.axes.T).astype(np.float32)
+    # Not a product of matrices, whose last digits depend on how many centres there are.
+    local: NDArray[np.float32] = turn[:, :1] * means[0]
+    for axis in (1, 2):
+        local += turn[:, axis : axis + 1] * means[axis]
     local -= shift[:, None]
     return local
 
@@ -269,12 +302,94 @@ def _touches(
     """
     x, y, z = local
     touching: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
-    for coordinate, (focal, offset, half) in zip((x, y), frustum.image_sides(view), strict=True):
+    for coordinate, side in zip((x, y), _sides(view), strict=True):
+        within = side.pixels * z + side.reach * largest
+        touching &= np.abs(side.focal * coordinate + side.offset * z) <= within
+    return touching
+
+
+class _Side(NamedTuple):
+    """Of a splat that may reach into the image, ``|focal x + offset z| <= pixels z + reach s``.
+
+    x is its centre across or down, z its depth and s its longest standard deviation.
+    """
+
+    focal: float
+    offset: float
+    pixels: float
+    reach: float
+
+
+def _sides(view: View) -> Iterator[_Side]:
+    """Yield the image of a view with the reach of footprints beside it, across and down."""
+    for focal, offset, half in frustum.image_sides(view):
         # A footprint is longest where the ray is steepest; the projection is linearised no further.
         slope = (abs(offset) + (1.0 + 2.0 * _BEYOND) * half) / focal
-        reach = REACH * focal * float(np.hypot(1.0, slope)) * largest  # (M,), px times depth
-        pixels = half + REACH * LOW_PASS**0.5
-        touching &= np.abs(focal * coordinate + offset * z) <= pixels * z + reach
+        reach = REACH * focal * float(np.hypot(1.0, slope))
+        yield _Side(focal, offset, half + REACH * LOW_PASS**0.5, reach)
+
+
+def _touching(
+    gaussians: Gaussians, scene: Scene, view: View
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the n Gaussians that may reach into the image of a view; see `_touches`.
+
+    Returns
+    -------
+    index : (n,) int64
+        Rows of the Gaussians, ascending.
+    local : (3, n) float32
+        Camera coordinates of their centres, scene sizes.
+    """
+    planes = clip_planes(scene, view)
+    found, places = [np.empty(0, np.int64)], [np.empty((3, 0), np.float32)]
+    for piece in _pieces(gaussians, scene, view, planes):
+        checkpoint()
+        local = _local(gaussians.means[:, piece], scene, view)  # (3, chunk)
+        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, planes))
+        found.append(touching + piece.start)
+        places.append(np.take(local, touching, axis=1))
+    return np.concatenate(found), np.concatenate(places, axis=1)
+
+
+def _pieces(
+    gaussians: Gaussians, scene: Scene, view: View, planes: tuple[float, float]
+) -> Iterator[slice]:
+    """Yield slices of at most `_CHUNK` Gaussians that hold all those that `_touches` a view."""
+    touch = np.zeros(-(-len(gaussians) // _BOX) + 2, np.bool_)
+    if len(gaussians):
+        touch[1:-1] = _boxes_touch(gaussians.boxes, scene, view, planes)
+    bounds = np.minimum(np.flatnonzero(np.diff(touch)) * _BOX, len(gaussians)).tolist()
+    for first, stop in zip(bounds[::2], bounds[1::2], strict=True):
+        for start in range(first, stop, _CHUNK):
+            yield slice(start, min(start + _CHUNK, stop))
+
+
+def _boxes_touch(
+    boxes: Boxes, scene: Scene, view: View, planes: tuple[float, float]
+) -> NDArray[np.bool_]:
+    """Return which boxes may hold a centre that `_touches` a view, (C,).
+
+    Each condition there is a linear function of the camera coordinates, ``w . p <= limit``. In a
+    box it is at least that of the middle less ``|w| . half``, turned into the frame of the box.
+    """
+    turn = view.rotation @ scene.axes.T  # (3, 3)
+    shift = view.rotation @ ((view.center - scene.origin) / scene.size)  # (3,)
+    middle = turn @ boxes.middle - shift[:, None]  # (3, C), camera coordinates
+    # What is added up to a coordinate, at most; float32 rounds in proportion to it.
+    sizes = np.abs(turn) @ (np.abs(boxes.middle) + boxes.half) + np.abs(shift)[:, None]
+    limits: list[tuple[list[float], NDArray[np.float64] | float]]
+    limits = [([0.0, 0.0, -1.0], -planes[0]), ([0.0, 0.0, 1.0], planes[1])]
+    for axis, side in enumerate(_sides(view)):
+        for sign in (1.0, -1.0):
+            weights = [0.0, 0.0, sign * side.offset - side.pixels]
+            weights[axis] = sign * side.focal
+            limits.append((weights, side.reach * boxes.largest))
+    touching = np.ones(len(boxes.largest), np.bool_)
+    for weights, limit in limits:
+        rounding = _MARGIN * (np.abs(weights) @ sizes + np.abs(limit))
+        least = weights @ middle - np.abs(weights @ turn) @ boxes.half
+        touching &= least <= limit + rounding
     return touching
 
 
