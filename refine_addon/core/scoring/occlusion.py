@@ -137,6 +137,7 @@ def score_once(
     views: ViewSet,
     settings: Occlusion = Occlusion(),
     *,
+    judges: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Scores, Measured]:
@@ -146,6 +147,8 @@ def score_once(
     ----------
     splats, views, settings, progress, threads
         See `score`; `settings.rounds` is ignored.
+    judges : bool
+        See `SightLines`.
 
     Returns
     -------
@@ -157,7 +160,7 @@ def score_once(
         See `score`.
     """
     run = Run(
-        splats, views, replace(settings, rounds=1),
+        splats, views, replace(settings, rounds=1), judges=judges,
         progress=part(progress, 0.0, 0.1), threads=threads,
     )  # fmt: skip
     measured = run.measure(range(run.measuring.count), part(progress, 0.1, 1.0))
@@ -244,6 +247,8 @@ class Run:
         See `score`.
     members : list of list of int, optional
         See `Measuring`.
+    judges : bool
+        See `SightLines`.
 
     Attributes
     ----------
@@ -261,13 +266,14 @@ class Run:
         See `score`.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - all but three are optional
         self,
         splats: Splats,
         views: ViewSet,
         settings: Occlusion,
         *,
         members: list[list[int]] | None = None,
+        judges: bool = False,
         progress: Progress = silent,
         threads: int | None = None,
     ) -> None:
@@ -280,7 +286,7 @@ class Run:
         self.undrawable = ~good  # (N,) bool
         refuse_undrawable(int(np.count_nonzero(good)), len(good))
         self.measuring = Measuring(scene, views, settings, threads, members)
-        self.sights = SightLines(self.measuring.views, self.gaussians, splats)
+        self.sights = SightLines(self.measuring.views, self.gaussians, splats, judges=judges)
         self.rounds = settings.rounds
         self.prior = closed_form.score(
             splats, views, PRIOR, progress=part(progress, 0.5, 1.0), threads=threads

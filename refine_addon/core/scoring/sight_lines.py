@@ -228,6 +228,9 @@ class SightLines:
         What the lines may meet.
     splats : Splats
         What the Gaussians were made of, for their colours.
+    judges : bool
+        Whether only about `JUDGES` of the views are looked from: enough for `against`, not for
+        `curve`.
 
     Attributes
     ----------
@@ -238,9 +241,15 @@ class SightLines:
     """
 
     def __init__(
-        self, views: Sequence[tuple[View, float]], gaussians: Gaussians, splats: Splats
+        self,
+        views: Sequence[tuple[View, float]],
+        gaussians: Gaussians,
+        splats: Splats,
+        *,
+        judges: bool = False,
     ) -> None:
         self.views, self.splats = views, splats
+        self.every = max(math.ceil(len(views) / JUDGES), 1) if judges else 1
         self.index = gaussians.index
         self.lines: list[Lines | None] = [None] * len(views)
 
@@ -256,7 +265,7 @@ class SightLines:
         footprints : Footprints
             Of these in this view.
         """
-        if self.lines[number] is not None:
+        if self.lines[number] is not None or number % self.every:
             return
         met = crowding(gaussians, footprints, self.views[number][0])
         count = min(LINES, MOST_MET / max(met, 1.0)) / len(self.views)
