@@ -80,6 +80,11 @@ def ring(count=5) -> ViewSet:
     return ViewSet(tuple(views))
 
 
+def floor_weights(folds) -> list[float]:
+    """Return the weights that `coverage` chooses by scores, floors and errors of each fold."""
+    return coverage.floor_weights([coverage.losses(*fold) for fold in folds])
+
+
 def agreement(first, second) -> float:
     """Share of the kept half that two scores have in common."""
     half = len(first) // 2
@@ -625,18 +630,18 @@ def test_the_floor_weighs_what_loses_least_of_what_the_left_out_views_saw():
     dark = np.zeros((1, 200))
     errors = np.stack([right * rng.uniform(0.9, 1.1, 200) for _ in range(4)])
 
-    found = coverage.floor_weights([(right, wrong, errors), (right, wrong, dark)])
+    found = floor_weights([(right, wrong, errors), (right, wrong, dark)])
     tenth = np.argsort(coverage.with_floor(right, wrong, found[0]))[:20]
     np.testing.assert_array_equal(np.sort(tenth), np.sort(np.argsort(right)[:20]))
     assert found[2:] == list(coverage.LEAST_FLOOR_WEIGHTS)[2:]
-    most = coverage.floor_weights([(wrong, right, errors)])
+    most = floor_weights([(wrong, right, errors)])
     assert min(most[:2]) > 0.3
     assert min(most[2:]) == pytest.approx(max(coverage.FLOOR_WEIGHTS))
-    assert coverage.floor_weights([]) == [1.0] * len(coverage.SHARES)
-    assert coverage.floor_weights([(right, wrong, dark)]) == [1.0] * len(coverage.SHARES)
+    assert floor_weights([]) == [1.0] * len(coverage.SHARES)
+    assert floor_weights([(right, wrong, dark)]) == [1.0] * len(coverage.SHARES)
     plain, glare = (np.vstack([errors, wrong * bright]) for bright in (1.0, 1e6))
-    assert coverage.floor_weights([(right, wrong, plain)]) == pytest.approx(
-        coverage.floor_weights([(right, wrong, glare)])
+    assert floor_weights([(right, wrong, plain)]) == pytest.approx(
+        floor_weights([(right, wrong, glare)])
     )
 
 
@@ -660,7 +665,7 @@ def test_each_share_has_the_weight_that_is_right_up_to_there():
     floors = np.where(truth <= 40, 41.0, truth)
     errors = np.stack([truth * rng.uniform(0.9, 1.1, 400) for _ in range(4)])
 
-    found = coverage.floor_weights([(scores, floors, errors)])
+    found = floor_weights([(scores, floors, errors)])
 
     assert found[0] < 0.002 < min(found[1:3])
 
@@ -672,7 +677,7 @@ def test_a_floor_that_gains_nothing_has_no_weight_while_little_goes():
     """
     right = np.random.default_rng(9).random(200)
 
-    found = coverage.floor_weights([(right, right, right[None])])
+    found = floor_weights([(right, right, right[None])])
 
     assert max(found[:2]) < 1e-5
     assert found[2:] == list(coverage.LEAST_FLOOR_WEIGHTS)[2:]
@@ -889,7 +894,7 @@ def test_scoring_is_cancelled_while_the_floor_is_weighed(monkeypatch, last):
     monkeypatch.setattr(coverage, "floor", counted)
 
     with pytest.raises(Cancelled):
-        occlusion.score(cloud(), ring(), progress=lambda *_: len(calls) < last)
+        occlusion.score(cloud(), ring(), progress=lambda *_: len(calls) < last, threads=1)
 
     assert len(calls) == last
 
@@ -951,8 +956,8 @@ def test_weights_that_are_nearly_as_good_do_not_jump():
     scores, floors = rng.random(300), rng.random(300)
     errors = rng.random((4, 300))
 
-    found = coverage.floor_weights([(scores, floors, errors)])
-    again = coverage.floor_weights([(scores, floors, errors * (1.0 + 1e-7 * rng.random((4, 300))))])
+    found = floor_weights([(scores, floors, errors)])
+    again = floor_weights([(scores, floors, errors * (1.0 + 1e-7 * rng.random((4, 300))))])
 
     np.testing.assert_allclose(again, found, rtol=1e-3)
 

@@ -25,13 +25,13 @@ import numpy as np
 from ..errors import RefineError
 from ..scores import Scores, shares_gone
 from ..splats import refuse_undrawable
-from ..work import Progress, part, report, silent
+from ..work import Progress, for_chunks, part, report, silent
 from . import closed_form, coverage, projection
 from .measuring import Measured, Measuring, Sampling
 from .sight_lines import SightLines
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -460,21 +460,22 @@ class Run:
         blocks, sample = tuple(sorted(which)), self._sample
         worth = self.prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)
 
-        def folds() -> Iterator[tuple[NDArray[np.float64], ...]]:
-            for number in blocks if len(blocks) > 1 else ():
-                report(progress, 0.0, "scoring")
-                block, errors = self._blocks[number]
-                others = Measured(
-                    # Rounding can leave a negative difference.
-                    np.maximum(measured.contribution[sample] - block.contribution[sample], 0.0),
-                    np.maximum(measured.error[sample] - block.error[sample], 0.0),
-                    measured.seen[sample] - block.seen[sample],
-                )
-                floors = coverage.floor(worth, others.seen, 1.0 + _exponent(0.0))
-                yield combined(others, 0.0), floors, errors
+        def fold(piece: slice) -> NDArray[np.float64]:
+            block, errors = self._blocks[blocks[piece.start]]
+            others = Measured(
+                # Rounding can leave a negative difference.
+                np.maximum(measured.contribution[sample] - block.contribution[sample], 0.0),
+                np.maximum(measured.error[sample] - block.error[sample], 0.0),
+                measured.seen[sample] - block.seen[sample],
+            )
+            floors = coverage.floor(worth, others.seen, 1.0 + _exponent(0.0))
+            return coverage.losses(combined(others, 0.0), floors, errors)
 
         if blocks not in self._weights:
-            self._weights[blocks] = coverage.floor_weights(folds())
+            folds, threads = len(blocks) if len(blocks) > 1 else 0, self.measuring.threads
+            self._weights[blocks] = coverage.floor_weights(
+                for_chunks(fold, folds, 1, progress=progress, what="scoring", threads=threads)
+            )
         return self._weights[blocks]
 
 
