@@ -232,16 +232,18 @@ def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     graph = MergeGraph(found, scene, factor, threads=threads)
     graph.reduce(len(rows) - excess, part(progress, 0.1, 0.95))
     keep[rows[~graph.alive]] = False
-    return _written(splats, sums, keep, rows, graph, part(progress, 0.95, 1.0))
+    ahead = part(progress, 0.95, 1.0)
+    return _written(splats, sums, keep, rows, graph, ahead, threads)
 
 
-def _written(
+def _written(  # noqa: PLR0913, PLR0917 - the parts of a stage
     splats: Splats,
     sums: ViewSums,
     keep: NDArray[np.bool_],
     rows: Index,
     graph: MergeGraph,
     progress: Progress,
+    threads: int | None,
 ) -> tuple[Splats, NDArray[np.bool_], Index, ViewSums]:
     """Return the results of `_absorb_once`, with the merged splats in place of the survivors.
 
@@ -256,6 +258,7 @@ def _written(
     graph : MergeGraph
         Reduced; its field shrinks to the changed survivors.
     progress : callable
+    threads : int, optional
     """
     own = np.arange(len(rows))
     # (M,) each: the survivor that each splat went into, and its share of the survivor's colour.
@@ -276,15 +279,15 @@ def _written(
     merged = graph.field = graph.field.take(np.flatnonzero(changed))
     report(progress, 0.0, "absorbing")
     with np.errstate(under="ignore"):
-        logs, quaternions = _axes(merged.covariances, part(progress, 0.0, 0.3))
+        logs, quaternions = _axes(merged.covariances, part(progress, 0.0, 0.3), threads)
         ahead = part(progress, 0.3, 1.0)
         result = Splats(
             _put(splats.means[keep], target, merged.means),
             _put(splats.log_scales[keep], target, logs),
             _put(splats.quaternions[keep], target, quaternions),
             _put(splats.opacity_logits[keep], target, _logit(merged.opacity)),
-            harmonics.put(splats.sh_dc[:, None], splats.sh_dc[keep][:, None], ahead)[:, 0],
-            harmonics.put(splats.sh_rest, splats.sh_rest[keep], ahead),
+            harmonics.put(splats.sh_dc[:, None], splats.sh_dc[keep][:, None], ahead, threads)[:, 0],
+            harmonics.put(splats.sh_rest, splats.sh_rest[keep], ahead, threads),
         )
     taken = np.where(keep, place, -1)
     taken[rows] = np.where(graph.alive[owner], place[rows[owner]], -1)
@@ -311,26 +314,30 @@ class _Blend:
         self.starts = np.flatnonzero(np.diff(targets[order], prepend=-1))
         self.targets = targets[order][self.starts]
 
-    def put(self, values: NDArray[Any], kept: NDArray[Any], progress: Progress) -> NDArray[Any]:
+    def put(
+        self, values: NDArray[Any], kept: NDArray[Any], progress: Progress, threads: int | None
+    ) -> NDArray[Any]:
         """Write the means of `values`, (N, K, 3), to the target rows of `kept`; return `kept`."""
-        if len(self.starts):
-            for column in range(values.shape[1]):
-                # One column at a time, to save memory.
-                report(progress, column / values.shape[1], "absorbing")
-                own = np.asarray(values[self.members, column], np.float64)
-                means = np.add.reduceat(own * self.share[:, None], self.starts)
-                kept[self.targets, column] = means
+
+        def fill(piece: slice) -> None:
+            # One column at a time, to save memory.
+            own = np.asarray(values[self.members, piece.start], np.float64)
+            means = np.add.reduceat(own * self.share[:, None], self.starts)
+            kept[self.targets, piece.start] = means
+
+        columns = values.shape[1] if len(self.starts) else 0
+        for_chunks(fill, columns, 1, progress=progress, what="absorbing", threads=threads)
         return kept
 
 
-def _axes(covariances: Array, progress: Progress) -> tuple[Array, Array]:
+def _axes(covariances: Array, progress: Progress, threads: int | None) -> tuple[Array, Array]:
     """Return `merging.axes` of M covariances, computed in chunks."""
     logs, quaternions = np.empty((len(covariances), 3)), np.empty((len(covariances), 4))
 
     def fill(piece: slice) -> None:
         logs[piece], quaternions[piece] = merging.axes(covariances[piece])
 
-    for_chunks(fill, len(covariances), _CHUNK, progress=progress, what="absorbing", threads=1)
+    for_chunks(fill, len(covariances), _CHUNK, progress=progress, what="absorbing", threads=threads)
     return logs, quaternions
 
 
