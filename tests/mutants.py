@@ -408,10 +408,11 @@ MUTANTS = {
         ),
         ("((stage + 1) / stages))", "(stage / stages))", "a stage late"),
         (
-            "math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE)) if",
-            "1 if",
+            "return math.ceil(math.log(share) / math.log(STAGE))",
+            "return 1",
             "measured only once",
         ),
+        ("    if share >= ALONE:\n", "    if share >= 1.0:\n", "half in two stages"),
         (
             "np.log(opacity) - np.log1p(-opacity)",
             "np.log(opacity) + np.log1p(-opacity)",

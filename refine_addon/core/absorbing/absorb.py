@@ -38,7 +38,11 @@ what is hidden; None before the first stage.
 """
 
 STAGE = 0.6
-"""A stage leaves at least this share of its splats."""
+"""One of several stages leaves at least this share of its splats."""
+
+ALONE = 0.55
+"""A single stage leaves at least this share: half of all splats, once a tenth of all was deleted.
+"""
 
 PATIENCE = 2.0
 """Factor on the cost of merging if half of the splats go; see `patience`."""
@@ -104,6 +108,19 @@ def patience(share: float) -> float:
     return PATIENCE * math.sqrt((1.0 - share) / share)
 
 
+def stages_to(share: float) -> int:
+    """Return in how many stages a share of the splats is reached, 0 to 1.
+
+    Examples
+    --------
+    >>> [stages_to(share) for share in (1.0, 0.5 / 0.9, 0.5, 0.3 / 0.9)]
+    [0, 1, 2, 3]
+    """
+    if share >= ALONE:
+        return int(share < 1.0)
+    return math.ceil(math.log(share) / math.log(STAGE))
+
+
 def absorb(  # noqa: PLR0913 - three keywords are optional
     splats: Splats,
     views: ViewSet,
@@ -158,7 +175,7 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     # Of each splat left: its row among the N, and how many of the N it stands for.
     origin, members = np.arange(count), np.ones(count, np.int64)
     factor = patience(1.0 - goal / max(began or count, 1))
-    stages = math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE)) if goal < count else 0
+    stages = stages_to(max(goal, 1) / max(count, 1))
     sums: ViewSums | None = None
     for stage in range(stages):
         ahead = part(progress, stage / stages, (stage + 1) / stages)
