@@ -111,6 +111,39 @@ MUTANTS = {
         ("if target.resolve() in read:", "if False:", "tiles replaced while read"),
         ("if target in targets[:place]:", "if False:", "one output for two tiles"),
     ],
+    "tiles/seen.py": [
+        ("rows=some.rows + start", "rows=some.rows", "rows of the first chunk"),
+        (
+            "np.concatenate(colors)[at]",
+            "np.concatenate(colors)",
+            "colours in the order of the curve",
+        ),
+        (
+            "at = np.searchsorted(rows, footprints.index)",
+            "at = np.argsort(footprints.index)",
+            "colours of others",
+        ),
+        (
+            "        if self.folder.has(name):\n            return\n        views",
+            "        views",
+            "measured again",
+        ),
+    ],
+    "tiles/scoring.py": [
+        (
+            "rows = slice(start, start + len(unit))",
+            "rows = slice(0, len(unit))",
+            "scores of others",
+        ),
+    ],
+    "tiles/absorbing.py": [
+        ("others * expected.error", "0.0 * expected.error", "the other views forgotten"),
+        ("_ASKEW if stage % 2 else", "_ASKEW if stage < 0 else", "the same planes in each stage"),
+        ("mine + self.starts[number]", "mine", "rows of the first source"),
+        ('own["stood"][stands], len(left)', "None, len(left)", "members forgotten"),
+        ("(k, whole), n / total", "(k, 0.0 * whole), n / total", "no allowance in any region"),
+        ("weights[order[last + 1 :]] = 0.0", "weights[:] = 1.0", "the same share of each region"),
+    ],
     "scoring/closed_form_block.py": [
         ("total *= self.alpha[piece]", "total *= self.alpha[piece] ** 2", "opacity twice"),
         ("LUMA = (0.299, 0.587, 0.114)", "LUMA = (0.114, 0.587, 0.299)", "BGR"),
@@ -266,7 +299,6 @@ MUTANTS = {
     "scoring/occlusion.py": [
         ("return 0.25 + 0.5 * gone", "return 0.25", "what has gone forgotten"),
         ("        self._turn += count\n", "", "the same views in every round"),
-        ("block.error[:] *= error", "pass", "errors before what hid them went"),
         (
             "LEAST ** (number / (rounds - 1))",
             "LEAST ** ((number - 1) / (rounds - 1))",
@@ -291,10 +323,11 @@ MUTANTS = {
             "the same views in every block",
         ),
         (
-            "total.contribution[footprints.index] += weight * (mass * visible)",
-            "total.contribution[footprints.index] += mass * visible",
+            "self.contribution[footprints.index] += weight * contribution",
+            "self.contribution[footprints.index] += contribution",
             "weight of views forgotten",
         ),
+        ("self.error * error", "self.error", "errors before what hid them went"),
         ("footprints.index[footprints.inside]", "footprints.index", "seen beside the image"),
         ("            seen *= seen\n", "", "transmittance not squared"),
     ],
@@ -306,8 +339,8 @@ MUTANTS = {
             "thickness of a thin point",
         ),
         (
-            "np.minimum(alphas, np.float32(ALPHA_MAX), out",
-            "np.maximum(alphas, 1.0, out",
+            "np.minimum(footprints.alphas, np.float32(ALPHA_MAX), out",
+            "np.maximum(footprints.alphas, 1.0, out",
             "covers more",
         ),
         ("    sums -= values\n", "", "a splat hides itself"),
@@ -370,13 +403,10 @@ MUTANTS = {
             "low-pass forgotten",
         ),
         (
-            "REACH * focal * float(np.hypot(1.0, slope))",
-            "0.0",
+            "reach = _reach(side) * largest",
+            "reach = 0.0 * largest",
             "size forgotten at the edge",
         ),
-        ("sign * side.offset - side.pixels", "sign * side.offset", "boxes beside the axis lost"),
-        ("np.maximum.reduceat(self.largest", "np.minimum.reduceat(self.largest", "small boxes"),
-        ("touching &= least <= limit", "touching |= least <= limit", "no box is left out"),
         ("known and away <=", "known or away <=", "farther than float32 holds"),
     ],
     "scoring/coverage.py": [
@@ -400,19 +430,23 @@ MUTANTS = {
             "shares of harmonics swapped",
         ),
         ("reversed(graph.merges)", "graph.merges", "merges followed forwards"),
-        ("np.flatnonzero(keep & good & free)", "np.flatnonzero(keep & good)", "unprotected"),
+        (
+            "np.flatnonzero(drawable(splats) & ~protected)",
+            "np.flatnonzero(drawable(splats))",
+            "unprotected",
+        ),
         (
             "protected=spared[origin]",
             "protected=spared[: len(origin)]",
             "protection of another row",
         ),
-        ("((stage + 1) / stages))", "(stage / stages))", "a stage late"),
+        ("((stage + 1) / number))", "(stage / number))", "a stage late"),
+        ("1 if share >= ALONE else", "", "half in two stages"),
         (
-            "return math.ceil(math.log(share) / math.log(STAGE))",
-            "return 1",
+            "else math.ceil(math.log(share) / math.log(STAGE))",
+            "else 1",
             "measured only once",
         ),
-        ("    if share >= ALONE:\n", "    if share >= 1.0:\n", "half in two stages"),
         (
             "np.log(opacity) - np.log1p(-opacity)",
             "np.log(opacity) + np.log1p(-opacity)",
@@ -420,8 +454,8 @@ MUTANTS = {
         ),
     ],
     "absorbing/merge_field.py": [
-        ("/ (1.0 + seen)\n", "\n", "as likely after many views"),
-        ("unhidden = seen @ worth", "unhidden = worth.sum()", "all seen once"),
+        ("worth * second / (1.0 + self.seen)", "worth * second", "as likely after many views"),
+        ("self.seen @ worth", "worth.sum()", "all seen once"),
         ("np.where(inside, counts, counts * BESIDE)", "counts", "views beside count"),
         (
             "np.where(inside, counts, counts * BESIDE) / squared",
@@ -478,7 +512,7 @@ MUTANTS = {
         ),
         ("        self._price(mine[there], progress)\n", "", "costs not renewed"),
         ("self.cost[mine] = self.patience * cost", "self.cost[mine] = cost", "patience ignored"),
-        ("count < connected / 2", "count < 0", "never connected anew"),
+        ("count < self.connected / 2", "count < 0", "never connected anew"),
         ("self.alive & ~np.isnan(self.field.error)", "self.alive", "a round that does nothing"),
     ],
     "scoring/auto.py": [
@@ -647,6 +681,7 @@ TESTS = {
     "viewport_arrays": ["../viewport/arrays.py"],
     "command_counts": ["report.py"],
     "tiles": ["tiles/units.py", "tiles/steps.py", "tiles/folder.py", "tiles/prune.py"],
+    "tiles_seen": ["tiles/seen.py", "tiles/scoring.py", "tiles/absorbing.py"],
     "levels": ["levels/lod.py", "levels/distance.py", "levels/files.py"],
     "pictures": ["png.py", "picture_files.py"],
 }

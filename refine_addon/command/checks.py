@@ -183,13 +183,13 @@ def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
 
 def _check_together(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     """Refuse what needs all splats at once, or one output."""
-    alone = ("object", "output", "absorb", "clean", "psnr", *ROLES)
+    alone = ("object", "output", "clean", *ROLES)
     for name in alone:
         if getattr(given, name, None):
             option = "-o" if name == "output" else f"--{name.replace('_', '-')}"
             parser.error(f"{option} does not go with --together")
-    if given.method != "closed-form":
-        parser.error("--together scores by the closed form so far: add --method closed-form")
+    if given.psnr is not None and (given.absorb or given.method == "closed-form"):
+        parser.error("with --together, --psnr goes with --method auto or occlusion, not --absorb")
     if given.workers is not None and given.scheduler:
         parser.error("expected --workers or --scheduler, and not both")
     if given.workers is not None and given.workers < 1:

@@ -33,7 +33,7 @@ EXAMPLES = {
         "refine prune in.ply --cameras sparse/0 --max-mb 5 --absorb -o out.ply",
         "refine prune in.ply --cameras sparse/0 --keep-inside box:-2,-2,-1,2,2,3 -o out.ply",
         f"{BLENDER}refine prune --object Splats --protect Statue --remove-inside Sky -o out.ply",
-        "refine prune *.ply --together --cameras sparse/0 --method closed-form --output-dir out",
+        "refine prune *.ply --together --cameras sparse/0 --ratio 0.6 --output-dir out",
         f"{BLENDER}refine prune --object Splats -o out.ply",
         f"{BLENDER}refine prune --object Splats --frames 1:250:10 --save",
         f"{BLENDER}refine prune --object Splats --source collection:Shot --dry-run",
@@ -157,8 +157,8 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     prune.add_argument(
         "--together",
         action="store_true",
-        help="the inputs are tiles of one scene: one budget over all of them, with a few rows at a "
-        "time in memory; for plain PLY and --method closed-form; all are written or none",
+        help="the inputs are tiles of one scene: one budget over all of them, and never all of "
+        "them in memory; for plain PLY; all are written or none",
     )
     prune.add_argument(
         "--workers",

@@ -206,6 +206,7 @@ def _prune_together(run: _Run, label: str, views: ViewSet) -> dict[str, Any]:
                 views,
                 budget(options),
                 settings(options),
+                absorb=options.absorb,
                 overwrite=options.overwrite,
                 progress=run.progress(label),
                 workers=workers,

@@ -165,12 +165,11 @@ def _pictures(
         with np.errstate(under="ignore"):
             footprints = projection.project(gaussians, scene, view)
             colors = colors_from(splats, gaussians.index[footprints.index], view)
-        found.append(_picture(gaussians, footprints, colors, view, ahead, threads))
+        found.append(_picture(footprints, colors, view, ahead, threads))
     return found
 
 
 def _picture(
-    gaussians: Gaussians,
     footprints: Footprints,
     colors: NDArray[np.float64],
     view: View,
@@ -181,21 +180,19 @@ def _picture(
 
     Parameters
     ----------
-    gaussians : Gaussians
     footprints : Footprints
-        Of these in the view.
+        In the view.
     colors : (3, n) float64
         Of the footprints.
     view : View
     progress : callable
     threads : int, optional
     """
-    alphas = gaussians.alphas.take(footprints.index)
 
     def work(piece: slice) -> NDArray[np.float64]:
         rows = np.arange(piece.start, piece.stop)
         with np.errstate(under="ignore"):
-            strip = _strip(footprints, alphas, colors, np.arange(view.width), rows)
+            strip = _strip(footprints, colors, np.arange(view.width), rows)
         return strip.reshape(3, len(rows), view.width)
 
     rows = max(_PIXELS // view.width, 1)
@@ -205,7 +202,6 @@ def _picture(
 
 def _strip(
     footprints: Footprints,
-    alphas: NDArray[np.float32],
     colors: NDArray[np.float64],
     columns: NDArray[np.int64],
     rows: NDArray[np.int64],
@@ -218,15 +214,13 @@ def _strip(
     Parameters
     ----------
     footprints : Footprints
-    alphas : (n,) float32
-        Of the Gaussians.
     colors : (3, n) float64
     columns, rows : (C,), (R,) int64
         Ascending.
     """
     pixels = len(columns) * len(rows)
     through, image = np.zeros(pixels), np.zeros((3, pixels))  # logarithm of the transmittance
-    reach = reaches(alphas)
+    reach = reaches(footprints.alphas)
     (left, wide), (top, tall) = (
         boxes(footprints, reach, axis, places) for axis, places in enumerate((columns, rows))
     )
@@ -243,7 +237,7 @@ def _strip(
         squared = mahalanobis(footprints, own, columns.take(across[open_]), rows.take(down[open_]))
         met = np.flatnonzero(squared < reach.take(own))
         own, line = own[met], line[met]
-        alpha = alphas.take(own) * np.exp(squared[met] / np.float32(-2.0))
+        alpha = footprints.alphas.take(own) * np.exp(squared[met] / np.float32(-2.0))
         order = np.argsort(line.astype(np.min_scalar_type(pixels)), kind="stable")
         own, line = own[order], line[order]
         alpha = np.minimum(alpha[order], np.float32(ALPHA_MAX))

@@ -43,6 +43,9 @@ UNESTIMATED = "the closed form estimates the pictures' quality only if a PSNR is
 UNFORETOLD = f"what absorbing reaches is not foretold for fewer than {FEWEST:,} splats"
 """Why there is no estimate: notes of the report."""
 
+MEASURES = "absorbing measures by occlusion: closed-form was not used"
+"""A note of the report."""
+
 TRIES = 3
 """How often absorbing is done at most to reach a PSNR."""
 
@@ -322,7 +325,7 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
         facts["absorbed"] = absorbed.facts()
         facts["notes"].append(absorbed.note())
         if known and task.settings.method == "closed-form":
-            facts["notes"].append("absorbing measures by occlusion: closed-form was not used")
+            facts["notes"].append(MEASURES)
     return Result(keep, scores, facts, absorbed)
 
 

@@ -130,14 +130,30 @@ def _principal_axes(
     scene : Scene
         Its origin and size are used.
     """
-    second, first = np.zeros((3, 3)), np.zeros(3)  # weighted moments
+    total = np.zeros((4, 3))
+    for found in moments(means, drawable, scene):
+        total += found
+    return principal_axes(total[:3], total[3])
+
+
+def moments(
+    means: NDArray[Any], drawable: NDArray[np.bool_], scene: Scene
+) -> Iterator[NDArray[np.float64]]:
+    """Yield of some positions after the other what `principal_axes` takes, (4, 3) float64.
+
+    The first three rows are the weighted sums of the products of coordinates, the last those of the
+    coordinates.
+
+    Parameters
+    ----------
+    means, drawable, scene
+        See `_principal_axes`.
+    """
     for piece in _pieces(len(means)):
         place = scene.place(means[piece][drawable[piece]])  # (n, 3)
         nearness = (1.0 + np.einsum("ij,ij->i", place, place)) ** -2.0  # (n,)
         weighted = place * nearness[:, None]
-        second += weighted.T @ place
-        first += weighted.sum(axis=0)
-    return principal_axes(second, first)
+        yield np.vstack([weighted.T @ place, weighted.sum(axis=0)])
 
 
 def principal_axes(second: NDArray[np.float64], first: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -204,6 +220,11 @@ def spatial_order(
         Positions that agree in 21 bits of each coordinate are at the same place; without `ties`
         they keep their order.
     """
+    return code_order(spatial_code(place), ties)
+
+
+def spatial_code(place: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return where positions lie along the curve of `spatial_order`, (N,)."""
     cells = float(1 << _BITS)
     code = np.zeros(len(place), np.int64)  # (N,), bits of the three coordinates interleaved
     # All of space is mapped into a ball, so the resolution falls with the distance.
@@ -214,6 +235,14 @@ def spatial_order(
         for shift, mask in _SPREAD_BITS:
             bits = (bits | bits << shift) & mask
         code |= bits << axis
+    return code
+
+
+def code_order(
+    code: NDArray[np.int64],
+    ties: Callable[[NDArray[np.int64]], NDArray[np.uint64]] | None = None,
+) -> NDArray[np.int64]:
+    """Return the order of the numbers of `spatial_code`; see `spatial_order`."""
     order = np.argsort(code, kind="stable")
     same = np.diff(code[order]) == 0  # (N - 1,)
     if ties is not None and same.any():

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .absorbing.absorb import Absorbed
+    from .splats import Splats
 
 
 class Columns(Protocol):
@@ -57,10 +58,17 @@ def survivor_columns(
     survivors = absorbed.splats.take(changed)
     if matrix is not None and not np.array_equal(matrix, np.eye(4)):
         survivors = transformed(survivors, matrix)
+    return columns_with(stored, rows, survivors)
+
+
+def columns_with(
+    stored: Columns | NDArray[Any], rows: NDArray[np.int64], splats: Splats
+) -> dict[str, NDArray[Any]]:
+    """Return stored columns with the values of some splats put in at their rows, rounded once."""
     columns = {}
     # A double may be too large or too small for a float.
     with np.errstate(over="ignore", under="ignore"):
-        for name, values in values_by_name(survivors).items():
+        for name, values in values_by_name(splats).items():
             columns[name] = stored[name].copy()
             columns[name][rows] = values
     return columns

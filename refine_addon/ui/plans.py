@@ -387,12 +387,11 @@ def _state(objects: list[bpy.types.Object], settings: Any) -> tuple[Any, ...]:  
 
 def _demanded(settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
     """Return what the settings name as to stay or to go, and where volumes stand."""
-    listed = [item for item in settings.volumes if item.object is not None]
     return (
         settings.protect,
         *(
             (item.role, item.object.session_uid, *map(tuple, item.object.matrix_world))
-            for item in listed
+            for item in demands.listed(settings.id_data)
         ),
     )
 

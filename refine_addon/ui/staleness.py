@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
+from .. import demands
 from ..cameras.objects import SOURCE, WEIGHT, render_size
 from ..cameras.sets import chosen_cameras
 from ..mesh import attributes as mesh_attributes
@@ -96,7 +97,7 @@ def _protected(obj: bpy.types.Object, mask: NDArray[np.bool_] | None) -> list[in
 
 def _volumes(scene: bpy.types.Scene) -> list[Any]:
     """Return the volumes that decide what has to go, if any: who, where, and of which shape."""
-    listed = [item for item in scene.refine.volumes if item.object is not None]
+    listed = demands.listed(scene)
     if all(item.role == "PROTECT" for item in listed):
         return []  # what is protected is scored like the rest; see `_protected`
     found, depsgraph = [], bpy.context.evaluated_depsgraph_get()

@@ -109,10 +109,9 @@ def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = Non
         _edited.clear()
         again(bpy.context)
         return
-    volumes = scene.refine.volumes
-    if not volumes:
+    if not scene.refine.volumes:
         return
-    there = {item.object for item in volumes if item.object is not None}
+    there = {item.object for item in demands.listed(scene)}
     there |= {obj.data for obj in there if obj.data is not None}
     for update in depsgraph.updates:
         original = update.id.original

@@ -13,7 +13,7 @@ import pytest
 from refine_addon.command import main
 from refine_addon.core import Budget, RefineError, Settings, prune_tiles, read_cameras, read_ply
 from refine_addon.core.formats.ply_header import with_count
-from refine_addon.core.tiles import cluster, units
+from refine_addon.core.tiles import absorbing, cluster, units
 from refine_addon.core.tiles.folder import Folder
 from refine_addon.core.tiles.steps import Job
 
@@ -46,9 +46,9 @@ def tiles(tmp_path, monkeypatch):
     return paths
 
 
-def prune(tiles, folder, **options):
+def prune(tiles, folder, settings=CLOSED, **options):
     """Prune the tiles into a folder, and return the bytes of the files."""
-    prune_tiles(tiles, folder, read_cameras(ROOM / "cameras.json"), BUDGET, CLOSED, **options)
+    prune_tiles(tiles, folder, read_cameras(ROOM / "cameras.json"), BUDGET, settings, **options)
     return [(folder / path.name).read_bytes() for path in tiles]
 
 
@@ -67,6 +67,30 @@ def test_a_killed_worker_changes_no_byte(tmp_path, tiles, workers, moment):
 
     assert killed
     assert found == prune(tiles, tmp_path / "here")
+    assert len(list((tmp_path / "out").iterdir())) == len(tiles)
+
+
+@needs_dask
+@pytest.mark.parametrize("moment", [0.2, 0.5, 0.7], ids=["measuring", "absorbing", "again"])
+def test_a_worker_killed_while_absorbing_changes_no_byte(
+    tmp_path, tiles, workers, monkeypatch, moment
+):
+    """Blocks of views and regions are done again by others, as runs of rows are."""
+    monkeypatch.setattr(absorbing, "REGION", 1500)
+    killed = []
+
+    def progress(fraction, _what):
+        if fraction >= moment and not killed:
+            killed.append(next(iter(workers._client.run(os.getpid).values())))
+            os.kill(killed[0], signal.SIGKILL)
+
+    settings = Settings(method="occlusion", views=8)
+    found = prune(
+        tiles, tmp_path / "out", settings, absorb=True, workers=workers, progress=progress
+    )
+
+    assert killed
+    assert found == prune(tiles, tmp_path / "here", settings, absorb=True)
     assert len(list((tmp_path / "out").iterdir())) == len(tiles)
 
 

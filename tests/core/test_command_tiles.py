@@ -79,11 +79,13 @@ def test_a_tile_that_is_missing_stops_all(folder, capsys):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--output-dir", "out"], "add --method closed-form"),
         ([*CLOSED, "-o", "out.ply"], "-o does not go with --together"),
-        ([*CLOSED, "--output-dir", "out", "--absorb"], "--absorb does not go with --together"),
         ([*CLOSED, "--output-dir", "out", "--clean"], "--clean does not go with --together"),
-        ([*CLOSED, "--output-dir", "out", "--psnr", "40"], "--psnr does not go with --together"),
+        (
+            [*CLOSED, "--output-dir", "out", "--psnr", "40"],
+            "--psnr goes with --method auto or occlusion",
+        ),
+        (["--output-dir", "out", "--psnr", "40", "--absorb"], "not --absorb"),
         (
             [*CLOSED, "--output-dir", "out", "--protect", "sphere:0,0,0,1"],
             "--protect does not go with --together",

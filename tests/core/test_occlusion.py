@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -78,11 +78,6 @@ def ring(count=5) -> ViewSet:
         view = replace(look_along_z(), rotation=rotation, center=-5.0 * forward)
         views.append(replace(view, name=f"{index:02}"))
     return ViewSet(tuple(views))
-
-
-def floor_weights(folds) -> list[float]:
-    """Return the weights that `coverage` chooses by scores, floors and errors of each fold."""
-    return coverage.floor_weights([coverage.losses(*fold) for fold in folds])
 
 
 def agreement(first, second) -> float:
@@ -223,7 +218,7 @@ def test_a_splat_as_narrow_as_a_cell_is_half_even():
     """By its narrow side: sigma 4 px on cells of 16 px^2; a third of it is a tenth, thrice .9."""
     sigmas = np.array([[50.0, 5.0, 12.0], [4.0, 4 / 3, 12.0]], np.float32)
     footprints = projection.Footprints(
-        np.arange(3), sigmas, sigmas, sigmas, sigmas, np.ones(3, bool)
+        np.arange(3), sigmas, sigmas, sigmas, sigmas, np.ones(3, bool), np.ones(3, np.float32)
     )
 
     found = froxels.evenness(footprints, 16.0)
@@ -385,42 +380,6 @@ def test_footprints_are_those_of_the_linearised_projection(seed):
     )
     assert abs(halves[:, 0] @ halves[:, 1]) < 1e-3 * covariance.max()
     np.testing.assert_allclose(found.sigmas[:, 0], np.linalg.norm(halves, axis=0), rtol=1e-5)
-
-
-@pytest.mark.parametrize("size", [1, 7, 64])
-def test_boxes_leave_out_no_splat_that_a_view_shows(monkeypatch, size):
-    """Views from within, of all directions and planes: with boxes and without, to the bit.
-
-    Some boxes lie in no view, so they are left out; boxes of one splat leave out most.
-    """
-    monkeypatch.setattr(projection, "_BOX", size)
-    rng = np.random.default_rng(size)
-    splats = cloud(400)
-    splats.means[:] *= rng.uniform(0.0, 30.0, (400, 1))
-    splats.log_scales[::9] += 2.0
-    views = [
-        replace(
-            look_along_z(rng.normal(size=3) * 5.0, cx=rng.uniform(-50, 130)),
-            rotation=np.linalg.qr(rng.normal(size=(3, 3)))[0],
-            near=rng.choice([0.0, 2.0]),
-            far=rng.choice([10.0, 1e6]),
-        )
-        for _ in range(40)
-    ]
-    gaussians, frame, _ = projection.prepare(splats, ViewSet(tuple(views)), threads=1)
-    boxed = [projection.project(gaussians, frame, view) for view in views]
-    looked = []
-    for view in views:
-        pieces = projection._pieces(gaussians, frame, view, projection.clip_planes(frame, view))
-        looked.append(sum(piece.stop - piece.start for piece in pieces))
-    monkeypatch.setattr(projection, "_boxes_touch", lambda boxes, *_: boxes.largest > 0.0)
-
-    for view, found in zip(views, boxed, strict=True):
-        every = projection.project(gaussians, frame, view)
-        for item in fields(projection.Footprints):
-            np.testing.assert_array_equal(getattr(found, item.name), getattr(every, item.name))
-    shown = np.mean([len(found.index) for found in boxed])
-    assert 0.0 < shown <= np.mean(looked) < len(gaussians)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e3])
@@ -630,18 +589,18 @@ def test_the_floor_weighs_what_loses_least_of_what_the_left_out_views_saw():
     dark = np.zeros((1, 200))
     errors = np.stack([right * rng.uniform(0.9, 1.1, 200) for _ in range(4)])
 
-    found = floor_weights([(right, wrong, errors), (right, wrong, dark)])
+    found = coverage.floor_weights([(right, wrong, errors), (right, wrong, dark)])
     tenth = np.argsort(coverage.with_floor(right, wrong, found[0]))[:20]
     np.testing.assert_array_equal(np.sort(tenth), np.sort(np.argsort(right)[:20]))
     assert found[2:] == list(coverage.LEAST_FLOOR_WEIGHTS)[2:]
-    most = floor_weights([(wrong, right, errors)])
+    most = coverage.floor_weights([(wrong, right, errors)])
     assert min(most[:2]) > 0.3
     assert min(most[2:]) == pytest.approx(max(coverage.FLOOR_WEIGHTS))
-    assert floor_weights([]) == [1.0] * len(coverage.SHARES)
-    assert floor_weights([(right, wrong, dark)]) == [1.0] * len(coverage.SHARES)
+    assert coverage.floor_weights([]) == [1.0] * len(coverage.SHARES)
+    assert coverage.floor_weights([(right, wrong, dark)]) == [1.0] * len(coverage.SHARES)
     plain, glare = (np.vstack([errors, wrong * bright]) for bright in (1.0, 1e6))
-    assert floor_weights([(right, wrong, plain)]) == pytest.approx(
-        floor_weights([(right, wrong, glare)])
+    assert coverage.floor_weights([(right, wrong, plain)]) == pytest.approx(
+        coverage.floor_weights([(right, wrong, glare)])
     )
 
 
@@ -665,7 +624,7 @@ def test_each_share_has_the_weight_that_is_right_up_to_there():
     floors = np.where(truth <= 40, 41.0, truth)
     errors = np.stack([truth * rng.uniform(0.9, 1.1, 400) for _ in range(4)])
 
-    found = floor_weights([(scores, floors, errors)])
+    found = coverage.floor_weights([(scores, floors, errors)])
 
     assert found[0] < 0.002 < min(found[1:3])
 
@@ -677,7 +636,7 @@ def test_a_floor_that_gains_nothing_has_no_weight_while_little_goes():
     """
     right = np.random.default_rng(9).random(200)
 
-    found = floor_weights([(right, right, right[None])])
+    found = coverage.floor_weights([(right, right, right[None])])
 
     assert max(found[:2]) < 1e-5
     assert found[2:] == list(coverage.LEAST_FLOOR_WEIGHTS)[2:]
@@ -838,7 +797,7 @@ def test_cells_follow_the_footprints_not_the_pixels(count, scale):
     """
     sigmas = np.full((2, count), 1.0, np.float32)
     footprints = projection.Footprints(
-        np.arange(count), sigmas, sigmas, sigmas, sigmas, np.ones(count, bool)
+        np.arange(count), sigmas, sigmas, sigmas, sigmas, np.ones(count, bool), sigmas[0]
     )
     view = look_along_z(width=400 * scale, height=300 * scale)
 
@@ -894,7 +853,7 @@ def test_scoring_is_cancelled_while_the_floor_is_weighed(monkeypatch, last):
     monkeypatch.setattr(coverage, "floor", counted)
 
     with pytest.raises(Cancelled):
-        occlusion.score(cloud(), ring(), progress=lambda *_: len(calls) < last, threads=1)
+        occlusion.score(cloud(), ring(), progress=lambda *_: len(calls) < last)
 
     assert len(calls) == last
 
@@ -911,7 +870,7 @@ def test_cells_stop_growing_where_each_footprint_needs_a_point_of_its_own(large,
     sigmas = np.where(np.arange(count) < large * count, 4.0, 0.5).astype(np.float32)
     both = np.broadcast_to(sigmas, (2, count))
     footprints = projection.Footprints(
-        np.arange(count), both, both, both, both, np.ones(count, bool)
+        np.arange(count), both, both, both, both, np.ones(count, bool), sigmas
     )
 
     side = froxels.cell_size(footprints, look_along_z(), 4.0, 2.0)
@@ -956,8 +915,8 @@ def test_weights_that_are_nearly_as_good_do_not_jump():
     scores, floors = rng.random(300), rng.random(300)
     errors = rng.random((4, 300))
 
-    found = floor_weights([(scores, floors, errors)])
-    again = floor_weights([(scores, floors, errors * (1.0 + 1e-7 * rng.random((4, 300))))])
+    found = coverage.floor_weights([(scores, floors, errors)])
+    again = coverage.floor_weights([(scores, floors, errors * (1.0 + 1e-7 * rng.random((4, 300))))])
 
     np.testing.assert_allclose(again, found, rtol=1e-3)
 

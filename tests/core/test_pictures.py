@@ -96,7 +96,7 @@ def test_a_picture_is_what_the_lines_of_sight_through_all_its_pixels_see(size):
     footprints = projection.project(gaussians, scene, view)
     expected = np.empty((3, size[1], size[0]))
     for row in range(size[1]):
-        lines = meet(gaussians, footprints, np.arange(size[0]), np.array([row]))
+        lines = meet(footprints, np.arange(size[0]), np.array([row]))
         expected[:, row] = lines.colors(colors_from(splats, gaussians.index[lines.met], view))
 
     (found,) = compare(splats, splats, views)

@@ -113,7 +113,7 @@ def test_lines_meet_what_their_pixels_show():
     view = views[1]
     columns, rows = sight_lines.spread(80, 9, 0.3), sight_lines.spread(60, 7, 0.8)
 
-    lines = sight_lines.meet(gaussians, projection.project(gaussians, scene, view), columns, rows)
+    lines = sight_lines.meet(projection.project(gaussians, scene, view), columns, rows)
 
     colors = np.array([color(splats, row, view) for row in gaussians.index[lines.met]])
     whole = picture(splats, view, views)

@@ -17,32 +17,23 @@ from refine_addon.core import (
     read_ply,
     score,
 )
-from refine_addon.core.formats.ply_header import with_count
 from refine_addon.core.scoring import closed_form
 from refine_addon.core.selection import select
 from refine_addon.core.tiles import prune as together
 from refine_addon.core.tiles import steps, units
 from refine_addon.core.tiles.folder import Folder
 from tests.strategies import plain_ply
+from tests.tiles import COUNT, ROOM, cut, joined, room_rows, write
 
-ROOM = Path(__file__).parents[2] / "tests/data/room_small"
 CLOSED = Settings(method="closed-form", views=8)
-COUNT = 5000
-CUTS = (0, 700, 700, 2600, COUNT)
-"""Rows at which the room is cut: a short tile, an empty one, and two that span units."""
 
 
 @pytest.fixture
 def rows(monkeypatch):
-    """Give rows of the room; some are equal, some cannot be drawn. A unit has 1000 of them."""
+    """Give rows of the room; a unit has 1000 of them."""
     monkeypatch.setattr(closed_form, "ROWS", 1000)
     monkeypatch.setattr(units, "ROWS", 1000)
-    rows = read_ply(ROOM / "point_cloud.ply").rows[::7][:COUNT].copy()
-    rows[900:1300] = rows[100]
-    rows["x"][[5, 2000]] = np.nan
-    rows["opacity"][10:400:7] = -np.inf
-    rows["scale_0"][4000] = np.inf
-    return rows
+    return room_rows()
 
 
 @pytest.fixture
@@ -55,21 +46,7 @@ def views():
 def tiles(tmp_path, rows):
     """Write the rows as four files, and as one."""
     write(tmp_path / "whole.ply", rows)
-    paths = [tmp_path / f"{name}.ply" for name in "badc"]
-    for path, start, stop in zip(paths, CUTS, CUTS[1:], strict=False):
-        write(path, rows[start:stop])
-    return paths
-
-
-def write(path, rows):
-    """Write rows of the room as a file."""
-    header = read_ply(ROOM / "point_cloud.ply").header
-    path.write_bytes(with_count(header, len(rows)) + rows.tobytes())
-
-
-def joined(paths):
-    """Return the rows of files as bytes."""
-    return b"".join(read_ply(path).rows.tobytes() for path in paths)
+    return cut(tmp_path, rows)
 
 
 BUDGETS = [
@@ -191,8 +168,7 @@ def test_a_size_that_no_splat_fits_in_is_refused(tmp_path, tiles, views):
 @pytest.mark.parametrize(
     ("settings", "budget", "words"),
     [
-        (Settings(), Budget(ratio=0.5), "method is auto.*only closed-form"),
-        (CLOSED, Budget(psnr=40.0), "PSNR needs all splats"),
+        (CLOSED, Budget(psnr=40.0), "closed-form estimates no PSNR"),
         (CLOSED, Budget(threshold=1e30), "would remove all 5000 splats"),
     ],
 )
@@ -223,6 +199,14 @@ def damaged(path, tiles):
     again = path.parent / "more" / tiles[1].name
     again.write_bytes(tiles[1].read_bytes())
     return [*tiles, again], f"another tile is called {again.name} too"
+
+
+@pytest.mark.parametrize("folder", ["out", None])
+def test_a_tile_that_is_given_twice_is_refused(tmp_path, tiles, views, folder):
+    """Also where nothing is written: its splats would count twice."""
+    output = None if folder is None else tmp_path / folder
+    with pytest.raises(RefineError, match=r"d\.ply: is given twice"):
+        prune_tiles([*tiles, tiles[2]], output, views, Budget(ratio=0.5), CLOSED)
 
 
 @pytest.mark.parametrize("kind", ["missing", "short.ply", "text.ply", "same"])
@@ -302,8 +286,8 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views,
     budget = Budget(ratio=0.5)
     prune_tiles(tiles, tmp_path / "once", views, budget, CLOSED)
     done = []
-    read, write_rows = steps.splats_of, steps.write_rows
-    monkeypatch.setattr(steps, "splats_of", lambda unit: done.append(unit.index) or read(unit))
+    read, write_rows = units.Unit.splats, steps.write_rows
+    monkeypatch.setattr(units.Unit, "splats", lambda unit: done.append(unit.index) or read(unit))
     monkeypatch.setattr(
         steps, "write_rows", lambda *rows: done.append(len(rows[1])) or write_rows(*rows)
     )

@@ -135,13 +135,17 @@ class Binary(Blender):
 
     def run(self, *words: str | Path) -> subprocess.CompletedProcess[str]:
         """Run a command in the root, offline; it can write to the test's folders alone."""
+        return _run(self.entered(*words))
+
+    def entered(self, *words: str | Path) -> list[str | Path]:
+        """Return the command that runs a command as `run` does."""
         enter = blender_root.enter(
             self.path,
             read_only=[PROJECT],
             writable=[self.work, self.resources],
             environment=self.environment(),
         )
-        return _run([*enter, "--chdir", self.work, *words])
+        return [*enter, "--chdir", self.work, *words]
 
     def blender(self, *words: str | Path) -> subprocess.CompletedProcess[str]:
         """Run Blender in the background, with the preferences that the test has saved."""

@@ -50,8 +50,35 @@ PATIENCE = 2.0
 _CHUNK = 1 << 14
 
 
+class Counts:
+    """How many splats absorbing changed, merged and deleted.
+
+    Attributes
+    ----------
+    changed : (K,) bool
+        Which survivors absorbed others.
+    merged, deleted : int
+        How many splats were absorbed by a survivor, and how many were deleted.
+    """
+
+    changed: NDArray[np.bool_]
+    merged: int
+    deleted: int
+
+    def facts(self) -> dict[str, int]:
+        """Return the counts, for a report."""
+        changed = int(np.count_nonzero(self.changed))
+        return {"changed": changed, "merged": self.merged, "deleted": self.deleted}
+
+    def note(self) -> str:
+        """Return the counts as a sentence, for the user."""
+        return "{changed:,} survivors absorbed {merged:,} splats; {deleted:,} were deleted".format(
+            **self.facts()
+        )
+
+
 @dataclass(frozen=True, eq=False)
-class Absorbed:
+class Absorbed(Counts):
     """The result of absorbing N splats.
 
     Attributes
@@ -71,17 +98,6 @@ class Absorbed:
     changed: NDArray[np.bool_]
     merged: int
     deleted: int
-
-    def facts(self) -> dict[str, int]:
-        """Return the counts, for a report."""
-        changed = int(np.count_nonzero(self.changed))
-        return {"changed": changed, "merged": self.merged, "deleted": self.deleted}
-
-    def note(self) -> str:
-        """Return the counts as a sentence, for the user."""
-        return "{changed:,} survivors absorbed {merged:,} splats; {deleted:,} were deleted".format(
-            **self.facts()
-        )
 
 
 def patience(share: float) -> float:
@@ -106,19 +122,6 @@ def patience(share: float) -> float:
     """
     share = min(max(share, 1e-3), 1.0 - 1e-3)
     return PATIENCE * math.sqrt((1.0 - share) / share)
-
-
-def stages_to(share: float) -> int:
-    """Return in how many stages a share of the splats is reached, 0 to 1.
-
-    Examples
-    --------
-    >>> [stages_to(share) for share in (1.0, 0.5 / 0.9, 0.5, 0.3 / 0.9)]
-    [0, 1, 2, 3]
-    """
-    if share >= ALONE:
-        return int(share < 1.0)
-    return math.ceil(math.log(share) / math.log(STAGE))
 
 
 def absorb(  # noqa: PLR0913 - three keywords are optional
@@ -175,14 +178,13 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     # Of each splat left: its row among the N, and how many of the N it stands for.
     origin, members = np.arange(count), np.ones(count, np.int64)
     factor = patience(1.0 - goal / max(began or count, 1))
-    stages = stages_to(max(goal, 1) / max(count, 1))
+    left_after = stages(count, goal)
     sums: ViewSums | None = None
-    for stage in range(stages):
-        ahead = part(progress, stage / stages, (stage + 1) / stages)
-        left = round(count * (goal / count) ** ((stage + 1) / stages))
+    for stage, left in enumerate(left_after):
+        ahead = part(progress, stage / len(left_after), (stage + 1) / len(left_after))
         sums = measure(splats, sums, part(ahead, 0.0, 0.5))
-        splats, kept, taken, sums = _absorb_once(
-            splats, views, scene, sums, max(left, goal), protected=spared[origin],
+        splats, kept, taken, sums = absorb_once(
+            splats, views, scene, sums, left, protected=spared[origin],
             factor=factor, progress=part(ahead, 0.5, 1.0), threads=threads,
         )  # fmt: skip
         # A survivor now also stands for all that the splats it absorbed stood for.
@@ -194,7 +196,25 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     return Absorbed(splats, keep, members > 1, merged, count - len(origin) - merged)
 
 
-def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
+def stages(count: int, goal: int) -> list[int]:
+    """Return how many of `count` splats are left after each stage; `goal` after the last.
+
+    Examples
+    --------
+    >>> stages(900, 500), stages(900, 450), stages(900, 900)
+    ([500], [636, 450], [])
+    """
+    if goal >= count:
+        return []
+    share = max(goal, 1) / count
+    number = 1 if share >= ALONE else math.ceil(math.log(share) / math.log(STAGE))
+    return [
+        max(round(count * (goal / count) ** ((stage + 1) / number)), goal)
+        for stage in range(number)
+    ]
+
+
+def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     splats: Splats,
     views: ViewSet,
     scene: Scene,
@@ -230,39 +250,71 @@ def _absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
         Of the K survivors, as far as these sums and the costs of the merges tell.
     """
     sums = ViewSums(np.asarray(sums.contribution, np.float64), np.asarray(sums.error, np.float64))
-    good, free = drawable(splats), ~protected
-    keep = np.ones(len(splats), np.bool_)
-    excess = max(len(splats) - keep_count, 0)
-    hopeless = np.flatnonzero(free & ~good)[:excess]
-    keep[hopeless] = False
-    excess -= len(hopeless)
-    rows = np.flatnonzero(keep & good & free)
-    excess = min(excess, len(rows))
+    rows = mergeable(splats, scene, protected)
     report(progress, 0.0, "absorbing")
+
+    def graph() -> MergeGraph:
+        ahead = part(progress, 0.0, 0.1)
+        found = merge_field.field(splats, rows, views, scene, sums, progress=ahead, threads=threads)
+        return MergeGraph(found, scene, factor, threads=threads)
+
+    ahead = part(progress, 0.1, 1.0)
+    return reduced(splats, sums, rows, graph, keep_count, protected=protected, progress=ahead)
+
+
+def mergeable(splats: Splats, scene: Scene, protected: NDArray[np.bool_]) -> Index:
+    """Return the rows of the splats that may merge, (M,), by their place in the scene.
+
+    So ties do not depend on the order of the file.
+    """
+    rows = np.flatnonzero(drawable(splats) & ~protected)
+    place = scene.place(splats.means[rows])
+    return rows[spatial_order(place, lambda some: splat_fingerprint(splats, rows[some]))]
+
+
+def reduced(  # noqa: PLR0913 - as `absorb_once`
+    splats: Splats,
+    sums: ViewSums,
+    rows: Index,
+    graph: Callable[[], MergeGraph],
+    keep_count: int,
+    *,
+    protected: NDArray[np.bool_],
+    progress: Progress = silent,
+) -> tuple[Splats, NDArray[np.bool_], Index, ViewSums]:
+    """Reduce splats by a graph; parameters and results as `absorb_once`.
+
+    Parameters
+    ----------
+    rows : (M,) int64
+        Rows of the splats that the graph holds, see `mergeable`.
+    graph : callable
+        Returns the graph; called only if some of these go.
+    """
+    excess = max(len(splats) - keep_count, 0)
+    may = np.zeros(len(splats), np.bool_)
+    may[rows] = True
+    keep = np.ones(len(splats), np.bool_)
+    hopeless = np.flatnonzero(~protected & ~may)[:excess]
+    keep[hopeless] = False
+    excess = min(excess - len(hopeless), len(rows))
     if excess <= 0:
         return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1), sums.take(keep)
-    # Sorted by place in the scene, so that ties do not depend on the order of the file.
-    place = scene.place(splats.means[rows])
-    rows = rows[spatial_order(place, lambda some: splat_fingerprint(splats, rows[some]))]
-    ahead = part(progress, 0.0, 0.1)
-    found = merge_field.field(splats, rows, views, scene, sums, progress=ahead, threads=threads)
-    graph = MergeGraph(found, scene, factor, threads=threads)
-    graph.reduce(len(rows) - excess, part(progress, 0.1, 0.95))
-    keep[rows[~graph.alive]] = False
-    ahead = part(progress, 0.95, 1.0)
-    return _written(splats, sums, keep, rows, graph, ahead, threads)
+    found = graph()
+    found.reduce(len(rows) - excess, part(progress, 0.0, 0.95))
+    keep[rows[~found.alive]] = False
+    return _written(splats, sums, keep, rows, found, part(progress, 0.95, 1.0))
 
 
-def _written(  # noqa: PLR0913, PLR0917 - the parts of a stage
+def _written(
     splats: Splats,
     sums: ViewSums,
     keep: NDArray[np.bool_],
     rows: Index,
     graph: MergeGraph,
     progress: Progress,
-    threads: int | None,
 ) -> tuple[Splats, NDArray[np.bool_], Index, ViewSums]:
-    """Return the results of `_absorb_once`, with the merged splats in place of the survivors.
+    """Return the results of `absorb_once`, with the merged splats in place of the survivors.
 
     Parameters
     ----------
@@ -275,9 +327,8 @@ def _written(  # noqa: PLR0913, PLR0917 - the parts of a stage
     graph : MergeGraph
         Reduced; its field shrinks to the changed survivors.
     progress : callable
-    threads : int, optional
     """
-    own = np.arange(len(rows))
+    own, threads = np.arange(len(rows)), graph.threads
     # (M,) each: the survivor that each splat went into, and its share of the survivor's colour.
     owner, share = own.copy(), np.ones(len(rows))
     # From the last round to the first: a survivor of one round may be absorbed in a later one.

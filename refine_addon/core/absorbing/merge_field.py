@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -229,7 +229,7 @@ def field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
     """Return some splats as merging needs them.
 
     A splat that these views do not show may be visible from elsewhere, so each splat gets an
-    allowance for what one more view may see of it (`_with_allowance`).
+    allowance for what one more view may see of it (`Unallowed`).
 
     Parameters
     ----------
@@ -251,6 +251,21 @@ def field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
     Cancelled
         If `progress` answers ``False``.
     """
+    bare = unallowed(splats, rows, views, scene, sums, progress=progress, threads=threads)
+    return bare.with_allowance(bare.seen_and_whole())
+
+
+def unallowed(  # noqa: PLR0913 - as `field`
+    splats: Splats,
+    rows: Index,
+    views: ViewSet,
+    scene: Scene,
+    sums: ViewSums,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Unallowed:
+    """Return some splats as merging needs them, but for the allowance; parameters as `field`."""
     count = len(rows)
     covariances, color = np.empty((count, 6)), np.empty((count, 3))
     ahead = part(progress, 0.0, 0.5)
@@ -273,43 +288,69 @@ def field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
         xx, xy, yy = footprint(covariances, across(looked.direction), blur)  # (M,) each
         # In pixels of a view, over 2 pi; a constant factor does not matter here.
         mass = alpha * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / looked.pixel
-        contribution = _with_allowance(sums.contribution[rows], mass, looked.seen)
-        error = _with_allowance(sums.error[rows], mass * alpha, looked.seen)
-    return Field(
+    found = Field(
         np.asarray(splats.means[rows], np.float64),
         covariances,
         alpha,
-        contribution,
-        error,
+        sums.contribution[rows],
+        sums.error[rows],
         looked.direction,
         looked.deviation,
         np.maximum(color, 0.0, out=color),
         blur,
     )
+    return Unallowed(found, mass, looked.seen)
 
 
-def _with_allowance(values: Array, worth: Array, seen: Array) -> Array:
-    """Return `values` plus what one more view may see of each splat, (M,).
+class Unallowed(NamedTuple):
+    """Splats as merging needs them, without an allowance for what one more view may see of each.
 
-    If nothing were hidden, each view would see the `worth` of the splats whose centre lies in it.
-    The views saw some share of that, summed over all splats, and another view is expected to see
-    the same share. If none of the n views that a splat lies in showed it, the next view shows it
-    with a probability of about 1 / (n + 1), by the rule of succession.
+    If nothing were hidden, each view would see the worth of the splats whose centre lies in it. The
+    views saw some share of that, summed over all splats, and another view is expected to see the
+    same share. If none of the n views that a splat lies in showed it, the next view shows it with a
+    probability of about 1 / (n + 1), by the rule of succession.
 
-    Parameters
+    Attributes
     ----------
-    values : (M,) float64
-        As measured, summed over views.
-    worth : (M,) float64
-        What one view sees of each splat if nothing hides it.
+    field : Field
+        Contribution and error are as measured, summed over views.
+    mass : (M,) float64
+        What one view sees of each splat if nothing hides it: its worth, beside the contribution;
+        beside the error that is ``mass opacity``.
     seen : (M,) float64
         In how many views each centre lies.
     """
-    unhidden = seen @ worth
-    if not unhidden > 0.0:
-        return values
-    allowed: Array = values + worth * (values.sum() / unhidden) / (1.0 + seen)
-    return allowed
+
+    field: Field
+    mass: Array
+    seen: Array
+
+    def seen_and_whole(self) -> Array:
+        """Return of contribution and of error the sum, and what it were if nothing hid anything.
+
+        Returns
+        -------
+        (2, 2) float64
+            Those of parts of a scene add up to those of the scene.
+        """
+        found, worth = self.field, self.mass * self.field.opacity
+        return np.array(
+            [
+                [found.contribution.sum(), self.seen @ self.mass],
+                [found.error.sum(), self.seen @ worth],
+            ]
+        )
+
+    def with_allowance(self, scene: Array) -> Field:
+        """Return the field with the allowance; `scene`: `seen_and_whole` of the whole scene."""
+        first, second = (seen / whole if whole > 0.0 else 0.0 for seen, whole in scene.tolist())
+        found, worth = self.field, self.mass * self.field.opacity
+        with np.errstate(under="ignore"):
+            return replace(
+                found,
+                contribution=found.contribution + self.mass * first / (1.0 + self.seen),
+                error=found.error + worth * second / (1.0 + self.seen),
+            )
 
 
 def across(normal: Array) -> tuple[Array, Array]:

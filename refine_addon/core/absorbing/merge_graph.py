@@ -45,6 +45,8 @@ class MergeGraph:
         Rows of the pairs that may be merged.
     cost : (E,) float64
         Of merging each pair; infinite where it is not less than that of deleting one of the two.
+    connected : int
+        How many splats were alive when pairs were found last; 0 before.
     """
 
     def __init__(
@@ -70,6 +72,31 @@ class MergeGraph:
         self.deleted = 0
         self.first = self.second = np.empty(0, np.int32)
         self.cost = np.empty(0)
+        self.connected = 0
+
+    @classmethod
+    def connected_by(
+        cls,
+        field: Field,
+        scene: Scene,
+        patience: float,
+        pairs: tuple[Rows, Rows, Array],
+        *,
+        threads: int | None = None,
+    ) -> MergeGraph:
+        """Return a graph as it is when its pairs have been found: `first`, `second` and `cost`."""
+        graph = cls(field, scene, patience, threads=threads)
+        graph.first, graph.second, graph.cost = pairs
+        graph.connected = len(graph.alive)
+        return graph
+
+    def best(self) -> tuple[Array, NDArray[np.bool_]]:
+        """Return the cost of each splat's cheapest operation, (N,), and whether it is a merge."""
+        error = self._errors()
+        best = error.copy()
+        np.minimum.at(best, self.first, self.cost)
+        np.minimum.at(best, self.second, self.cost)
+        return best, best < error
 
     def reduce(self, goal: int, progress: Progress = silent) -> None:
         """Merge and delete until `goal` splats are alive; call it once.
@@ -79,21 +106,21 @@ class MergeGraph:
         Cancelled
             If `progress` answers ``False``.
         """
-        start = count = connected = len(self.alive)
-        self._connect(part(progress, 0.0, 0.3))
+        start = count = len(self.alive)
+        if not self.connected:
+            self.connect(part(progress, 0.0, 0.3))
         while count > goal:
             done = 0.3 + 0.7 * (start - count) / (start - goal)
             here = part(progress, done, done)
             report(here, 0.0, "absorbing")
-            if count < connected / 2:
-                self._connect(here)
-                connected = count
+            if count < self.connected / 2:
+                self.connect(here)
             count -= self._round(min(max(int(BATCH * count), 1), count - goal), here)
         # The pairs are no longer needed; a large scene has ten million of them.
         self.first = self.second = np.empty(0, np.int32)
         self.cost = np.empty(0)
 
-    def _connect(self, progress: Progress) -> None:
+    def connect(self, progress: Progress = silent) -> None:
         """Find the pairs of neighbouring splats, and price them."""
         rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))  # (R,)
         place = self.scene.place(self.field.means[rows])  # (R, 3)
@@ -117,6 +144,7 @@ class MergeGraph:
         self.second = np.concatenate([none, *(second for _, second in found)])
         self.cost = np.empty(len(self.first))
         self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.5, 1.0))
+        self.connected = int(np.count_nonzero(self.alive))
 
     def _price(self, edges: Index, progress: Progress) -> None:
         """Set the costs of some pairs; infinite where deleting one of the two costs less."""
@@ -139,10 +167,7 @@ class MergeGraph:
         A pair is merged if it is the cheapest operation for both of its splats. A splat is deleted
         if that is cheaper than all of its pairs.
         """
-        # With unknown errors as infinity the cheapest operation is always carried out, so that
-        # every round removes a splat; a comparison with NaN would choose none.
-        known = self.alive & ~np.isnan(self.field.error)
-        error = np.where(known, self.field.error, np.inf)  # (N,)
+        error = self._errors()  # (N,)
         costs = np.concatenate([error[self.alive], self.cost[np.isfinite(self.cost)]])
         # Look at twice the quota, since operations that share a splat exclude each other.
         last = min(2 * quota, len(costs)) - 1
@@ -163,6 +188,15 @@ class MergeGraph:
         is_merge = order >= len(doomed)
         self._carry_out(doomed[order[~is_merge]], edges[order[is_merge] - len(doomed)], progress)
         return len(order)
+
+    def _errors(self) -> Array:
+        """Return the costs of deleting splats, (N,); infinite where unknown.
+
+        So the cheapest operation is always carried out, and every round removes a splat; a
+        comparison with NaN would choose none.
+        """
+        known = self.alive & ~np.isnan(self.field.error)
+        return np.where(known, self.field.error, np.inf)
 
     def _carry_out(self, doomed: Index, edges: Index, progress: Progress) -> None:
         """Delete splats, merge pairs, and price the pairs of the merged splats again."""

@@ -132,8 +132,8 @@ def look(
         The longer standard deviation of the footprints met, as a share of the longer side.
     """
     view = sights.views[number][0]
-    count = min(LINES, MOST_MET / max(sight_lines.crowding(gaussians, footprints, view), 1.0))
-    lines = sight_lines.meet(gaussians, footprints, *sights.pixels(number, count))
+    count = min(LINES, MOST_MET / max(sight_lines.crowding(footprints, view), 1.0))
+    lines = sight_lines.meet(footprints, *sights.pixels(number, count))
     if not len(lines.line):
         return None
     present = ~absent[lines.met].take(lines.owner)

@@ -185,7 +185,7 @@ class Lookout:
             columns, rows = _patches(view.width), _patches(view.height)
             with np.errstate(under="ignore"):
                 footprints = projection.project(gaussians, scene, view)
-                lines = sight_lines.meet(gaussians, footprints, columns, rows)
+                lines = sight_lines.meet(footprints, columns, rows)
                 index = gaussians.index[lines.met]
                 colors = lines.colors(colors_from(splats, index, view))
             _, owner, weight = lines.contributions()

@@ -284,7 +284,7 @@ def _fineness_of(
     """
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
-        lines = meet(gaussians, footprints, *pixels)
+        lines = meet(footprints, *pixels)
         if not len(lines.line):
             return 0.0
         square = np.zeros(len(gaussians))  # px^2

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..quality import UNSEEN
 from ..work import Progress, part, silent
-from .occlusion import FIRST_END, Run
+from .occlusion import FIRST_END, Rounds, Run
 
 if TYPE_CHECKING:
     from ..scores import Scores
@@ -73,14 +73,28 @@ def score(
     RefineError, Cancelled
         See `occlusion.score`.
     """
-    members = blocks_of(views)
     run = Run(
-        splats, views, settings, members=members,
+        splats, views, settings, members=blocks_of(views),
         progress=part(progress, 0.0, 0.1), threads=threads,
     )  # fmt: skip
-    end = FIRST_END if settings.rounds > 1 else 1.0
-    ahead = part(progress, 0.1, end)
-    if members is None or not tolerance:
+    return scored(run, tolerance, progress=part(progress, 0.1, 1.0), threads=threads)
+
+
+def scored(
+    run: Rounds, tolerance: float, *, progress: Progress = silent, threads: int | None = None
+) -> Scores:
+    """Return the scores of a run that has measured nothing yet.
+
+    Parameters
+    ----------
+    run : Rounds
+        With the blocks of `blocks_of`, if these are not None.
+    tolerance, progress, threads
+        See `score`.
+    """
+    end = FIRST_END if run.rounds > 1 else 1.0
+    ahead = part(progress, 0.0, end)
+    if len(run.measuring.views) < LEAST_VIEWS or not tolerance:
         run.measure(range(run.measuring.count), ahead)
         loss, judged = 0.0, dict[str, list[float]]()
     else:
@@ -118,13 +132,13 @@ def blocks_of(views: ViewSet) -> list[list[int]] | None:
 
 
 def _measure(
-    run: Run, tolerance: float, progress: Progress, threads: int | None
+    run: Rounds, tolerance: float, progress: Progress, threads: int | None
 ) -> tuple[float, dict[str, list[float]]]:
     """Measure the splats from as many views as are needed.
 
     Parameters
     ----------
-    run : Run
+    run : Rounds
         With the blocks of `blocks_of`.
     tolerance, progress, threads
         See `score`.
@@ -144,6 +158,7 @@ def _measure(
     members = run.measuring.members
     judges = [number for k in JUDGES for number in members[k]]
     ahead = part(progress, 0.0, LOOKING)
+    assert run.sights is not None  # noqa: S101 - as the judges need
     run.sights.look_from(judges, run.gaussians, run.measuring.scene, ahead, threads)
     run.measure(FIRST, part(progress, LOOKING, 0.55))
     run.measure(MORE, part(progress, 0.55, 0.7))

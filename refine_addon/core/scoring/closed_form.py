@@ -178,11 +178,14 @@ class Found:
     ----------
     undrawable : int
         How many cannot be drawn.
+    size : float
+        Of the scene, see `scene.Scene`.
     facts : dict of str to Any
         See `Scores`.
     """
 
     undrawable: int
+    size: float
     facts: dict[str, Any]
 
 
@@ -221,7 +224,7 @@ def steps(
     tallies, moments = (np.concatenate(of) for of in zip(*each("read"), strict=True))
     good = int(tallies[:, 0].sum())
     refuse_undrawable(good, total)
-    axes, eta, near = remember(
+    axes, eta, near, size = remember(
         "frame", lambda: _frame(each, good, np.sum(moments, axis=0), settings)
     )
     frame = Frame(axes, float(eta), float(near))
@@ -245,11 +248,13 @@ def steps(
         "lambda": dict(zip(adaptive.TERMS, lambdas, strict=True)),
         "statistics": vars(statistics).copy(),
     }
-    return Found(total - good, facts)
+    return Found(total - good, float(size), facts)
 
 
-def _frame(each: Each, good: int, moments: NDArray[np.float64], settings: ClosedForm) -> Frame:
-    """Return axes, and eta and the near plane, which are multiples of the scene's size.
+def _frame(
+    each: Each, good: int, moments: NDArray[np.float64], settings: ClosedForm
+) -> tuple[NDArray[np.float64], float, float, float]:
+    """Return what `Frame` takes, and the scene's size, of which eta and near plane are multiples.
 
     The size is a median over splats, so a few far splats hardly change it.
 
@@ -269,7 +274,7 @@ def _frame(each: Each, good: int, moments: NDArray[np.float64], settings: Closed
     size = size_of(radix.median(count, np.dtype(np.float64), good))
     axes = principal_axes(moments[:3], moments[3]) / size  # (3, 3)
     eta = ETA_RELATIVE * size * size if settings.eta is None else settings.eta
-    return Frame(axes, eta, NEAR_RELATIVE * size)
+    return axes, eta, NEAR_RELATIVE * size, size
 
 
 def _powers(

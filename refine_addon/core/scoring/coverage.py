@@ -24,7 +24,7 @@ import numpy as np
 from ..scene import MIX, fingerprint
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -81,36 +81,29 @@ def with_floor(
     return _unit(scores) + weight * floors
 
 
-def losses(
-    scores: NDArray[np.float64], floors: NDArray[np.float64], errors: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return what each weight of the floor loses in some views left out, (v, weights, shares).
+def floor_weights(folds: Iterable[tuple[NDArray[np.float64], ...]]) -> list[float]:
+    """Return the best weight of the floor for each of `SHARES`.
 
     Parameters
     ----------
-    scores, floors : (n,) float64
-        By all other views.
-    errors : (views, n) float64
-        Of each splat in each view left out; views without any error are ignored.
+    folds : iterable of scores, floors, errors
+        Scores, (n,), and floors, (n,), by all views but some; and the error of each splat in each
+        view left out, (views, n). Views without any error are ignored.
+
+    Returns
+    -------
+    list of float
+        All 1 if every view is ignored.
     """
-    views = errors[errors.any(axis=1)]  # (v, n)
-    if not (scores.any() and len(views)):
-        return np.empty((0, len(FLOOR_WEIGHTS), len(SHARES)))
-    tried = [_losses(with_floor(scores, floors, weight), views) for weight in FLOOR_WEIGHTS]
-    return np.stack(tried, axis=1)
-
-
-def floor_weights(lost: Sequence[NDArray[np.float64]]) -> list[float]:
-    """Return the best weight of the floor for each of `SHARES`; all 1 if no view tells it.
-
-    Parameters
-    ----------
-    lost : sequence of (v, weights, shares) float64
-        The `losses` of each fold.
-    """
-    if not any(map(len, lost)):
+    losses = []
+    for scores, floors, errors in folds:
+        views = errors[errors.any(axis=1)]  # (v, n)
+        if scores.any() and len(views):
+            tried = [_losses(with_floor(scores, floors, weight), views) for weight in FLOOR_WEIGHTS]
+            losses.append(np.stack(tried, axis=1))  # (v, weights, shares)
+    if not losses:
         return [1.0] * len(SHARES)
-    table = np.mean(np.concatenate(lost), axis=0)  # (weights, shares)
+    table = np.mean(np.concatenate(losses), axis=0)  # (weights, shares)
     logs = np.log(np.maximum(FLOOR_WEIGHTS, _NO_WEIGHT))  # (weights,)
     table += np.outer(logs / math.log(10.0), DOUBTS)
     nearly = np.exp(np.maximum((table.min(axis=0) - table) / TIED, -50.0))  # 1 for the best

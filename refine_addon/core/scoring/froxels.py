@@ -583,7 +583,6 @@ def _merged(
 
 def traits(
     footprints: Footprints,
-    alphas: NDArray[np.float32],
     mass: NDArray[np.float32],
     colors: NDArray[np.float32],
     area: float,
@@ -593,7 +592,7 @@ def traits(
     Parameters
     ----------
     footprints : Footprints
-    alphas, mass : (n,) float32
+    mass : (n,) float32
     colors : (n, 3) float32
     area : float
         Of a cell, px^2.
@@ -604,10 +603,10 @@ def traits(
         Red, green, blue; the mass over the cell's area; the largest share of a cell that the splat
         covers, which is its opacity; `evenness`.
     """
-    table = np.empty((len(alphas), 6), np.float32)
+    table = np.empty((len(mass), 6), np.float32)
     table[:, :3] = colors
     table[:, 3] = mass / np.float32(area)
-    np.minimum(alphas, np.float32(ALPHA_MAX), out=table[:, 4])
+    np.minimum(footprints.alphas, np.float32(ALPHA_MAX), out=table[:, 4])
     table[:, 5] = evenness(footprints, area)
     return table
 
@@ -764,9 +763,7 @@ def mean_visible(
     return np.asarray(np.bincount(owners, visible, count), np.float64), total
 
 
-def masses(
-    footprints: Footprints, alphas: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def masses(footprints: Footprints) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the integrals of alpha and of alpha^2 over each footprint, (n,) each, px^2.
 
     S is the product of the two sigmas, A the opacity, and q the squared Mahalanobis distance. The
@@ -775,6 +772,7 @@ def masses(
         integral of A exp(-q / 2) = 2 pi S (A - cut)
         integral of A^2 exp(-q)   =   pi S (A^2 - cut^2)
     """
+    alphas = footprints.alphas
     area = np.float32(2.0 * math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
     excess = alphas - np.float32(ALPHA_CUT)
     return area * excess, np.float32(0.5) * area * excess * (alphas + np.float32(ALPHA_CUT))

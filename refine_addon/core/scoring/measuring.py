@@ -21,7 +21,7 @@ from ..work import Progress, for_chunks
 from . import froxels, projection
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, MutableMapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -87,11 +87,13 @@ class Measured:
         return cls(np.zeros(count), np.zeros(count), np.zeros(count, np.int32))
 
     @classmethod
-    def sum(cls, parts: list[Measured]) -> Measured:
-        """Return the sums of all parts."""
-        total = cls.zero(len(parts[0].seen))
+    def sum(cls, parts: Iterable[Measured]) -> Measured:
+        """Return the sums of all parts, one at least."""
+        total: Measured | None = None
         for other in parts:
+            total = total or cls.zero(len(other.seen))
             total.add(other)
+        assert total is not None  # noqa: S101 - as promised
         return total
 
     def for_all(self, index: NDArray[np.int64], count: int) -> Measured:
@@ -106,11 +108,28 @@ class Measured:
         """Return the sums of some Gaussians."""
         return Measured(self.contribution[rows], self.error[rows], self.seen[rows])
 
+    def times(self, contribution: NDArray[np.float64], error: NDArray[np.float64]) -> Measured:
+        """Return the sums multiplied by factors, (M,) each."""
+        return Measured(self.contribution * contribution, self.error * error, self.seen)
+
     def add(self, other: Measured) -> None:
         """Add the sums of other views."""
         self.contribution[:] += other.contribution
         self.error[:] += other.error
         self.seen[:] += other.seen
+
+    def add_view(
+        self,
+        footprints: Footprints,
+        weight: float,
+        contribution: NDArray[np.float64],
+        error: NDArray[np.float64],
+    ) -> None:
+        """Add what one view sees of n footprints, times its weight; see `of_view`."""
+        self.seen[footprints.index[footprints.inside]] += 1
+        with np.errstate(under="ignore"):
+            self.contribution[footprints.index] += weight * contribution
+            self.error[footprints.index] += weight * error
 
 
 class Measuring:
@@ -152,6 +171,10 @@ class Measuring:
         """Number of blocks."""
         return len(self.members)
 
+    def none(self) -> MutableMapping[int, Measured]:
+        """Return where sums of blocks are kept, by their numbers: in memory."""
+        return {}
+
     def share(self, which: Sequence[int]) -> float:
         """Return the share of the weights of all views that some blocks have."""
         weights = [weight for _, weight in self.views]
@@ -160,10 +183,10 @@ class Measuring:
 
     def measure(
         self, gaussians: Gaussians, which: Sequence[int], progress: Progress
-    ) -> list[Measured]:
+    ) -> MutableMapping[int, Measured]:
         """Return the sums over some blocks of views; see `blocks`."""
         none = np.empty(0, np.int64)
-        return [block for block, _ in self.blocks(gaussians, none, progress, which=which)]
+        return self.blocks(gaussians, none, progress, which=which)[0]
 
     def blocks(
         self,
@@ -172,7 +195,7 @@ class Measuring:
         progress: Progress,
         which: Sequence[int] | None = None,
         sights: SightLines | None = None,
-    ) -> list[tuple[Measured, NDArray[np.float64]]]:
+    ) -> tuple[MutableMapping[int, Measured], dict[int, NDArray[np.float64]]]:
         """Return the sums over each block of views, and the errors of a sample in each view.
 
         Parameters
@@ -188,8 +211,8 @@ class Measuring:
 
         Returns
         -------
-        list of Measured, (views, m) float64
-            For each of these blocks.
+        dict of int to Measured, dict of int to (views, m) float64
+            Of each of these blocks.
         """
         chosen = range(self.count) if which is None else which
 
@@ -201,13 +224,15 @@ class Measuring:
                 before = total.error[sample]  # (m,)
                 footprints = measure_view(gaussians, self.scene, view, weight, self.sampling, total)
                 if sights is not None:
-                    sights.look(number, gaussians, footprints)
+                    sights.look(number, footprints)
                 errors.append(total.error[sample] - before)
             return total, np.array(errors)
 
-        return for_chunks(
+        found = for_chunks(
             block, len(chosen), 1, progress=progress, what="scoring", threads=self.threads
         )
+        sums, errors = zip(*found, strict=True)
+        return dict(zip(chosen, sums, strict=True)), dict(zip(chosen, errors, strict=True))
 
 
 def measure_view(
@@ -221,16 +246,34 @@ def measure_view(
     """Add what one view sees to `total`; return the footprints in it."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
-        count = len(footprints.index)  # n
-        if not count:
-            return footprints
-        total.seen[footprints.index[footprints.inside]] += 1
+    colors = gaussians.colors[footprints.index]  # (n, 3)
+    contribution, error = of_view(footprints, colors, view, sampling)
+    total.add_view(footprints, weight, contribution, error)
+    return footprints
+
+
+def of_view(
+    footprints: Footprints,
+    colors: NDArray[np.float32],
+    view: View,
+    sampling: Sampling,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the contribution of n footprints to a view and the error without each, (n,) each.
+
+    Parameters
+    ----------
+    footprints : Footprints
+    colors : (n, 3) float32
+    view : View
+    sampling : Sampling
+    """
+    if not len(footprints.index):
+        return np.empty(0), np.empty(0)
+    with np.errstate(under="ignore"):
         side = froxels.cell_size(footprints, view, sampling.cell, sampling.density)
         points = froxels.scatter(footprints, view, side, sampling.density)
-        alphas = gaussians.alphas[footprints.index]  # (n,)
-        mass, mass_squared = froxels.masses(footprints, alphas)  # (n,) each
-        colors = gaussians.colors[footprints.index]  # (n, 3)
-        traits = froxels.traits(footprints, alphas, mass, colors, points.area)  # (n, 6)
+        mass, mass_squared = froxels.masses(footprints)  # (n,) each
+        traits = froxels.traits(footprints, mass, colors, points.area)  # (n, 6)
         visible, errors = np.empty((2, len(points.owners)))  # (m,) each
         for cells, place in points.pieces():
             shares, mine = points.shares[place], traits.take(points.owners[place], axis=0)
@@ -240,6 +283,4 @@ def measure_view(
             seen *= seen
             errors[place] = seen * squared_contrast
         visible, errors = froxels.mean_visible(points, visible, errors)
-        total.contribution[footprints.index] += weight * (mass * visible)
-        total.error[footprints.index] += weight * (mass_squared * errors)
-    return footprints
+        return mass * visible, mass_squared * errors

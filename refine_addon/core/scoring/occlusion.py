@@ -25,13 +25,13 @@ import numpy as np
 from ..errors import RefineError
 from ..scores import Scores, shares_gone
 from ..splats import refuse_undrawable
-from ..work import Progress, for_chunks, part, report, silent
+from ..work import Progress, part, report, silent
 from . import closed_form, coverage, projection
 from .measuring import Measured, Measuring, Sampling
 from .sight_lines import SightLines
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, MutableMapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -235,64 +235,51 @@ def measure_part(  # noqa: PLR0913 - as `measure`, and which part
     parts = min(parts, blocks)
     which = range(turn % parts, blocks, parts)
     found = measuring.measure(gaussians, which, part(progress, 0.1, 1.0))
-    return Measured.sum(found).for_all(gaussians.index, len(splats)), measuring.share(which)
+    return Measured.sum(found.values()).for_all(gaussians.index, len(splats)), measuring.share(
+        which
+    )
 
 
-class Run:
+class Rounds:
     """One scoring: the views measure all splats, then rounds of removing and measuring again.
 
     Parameters
     ----------
-    splats, views, settings, progress, threads
-        See `score`.
-    members : list of list of int, optional
-        See `Measuring`.
-    judges : bool
-        See `SightLines`.
+    gaussians : Gaussians
+    measuring : Measuring
+    rounds : int
+        See `Occlusion`.
+    prior : (N,) float32
+    undrawable : (N,) bool
+    sights : SightLines, optional
 
     Attributes
     ----------
     gaussians : Gaussians
         The splats that can contribute to a picture, before any is removed.
     measuring : Measuring
-    sights : SightLines
+    sights : SightLines or None
         Note what the lines of sight of the views meet that measure all splats.
     prior : (N,) float32
         Orders the splats that are not among the Gaussians, and is the floor of all others.
-
-    Raises
-    ------
-    RefineError, Cancelled
-        See `score`.
+    undrawable : (N,) bool
+        Which splats cannot be drawn.
     """
 
-    def __init__(  # noqa: PLR0913 - all but three are optional
+    def __init__(
         self,
-        splats: Splats,
-        views: ViewSet,
-        settings: Occlusion,
-        *,
-        members: list[list[int]] | None = None,
-        judges: bool = False,
-        progress: Progress = silent,
-        threads: int | None = None,
+        gaussians: Gaussians,
+        measuring: Measuring,
+        rounds: int,
+        prior: NDArray[np.float32],
+        undrawable: NDArray[np.bool_],
+        sights: SightLines | None = None,
     ) -> None:
-        if not len(splats):
-            msg = "there are no splats to score"
-            raise RefineError(msg)
-        self.gaussians, scene, good = projection.prepare(
-            splats, views, progress=part(progress, 0.0, 0.5), threads=threads
-        )
-        self.undrawable = ~good  # (N,) bool
-        refuse_undrawable(int(np.count_nonzero(good)), len(good))
-        self.measuring = Measuring(scene, views, settings, threads, members)
-        self.sights = SightLines(self.measuring.views, self.gaussians, splats, judges=judges)
-        self.rounds = settings.rounds
-        self.prior = closed_form.score(
-            splats, views, PRIOR, progress=part(progress, 0.5, 1.0), threads=threads
-        ).values
-        self._sample = coverage.sample(self.gaussians)  # (m,)
-        self._blocks: dict[int, tuple[Measured, NDArray[np.float64]]] = {}
+        self.gaussians, self.measuring, self.rounds = gaussians, measuring, rounds
+        self.prior, self.undrawable, self.sights = prior, undrawable, sights
+        self._sample = coverage.sample(gaussians)  # (m,)
+        self._blocks = measuring.none()
+        self._errors: dict[int, NDArray[np.float64]] = {}  # of the sample, by blocks
         self._weights: dict[tuple[int, ...], list[float]] = {}  # of the floor, by blocks
         self._turn = 0  # how many blocks were measured again
 
@@ -304,16 +291,17 @@ class Run:
         Cancelled
             If `progress` answers ``False``.
         """
-        found = self.measuring.blocks(
+        found, errors = self.measuring.blocks(
             self.gaussians, self._sample, progress, which=which, sights=self.sights
         )
-        self._blocks |= dict(zip(which, found, strict=True))
+        self._blocks.update(found)
+        self._errors |= errors
         return self.measured()
 
     def measured(self, which: Sequence[int] | None = None) -> Measured:
         """Return the sums over some of the blocks that were measured, by default all, (M,)."""
         chosen = sorted(self._blocks if which is None else which)
-        return Measured.sum([self._blocks[k][0] for k in chosen])
+        return Measured.sum(self._blocks[k] for k in chosen)
 
     def once(self, which: Sequence[int], progress: Progress = silent) -> NDArray[np.float32]:
         """Return the values of all N splats, in one round, by some of the blocks measured.
@@ -347,9 +335,9 @@ class Run:
             raise RefineError(msg)
         seen = np.zeros(len(self.prior), np.int32)
         seen[self.gaussians.index] = measured.seen
-        weights = self._floor_weights(measured, list(self._blocks), part(progress, 0.0, 0.0))
-        used = sum(len(self.measuring.members[k]) for k in self._blocks)
-        blocks = {k: self._blocks.pop(k)[0] for k in sorted(self._blocks)}
+        blocks = self._blocks
+        weights = self._floor_weights(measured, list(blocks), part(progress, 0.0, 0.0))
+        used = sum(len(self.measuring.members[k]) for k in blocks)
         left, done = self.gaussians, 0.0
         for number, stay in enumerate(_survivors(len(self.prior), self.rounds)):
             end = 1.0 if number == self.rounds - 1 else done + (1.0 - done) * FIRST_COST
@@ -361,8 +349,10 @@ class Run:
             order = self._order(left, measured, weights, removal, go)
             removal.add(left.index[order[:go]])
             rows = np.sort(order[go:])
-            left = left.take(rows)
-            blocks = {k: block.take(rows) for k, block in blocks.items()}
+            if number < self.rounds - 1:
+                left = left.take(rows)
+                for k in blocks:
+                    blocks[k] = blocks[k].take(rows)
         removal.values[self.undrawable] = 0.0
         return Scores(
             values=removal.values,
@@ -382,7 +372,7 @@ class Run:
         return removal
 
     def _measure_again(
-        self, left: Gaussians, blocks: dict[int, Measured], progress: Progress
+        self, left: Gaussians, blocks: MutableMapping[int, Measured], progress: Progress
     ) -> Measured:
         """Measure the splats left in some blocks of views, which take turns; return all sums.
 
@@ -396,7 +386,7 @@ class Run:
             The sums of the splats left over each block of views, as measured last; changed.
         progress : callable
         """
-        numbers = list(blocks)
+        numbers = sorted(blocks)
         # An even number, since an odd one leaves one of two cores idle.
         share = ROUND_COST * len(self.gaussians) / max(len(left), 1)
         pairs = max(round(share * len(numbers) / 2), 1)
@@ -405,15 +395,14 @@ class Run:
         which = [numbers[(self._turn + step) % len(numbers)] for step in range(count)]
         self._turn += count
         found = self.measuring.measure(left, which, progress)
-        before, now = (Measured.sum(some) for some in ([blocks[k] for k in which], found))
-        every = Measured.sum(list(blocks.values()))
+        before, now = (Measured.sum(some[k] for k in which) for some in (blocks, found))
+        every = Measured.sum(blocks[k] for k in numbers)
         contribution = _growth(now.contribution, before.contribution, every.contribution)
         error = _growth(now.error, before.error, every.error)
-        for block in blocks.values():
-            block.contribution[:] *= contribution
-            block.error[:] *= error
-        blocks |= dict(zip(which, found, strict=True))
-        return Measured.sum(list(blocks.values()))
+        for k in set(numbers) - set(which):
+            blocks[k] = blocks[k].times(contribution, error)
+        blocks.update(found)
+        return Measured.sum(blocks[k] for k in numbers)
 
     def _order(
         self,
@@ -460,23 +449,68 @@ class Run:
         blocks, sample = tuple(sorted(which)), self._sample
         worth = self.prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)
 
-        def fold(piece: slice) -> NDArray[np.float64]:
-            block, errors = self._blocks[blocks[piece.start]]
-            others = Measured(
-                # Rounding can leave a negative difference.
-                np.maximum(measured.contribution[sample] - block.contribution[sample], 0.0),
-                np.maximum(measured.error[sample] - block.error[sample], 0.0),
-                measured.seen[sample] - block.seen[sample],
-            )
-            floors = coverage.floor(worth, others.seen, 1.0 + _exponent(0.0))
-            return coverage.losses(combined(others, 0.0), floors, errors)
+        def folds() -> Iterator[tuple[NDArray[np.float64], ...]]:
+            for number in blocks if len(blocks) > 1 else ():
+                report(progress, 0.0, "scoring")
+                block, errors = self._blocks[number], self._errors[number]
+                others = Measured(
+                    # Rounding can leave a negative difference.
+                    np.maximum(measured.contribution[sample] - block.contribution[sample], 0.0),
+                    np.maximum(measured.error[sample] - block.error[sample], 0.0),
+                    measured.seen[sample] - block.seen[sample],
+                )
+                floors = coverage.floor(worth, others.seen, 1.0 + _exponent(0.0))
+                yield combined(others, 0.0), floors, errors
 
         if blocks not in self._weights:
-            folds, threads = len(blocks) if len(blocks) > 1 else 0, self.measuring.threads
-            self._weights[blocks] = coverage.floor_weights(
-                for_chunks(fold, folds, 1, progress=progress, what="scoring", threads=threads)
-            )
+            self._weights[blocks] = coverage.floor_weights(folds())
         return self._weights[blocks]
+
+
+class Run(Rounds):
+    """A scoring of splats in memory.
+
+    Parameters
+    ----------
+    splats, views, settings, progress, threads
+        See `score`.
+    members : list of list of int, optional
+        See `Measuring`.
+    judges : bool
+        See `SightLines`.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `score`.
+    """
+
+    sights: SightLines
+
+    def __init__(  # noqa: PLR0913 - all but three are optional
+        self,
+        splats: Splats,
+        views: ViewSet,
+        settings: Occlusion,
+        *,
+        members: list[list[int]] | None = None,
+        judges: bool = False,
+        progress: Progress = silent,
+        threads: int | None = None,
+    ) -> None:
+        if not len(splats):
+            msg = "there are no splats to score"
+            raise RefineError(msg)
+        gaussians, scene, good = projection.prepare(
+            splats, views, progress=part(progress, 0.0, 0.5), threads=threads
+        )
+        refuse_undrawable(int(np.count_nonzero(good)), len(good))
+        measuring = Measuring(scene, views, settings, threads, members)
+        prior = closed_form.score(
+            splats, views, PRIOR, progress=part(progress, 0.5, 1.0), threads=threads
+        ).values
+        sights = SightLines(measuring.views, gaussians, splats, judges=judges)
+        super().__init__(gaussians, measuring, settings.rounds, prior, ~good, sights)
 
 
 class _Removal:
@@ -536,4 +570,5 @@ def _growth(
 
 
 def _exponent(gone: float) -> float:
+    """Return the exponent of the contribution, given the share that went before."""
     return 0.25 + 0.5 * gone

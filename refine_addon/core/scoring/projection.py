@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, fields
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from ..splats import SH_C0, drawable, opacity, rotation_matrices
 from ..work import Progress, checkpoint, for_chunks, part, report, silent
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -29,8 +29,6 @@ BRIGHTEST = 16.0
 """Brightest colour that is told apart, where white is 1; keeps sums finite."""
 
 _CHUNK = 1 << 14
-_BOX = 1 << 11  # Gaussians in one of `Boxes`
-_MARGIN = 1e-5  # of the numbers that are added up; far more than float32 rounds
 _FARTHEST = 1e6  # scene sizes; splats farther from the middle are in no view
 _LOG_SCALE_RANGE = (-16.0, 5.0)  # relative to the size of the scene; keeps float32 in range
 _LARGEST_VARIANCE = 1e12  # px^2; a footprint a million pixels wide is flat over any image
@@ -38,22 +36,6 @@ _FARTHEST_VIEW = 1e18  # scene sizes; a view farther away sees the scene as one 
 _LARGEST_LENS = 1e9  # px; beyond this or `_FARTHEST_VIEW` float32 would overflow
 _BEYOND = 0.15  # of the image's size; farther outside, the projection is linearised at this edge
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-
-
-class Boxes(NamedTuple):
-    """Boxes around every `_BOX` Gaussians in a row, C in all.
-
-    Attributes
-    ----------
-    middle, half : (3, C) float64
-        Of the box around the centres, scene sizes.
-    largest : (C,) float64
-        Longest standard deviation of any of them, scene sizes.
-    """
-
-    middle: NDArray[np.float64]
-    half: NDArray[np.float64]
-    largest: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,17 +69,6 @@ class Gaussians:
         """Return the number of splats."""
         return len(self.index)
 
-    @cached_property
-    def boxes(self) -> Boxes:
-        """The boxes around them. Neighbours are near each other, so the boxes are small."""
-        starts = np.arange(0, len(self), _BOX)
-        low, high = (
-            bound.reduceat(self.means, starts, axis=1).astype(np.float64)
-            for bound in (np.minimum, np.maximum)
-        )
-        largest = np.maximum.reduceat(self.largest, starts).astype(np.float64)
-        return Boxes((low + high) / 2, (high - low) / 2, largest)
-
     def take(self, keep: NDArray[Any]) -> Gaussians:
         """Return the splats at `keep` (a mask or integers)."""
         return Gaussians(
@@ -122,6 +93,8 @@ class Footprints:
         Their lengths, the longer first.
     inside : (n,) bool
         Which centres lie in the view's frustum; see `frustum`.
+    alphas : (n,) float32
+        Of the Gaussians.
     """
 
     index: NDArray[np.int64]
@@ -130,6 +103,7 @@ class Footprints:
     minor: NDArray[np.float32]
     sigmas: NDArray[np.float32]
     inside: NDArray[np.bool_]
+    alphas: NDArray[np.float32]
 
     def take(self, rows: NDArray[np.int64]) -> Footprints:
         """Return some footprints, in that order."""
@@ -151,32 +125,48 @@ def prepare(
     good : (N,) bool
         Which splats can be drawn.
     """
-    good = np.empty(len(splats), np.bool_)
-    opaque = np.empty(len(splats), np.bool_)
+    good, opaque = judge(splats, progress=part(progress, 0.0, 0.4), threads=threads)
+    scene = scene_of(splats.means, good, views)
+    report(progress, 0.4, "reading")
+    index, place = near(splats, opaque, scene)
+    report(progress, 0.4, "reading")
+    order = spatial_order(place, lambda rows: splat_fingerprint(splats, index[rows]))
+    ahead = part(progress, 0.4, 1.0)
+    return activate(splats, index[order], place[order], scene, ahead, threads), scene, good
 
-    def judge(piece: slice) -> None:
+
+def judge(
+    splats: Splats, *, progress: Progress = silent, threads: int | None = None
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which splats can be drawn, and which of these exceed `ALPHA_CUT`, (N,) each."""
+    good, opaque = np.empty((2, len(splats)), np.bool_)
+
+    def look(piece: slice) -> None:
         chunk = splats.take(piece)
         good[piece] = drawable(chunk)
         logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
         opaque[piece] = opacity(logits) > ALPHA_CUT
 
     for_chunks(
-        judge, len(splats), 4 * _CHUNK,
-        progress=part(progress, 0.0, 0.4), what="reading", threads=threads,
+        look, len(splats), 4 * _CHUNK, progress=progress, what="reading", threads=threads
     )  # fmt: skip
-    scene = scene_of(splats.means, good, views)
-    report(progress, 0.4, "reading")
+    return good, opaque
+
+
+def near(
+    splats: Splats, opaque: NDArray[np.bool_], scene: Scene
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the rows of opaque splats that are not too far away, (M,), and their places, (M, 3).
+
+    Places are those that `Scene.place` returns.
+    """
     index = np.flatnonzero(opaque)
     place = scene.place(splats.means[index])
-    near = np.max(np.abs(place), axis=1, initial=0.0) <= _FARTHEST
-    index, place = index[near], place[near]
-    report(progress, 0.4, "reading")
-    order = spatial_order(place, lambda rows: splat_fingerprint(splats, index[rows]))
-    ahead = part(progress, 0.4, 1.0)
-    return _activate(splats, index[order], place[order], scene, ahead, threads), scene, good
+    close = np.max(np.abs(place), axis=1, initial=0.0) <= _FARTHEST
+    return index[close], place[close]
 
 
-def _activate(
+def activate(
     splats: Splats,
     index: NDArray[np.int64],
     place: NDArray[np.float64],
@@ -230,24 +220,76 @@ def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
     The footprint is the Gaussian of covariance ``J W S W' J' + 0.3 I`` (Zwicker et al., "EWA
     splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean.
     """
+    return front_to_back([reaching(gaussians, scene, view)])
+
+
+class Reaching(NamedTuple):
+    """The footprints that may reach into an image, as in `Footprints` but in no order.
+
+    Attributes
+    ----------
+    rows : (n,) int64
+        Of the `Gaussians`.
+    depth : (n,) float32
+        Along the view's axis, scene sizes.
+    centers, major, minor, sigmas : (2, n) float32
+    inside : (n,) bool
+    alphas : (n,) float32
+    """
+
+    rows: NDArray[np.int64]
+    depth: NDArray[np.float32]
+    centers: NDArray[np.float32]
+    major: NDArray[np.float32]
+    minor: NDArray[np.float32]
+    sigmas: NDArray[np.float32]
+    inside: NDArray[np.bool_]
+    alphas: NDArray[np.float32]
+
+
+_NONE = np.empty((2, 0), np.float32)
+_NOTHING = Reaching(
+    np.empty(0, np.int64), _NONE[0], _NONE, _NONE, _NONE, _NONE, np.empty(0, np.bool_), _NONE[0]
+)
+
+
+def reaching(gaussians: Gaussians, scene: Scene, view: View) -> Reaching:
+    """Return the footprints of `project`, before they are sorted."""
     if not _computable(scene, view):
-        return _nothing()
-    index, local = _touching(gaussians, scene, view)
-    inside = frustum.contains(view, local, clip_planes(scene, view))
+        return _NOTHING
+    planes = clip_planes(scene, view)
     rotation = _rotation6(view.rotation @ scene.axes.T)
-    pieces: list[tuple[NDArray[Any], ...]] = []
-    for start in range(0, len(index), _CHUNK):
+    pieces: list[Reaching] = []
+    for start in range(0, len(gaussians), _CHUNK):
         checkpoint()
         piece = slice(start, start + _CHUNK)
-        shape = rotation @ np.take(gaussians.covariances, index[piece], axis=1)  # (6, n)
-        pieces.append(_ellipses(local[:, piece], shape, view))
-    if not pieces:
-        return _nothing()
-    ellipses = [np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True)]
+        local = _local(gaussians.means[:, piece], scene, view)  # (3, chunk)
+        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, planes))
+        if len(touching):
+            local = np.take(local, touching, axis=1)  # (3, n), as all that follows
+            shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)  # (6, n)
+            inside = frustum.contains(view, local, planes)
+            centers, major, minor, sigmas = _ellipses(local, shape, view)
+            rows = touching + start
+            alphas = gaussians.alphas.take(rows)
+            pieces.append(Reaching(rows, local[2], centers, major, minor, sigmas, inside, alphas))
+    return _together(pieces)
+
+
+def front_to_back(pieces: Sequence[Reaching]) -> Footprints:
+    """Return the footprints of some Gaussians by their depth; of equal depths the first first."""
+    found = _together(pieces)
     checkpoint()
-    centers, major, minor, sigmas = ellipses
-    found = Footprints(index, centers, major, minor, sigmas, inside)
-    return found.take(_by_depth(local[2]))
+    order = _by_depth(found.depth)
+    rows, _, *rest = found
+    return Footprints(rows[order], *(np.take(values, order, axis=-1) for values in rest))
+
+
+def _together(pieces: Sequence[Reaching]) -> Reaching:
+    if len(pieces) == 1:
+        return pieces[0]
+    every = zip(_NOTHING, *pieces, strict=True)
+    return Reaching(*(np.concatenate(arrays, axis=-1) for arrays in every))
 
 
 def in_camera(
@@ -256,11 +298,6 @@ def in_camera(
     """Return centres, (3, M), and covariances, (6, M), in camera coordinates, scene sizes."""
     turned = _rotation6(view.rotation @ scene.axes.T) @ gaussians.covariances
     return _local(gaussians.means, scene, view), turned
-
-
-def _nothing() -> Footprints:
-    empty = np.empty((2, 0), np.float32)
-    return Footprints(np.empty(0, np.int64), empty, empty, empty, empty, np.empty(0, np.bool_))
 
 
 def _computable(scene: Scene, view: View) -> bool:
@@ -281,11 +318,7 @@ def clip_planes(scene: Scene, view: View) -> tuple[float, float]:
 def _local(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.float32]:
     """Return camera coordinates of centres, (3, M), scene sizes."""
     shift = (view.rotation @ ((view.center - scene.origin) / scene.size)).astype(np.float32)
-    turn = (view.rotation @ scene.axes.T).astype(np.float32)
-    # Not a product of matrices, whose last digits depend on how many centres there are.
-    local: NDArray[np.float32] = turn[:, :1] * means[0]
-    for axis in (1, 2):
-        local += turn[:, axis : axis + 1] * means[axis]
+    local: NDArray[np.float32] = (view.rotation @ scene.axes.T).astype(np.float32) @ means
     local -= shift[:, None]
     return local
 
@@ -302,95 +335,49 @@ def _touches(
     """
     x, y, z = local
     touching: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
-    for coordinate, side in zip((x, y), _sides(view), strict=True):
-        within = side.pixels * z + side.reach * largest
-        touching &= np.abs(side.focal * coordinate + side.offset * z) <= within
+    for coordinate, side in zip((x, y), frustum.image_sides(view), strict=True):
+        reach = _reach(side) * largest  # (M,), px times depth
+        pixels = side.half + REACH * LOW_PASS**0.5
+        touching &= np.abs(side.focal * coordinate + side.offset * z) <= pixels * z + reach
     return touching
 
 
-class _Side(NamedTuple):
-    """Of a splat that may reach into the image, ``|focal x + offset z| <= pixels z + reach s``.
+def boxes_touch(boxes: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.bool_]:
+    """Return in which of B boxes a Gaussian may lie that reaches into the image of a view, (B,).
 
-    x is its centre across or down, z its depth and s its longest standard deviation.
+    Parameters
+    ----------
+    boxes : (B, 7) float32
+        Least and greatest coordinates of the means, and the longest standard deviation, in the
+        scene's frame, in scene sizes.
+    scene, view
+        See `project`.
     """
-
-    focal: float
-    offset: float
-    pixels: float
-    reach: float
-
-
-def _sides(view: View) -> Iterator[_Side]:
-    """Yield the image of a view with the reach of footprints beside it, across and down."""
-    for focal, offset, half in frustum.image_sides(view):
-        # A footprint is longest where the ray is steepest; the projection is linearised no further.
-        slope = (abs(offset) + (1.0 + 2.0 * _BEYOND) * half) / focal
-        reach = REACH * focal * float(np.hypot(1.0, slope))
-        yield _Side(focal, offset, half + REACH * LOW_PASS**0.5, reach)
-
-
-def _touching(
-    gaussians: Gaussians, scene: Scene, view: View
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return the n Gaussians that may reach into the image of a view; see `_touches`.
-
-    Returns
-    -------
-    index : (n,) int64
-        Rows of the Gaussians, ascending.
-    local : (3, n) float32
-        Camera coordinates of their centres, scene sizes.
-    """
-    planes = clip_planes(scene, view)
-    found, places = [np.empty(0, np.int64)], [np.empty((3, 0), np.float32)]
-    for piece in _pieces(gaussians, scene, view, planes):
-        checkpoint()
-        local = _local(gaussians.means[:, piece], scene, view)  # (3, chunk)
-        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, planes))
-        found.append(touching + piece.start)
-        places.append(np.take(local, touching, axis=1))
-    return np.concatenate(found), np.concatenate(places, axis=1)
-
-
-def _pieces(
-    gaussians: Gaussians, scene: Scene, view: View, planes: tuple[float, float]
-) -> Iterator[slice]:
-    """Yield slices of at most `_CHUNK` Gaussians that hold all those that `_touches` a view."""
-    touch = np.zeros(-(-len(gaussians) // _BOX) + 2, np.bool_)
-    if len(gaussians):
-        touch[1:-1] = _boxes_touch(gaussians.boxes, scene, view, planes)
-    bounds = np.minimum(np.flatnonzero(np.diff(touch)) * _BOX, len(gaussians)).tolist()
-    for first, stop in zip(bounds[::2], bounds[1::2], strict=True):
-        for start in range(first, stop, _CHUNK):
-            yield slice(start, min(start + _CHUNK, stop))
-
-
-def _boxes_touch(
-    boxes: Boxes, scene: Scene, view: View, planes: tuple[float, float]
-) -> NDArray[np.bool_]:
-    """Return which boxes may hold a centre that `_touches` a view, (C,).
-
-    Each condition there is a linear function of the camera coordinates, ``w . p <= limit``. In a
-    box it is at least that of the middle less ``|w| . half``, turned into the frame of the box.
-    """
-    turn = view.rotation @ scene.axes.T  # (3, 3)
-    shift = view.rotation @ ((view.center - scene.origin) / scene.size)  # (3,)
-    middle = turn @ boxes.middle - shift[:, None]  # (3, C), camera coordinates
-    # What is added up to a coordinate, at most; float32 rounds in proportion to it.
-    sizes = np.abs(turn) @ (np.abs(boxes.middle) + boxes.half) + np.abs(shift)[:, None]
-    limits: list[tuple[list[float], NDArray[np.float64] | float]]
-    limits = [([0.0, 0.0, -1.0], -planes[0]), ([0.0, 0.0, 1.0], planes[1])]
-    for axis, side in enumerate(_sides(view)):
-        for sign in (1.0, -1.0):
-            weights = [0.0, 0.0, sign * side.offset - side.pixels]
-            weights[axis] = sign * side.focal
-            limits.append((weights, side.reach * boxes.largest))
-    touching = np.ones(len(boxes.largest), np.bool_)
-    for weights, limit in limits:
-        rounding = _MARGIN * (np.abs(weights) @ sizes + np.abs(limit))
-        least = weights @ middle - np.abs(weights @ turn) @ boxes.half
-        touching &= least <= limit + rounding
+    if not _computable(scene, view):
+        return np.zeros(len(boxes), np.bool_)
+    near, far = clip_planes(scene, view)
+    places = itertools.product((0, 3), (1, 4), (2, 5))
+    corners = np.stack([boxes[:, place] for place in places], axis=-1)  # (B, 3, 8)
+    local = _local(np.moveaxis(corners, 1, 0).reshape(3, -1), scene, view)
+    x, y, z = local.reshape(3, len(boxes), 8).astype(np.float64)
+    # Rounding moves a mean by far less than this.
+    slack = 1e-4 * (1.0 + np.abs(local).max(axis=0).reshape(len(boxes), 8).max(axis=1))
+    touching: NDArray[np.bool_] = (z.max(axis=1) + slack >= near) & (z.min(axis=1) - slack <= far)
+    for coordinate, side in zip((x, y), frustum.image_sides(view), strict=True):
+        reach = _reach(side) * (boxes[:, 6].astype(np.float64) + slack)
+        shown = (side.half + REACH * LOW_PASS**0.5) * z
+        across = side.focal * coordinate + side.offset * z
+        for way in (1.0, -1.0):
+            # It is linear in the place, so it is least in a corner.
+            touching &= (way * across - shown).min(axis=1) <= reach
     return touching
+
+
+def _reach(side: frustum.Side) -> float:
+    """Return how far a footprint reaches, px times depth, for a longest standard deviation of 1."""
+    # A footprint is longest where the ray is steepest; the projection is linearised no further.
+    slope = (abs(side.offset) + (1.0 + 2.0 * _BEYOND) * side.half) / side.focal
+    return REACH * side.focal * float(np.hypot(1.0, slope))
 
 
 def _rotation6(rotation: NDArray[np.float64]) -> NDArray[np.float32]:

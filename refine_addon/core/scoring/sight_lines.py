@@ -235,7 +235,9 @@ class SightLines:
     Attributes
     ----------
     index : (M,) int64
-        Rows of the splats that the Gaussians are.
+        Rows of the splats that the Gaussians are, among all.
+    rows : (M,) int64
+        The same among `splats`, which need only hold those that are met.
     lines : list of Lines or None
         Of each view; None until `look` was called for it.
     """
@@ -250,27 +252,25 @@ class SightLines:
     ) -> None:
         self.views, self.splats = views, splats
         self.every = max(math.ceil(len(views) / JUDGES), 1) if judges else 1
-        self.index = gaussians.index
+        self.index = self.rows = gaussians.index
         self.lines: list[Lines | None] = [None] * len(views)
 
-    def look(self, number: int, gaussians: Gaussians, footprints: Footprints) -> None:
+    def colors(self, lines: Lines, view: View) -> NDArray[np.float64]:
+        """Return the colours in which a view sees what its lines meet, (3, u)."""
+        return colors_from(self.splats, self.rows[lines.met], view)
+
+    def look(self, number: int, footprints: Footprints) -> None:
         """Note what the lines of one view meet; several threads may call it at once.
 
         Parameters
         ----------
         number : int
             Of the view.
-        gaussians : Gaussians
-            Those that the lines may meet.
         footprints : Footprints
-            Of these in this view.
+            Of all that the lines may meet in this view.
         """
-        if self.lines[number] is not None or number % self.every:
-            return
-        met = crowding(gaussians, footprints, self.views[number][0])
-        count = min(LINES, MOST_MET / max(met, 1.0)) / len(self.views)
-        columns, rows = self.pixels(number, count)
-        self.lines[number] = meet(gaussians, footprints, columns, rows)
+        if self.lines[number] is None and number % self.every == 0:
+            self.lines[number] = met(self.views, number, footprints)
 
     def look_from(
         self,
@@ -286,20 +286,13 @@ class SightLines:
             number = numbers[piece.start]
             with np.errstate(under="ignore"):
                 footprints = projection.project(gaussians, scene, self.views[number][0])
-                self.look(number, gaussians, footprints)
+                self.look(number, footprints)
 
         for_chunks(work, len(numbers), 1, progress=progress, what="looking", threads=threads)
 
     def pixels(self, number: int, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the columns and rows of a view in which about `count` lines lie, spread evenly."""
-        view, count = self.views[number][0], max(count, LEAST_LINES)
-        columns = min(max(round(math.sqrt(count * view.width / view.height)), 1), view.width)
-        rows = min(max(round(count / columns), 1), view.height)
-        # Other pixels in each view: multiples of the plastic number's powers are spread evenly.
-        return (
-            spread(view.width, columns, (number * 0.7548776662466927) % 1.0),
-            spread(view.height, rows, (number * 0.5698402909980532) % 1.0),
-        )
+        return pixels(self.views[number][0], number, count)
 
     def psnr(self, keep: NDArray[np.bool_], *, threads: int | None = None) -> float | None:
         """Return the estimated PSNR with some splats removed, dB; None if too little is seen.
@@ -415,13 +408,22 @@ class SightLines:
             view = self.views[number][0]
             with np.errstate(under="ignore"):
                 footprints = projection.project(gaussians, scene, view)
-                other = meet(gaussians, footprints, lines.columns, lines.rows)
+                other = meet(footprints, lines.columns, lines.rows)
                 seen = other.colors(colors_from(splats, gaussians.index[other.met], view))
-                whole = lines.colors(colors_from(self.splats, self.index[lines.met], view))
+                whole = lines.colors(self.colors(lines, view))
             return np.array([psnr_of(seen, whole, view)])
 
+        return self._mean_of(compare, part(progress, 0.2, 1.0), threads)
+
+    def _mean_of(
+        self,
+        compare: Callable[[int, Lines], NDArray[np.float64]],
+        progress: Progress = silent,
+        threads: int | None = None,
+    ) -> float | None:
+        """Return the mean of what `compare` returns, (1,), for each of the judges."""
         judges = self._judges()
-        found = self._of_each(compare, judges, part(progress, 0.2, 1.0), threads)
+        found = self._of_each(compare, judges, progress, threads)
         return None if found is None else float(self._mean(found, judges)[0])
 
     def _removing(
@@ -449,7 +451,7 @@ class SightLines:
         def compare(number: int, lines: Lines) -> NDArray[np.float64]:
             view = self.views[number][0]
             with np.errstate(under="ignore"):
-                colors = colors_from(self.splats, self.index[lines.met], view)
+                colors = self.colors(lines, view)
             whole, values = lines.colors(colors), []
             own = place.take(lines.met)  # (u,)
             for count in counts:
@@ -475,7 +477,7 @@ class SightLines:
         def compare(number: int, lines: Lines) -> NDArray[np.float64]:
             view = self.views[number][0]
             with np.errstate(under="ignore"):
-                colors = colors_from(self.splats, self.index[lines.met], view)
+                colors = self.colors(lines, view)
             whole, own, gains = lines.colors(colors), place.take(lines.met), []
             for count in counts:
                 keep = own >= count  # (u,)
@@ -544,6 +546,27 @@ def _places(
     return place
 
 
+def met(views: Sequence[tuple[View, float]], number: int, footprints: Footprints) -> Lines:
+    """Return what the lines of sight of one of some views meet; see `SightLines.look`."""
+    view = views[number][0]
+    count = min(LINES, MOST_MET / max(crowding(footprints, view), 1.0)) / len(views)
+    return meet(footprints, *pixels(view, number, count))
+
+
+def pixels(view: View, number: int, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the columns and rows of a view in which about `count` lines lie, spread evenly.
+
+    Those of each `number` are others: multiples of the plastic number's powers are spread evenly.
+    """
+    count = max(count, LEAST_LINES)
+    columns = min(max(round(math.sqrt(count * view.width / view.height)), 1), view.width)
+    rows = min(max(round(count / columns), 1), view.height)
+    return (
+        spread(view.width, columns, (number * 0.7548776662466927) % 1.0),
+        spread(view.height, rows, (number * 0.5698402909980532) % 1.0),
+    )
+
+
 def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float64]:
     """Return the colours in which a view sees some splats, (3, n), at least 0.
 
@@ -584,16 +607,15 @@ def spread(size: int, count: int, start: float) -> NDArray[np.int64]:
     return np.asarray(np.floor(places), np.int64)
 
 
-def crowding(gaussians: Gaussians, footprints: Footprints, view: View) -> float:
+def crowding(footprints: Footprints, view: View) -> float:
     """Return about how many footprints a line of sight of a view meets, at most all of them."""
     size = float(view.width * view.height)
-    area = reaches(gaussians.alphas[footprints.index])  # (n,), px^2
+    area = reaches(footprints.alphas)  # (n,), px^2
     area *= np.float32(math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
     return float(np.minimum(area, np.float32(size)).sum(dtype=np.float64)) / size
 
 
 def meet(
-    gaussians: Gaussians,
     footprints: Footprints,
     columns: NDArray[np.int64],
     rows: NDArray[np.int64],
@@ -602,13 +624,12 @@ def meet(
 
     Parameters
     ----------
-    gaussians : Gaussians
     footprints : Footprints
-        Of these Gaussians in the view of the pixels.
+        In the view of the pixels.
     columns, rows : (C,), (R,) int64
         See `Lines`; ascending.
     """
-    reach = reaches(gaussians.alphas[footprints.index])  # (n,), squared Mahalanobis distance
+    reach = reaches(footprints.alphas)  # (n,), squared Mahalanobis distance
     # Of each footprint: the first column and row that its box holds, and how many it holds.
     (left, wide), (top, tall) = (
         boxes(footprints, reach, axis, places) for axis, places in enumerate((columns, rows))
@@ -630,7 +651,7 @@ def meet(
         squared = mahalanobis(footprints, own, columns.take(across), rows.take(down))
         met = np.flatnonzero(squared < reach.take(own))
         own = own[met]
-        alpha = gaussians.alphas.take(footprints.index[own]) * np.exp(squared[met] / -2.0)
+        alpha = footprints.alphas.take(own) * np.exp(squared[met] / -2.0)
         found.append((own, down[met] * len(columns) + across[met], alpha))
     found.append((np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32)))
     own, line, alpha = (np.concatenate(arrays) for arrays in zip(*found, strict=True))

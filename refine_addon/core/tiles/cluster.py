@@ -131,7 +131,7 @@ class Cluster:
                 raise RefineError(msg)
 
     def __call__(
-        self, job: Job, calls: Sequence[Call], progress: Progress, what: str
+        self, job: object, calls: Sequence[Call], progress: Progress, what: str
     ) -> Iterator[Any]:
         """Yield what each call returns, in their order.
 
@@ -185,9 +185,8 @@ def _do(packed: bytes, group: Sequence[Call]) -> list[Any]:
 
 
 @functools.lru_cache(maxsize=2)
-def _unpacked(packed: bytes) -> Job:
-    job: Job = pickle.loads(packed)  # noqa: S301 - Dask itself sends pickles
-    return job
+def _unpacked(packed: bytes) -> object:
+    return pickle.loads(packed)  # noqa: S301 - Dask itself sends pickles
 
 
 def _answer(version: str, job: Job, tiles: list[Tile]) -> str:

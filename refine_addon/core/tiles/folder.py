@@ -62,6 +62,25 @@ class Folder:
         for name in names:
             self._array(unit, name).unlink(missing_ok=True)
 
+    def map(self, unit: int, name: str) -> NDArray[Any]:
+        """Return an array of a unit without reading it yet."""
+        return np.asarray(np.load(self._array(unit, name), mmap_mode="r", allow_pickle=False))
+
+    def mapped(self, name: str) -> NDArray[Any]:
+        """Return an array that was noted without reading it yet."""
+        return np.asarray(np.load(self.path / "done" / name, mmap_mode="r", allow_pickle=False))
+
+    def has(self, name: str) -> bool:
+        """Return whether something is done."""
+        return any((self.path / "done" / f"{name}{end}").exists() for end in ("", ".tuple"))
+
+    def inner(self, name: str) -> Folder:
+        """Return a folder in this one, and make it if it is not there."""
+        folder = Folder(self.path / name)
+        for path in (folder.path, folder.path / "done", folder.path / "arrays"):
+            path.mkdir(parents=True, exist_ok=True)
+        return folder
+
     def note(self, name: str, result: Any) -> None:  # noqa: ANN401 - an array, a tuple of some, None
         """Note what came of something: from then on it is done."""
         alone = isinstance(result, np.ndarray)
@@ -93,8 +112,8 @@ class Folder:
             If it cannot be made, or somebody else works on the job.
         """
         try:
-            for folder in (self.path, self.tiles, self.path / "done", self.path / "arrays"):
-                folder.mkdir(parents=True, exist_ok=True)
+            self.tiles.mkdir(parents=True, exist_ok=True)
+            self.inner("")
             stream = (self.path / "lock").open("wb")
         except OSError as error:
             msg = f"{self.path}: cannot be made ({error.strerror or error})"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import tempfile
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,51 +16,35 @@ from ...version import VERSION
 from .. import radix
 from ..errors import RefineError
 from ..formats.ply_header import with_count
-from ..pipeline import nothing_removed, quality_facts
+from ..pipeline import FIRST, MEASURES, UNSEEN, nothing_removed, quality_facts
+from ..quality import out_of_reach
 from ..report import Clock, Files, complete_report, make_report
-from ..scores import Scores
-from ..scoring import closed_form
 from ..scoring.closed_form_block import ROWS
-from ..selection import least_seen, refuse_none_left, single
+from ..selection import Budget, least_seen, quality_of, refuse_none_left, select, single
 from ..task import DEFAULTS, Settings
 from ..whole_file import expanded, make_folder, publish, refuse_existing
 from ..work import Progress, part, silent
+from . import absorbing
 from .folder import Folder
-from .steps import Job, Rule, Shared
+from .scoring import by_closed_form, by_occlusion, to_absorb
+from .steps import SURVIVORS, Job, Rule
 from .units import reopened, tile_at, units_of
 from .workers import Call, Here, Interrupted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from ..selection import Budget
+    from ..scores import Scores
     from ..views import ViewSet
+    from .absorbing import Survivors
+    from .scoring import Seen
     from .units import Tile
     from .workers import Workers
 
-SHARES = {
-    "read": (0.0, 0.2),
-    "count": (0.2, 0.2),
-    "sum_views": (0.2, 0.75),
-    "add": (0.75, 0.78),
-    "compare": (0.78, 0.82),
-    "select": (0.82, 0.82),
-    "write": (0.82, 1.0),
-}
-"""Step -> the part of the progress that is its own."""
-
-STEP_NAMES = {
-    "read": "reading",
-    "count": "reading",
-    "sum_views": "scoring",
-    "add": "scoring",
-    "compare": "scoring",
-}
-
-_SMALL = 1 << 16
-"""Bytes of an argument that travels with each step; larger ones lie in the folder."""
+SCORED = 0.82
+"""Part of the progress that scoring is; the rest is writing."""
 
 
 def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
@@ -69,6 +54,7 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     budget: Budget,
     settings: Settings = DEFAULTS,
     *,
+    absorb: bool = False,
     overwrite: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
@@ -78,8 +64,9 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
 
     The same splats stay as if all files were one, in the order in which they are given: of equal
     scores, those of the first file go first. All files are written, or none. What stands between
-    the steps, 50 bytes a splat, lies in a folder beside the outputs until the job is done. If the
-    process is killed, the same call later goes on from there.
+    the steps lies in a folder beside the outputs until the job is done: 50 bytes a splat for the
+    closed form, 400 for occlusion. If the process is killed, the same call later goes on from
+    there.
 
     Parameters
     ----------
@@ -88,7 +75,10 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     folder : path-like or None
         Where each goes under its own name; made if it is not there. None writes nothing.
     views, budget, settings, progress, threads
-        See `pipeline.prune`; the method is the closed form.
+        See `pipeline.prune`. Here "auto" measures by all views.
+    absorb : bool
+        See `pipeline.prune`. A region of up to a million splats is absorbed at a time
+        (`absorbing`), so survivors are not exactly those of one file.
     overwrite : bool
         Whether files may be replaced.
     workers : callable, optional
@@ -106,8 +96,9 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
         over tiles, or two files have one name. Then nothing is written.
     """
     clock = Clock()
-    _refuse_what_needs_all(budget, settings)
+    _refuse_what_needs_all(budget, settings, absorb=absorb)
     tiles = [tile_at(path) for path in sources]
+    _refuse_twice(tiles)
     output = None if folder is None else expanded(folder)
     targets = [] if output is None else _targets(tiles, output, overwrite=overwrite)
     used = views.spread(settings.views)
@@ -115,12 +106,13 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
         if output is None:
             place = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="refine-")))
         else:
-            place = output.absolute() / f".refine-{_digest(tiles, used, budget, settings)}"
+            digest = _digest(tiles, used, budget, settings, absorb=absorb)
+            place = output.absolute() / f".refine-{digest}"
         job = Job(Folder(place), used, settings.closed_form, used.middle())
         held.enter_context(job.folder.opened())
         try:
             run = _Run(job, tiles, workers or Here(threads), progress)
-            facts = run.prune(budget, settings, views, clock)
+            facts = run.prune(budget, settings, views, clock, absorb=absorb)
             sizes = run.write() if targets else run.sizes()
             for target in targets:
                 publish(job.folder.tiles / target.name, target, overwrite=overwrite)
@@ -173,34 +165,52 @@ class _Run:
         self.total = sum(tile.splats for tile in tiles)
         self.counts = np.zeros((len(tiles), 2), np.int64)
         self._workers, self._progress = workers, progress
-        self._shared = 0
+        self._absorbed = False
         job.folder.note("begun", None)
         workers.check(job, tiles)
 
     def prune(
-        self, budget: Budget, settings: Settings, views: ViewSet, clock: Clock
+        self, budget: Budget, settings: Settings, views: ViewSet, clock: Clock, *, absorb: bool
     ) -> dict[str, Any]:
         """Score the tiles and decide what stays; return the report as far as it is known."""
-        job = self.job
-        with np.errstate(under="ignore"):  # as in `pipeline.score`
-            found = closed_form.steps(
-                self._each, self.total, job.views, job.settings, remember=self._remember
-            )
+        ahead = part(self._progress, 0.0, SCORED * (0.3 if absorb else 1.0))
+        seen: Seen | None = None
+        if absorb:
+            seen = to_absorb(self.job, self.units, settings, self._workers, ahead)
+            scores = seen.scores
+        elif settings.method == "closed-form":
+            scores = by_closed_form(self.job, self.units, self._workers, ahead)[0]
+        else:
+            scores = by_occlusion(self.job, self.units, settings, self._workers, ahead)
+        notes = (*scores.notes, views.note) if views.note else scores.notes
+        scores = replace(scores, notes=notes, views_given=len(views))
         clock.lap("score_s")
-        rule = self._rule(budget)
-        places = {tile: place for place, tile in enumerate(self.tiles)}
-        for unit, each in zip(self.units, self._map("choose", rule), strict=True):
-            for (tile, _, _), pair in zip(unit.parts, each, strict=True):
-                self.counts[places[tile]] += pair
+        self._count(self._map("choose", self._rule(budget, scores)))
         kept, unseen = self.counts.sum(axis=0).tolist()
         refuse_none_left(budget, self.total, kept)
         clock.lap("select_s")
-        nothing = Scores(
-            np.empty(0, np.float32), np.empty(0, np.int32), len(job.views), found.undrawable,
-            found.facts, (views.note,) if views.note else (), "closed-form",
-            job.settings.frustum, len(views),
-        )  # fmt: skip
-        facts = make_report(nothing, np.empty(0, np.bool_), budget, settings, clock)
+        keep, psnr, survivors = np.empty(0, np.bool_), None, None
+        if seen is not None:
+            survivors, psnr = self._absorb(seen, kept)
+            kept = int(self.counts[:, 0].sum())
+            clock.lap("absorb_s")
+        if scores.sights is not None:
+            keep = np.concatenate(
+                [self.job.folder.load(unit.index, ["keep"])["keep"] for unit in self.units]
+            )
+            psnr = scores.sights.psnr(keep) if not self._absorbed else psnr
+        facts = make_report(scores, keep, budget, settings, clock)
+        facts |= quality_facts(scores, keep, psnr, absorbed=survivors is not None)
+        if psnr is None and scores.sights is not None:
+            facts["notes"].append(UNSEEN)
+        facts["budget_remark"] = self._remark(budget, psnr)
+        if facts["budget_remark"]:
+            facts["notes"].append(facts["budget_remark"])
+        if survivors is not None:
+            facts["absorbed"] = survivors.facts()
+            facts["notes"].append(survivors.note())
+            if settings.method == "closed-form":
+                facts["notes"].append(MEASURES)
         facts["splats"] |= {
             "before": self.total,
             "kept": kept,
@@ -210,23 +220,66 @@ class _Run:
             "protected": 0,
             "forced": 0,
         }
-        facts["budget_remark"] = ""
-        if budget.max_mb is not None and kept == self.total:
-            facts["budget_remark"] = nothing_removed(sum(tile.size for tile in self.tiles))
-            facts["notes"].append(facts["budget_remark"])
-        return facts | quality_facts(nothing, np.empty(0, np.bool_), None, absorbed=False)
+        return facts
+
+    def _remark(self, budget: Budget, psnr: float | None) -> str:
+        """Return why a budget is out of reach or removes nothing, or ""."""
+        gone = self.total - int(self.counts[:, 0].sum())
+        if budget.psnr is not None:
+            return out_of_reach(budget.psnr, gone, self.total, psnr)
+        if budget.max_mb is not None and not gone:
+            return nothing_removed(sum(tile.size for tile in self.tiles))
+        return ""
+
+    def _absorb(self, seen: Seen, goal: int) -> tuple[Survivors, float | None]:
+        """Absorb to `goal` survivors; the units then say which stay, and as what.
+
+        Returns
+        -------
+        survivors : Survivors
+        psnr : float or None
+            The estimate for them, dB, if some of them changed.
+        """
+        first = min(math.floor(FIRST * self.total), self.total - goal)
+        rest = select(seen.scores, Budget(keep=self.total - first))
+        ahead = part(self._progress, 0.3 * SCORED, 0.95 * SCORED)
+        found = absorbing.absorb(seen, rest, goal, workers=self._workers, progress=ahead)
+        order = np.argsort(found.origin)
+        arrays = found.origin[order], order, found.changed[order]
+        for name, array in zip(SURVIVORS, arrays, strict=True):
+            self.job.folder.note(name, array)
+        begins = np.cumsum([0, *map(len, self.units)])
+        self._count(self._map("settle", begins, found.regions))
+        self._absorbed = bool(found.regions)
+        if not self._absorbed:
+            return found, None
+        ahead = part(self._progress, 0.95 * SCORED, SCORED)
+        return found, absorbing.estimated(seen, found, self._workers, ahead)
+
+    def _count(self, kept: Iterator[NDArray[np.int64]]) -> None:
+        """Note what each unit says of its parts, see `Job.choose`."""
+        places = {tile: place for place, tile in enumerate(self.tiles)}
+        self.counts[:] = 0
+        for unit, each in zip(self.units, kept, strict=True):
+            for (tile, _, _), pair in zip(unit.parts, each, strict=True):
+                self.counts[places[tile]] += pair
 
     def write(self) -> list[int]:
         """Write each tile into the folder of the job; return their bytes."""
         calls = [
             Call(
                 "write",
-                (tile, [u for u in self.units if any(tile == part.tile for part in u.parts)], kept),
+                (
+                    tile,
+                    [u for u in self.units if any(tile == part.tile for part in u.parts)],
+                    kept,
+                ),
                 tile.splats / self.total,
+                options={"absorbed": self._absorbed},
             )
             for tile, (kept, _) in zip(self.tiles, self.counts.tolist(), strict=True)
         ]
-        return [*self._workers(self.job, calls, part(self._progress, *SHARES["write"]), "writing")]
+        return [*self._workers(self.job, calls, part(self._progress, SCORED, 1.0), "writing")]
 
     def sizes(self) -> list[int]:
         """Return the bytes that `write` would write of each tile."""
@@ -237,48 +290,26 @@ class _Run:
             found.append(tile.fixed_bytes - shorter + kept * tile.row_bytes)
         return found
 
-    def _each(self, step: str, *arguments: Any) -> Iterator[Any]:  # noqa: ANN401 - of each step its own
-        """Do a step of the closed form with each unit."""
-        given = tuple(self._small(argument) for argument in arguments)
-        calls = [
-            Call("score", (unit, step, given), len(unit) / self.total, chunked=True)
-            for unit in self.units
-        ]
-        return self._workers(self.job, calls, part(self._progress, *SHARES[step]), STEP_NAMES[step])
-
     def _map(self, step: str, *arguments: Any, **options: Any) -> Iterator[Any]:  # noqa: ANN401 - of each its own
         """Do a step of `Job` with each unit."""
         calls = [
             Call(step, (unit, *arguments), len(unit) / self.total, options=options)
             for unit in self.units
         ]
-        ahead = part(self._progress, *SHARES["select"])
+        ahead = part(self._progress, SCORED, SCORED)
         return self._workers(self.job, calls, ahead, "selecting")
 
-    def _small(self, argument: Any) -> Any:  # noqa: ANN401 - as given
-        """Return an argument, or where it lies if it is large."""
-        if not isinstance(argument, np.ndarray) or argument.nbytes <= _SMALL:
-            return argument
-        self._shared += 1
-        name = f"shared-{self._shared}"
-        self.job.folder.note(name, argument)
-        return Shared(name)
-
-    def _remember(self, name: str, make: Callable[[], Any]) -> Any:  # noqa: ANN401 - as made
-        """Return what was made of the name, even by a run before this one."""
-        done, found = self.job.folder.noted(name)
-        if not done:
-            found = make()
-            self.job.folder.note(name, found)
-        return found
-
-    def _rule(self, budget: Budget) -> Rule:
-        """Return which splats a budget removes."""
+    def _rule(self, budget: Budget, scores: Scores) -> Rule:
+        """Return which splats a budget removes by scores."""
         if budget.threshold is not None:
             return Rule(threshold=float(single(budget.threshold)))
         if budget.min_seen is not None:
-            return Rule(least_seen=least_seen(budget.min_seen, len(self.job.views)))
-        amount, by_bytes = _amount(budget, self.tiles)
+            return Rule(least_seen=least_seen(budget.min_seen, scores.views_used))
+        if budget.psnr is not None:
+            share = quality_of(scores).share(budget.psnr)
+            amount, by_bytes = math.floor(share * self.total), False
+        else:
+            amount, by_bytes = _amount(budget, self.tiles)
         if not amount:
             return Rule(left=(0,) * len(self.units))
 
@@ -308,18 +339,26 @@ def _amount(budget: Budget, tiles: Sequence[Tile]) -> tuple[int, bool]:
     return max(excess, 0), True
 
 
-def _refuse_what_needs_all(budget: Budget, settings: Settings) -> None:
-    """Raise `RefineError` for methods and budgets that need all splats at once."""
-    if settings.method != "closed-form":
-        msg = (
-            f"method is {settings.method}, which needs all splats in memory: over tiles together "
-            "only closed-form works so far"
-        )
+def _refuse_what_needs_all(budget: Budget, settings: Settings, *, absorb: bool) -> None:
+    """Raise `RefineError` for budgets that need all splats at once."""
+    if absorb and (budget.threshold is not None or budget.psnr is not None):
+        what = "a threshold" if budget.psnr is None else "a PSNR"
+        msg = f"{what} needs all splats in memory to absorb: over tiles choose another budget"
         raise RefineError(msg)
-    if budget.psnr is not None:
-        msg = "a PSNR needs all splats in memory: over tiles together choose another budget"
+    if budget.psnr is not None and not settings.estimates:
+        msg = f"over tiles {settings.method} estimates no PSNR: choose auto or occlusion"
         raise RefineError(msg)
     budget.refuse_meaningless(settings.method, frustum=settings.frustum)
+
+
+def _refuse_twice(tiles: Sequence[Tile]) -> None:
+    """Raise `RefineError` if a file is given twice: its splats would count twice."""
+    given: set[str] = set()
+    for tile in tiles:
+        if tile.path in given:
+            msg = f"{tile.path}: is given twice"
+            raise RefineError(msg)
+        given.add(tile.path)
 
 
 def _targets(tiles: Sequence[Tile], folder: Path, *, overwrite: bool) -> list[Path]:
@@ -344,10 +383,12 @@ def _targets(tiles: Sequence[Tile], folder: Path, *, overwrite: bool) -> list[Pa
     return targets
 
 
-def _digest(tiles: Sequence[Tile], views: ViewSet, budget: Budget, settings: Settings) -> str:
+def _digest(
+    tiles: Sequence[Tile], views: ViewSet, budget: Budget, settings: Settings, *, absorb: bool
+) -> str:
     """Return a name for a job: that of the same job again, and of no other."""
     told = hashlib.blake2b(digest_size=8)
-    for fact in (VERSION, ROWS, [*tiles], budget, settings):
+    for fact in (VERSION, ROWS, [*tiles], budget, settings, absorb):
         told.update(repr(fact).encode("utf-8", "surrogateescape"))
     for view in views:
         for field in fields(view):

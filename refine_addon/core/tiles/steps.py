@@ -7,7 +7,7 @@ small. It does nothing that could not be done again: where its result is noted, 
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,24 +15,35 @@ import numpy as np
 
 from .. import radix
 from ..errors import RefineError
+from ..formats.ply_columns import splats_from_columns
 from ..formats.ply_header import with_count
 from ..formats.ply_write import write_rows
 from ..scoring.closed_form_block import STEPS, Block
 from ..selection import lowest
+from ..survivors import columns_with
 from ..whole_file import whole_file
 from ..work import Progress, silent
-from .units import reopened, rows_of, splats_of
+from .absorbing import unpacked
+from .units import reopened, rows_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from ..scoring.closed_form import ClosedForm
     from ..views import ViewSet
+    from .absorbing import Region
     from .folder import Folder
     from .units import Tile, Unit
 
 _REPEATED = ("count",)
 """Steps of `STEPS` that are done with several arguments: their results are not noted."""
+
+
+SURVIVORS = ("survivors", "places", "changed")
+"""Names of what is noted of survivors: their rows among all splats, ascending; where each is among
+those of all regions; and whether it changed."""
 
 
 class Shared(NamedTuple):
@@ -114,7 +125,7 @@ class Job:
             if done:
                 return result
             raise
-        splats = splats_of(unit) if step == "read" else None
+        splats = unit.splats() if step == "read" else None
         block = Block(
             splats, self.views, self.settings, self.middle, threads=threads, arrays=arrays
         )
@@ -154,16 +165,54 @@ class Job:
             weights = _bytes(unit) if rule.by_bytes else None
             keys = radix.keys_of(found["values"])
             gone = lowest(keys, rule.edge, rule.left[unit.index], weights)
-        self.folder.save(unit.index, {"keep": ~gone})
-        unseen = found["seen"] == 0
+        return self._kept(unit, ~gone)
+
+    def settle(
+        self, unit: Unit, begins: NDArray[np.int64], regions: Sequence[Region]
+    ) -> NDArray[np.int64]:
+        """Note which splats of a unit survive absorbing, and what those became that changed.
+
+        Parameters
+        ----------
+        unit : Unit
+        begins : (units + 1,) int64
+            How many splats lie before each unit, and all.
+        regions : sequence of Region
+            Where the survivors are.
+
+        Returns
+        -------
+        (parts, 2) int64
+            See `choose`.
+        """
+        begin, end = begins[unit.index : unit.index + 2].tolist()
+        origin, place, changed = (self.folder.mapped(name) for name in SURVIVORS)
+        some = slice(*np.searchsorted(origin, (begin, end)).tolist())
+        rows, mine = origin[some] - begin, changed[some]
+        keep = np.zeros(len(unit), np.bool_)
+        keep[rows] = True
+        starts = np.cumsum([0, *map(len, regions)])
+        at = place[some][mine]
+        which = np.searchsorted(starts, at, side="right") - 1
+        values = np.empty((len(at), regions[0].table().shape[1] if regions else 0))
+        for index in np.unique(which).tolist():
+            here = which == index
+            values[here] = regions[index].table()[at[here] - starts[index]]
+        self.folder.save(unit.index, {"changed": rows[mine], "became": values})
+        return self._kept(unit, keep)
+
+    def _kept(self, unit: Unit, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Note which splats of a unit stay; return what `choose` returns."""
+        self.folder.save(unit.index, {"keep": keep})
+        unseen = self.folder.load(unit.index, ["seen"])["seen"] == 0
         return np.array(
             [
-                [np.count_nonzero(~gone[piece]), np.count_nonzero(unseen[piece])]
+                [np.count_nonzero(keep[piece]), np.count_nonzero(unseen[piece])]
                 for piece in unit.slices()
             ]
         )
 
-    def write(self, tile: Tile, units: list[Unit], kept: int) -> int:
+    def write(self, tile: Tile, units: list[Unit], kept: int, *, absorbed: bool) -> int:
         """Write what stays of a tile into the folder of the job, and return its bytes.
 
         Parameters
@@ -173,6 +222,8 @@ class Job:
             Those in which it lies.
         kept : int
             How many of its splats stay.
+        absorbed : bool
+            Whether some of them changed.
         """
         name = f"{Path(tile.path).name}.written"
         made = self.folder.tiles / Path(tile.path).name
@@ -187,11 +238,22 @@ class Job:
                 keep = self.folder.load(unit.index, ["keep"])["keep"]
                 for part, piece in zip(unit.parts, unit.slices(), strict=True):
                     if part.tile == tile:
-                        write_rows(stream, rows_of(part), keep[piece], {})
+                        rows = rows_of(part)
+                        changed = self._changed(unit, rows, piece) if absorbed else {}
+                        write_rows(stream, rows, keep[piece], changed)
             stream.write(file.after.data)
             size = stream.tell()
         self.folder.note(name, np.array(size))
         return size
+
+    def _changed(self, unit: Unit, rows: NDArray[Any], piece: slice) -> dict[str, NDArray[Any]]:
+        """Return the columns of rows, a slice of a unit, with what some of them became."""
+        changed, became = self.folder.load(unit.index, ("changed", "became")).values()
+        some = slice(*np.searchsorted(changed, (piece.start, piece.stop)).tolist())
+        splats = unpacked(became[some])
+        degree = splats_from_columns(rows[:1]).sh_rest.shape[1]
+        splats = replace(splats, sh_rest=splats.sh_rest[:, :degree])
+        return columns_with(rows, changed[some] - piece.start, splats)
 
     def _keys(self, unit: Unit) -> NDArray[np.unsignedinteger[Any]]:
         return radix.keys_of(self.folder.load(unit.index, ["values"])["values"])

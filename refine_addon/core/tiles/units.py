@@ -97,6 +97,16 @@ class Unit:
         """Return the number of rows."""
         return sum(part.rows for part in self.parts)
 
+    def splats(self) -> Splats:
+        """Return its splats.
+
+        Returns
+        -------
+        Splats
+            Of the highest degree among its parts: coefficients that a part lacks are 0.
+        """
+        return joined([splats_from_columns(rows_of(part)) for part in self.parts])
+
     def slices(self) -> list[slice]:
         """Return where in the unit each part lies."""
         ends = np.cumsum([0, *(part.rows for part in self.parts)]).tolist()
@@ -185,14 +195,3 @@ def units_of(tiles: Sequence[Tile]) -> list[Unit]:
                 units.append(Unit(len(units), tuple(parts)))
                 parts, room = [], ROWS
     return [*units, Unit(len(units), tuple(parts))] if parts else units
-
-
-def splats_of(unit: Unit) -> Splats:
-    """Return the splats of a unit.
-
-    Returns
-    -------
-    Splats
-        Of the highest degree among its parts: coefficients that a part lacks are 0.
-    """
-    return joined([splats_from_columns(rows_of(part)) for part in unit.parts])

@@ -25,7 +25,7 @@ class Workers(Protocol):
         """Raise `RefineError` if a worker does not see the files."""
 
     def __call__(
-        self, job: Job, calls: Sequence[Call], progress: Progress, what: str
+        self, job: object, calls: Sequence[Call], progress: Progress, what: str
     ) -> Iterator[Any]:
         """Yield what each call returns, in their order."""
 
@@ -52,8 +52,8 @@ class Call(NamedTuple):
     chunked: bool = False
     options: Mapping[str, Any] = {}
 
-    def do(self, job: Job, *, progress: Progress = silent, threads: int | None = None) -> Any:  # noqa: ANN401 - of each step its own
-        """Return what the step returns."""
+    def do(self, job: object, *, progress: Progress = silent, threads: int | None = None) -> Any:  # noqa: ANN401 - of each step its own
+        """Return what the step returns; `job` has it as a method."""
         more = {"progress": progress, "threads": threads} if self.chunked else {}
         return getattr(job, self.step)(*self.arguments, **self.options, **more)
 
@@ -74,7 +74,7 @@ class Here:
         """Do nothing: this process sees what it sees."""
 
     def __call__(
-        self, job: Job, calls: Sequence[Call], progress: Progress, what: str
+        self, job: object, calls: Sequence[Call], progress: Progress, what: str
     ) -> Iterator[Any]:
         """Yield what each call returns, in their order."""
         done = 0.0

@@ -1,0 +1,530 @@
+"""What views see of splats that no memory holds at once, hidden by one another.
+
+The splats are activated unit by unit, and stored along a Z-shaped curve, so that a chunk of them is
+a box in space. A view loads the chunks that may reach into its image, and looks at their footprints
+together, as in memory: what it finds is the same to the bit, wherever the tiles were cut.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, MutableMapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from ..scene import code_order, moments, spatial_code, splat_fingerprint
+from ..scoring import projection
+from ..scoring.measuring import Measured, Measuring, of_view
+from ..scoring.projection import Gaussians
+from ..scoring.sight_lines import Lines, SightLines, meet, met, psnr_of
+from ..splats import drawable, joined
+from ..work import Progress, default_threads, for_chunks, part, silent
+from .workers import Call
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from ..scene import Scene
+    from ..scoring.measuring import Sampling
+    from ..splats import Splats
+    from ..views import View, ViewSet
+    from .folder import Folder
+    from .workers import Workers
+
+CHUNK = 1 << 16
+"""Splats of a chunk, 3.7 MB."""
+
+_MEANS, _COVARIANCES, _LARGEST, _ALPHAS, _COLORS = slice(3), slice(3, 9), 9, 10, slice(11, 14)
+"""Rows of a chunk, (14, n) float32: see `Gaussians`."""
+
+
+class Source(Protocol):
+    """A run of the rows of all splats."""
+
+    @property
+    def index(self) -> int:
+        """Which one of all."""
+        ...
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        ...
+
+    def splats(self) -> Splats:
+        """Return its splats."""
+        ...
+
+
+@dataclass(frozen=True)
+class SceneJob:
+    """Steps that find out what views see of all splats; see `steps.Job`.
+
+    Attributes
+    ----------
+    folder : Folder
+        Of its own.
+    views : ViewSet
+    sampling : Sampling
+    scene : Scene
+    """
+
+    folder: Folder
+    views: ViewSet
+    sampling: Sampling
+    scene: Scene
+
+    def moments(self, source: Source) -> NDArray[np.float64]:
+        """Return `scene.moments` of a source, (pieces, 4, 3)."""
+        splats = source.splats()
+        with np.errstate(under="ignore"):
+            found = [*moments(splats.means, drawable(splats), self.scene)]
+        return np.reshape(found, (-1, 4, 3))
+
+    def place(
+        self, source: Source, *, progress: Progress = silent, threads: int | None = 1
+    ) -> tuple[int, int]:
+        """Activate a source; return how many of it can be drawn, and how many any view may show."""
+        name = f"{source.index:06d}.place"
+        done, result = self.folder.noted(name)
+        if not done:
+            splats = source.splats()
+            good, opaque = projection.judge(splats, threads=threads)
+            with np.errstate(under="ignore"):
+                rows, place = projection.near(splats, opaque, self.scene)
+                found = projection.activate(splats, rows, place, self.scene, progress, threads)
+                code = spatial_code(place)
+            packed = np.empty((len(rows), 14), np.float32)
+            packed[:, _MEANS], packed[:, _COVARIANCES] = found.means.T, found.covariances.T
+            packed[:, _LARGEST], packed[:, _ALPHAS] = found.largest, found.alphas
+            packed[:, _COLORS] = found.colors
+            arrays = {"good": good, "rows": rows, "code": code, "gaussians": packed}
+            arrays["ties"] = splat_fingerprint(splats, rows)
+            self.folder.save(source.index, arrays)
+            result = np.array([np.count_nonzero(good), len(rows)])
+            self.folder.note(name, result)
+        return int(result[0]), int(result[1])
+
+    def gather(self, number: int, starts: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Write a chunk.
+
+        Parameters
+        ----------
+        number : int
+            Which one.
+        starts : (sources + 1,) int64
+            How many Gaussians the sources before each have, and all.
+
+        Returns
+        -------
+        (7,) float32
+            Its box, see `projection.boxes_touch`.
+        """
+        name = f"{number:06d}.gather"
+        done, box = self.folder.noted(name)
+        if not done:
+            order = self.folder.mapped("order")[number * CHUNK : (number + 1) * CHUNK]
+            source = np.searchsorted(starts, order, side="right") - 1
+            packed = np.empty((14, len(order)), np.float32)
+            for index in np.unique(source).tolist():
+                here = np.flatnonzero(source == index)
+                rows = self.folder.map(index, "gaussians")
+                packed[:, here] = rows[order[here] - starts[index]].T
+            self.folder.save(number, {"chunk": packed})
+            means = packed[_MEANS]
+            box = np.concatenate([means.min(axis=1), means.max(axis=1), [packed[_LARGEST].max()]])
+            self.folder.note(name, box)
+        return np.asarray(box, np.float32)
+
+    def look(
+        self,
+        turn: int,
+        block: int,
+        numbers: list[int],
+        *,
+        progress: Progress = silent,
+        threads: int | None = 1,
+    ) -> None:
+        """Measure what a block of views sees of the splats that are left.
+
+        Parameters
+        ----------
+        turn : int
+            How often splats have been removed.
+        block : int
+            Its number.
+        numbers : list of int
+            Of its views, in the order of `ViewSet.by_distance`.
+        progress, threads
+        """
+        name = seen_name(turn, block)
+        if self.folder.has(name):
+            return
+        views = self.views.by_distance()
+        boxes, left = self.folder.noted("boxes")[1], self.folder.mapped(f"left-{turn}")
+        sample = self.folder.noted("sample")[1] if turn == 0 else np.empty(0, np.int64)
+        total, errors = Measured.zero(len(left)), []
+        step = default_threads() if threads is None else threads
+        for start in range(0, len(numbers), step):
+            some = numbers[start : start + step]
+
+            def work(piece: slice, some: list[int] = some) -> Any:  # noqa: ANN401 - a tuple
+                view, weight = views[some[piece.start]]
+                footprints, colors = self._footprints(view, boxes, left)
+                if turn == 0:
+                    self._note_lines(some[piece.start], footprints)
+                return footprints, weight, *of_view(footprints, colors, view, self.sampling)
+
+            ahead = part(progress, start / len(numbers), (start + len(some)) / len(numbers))
+            found = for_chunks(work, len(some), 1, progress=ahead, what="scoring", threads=step)
+            for each in found:
+                before = total.error[sample]
+                total.add_view(*each)
+                errors.append(total.error[sample] - before)
+            del found
+        self.folder.note(name, (total.contribution, total.error, total.seen, np.array(errors)))
+
+    def meet(self, number: int, pixels: tuple[NDArray[np.int64], ...] | None = None) -> None:
+        """Note what the lines of sight of a view meet, before any splats are removed.
+
+        Parameters
+        ----------
+        number : int
+            Of the view.
+        pixels : (C,), (R,) int64, optional
+            Columns and rows that the lines go through, if they are not to be chosen.
+        """
+        boxes, left = self.folder.noted("boxes")[1], self.folder.mapped("left-0")
+        view, _ = self.views.by_distance()[number]
+        self._note_lines(number, self._footprints(view, boxes, left)[0], pixels)
+
+    def _note_lines(
+        self,
+        number: int,
+        footprints: projection.Footprints,
+        pixels: tuple[NDArray[np.int64], ...] | None = None,
+    ) -> None:
+        name = lines_name(number)
+        if self.folder.has(name):
+            return
+        with np.errstate(under="ignore"):
+            if pixels is None:
+                lines = met(self.views.by_distance(), number, footprints)
+            else:
+                lines = meet(footprints, *pixels)
+        self.folder.note(name, tuple(vars(lines).values()))
+
+    def pick(self, source: Source, rows: NDArray[np.int64]) -> Splats:
+        """Return some splats of a source."""
+        return source.splats().take(rows)
+
+    def _footprints(
+        self, view: View, boxes: NDArray[np.float32], left: NDArray[np.int64]
+    ) -> tuple[projection.Footprints, NDArray[np.float32]]:
+        """Return the n footprints in a view, front to back, and their colours, (n, 3)."""
+        found, colors = [], [np.empty((0, 3), np.float32)]
+        with np.errstate(under="ignore"):
+            for number in np.flatnonzero(projection.boxes_touch(boxes, self.scene, view)).tolist():
+                edges = np.array([number, number + 1]) * CHUNK
+                start, stop = np.searchsorted(left, edges).tolist()
+                chunk = self._chunk(number, np.asarray(left[start:stop]) - edges[0])
+                some = projection.reaching(chunk, self.scene, view)
+                found.append(some._replace(rows=some.rows + start))
+                colors.append(chunk.colors[some.rows])
+            footprints = projection.front_to_back(found)
+        rows = np.concatenate([np.empty(0, np.int64), *(some.rows for some in found)])  # ascending
+        at = np.searchsorted(rows, footprints.index)
+        return footprints, np.concatenate(colors)[at]
+
+    def _chunk(self, number: int, rows: NDArray[np.int64]) -> Gaussians:
+        """Return some of the Gaussians of a chunk."""
+        whole = self.folder.load(number, ["chunk"])["chunk"]
+        some = whole if len(rows) == whole.shape[1] else np.take(whole, rows, axis=1)
+        return Gaussians(
+            rows, some[_MEANS], some[_COVARIANCES], some[_LARGEST], some[_ALPHAS],
+            np.ascontiguousarray(some[_COLORS].T),
+        )  # fmt: skip
+
+
+def lines_name(number: int) -> str:
+    """Return under which name the lines of sight of a view are noted."""
+    return f"lines-{number:06d}"
+
+
+def seen_name(turn: int, block: int) -> str:
+    """Return under which name a block of views notes what it sees."""
+    return f"{turn:02d}-{block}.seen"
+
+
+class Stored(MutableMapping[int, Measured]):
+    """Sums of blocks of views, in a folder.
+
+    Parameters
+    ----------
+    folder : Folder
+    names : dict of int to str, optional
+        Under which names those lie that are there already.
+    """
+
+    def __init__(self, folder: Folder, names: dict[int, str] | None = None) -> None:
+        self._folder, self.names = folder, names or {}
+
+    def __getitem__(self, block: int) -> Measured:
+        """Return the sums of a block."""
+        return Measured(*self._folder.noted(self.names[block])[1][:3])
+
+    def __setitem__(self, block: int, sums: Measured) -> None:
+        """Keep other sums of a block; those that were noted stay for a run after this one."""
+        name = f"sums-{block}"
+        self._folder.note(name, (sums.contribution, sums.error, sums.seen))
+        self.names[block] = name
+
+    def __delitem__(self, block: int) -> None:
+        """Forget a block."""
+        del self.names[block]
+
+    def __iter__(self) -> Iterator[int]:
+        """Return the numbers of the blocks."""
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        """Return how many blocks there are."""
+        return len(self.names)
+
+    def update(self, other: Stored) -> None:  # type: ignore[override]
+        """Take over the blocks of another, which lie in the same folder."""
+        self.names |= other.names
+
+
+class Placed:
+    """All splats as `Gaussians`, in a folder.
+
+    Parameters
+    ----------
+    folder : Folder
+    index : (M,) int64
+        Rows of the splats, see `Gaussians`.
+    turn : int
+        How often splats have been removed.
+    left : (m,) int64, optional
+        Which of the Gaussians are left.
+
+    Attributes
+    ----------
+    index : (m,) int64
+        Rows of those that are left.
+    """
+
+    def __init__(
+        self,
+        folder: Folder,
+        index: NDArray[np.int64],
+        turn: int = 0,
+        left: NDArray[np.int64] | None = None,
+    ) -> None:
+        self.index, self.turn, self._folder = index, turn, folder
+        self._left = np.arange(len(index)) if left is None else left
+        folder.note(f"left-{turn}", self._left)
+
+    def __len__(self) -> int:
+        """Return how many are left."""
+        return len(self.index)
+
+    def take(self, rows: NDArray[np.int64]) -> Placed:
+        """Return some of those that are left."""
+        return Placed(self._folder, self.index[rows], self.turn + 1, self._left[rows])
+
+    @property
+    def alphas(self) -> NDArray[np.float32]:
+        """Opacities of all, (M,)."""
+        return np.concatenate([chunk[_ALPHAS] for chunk in self._chunks()])
+
+    @property
+    def colors(self) -> NDArray[np.float32]:
+        """Colours of all, (M, 3)."""
+        return np.concatenate([chunk[_COLORS].T for chunk in self._chunks()])
+
+    def _chunks(self) -> Iterator[NDArray[np.float32]]:
+        yield np.empty((14, 0), np.float32)
+        for number in range(-(-len(self._left) // CHUNK)):
+            yield self._folder.map(number, "chunk")
+
+
+class MeasuringTiles(Measuring):
+    """The views of one scoring, which measure what a folder holds.
+
+    Parameters
+    ----------
+    job : SceneJob
+    workers : callable
+        See `workers.Workers`.
+    members : list of list of int, optional
+        See `Measuring`.
+    """
+
+    def __init__(
+        self, job: SceneJob, workers: Workers, members: list[list[int]] | None = None
+    ) -> None:
+        super().__init__(job.scene, job.views, job.sampling, None, members)
+        self._job, self._workers = job, workers
+
+    def none(self) -> Stored:
+        """Return where sums of blocks are kept, by their numbers: in the folder."""
+        return Stored(self._job.folder)
+
+    def blocks(  # type: ignore[override]
+        self,
+        gaussians: Placed,
+        sample: NDArray[np.int64],
+        progress: Progress,
+        which: Sequence[int] | None = None,
+        sights: SightLines | None = None,
+    ) -> tuple[Stored, dict[int, NDArray[np.float64]]]:
+        """Return the sums over each block of views, and the errors of a sample in each view."""
+        folder, turn = self._job.folder, gaussians.turn
+        chosen = range(self.count) if which is None else which
+        if turn == 0:
+            folder.note("sample", sample)
+        calls = [
+            Call("look", (turn, block, self.members[block]), 1 / len(chosen), chunked=True)
+            for block in chosen
+        ]
+        for _ in self._workers(self._job, calls, progress, "scoring"):
+            pass
+        if isinstance(sights, StoredLines):
+            sights.noted.update(itertools.chain(*(self.members[block] for block in chosen)))
+        names = {block: seen_name(turn, block) for block in chosen}
+        errors = {block: folder.noted(name)[1][3] for block, name in names.items()}
+        return Stored(folder, names), errors
+
+
+class StoredLines(SightLines):
+    """The lines of sight of all views into one scene, and the splats that they meet.
+
+    Parameters
+    ----------
+    job : SceneJob
+    workers : callable
+        See `workers.Workers`.
+    sources : sequence of Source
+        All splats.
+    gaussians : Placed
+
+    Attributes
+    ----------
+    noted : set of int
+        Views whose lines lie in the folder.
+    """
+
+    def __init__(
+        self, job: SceneJob, workers: Workers, sources: Sequence[Source], gaussians: Placed
+    ) -> None:
+        self.views = job.views.by_distance()
+        self.index = self.rows = gaussians.index
+        self.lines = [None] * len(self.views)
+        self.noted: set[int] = set()
+        self._job, self._workers, self._sources = job, workers, sources
+
+    def look_from(
+        self,
+        numbers: Sequence[int],
+        gaussians: Gaussians,  # noqa: ARG002 - as for splats in memory
+        scene: Scene,  # noqa: ARG002
+        progress: Progress,
+        threads: int | None,  # noqa: ARG002
+    ) -> None:
+        """Project all splats into some views, and load what their lines meet."""
+        self._look([(number,) for number in numbers], progress)
+
+    def _look(self, given: Sequence[tuple[Any, ...]], progress: Progress) -> None:
+        calls = [Call("meet", arguments, 1 / len(given)) for arguments in given]
+        for _ in self._workers(self._job, calls, progress, "looking"):
+            pass
+        self.noted.update(number for number, *_ in given)
+        self.load()
+
+    def against_stored(self, other: StoredLines, progress: Progress) -> float | None:
+        """Return the estimated PSNR with other splats instead; see `SightLines.against`.
+
+        Parameters
+        ----------
+        other : StoredLines
+            Into those, by the same views; its lines have not been noted.
+        progress : callable
+        """
+        judges = self._judges()
+        lines = {number: self.lines[number] for number in judges}
+        other._look(
+            [(k, (own.columns, own.rows)) for k, own in lines.items() if own is not None], progress
+        )
+
+        def compare(number: int, lines: Lines) -> NDArray[np.float64]:
+            view, others = self.views[number][0], other.lines[number]
+            assert others is not None  # noqa: S101 - just noted
+            with np.errstate(under="ignore"):
+                seen = others.colors(other.colors(others, view))
+                return np.array([psnr_of(seen, lines.colors(self.colors(lines, view)), view)])
+
+        return self._mean_of(compare)
+
+    def load(self) -> None:
+        """Load the lines that were noted, and what they meet."""
+        folder = self._job.folder
+        for number in sorted(self.noted):
+            columns, rows, line, owner, alpha, dark, owners = folder.noted(lines_name(number))[1]
+            self.lines[number] = Lines(columns, rows, line, owner, alpha, dark, owners)
+        some = [lines.met for lines in self.lines if lines is not None]
+        rows = np.unique(np.concatenate([np.empty(0, np.int64), *(self.index[m] for m in some)]))
+        begins = np.cumsum([0, *map(len, self._sources)])
+        edges = itertools.pairwise(np.searchsorted(rows, begins).tolist())
+        calls = [
+            Call("pick", (source, rows[start:stop] - begin), 1 / len(rows))
+            for source, begin, (start, stop) in zip(self._sources, begins, edges, strict=False)
+            if stop > start
+        ]
+        picked = [*self._workers(self._job, calls, silent, "looking")]
+        if picked:
+            self.splats = joined(picked)
+        # Of Gaussians that no line meets it is any number.
+        self.rows = np.searchsorted(rows, self.index)
+
+
+def place(
+    job: SceneJob, sources: Sequence[Source], workers: Workers, progress: Progress
+) -> tuple[Placed, NDArray[np.bool_]]:
+    """Activate all splats and store them along the curve.
+
+    Returns
+    -------
+    gaussians : Placed
+    good : (N,) bool
+        Which splats can be drawn.
+    """
+    folder, total = job.folder, sum(map(len, sources))
+    calls = [Call("place", (source,), len(source) / total, chunked=True) for source in sources]
+    found = [*workers(job, calls, part(progress, 0.0, 0.6), "reading")]
+    starts = np.cumsum([0, *(count for _, count in found)])
+    begin = np.cumsum([0, *map(len, sources)])
+
+    def all_of(name: str) -> NDArray[Any]:
+        return np.concatenate([folder.map(source.index, name) for source in sources])
+
+    if not folder.has("order"):
+        order = code_order(all_of("code"), lambda rows: all_of("ties")[rows])
+        folder.note("order", order)
+        del order
+    order = folder.mapped("order")
+    rows = np.repeat(begin[:-1], np.diff(starts)) + all_of("rows")
+    index = rows[order]
+    del rows
+    chunks = -(-len(index) // CHUNK)
+    calls = [Call("gather", (number, starts), 1 / chunks) for number in range(chunks)]
+    boxes = [*workers(job, calls, part(progress, 0.6, 1.0), "reading")]
+    folder.note("boxes", np.reshape(np.array(boxes, np.float32), (-1, 7)))
+    good = all_of("good")
+    for source in sources:
+        folder.drop(source.index, ("code", "ties", "gaussians"))
+    return Placed(folder, index), good

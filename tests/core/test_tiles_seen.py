@@ -1,0 +1,308 @@
+"""Tiles pruned together by occlusion and with absorbing, against one file in memory."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.lib.recfunctions import drop_fields
+
+from refine_addon.core import (
+    Budget,
+    RefineError,
+    Settings,
+    prune,
+    prune_file,
+    prune_tiles,
+    read_cameras,
+    read_ply,
+)
+from refine_addon.core.scoring import closed_form, projection, sight_lines
+from refine_addon.core.splats import joined
+from refine_addon.core.tiles import absorbing, seen, units
+from refine_addon.core.tiles.seen import SceneJob
+from refine_addon.core.views import ViewSet
+from tests.strategies import plain_header, splat_names
+from tests.tiles import COUNT, ROOM, cut, room_rows, write
+
+OCCLUSION = Settings(method="occlusion", views=12)
+AUTO = Settings(views=20)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Make units, chunks and regions so small that 5000 splats have several of each."""
+    monkeypatch.setattr(closed_form, "ROWS", 1000)
+    monkeypatch.setattr(units, "ROWS", 1000)
+    monkeypatch.setattr(seen, "CHUNK", 700)
+    monkeypatch.setattr(absorbing, "REGION", 1500)
+
+
+@pytest.fixture
+def rows():
+    """Give rows of the room, and one far away."""
+    rows = room_rows()
+    rows["x"][7] = 1e30
+    return rows
+
+
+@pytest.fixture
+def views():
+    """Give the room's cameras."""
+    return read_cameras(ROOM / "cameras.json")
+
+
+@pytest.fixture
+def tiles(tmp_path, rows, small):  # noqa: ARG001 - set before
+    """Write the rows as four files, and as one."""
+    write(tmp_path / "whole.ply", rows)
+    return cut(tmp_path, rows)
+
+
+def read(folder, paths):
+    """Return the rows of the outputs of some tiles."""
+    return np.concatenate([read_ply(folder / path.name).rows for path in paths])
+
+
+# Occlusion, auto and what they estimate.
+
+
+@pytest.mark.parametrize("settings", [OCCLUSION, AUTO], ids=["occlusion", "auto"])
+@pytest.mark.parametrize(
+    "budget", [Budget(ratio=0.7), Budget(psnr=36.0), Budget(min_seen=60)], ids=str
+)
+def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budget, settings):
+    """To the byte, and the estimates are the same but for how rounding adds up."""
+    told = prune_tiles(tiles, tmp_path / "out", views, budget, settings)
+    whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", views, budget, settings)
+
+    expected = read_ply(tmp_path / "pruned.ply").rows
+    assert read(tmp_path / "out", tiles).tobytes() == expected.tobytes()
+    assert told["splats"] == whole.report["splats"]
+    assert told["views"] == whole.report["views"]
+    assert told["estimated_psnr"] == pytest.approx(whole.report["estimated_psnr"], abs=0.011)
+    for key in ("psnr", "absorbed"):
+        assert told["quality"][key] == pytest.approx(whole.report["quality"][key], abs=1e-6)
+    assert told["notes"] == whole.report["notes"]
+
+
+def test_views_of_nothing_are_refused_as_of_one_file(tmp_path, tiles, views):
+    """Near planes behind all splats: the message is that of one file, and nothing is left."""
+    away = ViewSet(tuple(replace(view, near=1e6) for view in views))
+    with pytest.raises(RefineError) as alone:
+        prune_file(tmp_path / "whole.ply", None, away, Budget(ratio=0.5), OCCLUSION)
+
+    with pytest.raises(RefineError) as together:
+        prune_tiles(tiles, tmp_path / "out", away, Budget(ratio=0.5), OCCLUSION)
+
+    assert str(together.value) == str(alone.value)
+    assert not list((tmp_path / "out").glob("*"))
+
+
+@pytest.mark.parametrize("stop", [0.1, 0.3, 0.55, 0.7])
+@pytest.mark.parametrize("absorb", [False, True], ids=["deleted", "absorbed"])
+def test_a_job_that_was_interrupted_goes_on_where_it_was(
+    tmp_path, tiles, views, monkeypatch, stop, absorb
+):
+    """What a block of views has measured is not measured again, and the bytes are the same."""
+    budget, done = Budget(ratio=0.5), []
+    prune_tiles(tiles, tmp_path / "once", views, budget, OCCLUSION, absorb=absorb)
+    measure = seen.of_view
+    monkeypatch.setattr(seen, "of_view", lambda *some: done.append(some) or measure(*some))
+
+    def interrupt(fraction, _what):
+        if fraction > stop:
+            raise KeyboardInterrupt
+
+    prune_tiles(tiles, tmp_path / "count", views, budget, OCCLUSION, absorb=absorb)
+    needed = len(done)
+    done.clear()
+    with pytest.raises(KeyboardInterrupt):
+        prune_tiles(
+            tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=absorb, progress=interrupt
+        )
+    prune_tiles(tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=absorb)
+
+    once, again = (read(tmp_path / folder, tiles).tobytes() for folder in ("once", "out"))
+    assert once == again
+    assert needed <= len(done) <= needed + 2  # the views of the block under way
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in tiles}
+
+
+# Absorbing.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", [0.5, 0.8])
+def test_absorbing_tiles_is_as_good_as_absorbing_one_file(tmp_path, views, monkeypatch, ratio):
+    """Within .3 dB, with four regions of the room's 39,755 splats, cut into eight tiles."""
+    monkeypatch.setattr(absorbing, "REGION", 10_000)
+    file = read_ply(ROOM / "point_cloud.ply")
+    tiles = cut(tmp_path, file.rows, np.linspace(0, len(file), 9).astype(int).tolist())
+    settings = Settings(method="occlusion")
+    told = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=ratio), settings, absorb=True)
+    splats = file.splats()
+    whole = prune(splats, views, Budget(ratio=ratio), settings, absorb=True)
+
+    sights = sight_lines.sights(splats, views.spread(64))
+    made = joined([read_ply(tmp_path / "out" / path.name).splats() for path in tiles])
+    one = sights.against(whole.absorbed.splats, views.spread(64))
+    assert sights.against(made, views.spread(64)) > one - 0.3
+    assert len(made) == told["splats"]["kept"] == whole.report["splats"]["kept"]
+    assert told["estimated_psnr"] == pytest.approx(sights.against(made, views.spread(64)), abs=0.1)
+
+
+@pytest.mark.slow
+def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views, monkeypatch):
+    """Three of 72 views show a quarter of the room; half of it goes, and 16 other views judge.
+
+    Regions that no view shows are merged like others, and keep what they would keep of one file.
+    """
+    monkeypatch.setattr(absorbing, "REGION", 10_000)
+    few, others = ViewSet(views.views[:3]), ViewSet(views.views[10::4])
+    splats = read_ply(ROOM / "point_cloud.ply").splats()
+    sights = sight_lines.sights(splats, others)
+    whole = prune(splats, few, Budget(ratio=0.5), OCCLUSION, absorb=True)
+
+    prune_tiles(
+        [ROOM / "point_cloud.ply"], tmp_path, few, Budget(ratio=0.5), OCCLUSION, absorb=True
+    )
+
+    made = read_ply(tmp_path / "point_cloud.ply").splats()
+    assert np.count_nonzero(whole.scores.seen) < 0.3 * len(splats)
+    one = sights.against(whole.absorbed.splats, others)
+    assert sights.against(made, others) > one - 0.3
+
+
+def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, rows, views):
+    """Kept, merged and deleted add up to all; survivors that did not change are their old bytes.
+
+    Stages divide along other planes, so regions of a stage are not those of the one before.
+    """
+    told = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.8), OCCLUSION, absorb=True)
+
+    made, counts = read(tmp_path / "out", tiles), told["absorbed"]
+    assert len(made) == told["splats"]["kept"] == COUNT // 5
+    assert counts["merged"] + counts["deleted"] == COUNT - len(made)
+    same = np.isin(made.view("V248"), rows.view("V248"))
+    assert np.count_nonzero(~same) == counts["changed"] > 100
+    assert counts["merged"] >= counts["changed"]
+    assert np.isfinite([made[name] for name in made.dtype.names]).all()
+
+
+def test_what_is_deleted_alone_needs_no_merging(tmp_path, tiles, views):
+    """Up to a tenth is deleted as in memory: the same rows, and nothing changes."""
+    told = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.1), OCCLUSION, absorb=True)
+    whole = prune_file(
+        tmp_path / "whole.ply", tmp_path / "pruned.ply", views, Budget(ratio=0.1), OCCLUSION,
+        absorb=True,
+    )  # fmt: skip
+
+    assert told["absorbed"] == whole.report["absorbed"]
+    expected = read_ply(tmp_path / "pruned.ply").rows
+    assert read(tmp_path / "out", tiles).tobytes() == expected.tobytes()
+
+
+@pytest.mark.usefixtures("small")
+def test_tiles_of_other_degrees_absorb_one_another(tmp_path, rows, views):
+    """Each keeps its own properties, and no number is lost that it has room for."""
+    write(tmp_path / "a.ply", rows[:2500])
+    flat = drop_fields(rows[2500:], [name for name in rows.dtype.names if "rest" in name])
+    names = splat_names(0)
+    plain = np.empty(len(flat), [(name, "<f4") for name in names])
+    for name in names:
+        plain[name] = flat[name]
+    (tmp_path / "b.ply").write_bytes(plain_header(len(plain), names) + plain.tobytes())
+    paths = [tmp_path / "a.ply", tmp_path / "b.ply"]
+
+    told = prune_tiles(paths, tmp_path / "out", views, Budget(ratio=0.6), OCCLUSION, absorb=True)
+
+    made = [read_ply(tmp_path / "out" / path.name).splats() for path in paths]
+    assert [splats.sh_rest.shape[1] for splats in made] == [15, 0]
+    assert sum(map(len, made)) == told["splats"]["kept"] == COUNT * 2 // 5
+    assert np.isfinite(made[0].sh_rest).all()
+    assert np.abs(made[0].sh_rest).max() > 0.1
+
+
+@pytest.mark.parametrize(
+    ("budget", "words"),
+    [(Budget(threshold=0.5), "a threshold needs"), (Budget(psnr=40.0), "a PSNR needs")],
+)
+def test_budgets_that_absorbing_tiles_cannot_meet_are_refused(
+    tmp_path, tiles, views, budget, words
+):
+    """Before anything is read."""
+    with pytest.raises(RefineError, match=words):
+        prune_tiles(tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=True)
+    assert not (tmp_path / "out").exists()
+
+
+@given(st.integers(1, 400), st.integers(1, 60), st.integers(0, 3), st.integers(0, 9))
+def test_regions_divide_all_splats(count, most, stage, seed):
+    """Each splat is in one region; none has more than it may, and none is much smaller."""
+    means = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
+    means[::17] = np.nan
+
+    found = absorbing.regions(means, most, stage)
+
+    assert sorted(np.concatenate(found).tolist()) == list(range(count))
+    sizes = [len(rows) for rows in found]
+    assert max(sizes) <= most
+    assert max(sizes) - min(sizes) <= 1 + max(sizes) // 2
+    assert all((np.diff(rows) > 0).all() for rows in found)
+
+
+def test_regions_of_one_stage_cross_those_of_the_next():
+    """Of 1000 splats in a cube, halves along an axis and askew: each pair has some in common."""
+    means = np.random.default_rng(1).uniform(size=(1000, 3)).astype(np.float32)
+
+    first, second = (absorbing.regions(means, 500, stage) for stage in (0, 1))
+
+    common = [len(np.intersect1d(one, other)) for one in first for other in second]
+    assert min(common) > 50
+
+
+# What a view loads.
+
+
+def test_a_view_loads_no_chunk_behind_it(tmp_path, tiles, views, monkeypatch):
+    """Of 100 chunks all are loaded by some view, and a fifth of the times none was needed."""
+    monkeypatch.setattr(seen, "CHUNK", 50)
+    loaded, load = [], SceneJob._chunk
+    monkeypatch.setattr(
+        SceneJob,
+        "_chunk",
+        lambda job, number, rows: loaded.append(number) or load(job, number, rows),
+    )
+    once = Settings(method="occlusion", views=12, occlusion=replace(OCCLUSION.occlusion, rounds=1))
+
+    prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), once, threads=1)
+
+    chunks = len(set(loaded))
+    assert 90 < chunks <= 100
+    assert len(loaded) < 0.8 * 12 * chunks
+
+
+@given(st.integers(0, 200))
+def test_no_box_is_left_out_that_a_splat_reaches_from(seed):
+    """Boxes of 20 splats each, anywhere around a camera: every one that has a footprint touches."""
+    random = np.random.default_rng(seed)
+    views = read_cameras(ROOM / "cameras.json")
+    file = read_ply(ROOM / "point_cloud.ply")
+    splats = file.splats().take(random.permutation(len(file))[:400])
+    splats = replace(splats, log_scales=splats.log_scales + random.normal(1.0, 1.0))
+    gaussians, scene, _ = projection.prepare(splats, views)
+    view = views.views[seed % len(views)]
+    pieces = np.array_split(np.arange(len(gaussians)), 20)
+    boxes = []
+    for piece in pieces:
+        means, largest = gaussians.means[:, piece], gaussians.largest[piece].max()
+        boxes.append([*means.min(axis=1), *means.max(axis=1), largest])
+
+    touching = projection.boxes_touch(np.array(boxes, np.float32), scene, view)
+
+    for box, piece in zip(touching, pieces, strict=True):
+        assert box or not len(projection.reaching(gaussians.take(piece), scene, view).rows)
