@@ -66,9 +66,16 @@ MUTANTS = {
     ],
     "frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
-        ("(near if np.ptp(near) > 0.0 else near[0, 0])", "0.0", "near plane ignored"),
+        ("depth[:count] >= self._near[views[:count]]", "depth[:count] >= 0.0", "no near plane"),
+        ("(outside < reach * self.steepness)", "(outside <= 0.0)", "what reaches inside left out"),
+        ("(np.maximum.reduce(most[:4]) <= 0.0)", "(outside <= 0.0)", "a corner inside is all"),
+        ("& (least[4] >= near) & (most[4] <= far)", "", "all inside before the near plane"),
         ("between & (beyond <= 0.0)", "between", "counted beside the image"),
-        ("between &= depth <= far", "between &= depth < far", "far plane excluded"),
+        (
+            "between &= depth[:count] <= self",
+            "between &= depth[:count] < self",
+            "far plane excluded",
+        ),
         ("np.hypot(1.0, slope)", "slope", "reach along the image only"),
         ("view.cx - view.width / 2", "view.width / 2 - view.cx", "shift mirrored"),
         ("view.height / 2)", "view.width / 2)", "axes swapped"),
@@ -83,6 +90,8 @@ MUTANTS = {
     ],
     "tiles/units.py": [
         ("room -= stop - start", "room = room", "units beyond their rows"),
+        ("begin + start, begin + stop", "start, stop", "rows of another place of the tile"),
+        ("[*kinds.values()] if len(kinds) > 1 else []", "[]", "types of a few rows"),
         ("tile.begin + part.start", "tile.begin + 0 * part.start", "always the first rows"),
         ("!= (tile.size, tile.changed)", "!= (tile.size, found.st_mtime_ns)", "time not compared"),
     ],
@@ -145,7 +154,12 @@ MUTANTS = {
         ("weights[order[last + 1 :]] = 0.0", "weights[:] = 1.0", "the same share of each region"),
     ],
     "scoring/closed_form_block.py": [
-        ("total *= self.alpha[piece]", "total *= self.alpha[piece] ** 2", "opacity twice"),
+        (
+            "visibility *= self.alpha[piece]",
+            "visibility *= self.alpha[piece] ** 2",
+            "opacity twice",
+        ),
+        ("self.count([0], HIGHEST)", "self.count([0], 0)", "another digit counted first"),
         ("LUMA = (0.299, 0.587, 0.114)", "LUMA = (0.114, 0.587, 0.299)", "BGR"),
         ("largest + middle", "largest + smallest", "wrong two scales"),
         ("share = 1.0 - away", "share = 1.0 - 0.0 * away", "all that reaches inside counts whole"),
@@ -156,6 +170,11 @@ MUTANTS = {
             "powers[self.cells[piece]]",
             "neighbours count from the first",
         ),
+    ],
+    "scoring/nearness.py": [
+        ("axes[2] ^= axes[1]", "", "no Hilbert curve"),
+        ("    return np.argsort(_places()[cell]", "    return np.argsort(cell", "cells in slices"),
+        ("dtype=np.float64)  # (N,)", "dtype=values.dtype)", "positions beyond float32"),
     ],
     "scoring/adaptive.py": [
         ("math.log(geometry)", "math.log(1 + geometry)", "wrong logarithm"),

@@ -1,10 +1,13 @@
 """How long tiles take that are pruned together, and what memory the process needs.
 
     python -m benchmarks.speed.tiles [--splats 10000000] [--tiles 10] [--workers 0 1 2]
+    python -m benchmarks.speed.tiles --method occlusion [--absorb]
 
 The tiles are the committed room's rows without harmonics above the constant one, 56 bytes each, a
-room beside the other, each room with its own cameras' views of it. They are compared with reading
-and writing the same bytes: `cat` of all tiles into one file.
+room beside the other along a street. The room's cameras stand in all rooms, in each as many, so a
+tile is seen by its own and by those that look along the street; with ``--one-room`` all of them
+stand in the middle one. They are compared with reading and writing the same bytes: `cat` of all
+tiles into one file.
 
 Memory is VmRSS, what is mapped included, of the process and those that it starts, each for itself.
 Seconds of the processor, of all of them and of the busiest one, tell what a busy machine hides:
@@ -15,8 +18,10 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import json
 import os
 import resource
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -29,6 +34,7 @@ import numpy as np
 from refine_addon.core import read_ply
 from refine_addon.core.formats.format import new_header
 from refine_addon.core.formats.ply_columns import REQUIRED
+from refine_addon.core.task import METHODS
 
 from ..baselines import splat_transform
 
@@ -64,6 +70,15 @@ def make_tiles(folder: Path, splats: int, tiles: int) -> list[Path]:
                 stream.write(rows.data)
         paths.append(path)
     return paths
+
+
+def make_cameras(path: Path, tiles: int) -> None:
+    """Write the room's cameras, spread over the rooms of `make_tiles`."""
+    cameras = json.loads((ROOM / "cameras.json").read_text())
+    shuffled = np.random.default_rng(0).permutation(len(cameras))
+    for camera, place in zip(cameras, shuffled.tolist(), strict=True):
+        camera["position"][0] += ASIDE * (place * tiles // len(cameras) - tiles // 2)
+    path.write_text(json.dumps(cameras))
 
 
 class Cost(NamedTuple):
@@ -140,7 +155,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Time tiles that are pruned together.")
     parser.add_argument("--splats", type=int, default=10_000_000)
     parser.add_argument("--tiles", type=int, default=10)
-    parser.add_argument("--workers", type=int, nargs="*", default=[0], help="0: none of Dask's")
+    parser.add_argument(
+        "--workers", type=int, nargs="*", default=[0], help="0: none of Dask's; any again"
+    )
+    parser.add_argument("--method", choices=METHODS, default="closed-form")
+    parser.add_argument("--absorb", action="store_true")
+    parser.add_argument("--one-room", action="store_true", help="all cameras in the middle room")
     parser.add_argument("--folder", type=Path, help="on the disk to measure; default the system's")
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory(dir=options.folder) as made:
@@ -149,15 +169,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
         size = sum(path.stat().st_size for path in paths)
         print(f"{options.splats:,} splats, {options.tiles} tiles, {size / 1e6:.0f} MB")
         print(f"load average {os.getloadavg()[0]:.1f}, {os.cpu_count()} cores")
+        cameras = folder / "cameras.json"
+        make_cameras(cameras, 1 if options.one_room else options.tiles)
         copy = ["sh", "-c", 'cat "$@" > "$0"', folder / "copy", *paths]
         prune = [sys.executable, "-m", "refine_addon", "prune", *paths, "--together", "--ratio"]
-        prune += ["0.5", "--cameras", ROOM / "cameras.json", "--method", "closed-form"]
-        commands = {"copy": copy}
+        prune += ["0.5", "--cameras", cameras, "--method", options.method]
+        prune += ["--absorb"] if options.absorb else []
+        output = folder / "out"
+        commands = [("copy", copy)]
         for workers in options.workers:
             more = ["--workers", str(workers)] if workers else []
-            commands[f"{workers} workers"] = [*prune, "--output-dir", folder / f"w{workers}", *more]
-        for name, command in commands.items():
+            commands.append((f"{workers} workers", [*prune, "--output-dir", output, *more]))
+        for name, command in commands:
             cost = run(command)
+            shutil.rmtree(output, ignore_errors=True)
             print(
                 f"{name:10} {cost.seconds:7.1f} s, processor {cost.busy:7.1f} s, busiest process "
                 f"{cost.busiest:7.1f} s, {cost.peak:6.0f} MB",

@@ -30,6 +30,9 @@ _STACK = 16
 _POINTS = 4096
 """Points that are counted at a time: what is known of them in all views stays in the caches."""
 
+_ROUNDING = 1e-14
+"""More than a sum of four products rounds, over the sum of their sizes."""
+
 _STEEPEST = 1e100
 """Limit of a focal length over half the image: its product with any length can be squared."""
 
@@ -112,47 +115,90 @@ class Frustums:
         self.steepness = np.hypot(1.0, slope)
         planes = np.array([clip_planes(view, near) for view in views])
         self._near, self._far = planes[:, :1], planes[:, 1:]
+        self._ends = bool(np.isfinite(self._far).any())
         # One buffer a thread is reused, since allocating one costs as much as the product.
         self._own = threading.local()
 
+    def look(
+        self, low: NDArray[np.float64], high: NDArray[np.float64], reach: NDArray[np.float64]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return which views may see something of boxes, and which surely see all of them.
+
+        Parameters
+        ----------
+        low, high : (3, k) float64
+            Corners of k boxes, relative to the origin.
+        reach : (k,) float64
+            How far outside an image points of each box still count, world units.
+
+        Returns
+        -------
+        some : (V, k) bool
+            Where it is False, each point of the box lies beyond a plane, or ``beyond`` of `project`
+            is at least `reach` times `steepness`.
+        whole : (V, k) bool
+            Where it is True, each point lies in the view.
+        """
+        middle, half = (low + high) / 2.0, (high - low) / 2.0
+        x, y, z = self._rows
+        # Of x' - z and so on, all linear, the least and the most in a box.
+        least, most = [], []
+        for row in (x - z, -x - z, y - z, -y - z, z):  # (V, 4) each
+            steep = np.abs(row)
+            at = row[:, :3] @ middle + row[:, 3:]  # (V, k)
+            # Neither these sums nor those of `project` are exact.
+            around = steep[:, :3] @ (half + _ROUNDING * (np.abs(middle) + half))
+            around += _ROUNDING * steep[:, 3:]
+            least.append(at - around)
+            most.append(at + around)
+        near, far = self._near, self._far
+        outside = np.maximum.reduce(least[:4])
+        some = (outside < reach * self.steepness) & (most[4] >= near) & (least[4] <= far)
+        whole = (np.maximum.reduce(most[:4]) <= 0.0) & (least[4] >= near) & (most[4] <= far)
+        return some, whole
+
     def project(
-        self, points: NDArray[np.float64], block: slice
+        self, points: NDArray[np.float64], views: NDArray[np.int64], count: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-        """Return how deep points lie in views, and where.
+        """Return how deep points lie in views, and where in the first of them.
 
         Parameters
         ----------
         points : (4, n) float64
             x, y, z relative to the origin, and 1.
-        block : slice
-            Which b views.
+        views : (b,) int64
+            Which.
+        count : int
+            Of how many of them, the first c, the latter two are wanted.
 
         Returns
         -------
         depth : (b, n) float64
             Along each view's axis, world units.
-        beyond : (b, n) float64
+        beyond : (c, n) float64
             ``max(|x'|, |y'|) - depth`` with x' and y' from the centre of the image, in half sizes
             of it at depth 1, world units: at most 0 in the image, edges included.
-        between : (b, n) bool
+        between : (c, n) bool
             Between near and far plane, planes included.
 
         The first two are overwritten by this thread's next call.
         """
-        rows = self._rows[:, block].reshape(-1, 4)  # (3 b, 4)
-        stack = np.zeros((-(-len(rows) // _STACK), _STACK, 4))
-        stack.reshape(-1, 4)[: len(rows)] = rows
+        end = len(views) + 2 * count
+        stack = np.zeros((-(-end // _STACK), _STACK, 4))
+        rows = stack.reshape(-1, 4)
+        rows[: len(views)] = self._rows[2, views]
+        rows[len(views) : end] = self._rows[:2, views[:count]].reshape(-1, 4)
         product = self._memory((*stack.shape[:2], points.shape[1]))
         np.matmul(stack, points, out=product)
-        x, y, depth = np.split(product.reshape(-1, points.shape[1])[: len(rows)], 3)
-        np.maximum(np.abs(x, out=x), np.abs(y, out=y), out=x)
-        x -= depth
-        near, far = self._near[block], self._far[block]
-        # Comparing with a single number is twice as fast as with one for each view.
-        between = depth >= (near if np.ptp(near) > 0.0 else near[0, 0])
-        if np.isfinite(far).any():
-            between &= depth <= far
-        return depth, x, between
+        flat = product.reshape(-1, points.shape[1])
+        depth, across = flat[: len(views)], flat[len(views) : end]
+        np.abs(across, out=across)
+        beyond = np.maximum(across[:count], across[count:], out=across[:count])
+        beyond -= depth[:count]
+        between = depth[:count] >= self._near[views[:count]]
+        if self._ends:
+            between &= depth[:count] <= self._far[views[:count]]
+        return depth, beyond, between
 
     def _memory(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
         """Return this thread's buffer in a shape; its content is arbitrary."""
@@ -190,13 +236,14 @@ def census(
     origin = views.middle()[0]
     frustums = Frustums(views, origin, float(np.finfo(np.float64).tiny))
     found = np.zeros((-(-len(points) // _POINTS), len(views)), np.int64)
+    every = np.arange(len(views))
 
     def work(piece: slice) -> None:
         local = np.ones((4, min(piece.stop, len(points)) - piece.start))
         with np.errstate(invalid="ignore", over="ignore", under="ignore"):
             local[:3] = (points[piece] - origin).T
             local[:, ~np.isfinite(local).all(axis=0)] = np.nan
-            _, beyond, between = frustums.project(local, slice(0, len(views)))
+            _, beyond, between = frustums.project(local, every, len(every))
             inside = between & (beyond <= 0.0)
         found[piece.start // _POINTS] = np.count_nonzero(inside, axis=1)
 

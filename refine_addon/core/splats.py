@@ -66,6 +66,21 @@ class Splats:
         """Return the splats at `index` (a mask, integers or a slice), in that order."""
         return Splats(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
 
+    def by_columns(self) -> Splats:
+        """Return copies of which each column is contiguous, and `sh_rest` as it is.
+
+        Rows of a file have the values of a splat side by side; numbers of many splats are computed
+        several times as fast where they stand side by side.
+        """
+        return replace(
+            self,
+            **{
+                field.name: np.asfortranarray(getattr(self, field.name))
+                for field in fields(self)
+                if field.name != "sh_rest"
+            },
+        )
+
 
 def joined(parts: Sequence[Splats]) -> Splats:
     """Return all splats of several sets, one at least, in that order.

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core import ClosedForm, RefineError, Splats, View, ViewSet
+from refine_addon.core.frustum import Frustums
 from refine_addon.core.scene import principal_axes
 from refine_addon.core.scoring import closed_form, closed_form_block
 
@@ -386,16 +387,40 @@ def test_scaling_moving_and_turning_the_scene_keeps_the_scores(seed, exponent, m
 
 @pytest.mark.parametrize(("chunk", "threads", "block"), [(7, 1, 64), (64, 3, 2), (4096, 2, 1)])
 def test_chunks_threads_and_view_blocks_change_nothing(monkeypatch, chunk, threads, block):
-    """Only sums of float64 are split differently."""
+    """Only sums of float64 are split differently, and runs are seen by other views."""
     splats, views = random_scene(5)
     expected = closed_form.score(splats, views, threads=1)
     monkeypatch.setattr(closed_form_block, "_CHUNK", chunk)
     monkeypatch.setattr(closed_form_block, "_VIEW_BLOCK", block)
+    monkeypatch.setattr(closed_form_block, "_RUN", 1 + chunk // 5)
 
     scores = closed_form.score(splats, views, threads=threads)
 
     np.testing.assert_allclose(scores.values, expected.values, rtol=1e-6)
     np.testing.assert_array_equal(scores.seen, expected.seen)
+
+
+@pytest.mark.parametrize("settings", READINGS, ids=str)
+def test_views_that_are_left_out_or_see_all_of_a_run_change_nothing(monkeypatch, settings):
+    """The same as where every view is asked of every splat, but for the order of sums."""
+    splats, views = random_scene(6, count=2000, view_count=20)
+    monkeypatch.setattr(closed_form_block, "_RUN", 20)
+    said = []
+
+    def every(self, low, high, reach):
+        said.append(look(self, low, high, reach))
+        return np.ones_like(said[-1][0]), np.zeros_like(said[-1][1])
+
+    scores = closed_form.score(splats, views, settings)
+    look = Frustums.look
+    monkeypatch.setattr(Frustums, "look", every)
+    expected = closed_form.score(splats, views, settings)
+
+    np.testing.assert_allclose(scores.values, expected.values, rtol=2e-7)
+    np.testing.assert_array_equal(scores.seen, expected.seen)
+    some, whole = (np.concatenate(each, axis=1) for each in zip(*said, strict=True))
+    assert some.mean() < 0.9
+    assert whole.any()
 
 
 def test_views_that_see_nothing_are_refused_with_a_sentence():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from refine_addon.core.selection import select
 from refine_addon.core.tiles import prune as together
 from refine_addon.core.tiles import steps, units
 from refine_addon.core.tiles.folder import Folder
-from tests.strategies import plain_ply
+from tests.strategies import plain_ply, ply_of
 from tests.tiles import COUNT, ROOM, cut, joined, room_rows, write
 
 CLOSED = Settings(method="closed-form", views=8)
@@ -274,6 +275,40 @@ def test_a_tile_that_cannot_be_written_leaves_none(tmp_path, tiles, views, monke
     assert not list((tmp_path / "out").glob("*"))
 
 
+def test_a_slice_of_a_unit_is_that_of_its_tiles(tmp_path):
+    """Any slice of a unit, across its parts, in the types and the degree of all of them.
+
+    Three tiles of 5, 4 and 6 splats, of degrees 0, 1 and 0, the last of doubles.
+    """
+    for name, count, degree in (("a", 5, 0), ("b", 4, 1), ("c", 6, 0)):
+        (tmp_path / f"{name}.ply").write_bytes(plain_ply(count, degree, seed=count))
+    doubles = {name: (1 / 3 + column).astype(float) for name, column in columns(tmp_path / "c.ply")}
+    (tmp_path / "c.ply").write_bytes(ply_of(doubles))
+    a, b, c = (units.tile_at(tmp_path / f"{name}.ply") for name in "abc")
+    unit = units.Unit(0, (units.Part(a, 1, 5), units.Part(b, 0, 4), units.Part(c, 0, 4)))
+    whole = unit.splats()
+
+    assert len(unit) == len(whole) == 12
+    assert whole.means.dtype == np.float64
+    assert whole.sh_rest.shape == (12, 3, 3)
+    np.testing.assert_array_equal(whole.means[:4], read_ply(tmp_path / "a.ply").splats().means[1:])
+    np.testing.assert_array_equal(whole.means[8:, 0], doubles["x"][:4])
+    for start in range(13):
+        for stop in range(start, 13):
+            some = unit.take(slice(start, stop))
+            for field in fields(some):
+                expected = getattr(whole, field.name)[start:stop]
+                found = getattr(some, field.name)
+                assert found.dtype == expected.dtype
+                np.testing.assert_array_equal(found, expected)
+
+
+def columns(path):
+    """Return the names and columns of a file."""
+    rows = read_ply(path).rows
+    return [(name, rows[name]) for name in rows.dtype.names]
+
+
 # What is done after an interruption.
 
 
@@ -286,8 +321,14 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views,
     budget = Budget(ratio=0.5)
     prune_tiles(tiles, tmp_path / "once", views, budget, CLOSED)
     done = []
-    read, write_rows = units.Unit.splats, steps.write_rows
-    monkeypatch.setattr(units.Unit, "splats", lambda unit: done.append(unit.index) or read(unit))
+    take, write_rows = units.Unit.take, steps.write_rows
+
+    def taken(unit, piece):
+        if not piece.stop:  # whoever reads a unit looks at its types first
+            done.append(unit.index)
+        return take(unit, piece)
+
+    monkeypatch.setattr(units.Unit, "take", taken)
     monkeypatch.setattr(
         steps, "write_rows", lambda *rows: done.append(len(rows[1])) or write_rows(*rows)
     )

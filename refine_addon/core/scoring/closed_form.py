@@ -30,7 +30,7 @@ from ..scores import Scores
 from ..splats import refuse_undrawable
 from ..work import Progress, part, silent
 from . import adaptive
-from .closed_form_block import CELLS, LUMA, ROWS, Block, Frame
+from .closed_form_block import CELLS, HIGHEST, LUMA, ROWS, Block, Frame
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -221,11 +221,13 @@ def steps(
     if not total:
         msg = "there are no splats to score"
         raise RefineError(msg)
-    tallies, moments = (np.concatenate(of) for of in zip(*each("read"), strict=True))
+    read = zip(*each("read"), strict=True)
+    tallies, moments = (np.concatenate(next(read)) for _ in range(2))
+    highest = radix.added(map(radix.Sparse, *read))
     good = int(tallies[:, 0].sum())
     refuse_undrawable(good, total)
     axes, eta, near, size = remember(
-        "frame", lambda: _frame(each, good, np.sum(moments, axis=0), settings)
+        "frame", lambda: _frame(each, good, np.sum(moments, axis=0), highest, settings)
     )
     frame = Frame(axes, float(eta), float(near))
     sums = np.concatenate([*each("sum_views", frame)])
@@ -252,7 +254,11 @@ def steps(
 
 
 def _frame(
-    each: Each, good: int, moments: NDArray[np.float64], settings: ClosedForm
+    each: Each,
+    good: int,
+    moments: NDArray[np.float64],
+    highest: NDArray[np.int64],
+    settings: ClosedForm,
 ) -> tuple[NDArray[np.float64], float, float, float]:
     """Return what `Frame` takes, and the scene's size, of which eta and near plane are multiples.
 
@@ -265,11 +271,13 @@ def _frame(
         How many splats can be drawn.
     moments : (4, 3) float64
         As `Block.read` returns them, of all splats.
+    highest : (1, 65536) int64
+        What the step "count" would return of the highest digit, of all splats.
     settings : ClosedForm
     """
 
     def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:
-        return radix.added(each("count", prefixes, shift))
+        return highest if shift == HIGHEST else radix.added(each("count", prefixes, shift))
 
     size = size_of(radix.median(count, np.dtype(np.float64), good))
     axes = principal_axes(moments[:3], moments[3]) / size  # (3, 3)

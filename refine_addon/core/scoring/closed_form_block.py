@@ -7,16 +7,18 @@ the other, with their numbers on disk in between, or on several machines.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
 from .. import radix
 from ..frustum import Frustums
 from ..splats import base_color, drawable, opacity
-from ..work import for_chunks, silent
+from ..work import for_chunks, part, silent
 from . import adaptive
+from .nearness import near_order
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -48,7 +50,14 @@ CELLS = 64
 ROWS = 1 << 18
 """Splats of a block: its numbers take 18 MB. Sums over cells depend on it in their last bits."""
 
+HIGHEST = 64 - radix.DIGIT
+"""Bits below the highest digit of a squared distance."""
+
 _CHUNK = 4096
+_RUN = 2000
+"""Splats that are looked at together: so few that what is known of them in 64 views stays in the
+second cache, and no multiple of a page, at which a processor takes reads for writes."""
+
 _VIEW_BLOCK = 64
 _SMALLEST_AREA = -300.0  # natural logarithm
 _SMALLEST_SQUARE = 1e-300
@@ -131,6 +140,16 @@ STEPS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = 
 """Step -> arrays that it needs, that it makes, and that nobody needs after it."""
 
 
+class Source(Protocol):
+    """Splats, be they in memory or read when they are taken."""
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+
+    def take(self, piece: slice, /) -> Splats:
+        """Return some of them; of an empty slice too the types are those of all."""
+
+
 class Block:
     """What the formula needs of n splats, filled step by step, chunk by chunk.
 
@@ -138,7 +157,7 @@ class Block:
 
     Parameters
     ----------
-    splats : Splats or None
+    splats : Splats, Source or None
         Needed for `read` alone.
     views : ViewSet
     settings : ClosedForm
@@ -187,7 +206,7 @@ class Block:
 
     def __init__(
         self,
-        splats: Splats | None,
+        splats: Source | None,
         views: ViewSet,
         settings: ClosedForm,
         middle: tuple[NDArray[np.float64], float],
@@ -209,7 +228,7 @@ class Block:
             vars(self).pop(array, None)
         return result
 
-    def read(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def read(self) -> tuple[Any, ...]:
         """Activate the splats.
 
         Returns
@@ -217,11 +236,14 @@ class Block:
         tallies : (chunks, 5) float64
         moments : (chunks, 4, 3) float64
             See `_read`.
+        prefixes, places, counts
+            `count` of the highest digit, which the first pass needs anyway.
         """
         assert self.splats is not None  # noqa: S101 - whoever calls this gave them
         count = len(self.splats)
         self.good = np.empty(count, np.bool_)
-        self.means = np.empty((count, 3), self.splats.means.dtype.newbyteorder("="))
+        kind = self.splats.take(slice(0, 0)).means.dtype.newbyteorder("=")
+        self.means = np.empty((count, 3), kind)
         self.squared, self.alpha, self.area, self.reach = (np.empty(count) for _ in range(4))
         self.luma = np.empty(count, np.float32)
         found = for_chunks(
@@ -230,7 +252,7 @@ class Block:
         )  # fmt: skip
         self.splats = None
         tallies, moments = zip(*found, strict=True)
-        return np.array(tallies), np.array(moments)
+        return np.array(tallies), np.array(moments), *self.count([0], HIGHEST)
 
     def _read(self, piece: slice) -> tuple[tuple[float, ...], NDArray[np.float64]]:
         """Activate one slice of splats.
@@ -244,17 +266,25 @@ class Block:
             Over the drawable splats, weighted by 1 / `squared`: the sums of the products of their
             coordinates from the origin, and of the coordinates.
         """
-        chunk = self.splats.take(piece)  # type: ignore[union-attr]
+        chunk = self.splats.take(piece).by_columns()  # type: ignore[union-attr]
         good = self.good[piece] = drawable(chunk)  # (n,)
-        means = self.means[piece] = np.where(good[:, None], chunk.means, 0.0)  # (n, 3)
-        offset = means - self.origin
+        if not good.all():
+            chunk = replace(
+                chunk,
+                means=np.where(good[:, None], chunk.means, 0.0),
+                log_scales=np.where(good[:, None], chunk.log_scales, 0.0),
+                opacity_logits=np.where(good, chunk.opacity_logits, -np.inf),
+                sh_dc=np.where(good[:, None], chunk.sh_dc, 0.0),
+            )
+        self.means[piece] = chunk.means
+        offset = chunk.means - self.origin  # (n, 3)
         # Values that underflow to 0 are negligible in the sums.
         with np.errstate(under="ignore"):
             self.squared[piece] = np.einsum("ij,ij->i", offset, offset) + self.view_variance
-            alpha = self.alpha[piece] = opacity(np.where(good, chunk.opacity_logits, -np.inf))
-            red, green, blue = base_color(np.where(good[:, None], chunk.sh_dc, 0.0)).T
+            alpha = self.alpha[piece] = opacity(chunk.opacity_logits)
+            red, green, blue = base_color(chunk.sh_dc).T
             self.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
-            logs = np.where(good[:, None], chunk.log_scales, 0.0).astype(np.float64)
+            logs = chunk.log_scales.astype(np.float64)
             self.area[piece], ratio, longest = self._axes(logs)
             self.reach[piece] = REACH * longest
             alpha, luma = alpha[good], self.luma[piece][good].astype(np.float64)
@@ -300,49 +330,102 @@ class Block:
         self.axes, self.eta = frame.axes, frame.eta
         self.frustums = Frustums(self.views, self.origin, frame.near)
         self.visibility = np.empty(count)
-        self.seen = np.zeros(count, np.int32)
+        self.seen = np.empty(count, np.int32)
         self.cells = np.zeros(count, np.int32)
+        look, sums = part(self.progress, 0.0, 0.9), part(self.progress, 0.9, 1.0)
+        for_chunks(
+            partial(self._look, near_order(self.means)), count, 8 * _CHUNK,
+            progress=look, what="scoring", threads=self.threads,
+        )  # fmt: skip
         return np.array(
             for_chunks(
-                self._sum_views, count, _CHUNK,
-                progress=self.progress, what="scoring", threads=self.threads,
+                self._sum, count, _CHUNK, progress=sums, what="scoring", threads=self.threads
             )
-        )  # fmt: skip
+        )
 
-    def _sum_views(self, piece: slice) -> list[float]:
-        points = np.ones((4, piece.stop - piece.start))  # x, y, z, 1
-        points[:3] = (self.means[piece] - self.origin).T
-        total = np.zeros(points.shape[1])  # (n,), H before alpha
-        seen = np.zeros(points.shape[1], np.int32)
+    def _look(self, order: NDArray[np.int64], piece: slice) -> None:
+        """Set H before alpha, and in how many views each splat lies, of a slice of an order.
+
+        Splats of a run lie near each other, so most views see none of them, and many see all.
+        """
+        rows = order[piece]
+        points = np.ones((4, len(rows)))  # x, y, z, 1
+        near = np.take(self.means, rows, axis=0)
+        np.subtract(near.T, self.origin[:, None], out=points[:3])
+        reach = self.reach[rows]
+        starts = np.arange(0, len(rows), _RUN)
+        low, high = (each.reduceat(points[:3], starts, axis=1) for each in (np.minimum, np.maximum))
+        visibility, seen = np.empty(len(rows)), np.empty(len(rows), np.int32)
         with np.errstate(under="ignore"):
-            for start in range(0, len(self.weights), _VIEW_BLOCK):
-                block = slice(start, start + _VIEW_BLOCK)
-                depth, beyond, inside = self.frustums.project(points, block)  # (V, n) each
-                fringe = None
-                if self.settings.frustum:
-                    between, inside = inside, beyond <= 0.0
-                    inside &= between
-                    fringe = self._fringe(depth, beyond, between > inside, piece, block)
-                else:
-                    inside[:] = True
+            some, whole = self.frustums.look(low, high, np.maximum.reduceat(reach, starts))
+            if not self.settings.frustum:
+                some[:] = whole[:] = True
+            # Views of which a run is partly outside come first, then those that see all of it.
+            views = np.argsort(whole * 1 - some * 2, axis=0, kind="stable")  # (V, runs)
+            counts = np.count_nonzero(some, axis=0).tolist()
+            partly = np.count_nonzero(some & ~whole, axis=0).tolist()
+            for run, start in enumerate(starts.tolist()):
+                here = slice(start, start + _RUN)
+                visibility[here], seen[here] = self._run(
+                    points[:, here], reach[here], views[: counts[run], run], partly[run]
+                )
+        self.visibility[rows] = visibility
+        self.seen[rows] = seen
+
+    def _run(
+        self,
+        points: NDArray[np.float64],
+        reach: NDArray[np.float64],
+        views: NDArray[np.int64],
+        partly: int,
+    ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """Return H before alpha of n splats, and in how many views each lies, (n,) each.
+
+        Parameters
+        ----------
+        points : (4, n) float64
+        reach : (n,) float64
+        views : (v,) int64
+            Those that see some of them; of these, the first `partly` may not see all.
+        partly : int
+        """
+        total = np.zeros(points.shape[1])  # (n,), H before alpha
+        seen = np.full(points.shape[1], len(views) - partly, np.int32)
+        for start in range(0, len(views), _VIEW_BLOCK):
+            block = views[start : start + _VIEW_BLOCK]
+            count = min(max(partly - start, 0), len(block))
+            depth, beyond, between = self.frustums.project(points, block, count)
+            inside = fringe = None
+            if count:
+                inside = beyond <= 0.0  # (c, n)
+                inside &= between
+                fringe = self._fringe(depth, beyond, between > inside, reach, block[:count])
                 # A byte can count the at most 64 views of a block.
                 seen += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.uint8)
-                total += self._block(points, depth, inside, fringe, block)
-            if not total.all():
+            total += self._block(points, depth, inside, fringe, block)
+        return total, seen
+
+    def _sum(self, piece: slice) -> list[float]:
+        """Make H of what `_look` left, and return its sums; see `sum_views`."""
+        points = np.empty((3, piece.stop - piece.start))
+        np.subtract(self.means[piece].T, self.origin[:, None], out=points)
+        visibility, good = self.visibility[piece], self.good[piece]
+        with np.errstate(under="ignore"):
+            if not visibility.all():
                 near = self.squared[piece] + self.eta if self.settings.projection else 1.0
-                total = np.where(total == 0.0, UNSEEN / near, total)
+                visibility[:] = np.where(visibility == 0.0, UNSEEN / near, visibility)
             if self.settings.visibility:
-                total *= self.alpha[piece]
-            visibility = self.visibility[piece] = total * self.good[piece]
+                visibility *= self.alpha[piece]
+            visibility *= good
             sums = [float(np.sum(visibility * content)) for content in self._contents(piece)]
             if self.settings.local:
                 self.cells[piece] = self._cells(points)
-        self.seen[piece] = seen * self.good[piece]
+        self.seen[piece] *= good
         return [*sums, float(np.sum(self.seen[piece]))]
 
     def _cells(self, points: NDArray[np.float64]) -> NDArray[np.int32]:
         """Return which neighbourhood each of n points lies in, (n,)."""
-        place = self.axes @ points[:3]  # (3, n), scene sizes
+        place = self.axes @ points  # (3, n), scene sizes
         # All of space is mapped into a ball, so cells grow with the distance.
         place *= CELLS / 2 / (1.0 + np.sqrt(np.einsum("in,in->n", place, place)))
         x, y, z = np.minimum((place + CELLS / 2).astype(np.int32), CELLS - 1)
@@ -352,23 +435,27 @@ class Block:
         self,
         points: NDArray[np.float64],
         depth: NDArray[np.float64],
-        inside: NDArray[np.bool_],
+        inside: NDArray[np.bool_] | None,
         fringe: _Fringe | None,
-        block: slice,
+        views: NDArray[np.int64],
     ) -> NDArray[np.float64]:
         """Return H before alpha of n splats from a block of views, (n,); `depth` is overwritten."""
-        weights = self.weights[block]
-        counted = inside
+        weights = self.weights[views]
         share = fringe.share if fringe else None
         if self.settings.projection:
-            squared = self._squared(points, depth, block)
+            squared = self._squared(points, depth, views)
             if fringe:
                 at = np.square(fringe.across)
                 if self.settings.depth == "distance":
                     at = squared[fringe.view, fringe.splat]
                 share = fringe.share / (at + self.eta)
             squared += self.eta
-            counted = np.divide(inside, squared, out=squared)
+            counted = np.divide(1.0, squared, out=squared)
+        else:
+            depth[:] = 1.0
+            counted = depth
+        if inside is not None:
+            counted[: len(inside)] *= inside
         total: NDArray[np.float64] = np.einsum("v,vn->n", weights, counted)
         if fringe and share is not None:
             total += np.bincount(fringe.splat, weights[fringe.view] * share, len(total))
@@ -379,18 +466,17 @@ class Block:
         depth: NDArray[np.float64],
         beyond: NDArray[np.float64],
         outside: NDArray[np.bool_],
-        piece: slice,
-        block: slice,
+        reach: NDArray[np.float64],
+        views: NDArray[np.int64],
     ) -> _Fringe:
         """Return which splats reach into which views from outside, and how far."""
-        steepness = self.frustums.steepness[block]
-        limit = self.reach[piece] * (steepness if np.ptp(steepness) > 0.0 else steepness[:1])
-        outside &= beyond < limit  # (b, n)
+        limit = reach * self.frustums.steepness[views]  # (c, n)
+        outside &= beyond < limit  # (c, n)
         index = np.flatnonzero(outside)  # of few; everything else is done for all of them
         view = index // outside.shape[1]
         splat = index - view * outside.shape[1]
         away = beyond.ravel()[index]
-        share = 1.0 - away / (limit[0, splat] if len(limit) == 1 else limit[view, splat])
+        share = 1.0 - away / limit.ravel()[index]
         return _Fringe(view, splat, share, depth.ravel()[index] + away)
 
     def _contents(self, piece: slice) -> tuple[NDArray[np.float64], ...]:
@@ -399,14 +485,14 @@ class Block:
         return self.area[piece], luma * luma, alpha * alpha
 
     def _squared(
-        self, points: NDArray[np.float64], depth: NDArray[np.float64], block: slice
+        self, points: NDArray[np.float64], depth: NDArray[np.float64], views: NDArray[np.int64]
     ) -> NDArray[np.float64]:
         """Return d^2, (V, n); `depth` is overwritten by it."""
         if self.settings.depth == "z":
             return np.multiply(depth, depth, out=depth)
         depth[:] = 0.0
         for axis in range(3):
-            step = points[axis] - self.frustums.centers[block, axis, None]
+            step = points[axis] - self.frustums.centers[views, axis, None]
             depth += np.multiply(step, step, out=step)
         return depth
 
@@ -423,8 +509,10 @@ class Block:
         if not self.settings.local:
             return None
         sums = np.bincount(self.cells, self.plain).astype(np.float64, copy=False)
-        counts = np.bincount(self.cells, self.good).astype(np.int64)
-        there = np.flatnonzero(np.bincount(self.cells)).astype(np.int32)
+        counts = np.bincount(self.cells)
+        there = np.flatnonzero(counts).astype(np.int32)
+        if not self.good.all():
+            counts = np.bincount(self.cells, self.good).astype(np.int64)
         return Crowds(there, sums[there], counts[there])
 
     def _add(self, factors: NDArray[np.float64], piece: slice) -> None:

@@ -125,11 +125,7 @@ class Job:
             if done:
                 return result
             raise
-        splats = unit.splats() if step == "read" else None
-        block = Block(
-            splats, self.views, self.settings, self.middle, threads=threads, arrays=arrays
-        )
-        del splats
+        block = Block(unit, self.views, self.settings, self.middle, threads=threads, arrays=arrays)
         block.progress = progress
         result = getattr(block, step)(*map(self._whole, arguments))
         self.folder.save(unit.index, {array: getattr(block, array) for array in made})

@@ -98,14 +98,37 @@ class Unit:
         return sum(part.rows for part in self.parts)
 
     def splats(self) -> Splats:
-        """Return its splats.
+        """Return its splats; see `take`."""
+        return self.take(slice(0, len(self)))
+
+    def take(self, piece: slice) -> Splats:
+        """Read some of its splats.
+
+        Parameters
+        ----------
+        piece : slice
+            From a row to another, which may be the same.
 
         Returns
         -------
         Splats
-            Of the highest degree among its parts: coefficients that a part lacks are 0.
+            Of types and a degree that hold the numbers of all parts: coefficients that a part lacks
+            are 0.
+
+        Raises
+        ------
+        RefineError
+            See `rows_of`.
         """
-        return joined([splats_from_columns(rows_of(part)) for part in self.parts])
+        kinds = {part.tile.dtype: part._replace(stop=part.start) for part in self.parts}
+        chosen = [*kinds.values()] if len(kinds) > 1 else []
+        for part, place in zip(self.parts, self.slices(), strict=True):
+            start, stop = max(piece.start, place.start), min(piece.stop, place.stop)
+            if start < stop:
+                begin = part.start - place.start
+                chosen.append(Part(part.tile, begin + start, begin + stop))
+        chosen = chosen or [*kinds.values()]
+        return joined([splats_from_columns(rows_of(part)) for part in chosen])
 
     def slices(self) -> list[slice]:
         """Return where in the unit each part lies."""
