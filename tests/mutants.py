@@ -472,9 +472,10 @@ MUTANTS = {
             "protection of another row",
         ),
         ("((stage + 1) / number))", "(stage / number))", "a stage late"),
+        ("1 if share >= ALONE else", "", "half in two stages"),
         (
-            "math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE))",
-            "1",
+            "else math.ceil(math.log(share) / math.log(STAGE))",
+            "else 1",
             "measured only once",
         ),
         (
@@ -540,7 +541,7 @@ MUTANTS = {
             "field.contribution[second] < field.contribution[first]",
             "the less seen survives",
         ),
-        ("        touched[into] = True\n", "", "costs not renewed"),
+        ("        self._price(mine[there], progress)\n", "", "costs not renewed"),
         ("self.cost[mine] = self.patience * cost", "self.cost[mine] = cost", "patience ignored"),
         ("count < self.connected / 2", "count < 0", "never connected anew"),
         ("self.alive & ~np.isnan(self.field.error)", "self.alive", "a round that does nothing"),
@@ -675,7 +676,7 @@ MUTANTS = {
             "a point its own neighbour",
         ),
         ("key[:, 1:][key[:, 1:] == key[:, :-1]] = _NOBODY", "", "the same neighbour twice"),
-        ("points @ turn.T + shift", "points", "all curves the same"),
+        ("points @ turns[curve].T + SHIFTS[curve]", "points", "all curves the same"),
         (
             "key |= candidates.astype(np.uint64)",
             "key |= candidates[::-1].astype(np.uint64)",

@@ -407,8 +407,11 @@ def _absorbed(
     """
     splats, views = task.scene()
     start = 0.0 if known else 0.2
-    known = known or _score_once(splats, views, task.settings, part(progress, 0.0, start), threads)
-    scores, goal = known[0], task.budget.psnr
+    goal, ahead = task.budget.psnr, part(progress, 0.0, start)
+    known = known or _score_once(
+        splats, views, task.settings, ahead, threads, curve=goal is not None
+    )
+    scores = known[0]
     if goal is not None and scores.quality is None:
         scores = with_quality(scores, protected=task.protected, threads=threads)
     used, origin = views.spread(task.settings.views), task.origin
@@ -462,8 +465,9 @@ def _scores_of(
     splats, views = task.scene()
     if task.absorb and not task.budget.needs_scores:
         # The number of survivors does not depend on scores, so the scores for absorbing are enough.
-        known = _score_once(splats, views, task.settings, progress, threads)
-        if task.budget.psnr is not None:
+        goal = task.budget.psnr
+        known = _score_once(splats, views, task.settings, progress, threads, curve=goal is not None)
+        if goal is not None:
             curve = with_quality(known[0], protected=task.protected, threads=threads)
             known = curve, known[1]
         return known[0], known
@@ -482,14 +486,24 @@ def _scores_of(
 
 
 def _score_once(
-    splats: Splats, views: ViewSet, settings: Settings, progress: Progress, threads: int | None
+    splats: Splats,
+    views: ViewSet,
+    settings: Settings,
+    progress: Progress,
+    threads: int | None,
+    *,
+    curve: bool = False,
 ) -> tuple[Scores, Measured]:
-    """Return scores by occlusion in one round, and what was measured of each splat."""
+    """Return scores by occlusion in one round, and what was measured of each splat.
+
+    With `curve` the lines of sight tell the whole curve of the PSNR, else only that of a result.
+    """
     used = views.spread(settings.views)
     with np.errstate(under="ignore"):  # as in `score`
         scores, measured = occlusion.score_once(
-            splats, used, settings.occlusion, progress=part(progress, 0.0, 0.99), threads=threads
-        )
+            splats, used, settings.occlusion, judges=not curve,
+            progress=part(progress, 0.0, 0.99), threads=threads,
+        )  # fmt: skip
     ahead = part(progress, 0.99, 1.0)
     return _with_views(scores, splats, views, used, ahead, threads), measured
 

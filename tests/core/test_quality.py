@@ -24,7 +24,7 @@ from refine_addon.core import (
 )
 from refine_addon.core.pipeline import decide
 from refine_addon.core.quality import PSNR_CAP, SHARES, Quality, absorbed_from
-from refine_addon.core.scoring import projection, sight_lines
+from refine_addon.core.scoring import occlusion, projection, sight_lines
 from refine_addon.core.splats import opacity
 from refine_addon.core.task import Task
 from tests.core.test_invariance import MOTIONS, moved
@@ -491,6 +491,19 @@ def test_the_closed_form_says_that_it_made_no_estimate():
     assert done["quality"] is None
     assert "only if a PSNR is the budget" in done["estimated_psnr_note"]
     assert done["notes"] == []
+
+
+def test_absorbing_looks_from_no_more_views_than_judge_it():
+    """Of 60 views every third is one of at most 24 judges: the same estimate as with all lines."""
+    splats, views = cloud(), ring(60)
+    settings = occlusion.Occlusion()
+    some, _ = occlusion.score_once(splats, views, settings, judges=True)
+    every, _ = occlusion.score_once(splats, views, settings)
+    other = replace(splats, sh_dc=splats.sh_dc + 0.1)
+
+    assert [lines is not None for lines in some.sights.lines] == [True, False, False] * 20
+    assert all(every.sights.lines)
+    assert some.sights.against(other, views) == every.sights.against(other, views)
 
 
 def test_merged_splats_are_judged_against_the_original():

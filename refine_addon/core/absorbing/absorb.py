@@ -38,7 +38,11 @@ what is hidden; None before the first stage.
 """
 
 STAGE = 0.6
-"""A stage leaves at least this share of its splats."""
+"""One of several stages leaves at least this share of its splats."""
+
+ALONE = 0.55
+"""A single stage leaves at least this share: half of all splats, once a tenth of all was deleted.
+"""
 
 PATIENCE = 2.0
 """Factor on the cost of merging if half of the splats go; see `patience`."""
@@ -193,10 +197,17 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
 
 
 def stages(count: int, goal: int) -> list[int]:
-    """Return how many of `count` splats are left after each stage; `goal` after the last."""
+    """Return how many of `count` splats are left after each stage; `goal` after the last.
+
+    Examples
+    --------
+    >>> stages(900, 500), stages(900, 450), stages(900, 900)
+    ([500], [636, 450], [])
+    """
     if goal >= count:
         return []
-    number = math.ceil(math.log(max(goal, 1) / count) / math.log(STAGE))
+    share = max(goal, 1) / count
+    number = 1 if share >= ALONE else math.ceil(math.log(share) / math.log(STAGE))
     return [
         max(round(count * (goal / count) ** ((stage + 1) / number)), goal)
         for stage in range(number)
@@ -317,7 +328,7 @@ def _written(
         Reduced; its field shrinks to the changed survivors.
     progress : callable
     """
-    own = np.arange(len(rows))
+    own, threads = np.arange(len(rows)), graph.threads
     # (M,) each: the survivor that each splat went into, and its share of the survivor's colour.
     owner, share = own.copy(), np.ones(len(rows))
     # From the last round to the first: a survivor of one round may be absorbed in a later one.
@@ -336,15 +347,15 @@ def _written(
     merged = graph.field = graph.field.take(np.flatnonzero(changed))
     report(progress, 0.0, "absorbing")
     with np.errstate(under="ignore"):
-        logs, quaternions = _axes(merged.covariances, part(progress, 0.0, 0.3))
+        logs, quaternions = _axes(merged.covariances, part(progress, 0.0, 0.3), threads)
         ahead = part(progress, 0.3, 1.0)
         result = Splats(
             _put(splats.means[keep], target, merged.means),
             _put(splats.log_scales[keep], target, logs),
             _put(splats.quaternions[keep], target, quaternions),
             _put(splats.opacity_logits[keep], target, _logit(merged.opacity)),
-            harmonics.put(splats.sh_dc[:, None], splats.sh_dc[keep][:, None], ahead)[:, 0],
-            harmonics.put(splats.sh_rest, splats.sh_rest[keep], ahead),
+            harmonics.put(splats.sh_dc[:, None], splats.sh_dc[keep][:, None], ahead, threads)[:, 0],
+            harmonics.put(splats.sh_rest, splats.sh_rest[keep], ahead, threads),
         )
     taken = np.where(keep, place, -1)
     taken[rows] = np.where(graph.alive[owner], place[rows[owner]], -1)
@@ -371,26 +382,30 @@ class _Blend:
         self.starts = np.flatnonzero(np.diff(targets[order], prepend=-1))
         self.targets = targets[order][self.starts]
 
-    def put(self, values: NDArray[Any], kept: NDArray[Any], progress: Progress) -> NDArray[Any]:
+    def put(
+        self, values: NDArray[Any], kept: NDArray[Any], progress: Progress, threads: int | None
+    ) -> NDArray[Any]:
         """Write the means of `values`, (N, K, 3), to the target rows of `kept`; return `kept`."""
-        if len(self.starts):
-            for column in range(values.shape[1]):
-                # One column at a time, to save memory.
-                report(progress, column / values.shape[1], "absorbing")
-                own = np.asarray(values[self.members, column], np.float64)
-                means = np.add.reduceat(own * self.share[:, None], self.starts)
-                kept[self.targets, column] = means
+
+        def fill(piece: slice) -> None:
+            # One column at a time, to save memory.
+            own = np.asarray(values[self.members, piece.start], np.float64)
+            means = np.add.reduceat(own * self.share[:, None], self.starts)
+            kept[self.targets, piece.start] = means
+
+        columns = values.shape[1] if len(self.starts) else 0
+        for_chunks(fill, columns, 1, progress=progress, what="absorbing", threads=threads)
         return kept
 
 
-def _axes(covariances: Array, progress: Progress) -> tuple[Array, Array]:
+def _axes(covariances: Array, progress: Progress, threads: int | None) -> tuple[Array, Array]:
     """Return `merging.axes` of M covariances, computed in chunks."""
     logs, quaternions = np.empty((len(covariances), 3)), np.empty((len(covariances), 4))
 
     def fill(piece: slice) -> None:
         logs[piece], quaternions[piece] = merging.axes(covariances[piece])
 
-    for_chunks(fill, len(covariances), _CHUNK, progress=progress, what="absorbing", threads=1)
+    for_chunks(fill, len(covariances), _CHUNK, progress=progress, what="absorbing", threads=threads)
     return logs, quaternions
 
 

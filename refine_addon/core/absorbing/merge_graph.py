@@ -211,15 +211,20 @@ class MergeGraph:
         self.alive[doomed] = False
         self.alive[gone] = False
         self.deleted += len(doomed)
+        changed = np.zeros(len(self.alive), np.bool_)
+        changed[doomed] = changed[gone] = changed[into] = True
+        # Most pairs are not concerned, so that only these are looked at twice.
+        mine = np.flatnonzero(changed.take(self.first) | changed.take(self.second))  # (e,)
         # Pairs of an absorbed splat become pairs of the splat that absorbed it.
         heir = np.arange(len(self.alive), dtype=np.int32)  # (N,)
         heir[gone] = into
-        first, second = heir[self.first], heir[self.second]
-        valid = self.alive[first] & self.alive[second] & (first != second)
-        self.first, self.second, self.cost = first[valid], second[valid], self.cost[valid]
-        touched = np.zeros(len(self.alive), np.bool_)
-        touched[into] = True
-        self._price(np.flatnonzero(touched[self.first] | touched[self.second]), progress)
+        first, second = heir.take(self.first[mine]), heir.take(self.second[mine])
+        self.first[mine], self.second[mine] = first, second
+        there = self.alive[first] & self.alive[second] & (first != second)
+        self._price(mine[there], progress)
+        valid = np.ones(len(self.first), np.bool_)
+        valid[mine[~there]] = False
+        self.first, self.second, self.cost = self.first[valid], self.second[valid], self.cost[valid]
 
 
 def _disjoint(first: Index, second: Index) -> Index:

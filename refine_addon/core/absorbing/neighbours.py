@@ -15,7 +15,7 @@ import numpy as np
 
 from ..scene import spatial_order
 from ..splats import rotation_matrices
-from ..work import Progress, for_chunks, part, report, silent
+from ..work import Progress, for_chunks, part, silent
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -74,7 +74,8 @@ def nearest(
     count = min(count, total - 1)
     if count <= 0:
         return np.empty((total, 0), np.int32)
-    around = _candidates(points, max((count + 1) // 2, WINDOW), part(progress, 0.0, 0.4))
+    ahead = part(progress, 0.0, 0.4)
+    around = _candidates(points, max((count + 1) // 2, WINDOW), ahead, threads)
     found = np.empty((total, count), np.int32)
 
     def search(piece: slice) -> None:
@@ -88,7 +89,7 @@ def nearest(
 
 
 def _candidates(
-    points: NDArray[np.float64], window: int, progress: Progress
+    points: NDArray[np.float64], window: int, progress: Progress, threads: int | None
 ) -> Callable[[slice], NDArray[np.int32]]:
     """Return a function that gives the candidates of n points, (n, C) indices.
 
@@ -98,21 +99,25 @@ def _candidates(
     if total <= max(SMALL, 2 * window + 1):
         everyone = np.arange(total, dtype=np.int32)
         return lambda piece: np.broadcast_to(everyone, (piece.stop - piece.start, total))
-    orders, places = [], []
-    for number, (turn, shift) in enumerate(zip(rotation_matrices(CURVES), SHIFTS, strict=True)):
-        report(progress, number / len(CURVES), "finding neighbours")
-        order = spatial_order(points @ turn.T + shift).astype(np.int32)
+    turns = rotation_matrices(CURVES)
+
+    def along(piece: slice) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        curve = piece.start
+        order = spatial_order(points @ turns[curve].T + SHIFTS[curve]).astype(np.int32)
         place = np.empty(total, np.int32)
         place[order] = np.arange(total, dtype=np.int32)
-        orders.append(order)
         # At either end of a curve the window lies to one side.
-        places.append(np.clip(place - window, 0, total - 1 - 2 * window))
+        return order, np.clip(place - window, 0, total - 1 - 2 * window)
+
+    curves = for_chunks(
+        along, len(CURVES), 1, progress=progress, what="finding neighbours", threads=threads
+    )
 
     def around(piece: slice) -> NDArray[np.int32]:
         steps = np.arange(2 * window + 1, dtype=np.int32)
         windows = (
             order.take(first[piece, None] + steps)  # (n, 2 window + 1)
-            for order, first in zip(orders, places, strict=True)
+            for order, first in curves
         )
         return np.concatenate(list(windows), axis=1)
 

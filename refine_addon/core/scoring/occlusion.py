@@ -137,6 +137,7 @@ def score_once(
     views: ViewSet,
     settings: Occlusion = Occlusion(),
     *,
+    judges: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Scores, Measured]:
@@ -146,6 +147,8 @@ def score_once(
     ----------
     splats, views, settings, progress, threads
         See `score`; `settings.rounds` is ignored.
+    judges : bool
+        See `SightLines`.
 
     Returns
     -------
@@ -157,7 +160,7 @@ def score_once(
         See `score`.
     """
     run = Run(
-        splats, views, replace(settings, rounds=1),
+        splats, views, replace(settings, rounds=1), judges=judges,
         progress=part(progress, 0.0, 0.1), threads=threads,
     )  # fmt: skip
     measured = run.measure(range(run.measuring.count), part(progress, 0.1, 1.0))
@@ -473,6 +476,8 @@ class Run(Rounds):
         See `score`.
     members : list of list of int, optional
         See `Measuring`.
+    judges : bool
+        See `SightLines`.
 
     Raises
     ------
@@ -482,13 +487,14 @@ class Run(Rounds):
 
     sights: SightLines
 
-    def __init__(
+    def __init__(  # noqa: PLR0913 - all but three are optional
         self,
         splats: Splats,
         views: ViewSet,
         settings: Occlusion,
         *,
         members: list[list[int]] | None = None,
+        judges: bool = False,
         progress: Progress = silent,
         threads: int | None = None,
     ) -> None:
@@ -503,7 +509,7 @@ class Run(Rounds):
         prior = closed_form.score(
             splats, views, PRIOR, progress=part(progress, 0.5, 1.0), threads=threads
         ).values
-        sights = SightLines(measuring.views, gaussians, splats)
+        sights = SightLines(measuring.views, gaussians, splats, judges=judges)
         super().__init__(gaussians, measuring, settings.rounds, prior, ~good, sights)
 
 

@@ -228,6 +228,9 @@ class SightLines:
         What the lines may meet.
     splats : Splats
         What the Gaussians were made of, for their colours.
+    judges : bool
+        Whether only about `JUDGES` of the views are looked from: enough for `against`, not for
+        `curve`.
 
     Attributes
     ----------
@@ -240,9 +243,15 @@ class SightLines:
     """
 
     def __init__(
-        self, views: Sequence[tuple[View, float]], gaussians: Gaussians, splats: Splats
+        self,
+        views: Sequence[tuple[View, float]],
+        gaussians: Gaussians,
+        splats: Splats,
+        *,
+        judges: bool = False,
     ) -> None:
         self.views, self.splats = views, splats
+        self.every = max(math.ceil(len(views) / JUDGES), 1) if judges else 1
         self.index = self.rows = gaussians.index
         self.lines: list[Lines | None] = [None] * len(views)
 
@@ -260,7 +269,7 @@ class SightLines:
         footprints : Footprints
             Of all that the lines may meet in this view.
         """
-        if self.lines[number] is None:
+        if self.lines[number] is None and number % self.every == 0:
             self.lines[number] = met(self.views, number, footprints)
 
     def look_from(
