@@ -133,7 +133,7 @@ MUTANTS = {
         ("if target in targets[:place]:", "if False:", "one output for two tiles"),
     ],
     "tiles/seen.py": [
-        ("rows=some.rows + start", "rows=some.rows", "rows of the first chunk"),
+        ("index=some.index + start", "index=some.index", "rows of the first chunk"),
         (
             "np.concatenate(colors)[at]",
             "np.concatenate(colors)",

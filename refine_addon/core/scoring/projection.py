@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -223,43 +223,24 @@ def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
     return front_to_back([reaching(gaussians, scene, view)])
 
 
-class Reaching(NamedTuple):
-    """The footprints that may reach into an image, as in `Footprints` but in no order.
-
-    Attributes
-    ----------
-    rows : (n,) int64
-        Of the `Gaussians`.
-    depth : (n,) float32
-        Along the view's axis, scene sizes.
-    centers, major, minor, sigmas : (2, n) float32
-    inside : (n,) bool
-    alphas : (n,) float32
-    """
-
-    rows: NDArray[np.int64]
-    depth: NDArray[np.float32]
-    centers: NDArray[np.float32]
-    major: NDArray[np.float32]
-    minor: NDArray[np.float32]
-    sigmas: NDArray[np.float32]
-    inside: NDArray[np.bool_]
-    alphas: NDArray[np.float32]
-
-
 _NONE = np.empty((2, 0), np.float32)
-_NOTHING = Reaching(
-    np.empty(0, np.int64), _NONE[0], _NONE, _NONE, _NONE, _NONE, np.empty(0, np.bool_), _NONE[0]
+_NOTHING = Footprints(
+    np.empty(0, np.int64), _NONE, _NONE, _NONE, _NONE, np.empty(0, np.bool_), _NONE[0]
 )
 
 
-def reaching(gaussians: Gaussians, scene: Scene, view: View) -> Reaching:
-    """Return the footprints of `project`, before they are sorted."""
+def reaching(
+    gaussians: Gaussians, scene: Scene, view: View
+) -> tuple[Footprints, NDArray[np.float32]]:
+    """Return the footprints of `project` in the order of the Gaussians, and their depths, (n,).
+
+    Depths are along the view's axis, in scene sizes.
+    """
     if not _computable(scene, view):
-        return _NOTHING
+        return _together([])
     planes = clip_planes(scene, view)
     rotation = _rotation6(view.rotation @ scene.axes.T)
-    pieces: list[Reaching] = []
+    pieces = []
     for start in range(0, len(gaussians), _CHUNK):
         checkpoint()
         piece = slice(start, start + _CHUNK)
@@ -269,27 +250,39 @@ def reaching(gaussians: Gaussians, scene: Scene, view: View) -> Reaching:
             local = np.take(local, touching, axis=1)  # (3, n), as all that follows
             shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)  # (6, n)
             inside = frustum.contains(view, local, planes)
+            index = touching + start
+            alphas = gaussians.alphas.take(index)
             centers, major, minor, sigmas = _ellipses(local, shape, view)
-            rows = touching + start
-            alphas = gaussians.alphas.take(rows)
-            pieces.append(Reaching(rows, local[2], centers, major, minor, sigmas, inside, alphas))
+            found = Footprints(index, centers, major, minor, sigmas, inside, alphas)
+            pieces.append((found, local[2]))
     return _together(pieces)
 
 
-def front_to_back(pieces: Sequence[Reaching]) -> Footprints:
-    """Return the footprints of some Gaussians by their depth; of equal depths the first first."""
-    found = _together(pieces)
+def front_to_back(pieces: Sequence[tuple[Footprints, NDArray[np.float32]]]) -> Footprints:
+    """Return footprints of some Gaussians by their depth; of equal depths the first first.
+
+    Parameters
+    ----------
+    pieces : sequence of Footprints, (n,) float32
+        As `reaching` returns them.
+    """
+    found, depth = _together(pieces)
     checkpoint()
-    order = _by_depth(found.depth)
-    rows, _, *rest = found
-    return Footprints(rows[order], *(np.take(values, order, axis=-1) for values in rest))
+    return found.take(_by_depth(depth))
 
 
-def _together(pieces: Sequence[Reaching]) -> Reaching:
+def _together(
+    pieces: Sequence[tuple[Footprints, NDArray[np.float32]]],
+) -> tuple[Footprints, NDArray[np.float32]]:
+    """Return the footprints of all pieces as one, and their depths."""
     if len(pieces) == 1:
         return pieces[0]
-    every = zip(_NOTHING, *pieces, strict=True)
-    return Reaching(*(np.concatenate(arrays, axis=-1) for arrays in every))
+    every = [_NOTHING, *(found for found, _ in pieces)]
+    joined = (
+        np.concatenate([getattr(found, item.name) for found in every], axis=-1)
+        for item in fields(Footprints)
+    )
+    return Footprints(*joined), np.concatenate([_NONE[0], *(depth for _, depth in pieces)])
 
 
 def in_camera(

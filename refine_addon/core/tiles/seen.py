@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, MutableMapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -231,11 +231,12 @@ class SceneJob:
                 edges = np.array([number, number + 1]) * CHUNK
                 start, stop = np.searchsorted(left, edges).tolist()
                 chunk = self._chunk(number, np.asarray(left[start:stop]) - edges[0])
-                some = projection.reaching(chunk, self.scene, view)
-                found.append(some._replace(rows=some.rows + start))
-                colors.append(chunk.colors[some.rows])
+                some, depth = projection.reaching(chunk, self.scene, view)
+                found.append((replace(some, index=some.index + start), depth))
+                colors.append(chunk.colors[some.index])
             footprints = projection.front_to_back(found)
-        rows = np.concatenate([np.empty(0, np.int64), *(some.rows for some in found)])  # ascending
+        # Ascending, since chunks are.
+        rows = np.concatenate([np.empty(0, np.int64), *(some.index for some, _ in found)])
         at = np.searchsorted(rows, footprints.index)
         return footprints, np.concatenate(colors)[at]
 
