@@ -31,14 +31,15 @@ if TYPE_CHECKING:
 
 READINGS = ("z", "distance", "default")
 ANALYTIC = {
-    "x', y', z: three rows of four products and three sums": (21, 21, 21),
-    "abs(x'), abs(y'), their maximum less z, a comparison: the frustum": (5, 5, 5),
-    "two comparisons: what is inside, and what reaches inside": (0, 0, 2),
+    "z: a row of four products and three sums": (7, 7, 7),
+    "x', y': two more rows": (0, 0, 14),
+    "abs(x'), abs(y'), their maximum less z, a comparison: the frustum": (0, 0, 5),
+    "two comparisons, two products: what is inside, and what reaches inside": (0, 0, 4),
     "d^2: z z, or three differences, products and sums": (1, 9, 1),
     "+ eta, the division, weight and sum": (4, 4, 4),
 }
-"""Term -> operations of a splat and a view, for both published readings and the default; the few
-splats that reach into a view from outside are left out."""
+"""Term -> operations of a splat and a view, for both published readings and the default, in a view
+that sees a part of the splats around it; the few that reach into it from outside are left out."""
 
 PER_HIT = 34
 """Operations of the reference renderer for a splat in a pixel, least: 16 for alpha (offset 4, form

@@ -56,7 +56,7 @@ def test_what_is_no_arithmetic_counts_nothing() -> None:
     ],
 )
 def test_the_table_is_what_the_closed_form_does(reading: str, settings: ClosedForm) -> None:
-    """32 views less 16, over 16 views and the splats; the last hundredth is per call."""
+    """32 views less 16, over 16 views and the splats; a fifth is of the boxes of runs."""
     rng = np.random.default_rng(0)
     count = 3000
     splats = Splats(
@@ -79,12 +79,12 @@ def test_the_table_is_what_the_closed_form_does(reading: str, settings: ClosedFo
     few = flops.count(splats, views.take(range(16)), options)
     many = flops.count(splats, views, options)
 
-    assert (many - few) / 16 / count == pytest.approx(expected, rel=0.01)
+    assert (many - few) / 16 / count == pytest.approx(expected, abs=0.2)
     assert closed_form.np is np
 
 
 def test_the_table_s_terms_are_whole_numbers_of_all_readings() -> None:
-    """31 for z, 39 for the distance, 33 for the default."""
+    """12 for z, 20 for the distance, 35 for the default."""
     totals = [math.fsum(term[reading] for term in ANALYTIC.values()) for reading in range(3)]
 
-    assert totals == [31, 39, 33]
+    assert totals == [12, 20, 35]

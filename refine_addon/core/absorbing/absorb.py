@@ -196,8 +196,10 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     return Absorbed(splats, keep, members > 1, merged, count - len(origin) - merged)
 
 
-def stages(count: int, goal: int) -> list[int]:
+def stages(count: int, goal: int, alone: float = ALONE) -> list[int]:
     """Return how many of `count` splats are left after each stage; `goal` after the last.
+
+    If at least the share `alone` is left, one stage does.
 
     Examples
     --------
@@ -207,7 +209,7 @@ def stages(count: int, goal: int) -> list[int]:
     if goal >= count:
         return []
     share = max(goal, 1) / count
-    number = 1 if share >= ALONE else math.ceil(math.log(share) / math.log(STAGE))
+    number = 1 if share >= alone else math.ceil(math.log(share) / math.log(STAGE))
     return [
         max(round(count * (goal / count) ** ((stage + 1) / number)), goal)
         for stage in range(number)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..absorbing import merge_field
-from ..absorbing.absorb import Counts, mergeable, patience, reduced, stages
+from ..absorbing.absorb import ALONE, STAGE, Counts, mergeable, patience, reduced, stages
 from ..absorbing.merge_field import Field, ViewSums
 from ..absorbing.merge_graph import MergeGraph
 from ..pipeline import PARTS
@@ -285,7 +285,9 @@ def absorb(
     Memory of this process: about 150 bytes a splat; of a worker: see `REGION`.
     """
     count, total = int(np.count_nonzero(rest)), len(rest)
-    factor, left_after = patience(1.0 - goal / max(count, 1)), stages(count, goal)
+    factor = patience(1.0 - goal / max(count, 1))
+    # Several regions need another stage, with other borders, where a single one does not.
+    left_after = stages(count, goal, ALONE if count <= REGION else STAGE)
     sources: Sequence[Source] = found.sources
     regions_left: list[Region] = []
     rows = np.flatnonzero(rest)  # (n,), among those of all sources
