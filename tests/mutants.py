@@ -103,11 +103,6 @@ MUTANTS = {
         ),
         ("rule.left[unit.index]", "rule.left[0]", "ties of the first unit"),
         ("if part.tile == tile:", "if True:", "rows of other tiles"),
-        (
-            "        if noted:\n            self.folder.note(name, result)",
-            "        if False:\n            pass",
-            "nothing is done for good",
-        ),
     ],
     "tiles/storage.py": [
         ("if not any(word in name", 'if name == "size" and not any(word in name', "only the size"),
@@ -122,6 +117,7 @@ MUTANTS = {
         ("isinstance(text, str) and _URL", "False and _URL", "URLs as paths"),
     ],
     "tiles/folder.py": [
+        ("        self.note(name, found)\n", "", "nothing is done for good"),
         ("result or ()]", "()]", "results forgotten"),
         ("fcntl.LOCK_EX | fcntl.LOCK_NB", "fcntl.LOCK_SH | fcntl.LOCK_NB", "two runs at once"),
     ],
@@ -472,7 +468,7 @@ MUTANTS = {
             "protection of another row",
         ),
         ("((stage + 1) / number))", "(stage / number))", "a stage late"),
-        ("1 if share >= ALONE else", "", "half in two stages"),
+        ("1 if share >= alone else", "", "half in two stages"),
         (
             "else math.ceil(math.log(share) / math.log(STAGE))",
             "else 1",

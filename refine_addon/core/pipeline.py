@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from .absorbing.absorb import Absorbed
+    from .absorbing.absorb import Absorbed, Counts
     from .scores import Scores
     from .scoring.measuring import Measured
     from .selection import RowBytes
@@ -315,50 +315,73 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     else:
         psnr = _estimated(scores, keep, threads)
     facts = make_report(scores, keep, task.budget, task.settings, clock)
-    facts |= quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
-    if psnr is None and scores.sights is not None:
-        facts["notes"].append(UNSEEN)
-    facts["budget_remark"] = _remark(task, keep, psnr)
-    if facts["budget_remark"]:
-        facts["notes"].append(facts["budget_remark"])
-    if absorbed:
-        facts["absorbed"] = absorbed.facts()
-        facts["notes"].append(absorbed.note())
-        if known and task.settings.method == "closed-form":
-            facts["notes"].append(MEASURES)
+    size = int(np.broadcast_to(task.row_bytes, len(keep)).sum() + task.fixed_bytes)
+    gone = len(keep) - int(np.count_nonzero(keep))
+    why = remark(task.budget, gone, len(keep), psnr, size)
+    conclude(facts, scores, keep, psnr, absorbed, why)
+    if absorbed and known and task.settings.method == "closed-form":
+        facts["notes"].append(MEASURES)
     return Result(keep, scores, facts, absorbed)
 
 
-def _remark(task: Task, keep: NDArray[np.bool_], psnr: float | None) -> str:
-    """Return why a budget is out of reach or removes nothing, or ""."""
-    budget, gone = task.budget, len(keep) - int(np.count_nonzero(keep))
-    if budget.psnr is not None:
-        return out_of_reach(budget.psnr, gone, len(keep), psnr)
-    if budget.max_mb is not None and not gone:
-        rows = np.broadcast_to(task.row_bytes, len(keep)).sum() + task.fixed_bytes
-        return nothing_removed(int(rows))
-    return ""
-
-
-def nothing_removed(size: int) -> str:
-    """Return the remark on a file that is no larger than it may be; `size` is its bytes."""
-    return f"already {size_in_words(size)}: the budget removes nothing"
-
-
-def quality_facts(
-    scores: Scores, keep: NDArray[np.bool_], psnr: float | None, *, absorbed: bool
-) -> dict[str, Any]:
-    """Return what a report says about the quality of the pictures.
+def remark(budget: Budget, gone: int, total: int, psnr: float | None, size: int) -> str:
+    """Return why a budget is out of reach or removes nothing, or "".
 
     Parameters
     ----------
+    budget : Budget
+    gone, total : int
+        How many splats go, of how many.
+    psnr : float or None
+        The estimate for the result, dB.
+    size : int
+        Bytes of the file before.
+    """
+    if budget.psnr is not None:
+        return out_of_reach(budget.psnr, gone, total, psnr)
+    if budget.max_mb is not None and not gone:
+        return f"already {size_in_words(size)}: the budget removes nothing"
+    return ""
+
+
+def conclude(
+    facts: dict[str, Any],
+    scores: Scores,
+    keep: NDArray[np.bool_],
+    psnr: float | None,
+    absorbed: Counts | None,
+    why: str,
+) -> None:
+    """Add to a report what it says about the quality of the pictures and about absorbing.
+
+    Parameters
+    ----------
+    facts : dict
+        The report; changed.
     scores : Scores
     keep : (N,) bool
     psnr : float or None
         The estimate for the result, dB.
-    absorbed : bool
-        Whether survivors absorbed the others.
+    absorbed : Counts or None
+        What survivors absorbed, if they did.
+    why : str
+        See `remark`.
     """
+    facts |= _quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
+    if psnr is None and scores.sights is not None:
+        facts["notes"].append(UNSEEN)
+    facts["budget_remark"] = why
+    if why:
+        facts["notes"].append(why)
+    if absorbed is not None:
+        facts["absorbed"] = absorbed.facts()
+        facts["notes"].append(absorbed.note())
+
+
+def _quality_facts(
+    scores: Scores, keep: NDArray[np.bool_], psnr: float | None, *, absorbed: bool
+) -> dict[str, Any]:
+    """Return what a report says about the quality of the pictures; see `conclude`."""
     curve, other = scores.quality, psnr if absorbed else None
     if curve is not None and curve.foretold and not absorbed:
         other = curve.at(1.0 - float(np.mean(keep)), absorb=True)

@@ -133,7 +133,7 @@ def look(
     """
     view = sights.views[number][0]
     count = min(LINES, MOST_MET / max(sight_lines.crowding(footprints, view), 1.0))
-    lines = sight_lines.meet(footprints, *sights.pixels(number, count))
+    lines = sight_lines.meet(footprints, *sight_lines.pixels(view, number, count))
     if not len(lines.line):
         return None
     present = ~absent[lines.met].take(lines.owner)

@@ -25,7 +25,7 @@ from .. import frustum
 from ..affine import QUARTERS
 from ..work import Progress, for_chunks, part, report, silent
 from . import projection
-from .sight_lines import SightLines, meet
+from .sight_lines import meet, pixels
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -247,14 +247,14 @@ def _fineness(
     gaussians, scene, _ = projection.prepare(
         some, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
-    sights = SightLines(views.by_distance(), gaussians, some)
-    count, rotations = len(sights.views), list(QUARTERS.values())
+    looks = [view for view, _ in views.by_distance()]
+    count, rotations = len(looks), list(QUARTERS.values())
 
     def work(piece: slice) -> float:
         turn, number = divmod(piece.start, count)
-        columns, rows = sights.pixels(number, LINES / count)
-        view = sights.views[number][0].turned(rotations[turn])
-        return _fineness_of(gaussians, scene, view, (columns, rows), crowd)
+        places = pixels(looks[number], number, LINES / count)
+        view = looks[number].turned(rotations[turn])
+        return _fineness_of(gaussians, scene, view, places, crowd)
 
     found = for_chunks(
         work, len(QUARTERS) * count, 1,

@@ -333,8 +333,10 @@ class Block:
         self.seen = np.empty(count, np.int32)
         self.cells = np.zeros(count, np.int32)
         look, sums = part(self.progress, 0.0, 0.9), part(self.progress, 0.9, 1.0)
+        # Without a frustum every view counts for all, wherever they lie.
+        order = near_order(self.means) if self.settings.frustum else np.arange(count)
         for_chunks(
-            partial(self._look, near_order(self.means)), count, 8 * _CHUNK,
+            partial(self._look, order), count, 8 * _CHUNK,
             progress=look, what="scoring", threads=self.threads,
         )  # fmt: skip
         return np.array(

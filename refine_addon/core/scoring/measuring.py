@@ -175,6 +175,11 @@ class Measuring:
         """Return where sums of blocks are kept, by their numbers: in memory."""
         return {}
 
+    def part(self, turn: int, parts: int) -> range:
+        """Return the blocks of one of `parts` parts of the views; see `occlusion.measure_part`."""
+        parts = min(parts, self.count)
+        return range(turn % parts, self.count, parts)
+
     def share(self, which: Sequence[int]) -> float:
         """Return the share of the weights of all views that some blocks have."""
         weights = [weight for _, weight in self.views]

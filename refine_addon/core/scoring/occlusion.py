@@ -231,9 +231,7 @@ def measure_part(  # noqa: PLR0913 - as `measure`, and which part
         splats, views, progress=part(progress, 0.0, 0.1), threads=threads
     )
     measuring = Measuring(scene, views, settings, threads)
-    blocks = measuring.count
-    parts = min(parts, blocks)
-    which = range(turn % parts, blocks, parts)
+    which = measuring.part(turn, parts)
     found = measuring.measure(gaussians, which, part(progress, 0.1, 1.0))
     return Measured.sum(found.values()).for_all(gaussians.index, len(splats)), measuring.share(
         which

@@ -290,10 +290,6 @@ class SightLines:
 
         for_chunks(work, len(numbers), 1, progress=progress, what="looking", threads=threads)
 
-    def pixels(self, number: int, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the columns and rows of a view in which about `count` lines lie, spread evenly."""
-        return pixels(self.views[number][0], number, count)
-
     def psnr(self, keep: NDArray[np.bool_], *, threads: int | None = None) -> float | None:
         """Return the estimated PSNR with some splats removed, dB; None if too little is seen.
 

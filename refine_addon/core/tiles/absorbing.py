@@ -19,7 +19,7 @@ from ..absorbing.merge_field import Field, ViewSums
 from ..absorbing.merge_graph import MergeGraph
 from ..pipeline import PARTS
 from ..scoring.measuring import Measured
-from ..splats import Splats
+from ..splats import Splats, joined
 from ..work import Progress, part, silent
 from .seen import MeasuringTiles, StoredLines, place
 from .workers import Call
@@ -124,21 +124,21 @@ class AbsorbJob:
             See `merge_field.Unallowed.seen_and_whole`.
         """
         name = f"{index:06d}.gather"
-        done, result = self.folder.noted(name)
-        if not done:
-            rows, sums = self.folder.load(index, ("rows", "sums")).values()
-            splats, origin, members = self._gathered(rows)
-            may = mergeable(splats, self.scene, np.zeros(len(rows), np.bool_))
-            found = merge_field.unallowed(
-                splats, may, self.views, self.scene, ViewSums(*sums),
-                progress=progress, threads=threads,
-            )  # fmt: skip
-            arrays = {"gathered": packed(splats), "whence": origin, "stood": members, "may": may}
-            arrays |= {"mass": found.mass, "looks": found.seen}
-            self.folder.save(index, arrays | vars(found.field))
-            result = found.seen_and_whole()
-            self.folder.note(name, result)
-        return np.asarray(result)
+        return np.asarray(self.folder.once(name, lambda: self._ready(index, progress, threads)))
+
+    def _ready(self, index: int, progress: Progress, threads: int | None) -> NDArray[np.float64]:
+        rows, sums = self.folder.load(index, ("rows", "sums")).values()
+        table, origin, members = self._gathered(rows)
+        splats = unpacked(table)
+        may = mergeable(splats, self.scene, np.zeros(len(rows), np.bool_))
+        found = merge_field.unallowed(
+            splats, may, self.views, self.scene, ViewSums(*sums),
+            progress=progress, threads=threads,
+        )  # fmt: skip
+        arrays = {"gathered": table, "whence": origin, "stood": members, "may": may}
+        arrays |= {"mass": found.mass, "looks": found.seen}
+        self.folder.save(index, arrays | vars(found.field))
+        return found.seen_and_whole()
 
     def price(
         self,
@@ -167,7 +167,7 @@ class AbsorbJob:
         graph = MergeGraph(bare.with_allowance(whole), self.scene, self.factor, threads=threads)
         graph.connect(progress)
         best, merges = graph.best()
-        rows, may = (self.folder.load(index, [name])[name] for name in ("rows", "may"))
+        rows, may = self.folder.load(index, ("rows", "may")).values()
         costs, weights = np.full(len(rows), -1.0), np.ones(len(rows), np.float32)
         # What cannot be drawn goes first; of two splats that merge, one goes.
         costs[may], weights[may] = best, np.where(merges, np.float32(0.5), np.float32(1.0))
@@ -182,44 +182,46 @@ class AbsorbJob:
     ) -> int:
         """Absorb a region down to `count` splats, and write it; return how many survived."""
         name = f"{index:06d}.absorb"
-        done, result = self.folder.noted(name)
-        if not done:
-            own = self.folder.load(index, ("gathered", "whence", "stood", "may", "sums"))
+        left = self.folder.once(name, lambda: self._absorbed(index, count, progress, threads))
+        self.folder.drop(index, _OVER)
+        return int(left)
 
-            def graph() -> MergeGraph:
-                made = self.folder.load(index, (*_FIELD, *_PRICED)).values()
-                *field, contribution, error, first, second, cost = made
-                return MergeGraph.connected_by(
-                    replace(Field(*field), contribution=contribution, error=error),
-                    self.scene, self.factor, (first, second, cost), threads=threads,
-                )  # fmt: skip
+    def _absorbed(
+        self, index: int, count: int, progress: Progress, threads: int | None
+    ) -> NDArray[np.int64]:
+        own = self.folder.load(index, ("gathered", "whence", "stood", "may", "sums"))
 
-            with np.errstate(under="ignore"):
-                left, keep, taken, expected = reduced(
-                    unpacked(own["gathered"]), ViewSums(*own["sums"]), own["may"], graph, count,
-                    protected=np.zeros(len(own["whence"]), np.bool_), progress=progress,
-                )  # fmt: skip
-            stands = taken >= 0
-            total = np.bincount(taken[stands], own["stood"][stands], len(left)).astype(np.int64)
-            made = {"splats": packed(left), "origin": own["whence"][keep], "members": total}
-            made["expected"] = np.array([expected.contribution, expected.error])
-            self.folder.save(index, made)
-            result = np.array(len(left))
-            self.folder.note(name, result)
-            self.folder.drop(index, _OVER)
-        return int(result)
+        def graph() -> MergeGraph:
+            made = self.folder.load(index, (*_FIELD, *_PRICED)).values()
+            *field, contribution, error, first, second, cost = made
+            return MergeGraph.connected_by(
+                replace(Field(*field), contribution=contribution, error=error),
+                self.scene, self.factor, (first, second, cost), threads=threads,
+            )  # fmt: skip
+
+        with np.errstate(under="ignore"):
+            left, keep, taken, expected = reduced(
+                unpacked(own["gathered"]), ViewSums(*own["sums"]), own["may"], graph, count,
+                protected=np.zeros(len(own["whence"]), np.bool_), progress=progress,
+            )  # fmt: skip
+        stands = taken >= 0
+        total = np.bincount(taken[stands], own["stood"][stands], len(left)).astype(np.int64)
+        made = {"splats": packed(left), "origin": own["whence"][keep], "members": total}
+        made["expected"] = np.array([expected.contribution, expected.error])
+        self.folder.save(index, made)
+        return np.array(len(left))
 
     def _gathered(
         self, rows: NDArray[np.int64]
-    ) -> tuple[Splats, NDArray[np.int64], NDArray[np.int64]]:
-        """Return the splats of some rows, ascending, and of each its first row and its members."""
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+        """Return the table of some rows, ascending, and of each its first row and its members."""
         parts, origins, members = [], [], []
         edges = np.searchsorted(rows, self.starts)
         for number, source in enumerate(self.sources):
             mine = rows[edges[number] : edges[number + 1]] - self.starts[number]
             if not len(mine):
                 continue
-            parts.append(packed(source.splats().take(mine)))
+            parts.append(source.splats().take(mine))
             if isinstance(source, Region):
                 found = source.folder.load(source.index, ("origin", "members"))
                 origins.append(found["origin"][mine])
@@ -227,9 +229,7 @@ class AbsorbJob:
             else:
                 origins.append(mine + self.starts[number])
                 members.append(np.ones(len(mine), np.int64))
-        width = max(array.shape[1] for array in parts)
-        whole = np.concatenate([_widened(array, width) for array in parts])
-        return unpacked(whole), np.concatenate(origins), np.concatenate(members)
+        return packed(joined(parts)), np.concatenate(origins), np.concatenate(members)
 
 
 @dataclass(frozen=True, eq=False)
@@ -394,10 +394,8 @@ def _measure(
     """
     gaussians, good = place(job, sources, workers, part(progress, 0.0, 0.2))
     measuring = MeasuringTiles(job, workers)
-    parts = min(PARTS, measuring.count)
-    which = range(turn % parts, measuring.count, parts)
-    nobody = np.empty(0, np.int64)
-    found, _ = measuring.blocks(gaussians, nobody, part(progress, 0.2, 1.0), which)
+    which = measuring.part(turn, PARTS)
+    found = measuring.measure(gaussians, which, part(progress, 0.2, 1.0))  # type: ignore[arg-type]
     every = Measured.sum(found.values()).for_all(gaussians.index, len(good))
     others = 1.0 - measuring.share(which)
     every.contribution[:] += others * expected.contribution
@@ -457,8 +455,3 @@ def unpacked(table: NDArray[np.float64]) -> Splats:
     means, scales, quaternions, logits, constant, rest = np.split(table, [3, 6, 10, 11, 14], axis=1)
     harmonics = rest.reshape(len(table), rest.shape[1] // 3, 3)
     return Splats(means, scales, quaternions, logits[:, 0], constant, harmonics)
-
-
-def _widened(table: NDArray[np.float64], width: int) -> NDArray[np.float64]:
-    """Return a table with zeros for the harmonics that it lacks."""
-    return np.pad(table, ((0, 0), (0, width - table.shape[1])))

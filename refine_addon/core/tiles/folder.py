@@ -22,7 +22,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator, Mapping
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -69,6 +69,22 @@ class Folder:
     def mapped(self, name: str) -> NDArray[Any]:
         """Return an array that was noted without reading it yet."""
         return np.asarray(np.load(self.path / "done" / name, mmap_mode="r", allow_pickle=False))
+
+    def once(self, name: str, make: Callable[[], Any]) -> Any:  # noqa: ANN401 - as made, or `noted`
+        """Return what came of something, as it was noted; if it is not done, make and note it."""
+        done, found = self.noted(name)
+        if done:
+            return found
+        try:
+            found = make()
+        except FileNotFoundError:
+            # Another worker, taken for dead, ended this just now and cleared away what it needs.
+            done, found = self.noted(name)
+            if not done:
+                raise
+            return found
+        self.note(name, found)
+        return found
 
     def has(self, name: str) -> bool:
         """Return whether something is done."""

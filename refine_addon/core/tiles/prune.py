@@ -16,8 +16,7 @@ from ...version import VERSION
 from .. import radix
 from ..errors import RefineError
 from ..formats.ply_header import with_count
-from ..pipeline import FIRST, MEASURES, UNSEEN, nothing_removed, quality_facts
-from ..quality import out_of_reach
+from ..pipeline import FIRST, MEASURES, conclude, remark
 from ..report import Clock, Files, complete_report, make_report
 from ..scoring.closed_form_block import ROWS
 from ..selection import Budget, least_seen, quality_of, refuse_none_left, select, single
@@ -78,7 +77,7 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
         URL, the folder of the job is in the current directory, files are copied to the URL under
         other names, and renamed at the end.
     views, budget, settings, progress, threads
-        See `pipeline.prune`. Here "auto" measures by all views.
+        See `pipeline.prune`.
     absorb : bool
         See `pipeline.prune`. A region of up to a million splats is absorbed at a time
         (`absorbing`), so survivors are not exactly those of one file.
@@ -215,17 +214,11 @@ class _Run:
             )
             psnr = scores.sights.psnr(keep) if not self._absorbed else psnr
         facts = make_report(scores, keep, budget, settings, clock)
-        facts |= quality_facts(scores, keep, psnr, absorbed=survivors is not None)
-        if psnr is None and scores.sights is not None:
-            facts["notes"].append(UNSEEN)
-        facts["budget_remark"] = self._remark(budget, psnr)
-        if facts["budget_remark"]:
-            facts["notes"].append(facts["budget_remark"])
-        if survivors is not None:
-            facts["absorbed"] = survivors.facts()
-            facts["notes"].append(survivors.note())
-            if settings.method == "closed-form":
-                facts["notes"].append(MEASURES)
+        size = sum(tile.size for tile in self.tiles)
+        why = remark(budget, self.total - kept, self.total, psnr, size)
+        conclude(facts, scores, keep, psnr, survivors, why)
+        if survivors is not None and settings.method == "closed-form":
+            facts["notes"].append(MEASURES)
         facts["splats"] |= {
             "before": self.total,
             "kept": kept,
@@ -236,15 +229,6 @@ class _Run:
             "forced": 0,
         }
         return facts
-
-    def _remark(self, budget: Budget, psnr: float | None) -> str:
-        """Return why a budget is out of reach or removes nothing, or ""."""
-        gone = self.total - int(self.counts[:, 0].sum())
-        if budget.psnr is not None:
-            return out_of_reach(budget.psnr, gone, self.total, psnr)
-        if budget.max_mb is not None and not gone:
-            return nothing_removed(sum(tile.size for tile in self.tiles))
-        return ""
 
     def _absorb(self, seen: Seen, goal: int) -> tuple[Survivors, float | None]:
         """Absorb to `goal` survivors; the units then say which stay, and as what.

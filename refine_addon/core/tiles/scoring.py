@@ -18,7 +18,7 @@ from .steps import Job, Shared
 from .workers import Call
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from ..scoring.measuring import Measured
     from ..scoring.occlusion import Occlusion
@@ -77,26 +77,11 @@ class _Steps:
         self.job.folder.note(name, argument)
         return Shared(name)
 
-    def remember(self, name: str, make: Callable[[], Any]) -> Any:  # noqa: ANN401 - as made
-        """Return what was made of the name, even by a run before this one."""
-        done, found = self.job.folder.noted(name)
-        if not done:
-            found = make()
-            self.job.folder.note(name, found)
-        return found
-
 
 def by_closed_form(
     job: Job, units: Sequence[Unit], workers: Workers, progress: Progress
 ) -> tuple[Scores, float]:
     """Score units by the closed form; the folder has ``values`` and ``seen`` of each afterwards.
-
-    Returns
-    -------
-    scores : Scores
-        Without the values and numbers of views of any splat.
-    size : float
-        Of the scene.
 
     Parameters
     ----------
@@ -104,6 +89,13 @@ def by_closed_form(
     units : sequence of Unit
     workers, progress : callable
         See `prune.prune_tiles`.
+
+    Returns
+    -------
+    scores : Scores
+        Without the values and numbers of views of any splat.
+    size : float
+        Of the scene.
 
     Raises
     ------
@@ -114,7 +106,7 @@ def by_closed_form(
     total = sum(map(len, units))
     with np.errstate(under="ignore"):  # as in `pipeline.score`
         found = closed_form.steps(
-            steps.each, total, job.views, job.settings, remember=steps.remember
+            steps.each, total, job.views, job.settings, remember=job.folder.once
         )
     nothing = np.empty(0)
     scores = Scores(

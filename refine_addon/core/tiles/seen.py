@@ -88,25 +88,26 @@ class SceneJob:
         self, source: Source, *, progress: Progress = silent, threads: int | None = 1
     ) -> tuple[int, int]:
         """Activate a source; return how many of it can be drawn, and how many any view may show."""
-        name = f"{source.index:06d}.place"
-        done, result = self.folder.noted(name)
-        if not done:
-            splats = source.splats()
-            good, opaque = projection.judge(splats, threads=threads)
-            with np.errstate(under="ignore"):
-                rows, place = projection.near(splats, opaque, self.scene)
-                found = projection.activate(splats, rows, place, self.scene, progress, threads)
-                code = spatial_code(place)
-            packed = np.empty((len(rows), 14), np.float32)
-            packed[:, _MEANS], packed[:, _COVARIANCES] = found.means.T, found.covariances.T
-            packed[:, _LARGEST], packed[:, _ALPHAS] = found.largest, found.alphas
-            packed[:, _COLORS] = found.colors
-            arrays = {"good": good, "rows": rows, "code": code, "gaussians": packed}
-            arrays["ties"] = splat_fingerprint(splats, rows)
-            self.folder.save(source.index, arrays)
-            result = np.array([np.count_nonzero(good), len(rows)])
-            self.folder.note(name, result)
-        return int(result[0]), int(result[1])
+        good, near = self.folder.once(
+            f"{source.index:06d}.place", lambda: self._placed(source, progress, threads)
+        )
+        return int(good), int(near)
+
+    def _placed(self, source: Source, progress: Progress, threads: int | None) -> NDArray[np.int64]:
+        splats = source.splats()
+        good, opaque = projection.judge(splats, threads=threads)
+        with np.errstate(under="ignore"):
+            rows, place = projection.near(splats, opaque, self.scene)
+            found = projection.activate(splats, rows, place, self.scene, progress, threads)
+            code = spatial_code(place)
+        packed = np.empty((len(rows), 14), np.float32)
+        packed[:, _MEANS], packed[:, _COVARIANCES] = found.means.T, found.covariances.T
+        packed[:, _LARGEST], packed[:, _ALPHAS] = found.largest, found.alphas
+        packed[:, _COLORS] = found.colors
+        arrays = {"good": good, "rows": rows, "code": code, "gaussians": packed}
+        arrays["ties"] = splat_fingerprint(splats, rows)
+        self.folder.save(source.index, arrays)
+        return np.array([np.count_nonzero(good), len(rows)])
 
     def gather(self, number: int, starts: NDArray[np.int64]) -> NDArray[np.float32]:
         """Write a chunk.
@@ -123,21 +124,20 @@ class SceneJob:
         (7,) float32
             Its box, see `projection.boxes_touch`.
         """
-        name = f"{number:06d}.gather"
-        done, box = self.folder.noted(name)
-        if not done:
-            order = self.folder.mapped("order")[number * CHUNK : (number + 1) * CHUNK]
-            source = np.searchsorted(starts, order, side="right") - 1
-            packed = np.empty((14, len(order)), np.float32)
-            for index in np.unique(source).tolist():
-                here = np.flatnonzero(source == index)
-                rows = self.folder.map(index, "gaussians")
-                packed[:, here] = rows[order[here] - starts[index]].T
-            self.folder.save(number, {"chunk": packed})
-            means = packed[_MEANS]
-            box = np.concatenate([means.min(axis=1), means.max(axis=1), [packed[_LARGEST].max()]])
-            self.folder.note(name, box)
+        box = self.folder.once(f"{number:06d}.gather", lambda: self._gathered(number, starts))
         return np.asarray(box, np.float32)
+
+    def _gathered(self, number: int, starts: NDArray[np.int64]) -> NDArray[np.float32]:
+        order = self.folder.mapped("order")[number * CHUNK : (number + 1) * CHUNK]
+        source = np.searchsorted(starts, order, side="right") - 1
+        packed = np.empty((14, len(order)), np.float32)
+        for index in np.unique(source).tolist():
+            here = np.flatnonzero(source == index)
+            rows = self.folder.map(index, "gaussians")
+            packed[:, here] = rows[order[here] - starts[index]].T
+        self.folder.save(number, {"chunk": packed})
+        means = packed[_MEANS]
+        return np.concatenate([means.min(axis=1), means.max(axis=1), [packed[_LARGEST].max()]])
 
     def look(
         self,

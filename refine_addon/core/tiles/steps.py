@@ -113,20 +113,25 @@ class Job:
         threads: int | None = 1,
     ) -> Any:  # noqa: ANN401 - of each step its own
         """Do a step of `STEPS` with a unit."""
-        name, noted = f"{unit.index:06d}.{step}", step not in _REPEATED
-        if noted:
-            done, result = self.folder.noted(name)
-            if done:
-                return result
-        needed, made, over = STEPS[step]
-        try:
-            arrays = self.folder.load(unit.index, needed)
-        except FileNotFoundError:
-            # Another worker, taken for dead, ended this step just now.
-            done, result = self.folder.noted(name)
-            if done:
-                return result
-            raise
+        if step in _REPEATED:
+            return self._scored(unit, step, arguments, progress, threads)
+        name = f"{unit.index:06d}.{step}"
+        result = self.folder.once(
+            name, lambda: self._scored(unit, step, arguments, progress, threads)
+        )
+        self.folder.drop(unit.index, STEPS[step][2])
+        return result
+
+    def _scored(
+        self,
+        unit: Unit,
+        step: str,
+        arguments: tuple[Any, ...],
+        progress: Progress,
+        threads: int | None,
+    ) -> Any:  # noqa: ANN401 - of each step its own
+        needed, made, _ = STEPS[step]
+        arrays = self.folder.load(unit.index, needed)
         # From a disk a unit is read chunk by chunk; behind a URL each chunk would be a request.
         splats = unit.splats() if step == "read" and unit.remote else unit
         block = Block(
@@ -136,9 +141,6 @@ class Job:
         block.progress = progress
         result = getattr(block, step)(*map(self._whole, arguments))
         self.folder.save(unit.index, {array: getattr(block, array) for array in made})
-        if noted:
-            self.folder.note(name, result)
-        self.folder.drop(unit.index, over)
         return result
 
     def rank(self, unit: Unit, prefixes: list[int], shift: int, *, by_bytes: bool) -> radix.Sparse:
