@@ -39,6 +39,16 @@ MUTANTS = {
         ("passed * (total - done) / done", "passed * total / done", "time in all, not left"),
         ("not 0.0 < done < total", "not 0.0 <= done < total", "a pace before anything is done"),
     ],
+    "processes.py": [
+        ("work(begin + piece.start)", "work(piece.start)", "what is left begins anew"),
+        ("                begin += 1\n", "", "what was done is done again"),
+        ("            for process in team:\n                process.give(None)\n", "", "work kept"),
+        (
+            "progress=progress, what=what, threads=number, stop=stop",
+            "progress=progress, what=what, threads=number",
+            "processes go on",
+        ),
+    ],
     "work.py": [
         ("            cancelled.set()\n", "", "what runs is not told"),
         ("time.monotonic() - told >= _REPORT_INTERVAL", "False", "one thread not asked"),
@@ -141,8 +151,8 @@ MUTANTS = {
             "colours of others",
         ),
         (
-            "        if self.folder.has(name):\n            return\n        views",
-            "        views",
+            "        if self.folder.has(name):\n            return\n        sample",
+            "        sample",
             "measured again",
         ),
     ],
@@ -345,17 +355,17 @@ MUTANTS = {
     ],
     "scoring/measuring.py": [
         (
-            "self.members[chosen[piece.start]]",
-            "self.members[chosen[0]]",
-            "the same views in every block",
+            "number = self.numbers[place]",
+            "number = self.numbers[0]",
+            "the same view for all",
         ),
         (
-            "self.contribution[footprints.index] += weight * contribution",
-            "self.contribution[footprints.index] += contribution",
+            "self.contribution[seen.rows] += weight * seen.contribution",
+            "self.contribution[seen.rows] += seen.contribution",
             "weight of views forgotten",
         ),
         ("self.error * error", "self.error", "errors before what hid them went"),
-        ("footprints.index[footprints.inside]", "footprints.index", "seen beside the image"),
+        ("seen.rows[seen.inside]", "seen.rows", "seen beside the image"),
         ("            seen *= seen\n", "", "transmittance not squared"),
     ],
     "scoring/froxels.py": [

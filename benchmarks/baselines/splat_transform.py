@@ -128,12 +128,19 @@ def _wait(process: subprocess.Popen[bytes]) -> tuple[int, int | None]:
 
 
 def memory(what: str, process: int | str = "self") -> int | None:
-    """Return a line of Linux's account of a process in bytes; None elsewhere, or once it ended."""
+    """Return a line of Linux's account of a process, and of those that it started, in bytes.
+
+    None elsewhere, or once it ended.
+    """
+    place = Path("/proc") / str(process)
     try:
-        lines = Path(f"/proc/{process}/status").read_text(encoding="ascii").splitlines()
+        lines = (place / "status").read_text(encoding="ascii").splitlines()
+        started = [each.read_text(encoding="ascii") for each in place.glob("task/*/children")]
     except OSError:
         return None
-    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(what)), None)
+    own = next((int(line.split()[1]) * 1024 for line in lines if line.startswith(what)), None)
+    others = [memory(what, int(child)) for child in " ".join(started).split()]
+    return None if own is None else own + sum(other or 0 for other in others)
 
 
 def processor_seconds(whose: int) -> float:

@@ -12,8 +12,9 @@ commands are processes of their own, interpreter start included; they run in tur
 with the input in the page cache and nothing at the output's place. Seconds of the processor, of all
 cores together, tell what a busy machine hides.
 
-Memory is sampled from ``/proc``: the pages that belong to the process alone (RssAnon). What it maps
-of the input is the page cache's, which the system takes back when others need it.
+Memory is sampled from ``/proc``: the pages that belong to the process alone (RssAnon), and to those
+that it starts. What it maps of the input is the page cache's, which the system takes back when
+others need it.
 """
 
 from __future__ import annotations
@@ -78,23 +79,14 @@ def run(command: Sequence[str | Path]) -> tuple[float, float, float]:
     before = splat_transform.processor_seconds(resource.RUSAGE_CHILDREN)
     start = time.perf_counter()
     with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL) as process:
-        status = Path(f"/proc/{process.pid}/status")
         while process.poll() is None:
-            peak = max(peak, _anonymous(status))
+            peak = max(peak, (splat_transform.memory("RssAnon", process.pid) or 0) / 1e6)
             time.sleep(0.002)
         seconds = time.perf_counter() - start
     if process.returncode:
         raise subprocess.CalledProcessError(process.returncode, list(map(str, command)))
     busy = splat_transform.processor_seconds(resource.RUSAGE_CHILDREN) - before
     return seconds, busy, peak
-
-
-def _anonymous(status: Path) -> float:
-    try:
-        lines = status.read_text().splitlines()
-    except OSError:  # it ended in between, or this is no Linux
-        return 0.0
-    return sum(int(line.split()[1]) / 1000 for line in lines if line.startswith("RssAnon:"))
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

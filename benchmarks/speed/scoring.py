@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import resource
 import statistics
 import time
 from dataclasses import replace
@@ -23,6 +22,8 @@ import numpy as np
 
 from refine_addon.core import ClosedForm, Occlusion, Settings, Splats, read_cameras, read_ply, score
 from refine_addon.core.work import default_threads
+
+from ..baselines import splat_transform
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -96,7 +97,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rate = len(splats) * 64 / seconds / 1e6
         print(f"  {len(splats):>11,} splats  {seconds:7.2f} s  {rate:6.1f} M/s")
 
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    peak = (splat_transform.memory("VmHWM") or 0) / 1e6
     print(f"\npeak memory of all of this: {peak:,.0f} MB")
 
 

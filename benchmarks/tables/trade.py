@@ -27,6 +27,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from refine_addon.core import processes
 from refine_addon.core.errors import RefineError
 from refine_addon.core.selection import Budget, select
 
@@ -108,16 +109,23 @@ def measured(work: Callable[[], Any], runs: int) -> tuple[Any, Cost]:
     while len(seconds) < runs and (not seconds or sum(seconds) < PATIENCE):
         result = None
         gc.collect()
-        before, worked = _start_peak(), splat_transform.processor_seconds(resource.RUSAGE_SELF)
+        before, worked = _start_peak(), _busy()
         start = time.perf_counter()
         result = work()
         seconds.append(time.perf_counter() - start)
-        busy.append(splat_transform.processor_seconds(resource.RUSAGE_SELF) - worked)
         after = splat_transform.memory("VmHWM")
+        processes.end_idle()  # the next run starts them too
+        busy.append(_busy() - worked)
         if before is not None and after is not None:
             peak = max(peak or 0, after - before)
     cost = Cost(statistics.median(seconds), statistics.median(busy), len(seconds), peak)
     return result, cost
+
+
+def _busy() -> float:
+    """Return the processor's seconds of this process and of those that have ended, so far."""
+    whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return sum(splat_transform.processor_seconds(each) for each in whose)
 
 
 def _start_peak() -> int | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
@@ -106,6 +107,38 @@ def for_chunks(
         If `progress` answers ``False``. Slices that have not begun are dropped; those that have
         begun end at their next `checkpoint`.
     """
+    return list(each_chunk(work, total, chunk, progress=progress, what=what, threads=threads))
+
+
+def each_chunk(  # noqa: PLR0913 - all but three are optional
+    work: Callable[[slice], Result],
+    total: int,
+    chunk: int,
+    *,
+    progress: Progress = silent,
+    what: str = "",
+    threads: int | None = None,
+    stop: Callable[[], None] | None = None,
+) -> Iterator[Result]:
+    """Do the same as `for_chunks`, and yield each result as soon as those before it are there.
+
+    Parameters
+    ----------
+    work, total, chunk, progress, what, threads
+        See `for_chunks`.
+    stop : callable, optional
+        Called if the work on several threads is given up: ends what no `checkpoint` does.
+
+    Yields
+    ------
+    object
+        One result for each slice, in the order of the slices.
+
+    Raises
+    ------
+    Cancelled
+        See `for_chunks`.
+    """
     # Freeing one 30 MB block raises glibc's mmap threshold, so chunk buffers are reused instead of
     # page-faulted. No effect on other systems.
     np.empty(_HELD, np.uint8)
@@ -114,42 +147,44 @@ def for_chunks(
     # About a hundred reports are enough for a progress bar; each may cost a redraw.
     step = max(len(slices) // 100, 1)
     if threads <= 1 or len(slices) <= 1:
-        return _in_turn(work, slices, step, progress, what)
-    return _side_by_side(work, slices, step, progress, what, threads)
+        yield from _in_turn(work, slices, step, progress, what)
+    else:
+        yield from _side_by_side(work, slices, step, progress, what, threads, stop)
 
 
 def _in_turn(
     work: Callable[[slice], Result], slices: list[slice], step: int, progress: Progress, what: str
-) -> list[Result]:
+) -> Iterator[Result]:
     """Do the work of `for_chunks` in this thread."""
-    results: list[Result] = []
+    done = 0
     told = 0.0  # when `progress` was last called, seconds
 
     def tell() -> None:
         nonlocal told
         told = time.monotonic()
-        report(progress, len(results) / len(slices), what)
+        report(progress, done / len(slices), what)
 
     def check() -> None:
         if time.monotonic() - told >= _REPORT_INTERVAL:
             tell()
 
-    with checked_by(check):
-        for index, piece in enumerate(slices):
-            if index % step == 0:
-                tell()
-            results.append(work(piece))
-    return results
+    for done, piece in enumerate(slices):
+        if done % step == 0:
+            tell()
+        with checked_by(check):
+            result = work(piece)
+        yield result
 
 
-def _side_by_side(
+def _side_by_side(  # noqa: PLR0913, PLR0917 - those of `for_chunks`
     work: Callable[[slice], Result],
     slices: list[slice],
     step: int,
     progress: Progress,
     what: str,
     threads: int,
-) -> list[Result]:
+    stop: Callable[[], None] | None,
+) -> Iterator[Result]:
     """Do the work of `for_chunks` on several threads."""
     cancelled = threading.Event()
 
@@ -161,19 +196,21 @@ def _side_by_side(
         with checked_by(check):
             return work(piece)
 
-    results: list[Result] = []
     with ThreadPoolExecutor(threads) as pool:
-        futures = [pool.submit(checked, piece) for piece in slices]
+        futures = deque(pool.submit(checked, piece) for piece in slices)
         try:
-            for index, future in enumerate(futures):
+            for index in range(len(slices)):
                 if index % step == 0:
                     report(progress, index / len(slices), what)
+                future = futures.popleft()  # and forget the result once it is used
                 while not future.done() and not wait([future], _REPORT_INTERVAL).done:
                     report(progress, index / len(slices), what)
-                results.append(future.result())
+                yield future.result()
+                del future
         except BaseException:
             cancelled.set()
             for future in futures:
                 future.cancel()
+            if stop is not None:
+                stop()
             raise
-    return results

@@ -41,7 +41,7 @@ def measured(splats: Splats, side: float) -> Measured:
     gaussians, frame, _ = projection.prepare(splats, views, threads=1)
     total = Measured.zero(len(gaussians))
     settings = Occlusion(cell=side, density=8.0)
-    measuring.measure_view(gaussians, frame, view(), 1.0, settings, total)
+    total.add_view(measuring.measure_view(gaussians, frame, view(), settings)[1], 1.0)
     back = np.argsort(gaussians.index)
     return Measured(total.contribution[back], total.error[back], total.seen[back])
 

@@ -49,7 +49,7 @@ def measured(splats: Splats, *views: View, settings: Occlusion = ONCE) -> Measur
     gaussians, frame, _ = projection.prepare(splats, ViewSet(views), threads=1)
     total = Measured.zero(len(gaussians))
     for view in views:
-        measuring.measure_view(gaussians, frame, view, 1.0, settings, total)
+        total.add_view(measuring.measure_view(gaussians, frame, view, settings)[1], 1.0)
     back = np.argsort(gaussians.index)
     return Measured(total.contribution[back], total.error[back], total.seen[back])
 

@@ -289,7 +289,7 @@ def test_occlusion_in_floats_keeps_the_splats_that_doubles_keep(
     gaussians, frame, _ = projection.prepare(wide(file.splats()), some)
     assert projection.project(gaussians, frame, some[0]).centers.dtype == np.float64
 
-    expected = score(wide(file.splats()), some, settings)
+    expected = score(wide(file.splats()), some, settings, threads=1)  # other processes have floats
 
     assert min(agreement(scores, expected)) >= 0.999
 

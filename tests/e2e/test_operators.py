@@ -29,6 +29,15 @@ def test_import_score_apply_export(blender: Blender, cloud: Path, cameras: Path,
     assert np.count_nonzero(rows_in(after, rows(pruned))) >= 0.999 * len(after)
 
 
+def test_views_are_measured_in_processes_of_blenders_python(
+    blender: Blender, cloud: Path, cameras: Path
+):
+    """Two were asked for. They find the extension under its name, and are not Blender itself."""
+    found = blender.step("processes", cloud=cloud, cameras=cameras)
+
+    assert found["processes"] == 2, found
+
+
 def test_a_point_cloud_is_pruned_saved_and_converted_back(
     blender: Blender, cloud: Path, cameras: Path
 ):

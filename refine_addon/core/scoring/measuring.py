@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..errors import RefineError
-from ..work import Progress, for_chunks
+from ..processes import for_each
 from . import froxels, projection
+from .sight_lines import met
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, MutableMapping, Sequence
@@ -27,11 +28,15 @@ if TYPE_CHECKING:
 
     from ..scene import Scene
     from ..views import View, ViewSet
+    from ..work import Progress
     from .projection import Footprints, Gaussians
-    from .sight_lines import SightLines
+    from .sight_lines import Lines, SightLines
 
 BLOCKS = 8
 """Of views; sums are added block by block, so they do not depend on threads."""
+
+SECONDS = 1.2e-6
+"""About how long one core measures a splat in one view, to tell what is worth a process."""
 
 
 @dataclass(frozen=True)
@@ -118,18 +123,30 @@ class Measured:
         self.error[:] += other.error
         self.seen[:] += other.seen
 
-    def add_view(
-        self,
-        footprints: Footprints,
-        weight: float,
-        contribution: NDArray[np.float64],
-        error: NDArray[np.float64],
-    ) -> None:
-        """Add what one view sees of n footprints, times its weight; see `of_view`."""
-        self.seen[footprints.index[footprints.inside]] += 1
+    def add_view(self, seen: Seen, weight: float) -> None:
+        """Add what one view sees, times its weight."""
+        self.seen[seen.rows[seen.inside]] += 1
         with np.errstate(under="ignore"):
-            self.contribution[footprints.index] += weight * contribution
-            self.error[footprints.index] += weight * error
+            self.contribution[seen.rows] += weight * seen.contribution
+            self.error[seen.rows] += weight * seen.error
+
+
+class Seen(NamedTuple):
+    """What one view sees of n Gaussians.
+
+    Attributes
+    ----------
+    rows : (n,) int64
+    inside : (n,) bool
+        Which centres lie in the view's frustum.
+    contribution, error : (n,) float64
+        Integrals over its image, px^2; see the top of this file.
+    """
+
+    rows: NDArray[np.int64]
+    inside: NDArray[np.bool_]
+    contribution: NDArray[np.float64]
+    error: NDArray[np.float64]
 
 
 class Measuring:
@@ -220,41 +237,72 @@ class Measuring:
             Of each of these blocks.
         """
         chosen = range(self.count) if which is None else which
-
-        def block(piece: slice) -> tuple[Measured, NDArray[np.float64]]:
-            total = Measured.zero(len(gaussians))
-            errors = []
-            for number in self.members[chosen[piece.start]]:
-                view, weight = self.views[number]
+        numbers = [number for k in chosen for number in self.members[k]]
+        missing = {n for n in numbers if sights is not None and sights.lacks(n)}
+        found = for_each(
+            _Looking(gaussians, self.scene, self.views, self.sampling, numbers, missing),
+            len(numbers), SECONDS * len(gaussians) * len(numbers),
+            progress=progress, what="scoring", threads=self.threads,
+        )  # fmt: skip
+        sums: dict[int, Measured] = {}
+        errors: dict[int, NDArray[np.float64]] = {}
+        for k in chosen:
+            total = sums[k] = Measured.zero(len(gaussians))
+            grown = []
+            for number in self.members[k]:
+                seen, lines = next(found)
                 before = total.error[sample]  # (m,)
-                footprints = measure_view(gaussians, self.scene, view, weight, self.sampling, total)
-                if sights is not None:
-                    sights.look(number, footprints)
-                errors.append(total.error[sample] - before)
-            return total, np.array(errors)
+                total.add_view(seen, self.views[number][1])
+                grown.append(total.error[sample] - before)
+                if sights is not None and lines is not None:
+                    sights.lines[number] = lines
+            errors[k] = np.array(grown)
+        for _ in found:
+            pass  # lets it end
+        return sums, errors
 
-        found = for_chunks(
-            block, len(chosen), 1, progress=progress, what="scoring", threads=self.threads
+
+@dataclass(frozen=True, eq=False)
+class _Looking:
+    """Measures some views; any process can.
+
+    Attributes
+    ----------
+    gaussians : Gaussians
+    scene : Scene
+    views : list of (View, float)
+        All of them.
+    sampling : Sampling
+    numbers : list of int
+        Of those that measure.
+    missing : set of int
+        Numbers of the views whose lines of sight are wanted.
+    """
+
+    gaussians: Gaussians
+    scene: Scene
+    views: list[tuple[View, float]]
+    sampling: Sampling
+    numbers: list[int]
+    missing: set[int]
+
+    def __call__(self, place: int) -> tuple[Seen, Lines | None]:
+        """Return what a view sees, and what its lines of sight meet."""
+        number = self.numbers[place]
+        footprints, seen = measure_view(
+            self.gaussians, self.scene, self.views[number][0], self.sampling
         )
-        sums, errors = zip(*found, strict=True)
-        return dict(zip(chosen, sums, strict=True)), dict(zip(chosen, errors, strict=True))
+        return seen, met(self.views, number, footprints) if number in self.missing else None
 
 
 def measure_view(
-    gaussians: Gaussians,
-    scene: Scene,
-    view: View,
-    weight: float,
-    sampling: Sampling,
-    total: Measured,
-) -> Footprints:
-    """Add what one view sees to `total`; return the footprints in it."""
+    gaussians: Gaussians, scene: Scene, view: View, sampling: Sampling
+) -> tuple[Footprints, Seen]:
+    """Return the footprints in a view, and what it sees of them."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
     colors = gaussians.colors[footprints.index]  # (n, 3)
-    contribution, error = of_view(footprints, colors, view, sampling)
-    total.add_view(footprints, weight, contribution, error)
-    return footprints
+    return footprints, of_view(footprints, colors, view, sampling)
 
 
 def of_view(
@@ -262,8 +310,8 @@ def of_view(
     colors: NDArray[np.float32],
     view: View,
     sampling: Sampling,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the contribution of n footprints to a view and the error without each, (n,) each.
+) -> Seen:
+    """Return what a view sees of n footprints.
 
     Parameters
     ----------
@@ -272,8 +320,9 @@ def of_view(
     view : View
     sampling : Sampling
     """
-    if not len(footprints.index):
-        return np.empty(0), np.empty(0)
+    rows, inside = footprints.index, footprints.inside
+    if not len(rows):
+        return Seen(rows, inside, np.empty(0), np.empty(0))
     with np.errstate(under="ignore"):
         side = froxels.cell_size(footprints, view, sampling.cell, sampling.density)
         points = froxels.scatter(footprints, view, side, sampling.density)
@@ -288,4 +337,4 @@ def of_view(
             seen *= seen
             errors[place] = seen * squared_contrast
         visible, errors = froxels.mean_visible(points, visible, errors)
-        return mass * visible, mass_squared * errors
+        return Seen(rows, inside, mass * visible, mass_squared * errors)

@@ -22,12 +22,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .. import processes
 from ..errors import RefineError
 from ..scores import Scores, shares_gone
 from ..splats import refuse_undrawable
 from ..work import Progress, part, report, silent
 from . import closed_form, coverage, projection
-from .measuring import Measured, Measuring, Sampling
+from .measuring import SECONDS, Measured, Measuring, Sampling
 from .sight_lines import SightLines
 
 if TYPE_CHECKING:
@@ -385,7 +386,7 @@ class Rounds:
         progress : callable
         """
         numbers = sorted(blocks)
-        # An even number, since an odd one leaves one of two cores idle.
+        # In pairs of blocks, as the figures of docs/decisions.md were measured.
         share = ROUND_COST * len(self.gaussians) / max(len(left), 1)
         pairs = max(round(share * len(numbers) / 2), 1)
         half = math.ceil(len(numbers) / 4)  # in pairs
@@ -499,6 +500,7 @@ class Run(Rounds):
         if not len(splats):
             msg = "there are no splats to score"
             raise RefineError(msg)
+        processes.start(SECONDS * len(splats) * len(views), threads)
         gaussians, scene, good = projection.prepare(
             splats, views, progress=part(progress, 0.0, 0.5), threads=threads
         )

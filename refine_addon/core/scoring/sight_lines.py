@@ -239,7 +239,7 @@ class SightLines:
     rows : (M,) int64
         The same among `splats`, which need only hold those that are met.
     lines : list of Lines or None
-        Of each view; None until `look` was called for it.
+        Of each view; None where they are not known.
     """
 
     def __init__(
@@ -259,18 +259,9 @@ class SightLines:
         """Return the colours in which a view sees what its lines meet, (3, u)."""
         return colors_from(self.splats, self.rows[lines.met], view)
 
-    def look(self, number: int, footprints: Footprints) -> None:
-        """Note what the lines of one view meet; several threads may call it at once.
-
-        Parameters
-        ----------
-        number : int
-            Of the view.
-        footprints : Footprints
-            Of all that the lines may meet in this view.
-        """
-        if self.lines[number] is None and number % self.every == 0:
-            self.lines[number] = met(self.views, number, footprints)
+    def lacks(self, number: int) -> bool:
+        """Return whether what the lines of a view meet is wanted, and not yet known."""
+        return self.lines[number] is None and number % self.every == 0
 
     def look_from(
         self,
@@ -284,9 +275,10 @@ class SightLines:
 
         def work(piece: slice) -> None:
             number = numbers[piece.start]
-            with np.errstate(under="ignore"):
-                footprints = projection.project(gaussians, scene, self.views[number][0])
-                self.look(number, footprints)
+            if self.lacks(number):
+                with np.errstate(under="ignore"):
+                    footprints = projection.project(gaussians, scene, self.views[number][0])
+                    self.lines[number] = met(self.views, number, footprints)
 
         for_chunks(work, len(numbers), 1, progress=progress, what="looking", threads=threads)
 
@@ -543,7 +535,7 @@ def _places(
 
 
 def met(views: Sequence[tuple[View, float]], number: int, footprints: Footprints) -> Lines:
-    """Return what the lines of sight of one of some views meet; see `SightLines.look`."""
+    """Return what the lines of sight of one of some views meet."""
     view = views[number][0]
     count = min(LINES, MOST_MET / max(crowding(footprints, view), 1.0)) / len(views)
     return meet(footprints, *pixels(view, number, count))

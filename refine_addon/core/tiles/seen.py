@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from ..processes import for_each
 from ..scene import code_order, moments, spatial_code, splat_fingerprint
 from ..scoring import projection
-from ..scoring.measuring import Measured, Measuring, of_view
+from ..scoring.measuring import SECONDS, Measured, Measuring, of_view
 from ..scoring.projection import Gaussians
 from ..scoring.sight_lines import Lines, SightLines, meet, met, psnr_of
 from ..splats import drawable, joined
-from ..work import Progress, default_threads, for_chunks, part, silent
+from ..work import Progress, part, silent
 from .workers import Call
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..scene import Scene
-    from ..scoring.measuring import Sampling
+    from ..scoring.measuring import Sampling, Seen
     from ..splats import Splats
     from ..views import View, ViewSet
     from .folder import Folder
@@ -163,29 +164,27 @@ class SceneJob:
         name = seen_name(turn, block)
         if self.folder.has(name):
             return
-        views = self.views.by_distance()
-        boxes, left = self.folder.noted("boxes")[1], self.folder.mapped(f"left-{turn}")
         sample = self.folder.noted("sample")[1] if turn == 0 else np.empty(0, np.int64)
-        total, errors = Measured.zero(len(left)), []
-        step = default_threads() if threads is None else threads
-        for start in range(0, len(numbers), step):
-            some = numbers[start : start + step]
-
-            def work(piece: slice, some: list[int] = some) -> Any:  # noqa: ANN401 - a tuple
-                view, weight = views[some[piece.start]]
-                footprints, colors = self._footprints(view, boxes, left)
-                if turn == 0:
-                    self._note_lines(some[piece.start], footprints)
-                return footprints, weight, *of_view(footprints, colors, view, self.sampling)
-
-            ahead = part(progress, start / len(numbers), (start + len(some)) / len(numbers))
-            found = for_chunks(work, len(some), 1, progress=ahead, what="scoring", threads=step)
-            for each in found:
-                before = total.error[sample]
-                total.add_view(*each)
-                errors.append(total.error[sample] - before)
-            del found
+        count = len(self.folder.mapped(f"left-{turn}"))
+        total, errors = Measured.zero(count), []
+        found = for_each(
+            _Looking(self, turn, numbers), len(numbers), SECONDS * count * len(numbers),
+            progress=progress, what="scoring", threads=threads,
+        )  # fmt: skip
+        for seen, weight in found:
+            before = total.error[sample]
+            total.add_view(seen, weight)
+            errors.append(total.error[sample] - before)
         self.folder.note(name, (total.contribution, total.error, total.seen, np.array(errors)))
+
+    def measure_view(self, turn: int, number: int) -> tuple[Seen, float]:
+        """Return what a view sees of the splats that are left, and its weight; note its lines."""
+        boxes, left = self.folder.noted("boxes")[1], self.folder.mapped(f"left-{turn}")
+        view, weight = self.views.by_distance()[number]
+        footprints, colors = self._footprints(view, boxes, left)
+        if turn == 0:
+            self._note_lines(number, footprints)
+        return of_view(footprints, colors, view, self.sampling), weight
 
     def meet(self, number: int, pixels: tuple[NDArray[np.int64], ...] | None = None) -> None:
         """Note what the lines of sight of a view meet, before any splats are removed.
@@ -352,6 +351,27 @@ class Placed:
         yield np.empty((14, 0), np.float32)
         for number in range(-(-len(self._left) // CHUNK)):
             yield self._folder.map(number, "chunk")
+
+
+@dataclass(frozen=True)
+class _Looking:
+    """Measures some views; any process can.
+
+    Attributes
+    ----------
+    job : SceneJob
+    turn : int
+    numbers : list of int
+        See `SceneJob.look`.
+    """
+
+    job: SceneJob
+    turn: int
+    numbers: list[int]
+
+    def __call__(self, place: int) -> tuple[Seen, float]:
+        """Return what a view sees, and its weight."""
+        return self.job.measure_view(self.turn, self.numbers[place])
 
 
 class MeasuringTiles(Measuring):

@@ -1,0 +1,250 @@
+"""Work in processes of their own: the same results in order, and nothing left behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+# Of modules, not of the package: a process that runs `row` imports these too, from the same places.
+from refine_addon.core import processes
+from refine_addon.core.cameras.read import read_cameras
+from refine_addon.core.errors import Cancelled, RefineError
+from refine_addon.core.formats.ply import read_ply
+from refine_addon.core.pipeline import prune
+from refine_addon.core.processes import for_each
+from refine_addon.core.selection import Budget
+from refine_addon.core.task import Settings
+
+ROOM = Path(__file__).parents[1] / "data/room_small"
+LONG = 60.0
+MUCH = 1e3  # seconds of work: worth processes
+
+
+@pytest.fixture(autouse=True)
+def _no_process_stays():
+    yield
+    processes.end_idle()
+
+
+def row(array: np.ndarray, number: int) -> tuple[int, np.ndarray]:
+    """Return where this ran, and a part of an array."""
+    print("what work prints is no result")
+    return os.getpid(), array[number] * 2
+
+
+def slow(_number: int) -> None:
+    time.sleep(LONG)
+
+
+def refuse(number: int) -> int:
+    if number == 2:
+        message = "broken"
+        raise RefineError(message)
+    return number
+
+
+def end_elsewhere(here: int, number: int) -> int:
+    """End the process, unless it is the one that asked for this."""
+    if os.getpid() != here and number == 1:
+        os._exit(1)
+    return number
+
+
+def gone(pid: int) -> bool:
+    """Return whether a process has ended, within some seconds."""
+    end = time.monotonic() + 10
+    while time.monotonic() < end:
+        try:
+            os.kill(pid, 0)
+            if "\nState:\tZ" in Path(f"/proc/{pid}/status").read_text(encoding="ascii"):
+                return True
+        except OSError:
+            return True
+        time.sleep(0.05)
+    return False
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_processes_return_what_this_one_would_in_order(order):
+    """Eleven rows by two processes: each row is doubled, and none was doubled here."""
+    array = np.asarray(np.random.default_rng(0).random((11, 1000)), order=order)
+
+    where, rows = zip(*for_each(partial(row, array), 11, MUCH, threads=2), strict=True)
+
+    np.testing.assert_array_equal(rows, array * 2)
+    assert len(set(where)) == 2
+    assert os.getpid() not in where
+
+
+def test_processes_are_kept_for_the_next_work():
+    """Once they are there, a tenth of the work is worth them too."""
+    array = np.zeros((4, 1))
+
+    first = {pid for pid, _ in for_each(partial(row, array), 4, MUCH, threads=2)}
+    again = {pid for pid, _ in for_each(partial(row, array), 4, processes.WORTH / 2, threads=2)}
+
+    assert again == first
+
+
+@pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="asks Linux what is mapped")
+def test_processes_forget_the_work_when_it_is_done():
+    """The arrays are no longer mapped, so they take neither memory nor disk."""
+    found = for_each(partial(row, np.zeros((4, 1))), 4, MUCH, threads=2)
+    pid, _ = next(found)
+    maps = Path(f"/proc/{pid}/maps")
+    assert "/arrays" in maps.read_text(encoding="utf-8")
+
+    list(found)
+
+    end = time.monotonic() + 10
+    while "/arrays" in maps.read_text(encoding="utf-8"):
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
+def test_processes_that_were_started_ahead_do_the_work():
+    """They are there, so little work is worth them too."""
+    processes.start(MUCH, 2)
+
+    found = for_each(partial(row, np.zeros((4, 1))), 4, processes.WORTH / 2, threads=2)
+
+    assert os.getpid() not in {pid for pid, _ in found}
+
+
+@pytest.mark.parametrize(
+    ("seconds", "threads", "python"),
+    [(MUCH, 1, sys.executable), (0.1, 2, sys.executable), (MUCH, 2, "/opt/blender/blender")],
+)
+def test_work_stays_here_if_processes_are_not_worth_it_or_not_to_be_had(
+    seconds, threads, python, monkeypatch
+):
+    """One core; little work; and a program that is no Python, so starting it again is no way."""
+    monkeypatch.setattr(sys, "executable", python)
+
+    found = for_each(partial(row, np.zeros((4, 1))), 4, seconds, threads=threads)
+
+    assert {pid for pid, _ in found} == {os.getpid()}
+
+
+def test_where_no_process_can_be_started_threads_do_the_work(monkeypatch):
+    """As on a system that has no more room for one."""
+
+    def full(*_arguments: object, **_options: object) -> None:
+        raise OSError(11, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(subprocess, "Popen", full)
+
+    assert list(for_each(refuse, 2, MUCH, threads=2)) == [0, 1]
+
+
+def test_where_the_file_has_no_room_threads_do_the_work(monkeypatch):
+    """As on a full disk."""
+
+    def full(*_arguments: object, **_options: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(processes.tempfile, "TemporaryDirectory", full)
+
+    assert list(for_each(refuse, 2, MUCH, threads=2)) == [0, 1]
+
+
+def test_the_work_of_a_process_that_was_killed_is_done_here():
+    """Number 1 ends every process that tries it; the results are complete all the same."""
+    assert list(for_each(partial(end_elsewhere, os.getpid()), 5, MUCH, threads=2)) == [*range(5)]
+
+
+def test_what_the_work_raises_is_raised_here():
+    """Numbers 0 and 1 come first, as in this thread; then the error with its words."""
+    found = for_each(refuse, 4, MUCH, threads=2)
+
+    assert [next(found), next(found)] == [0, 1]
+    with pytest.raises(RefineError, match="broken"):
+        next(found)
+
+
+def test_cancelling_ends_processes_at_once():
+    """Work that would take a minute, and never looks whether to go on."""
+    calls = iter(range(100))
+    start = time.monotonic()
+
+    with pytest.raises(Cancelled):
+        list(for_each(slow, 4, MUCH, progress=lambda _fraction, _what: next(calls) < 3, threads=2))
+
+    assert time.monotonic() - start < LONG / 10
+
+
+def test_results_that_nobody_fetches_leave_no_process():
+    """A caller that fails between two results gives up the rest."""
+    found = for_each(partial(row, np.zeros((9, 1))), 9, MUCH, threads=2)
+    pid, _ = next(found)
+
+    found.close()
+
+    assert gone(pid)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="asks the system about processes by signals")
+def test_processes_end_with_the_one_that_started_them():
+    """Which is killed, so it cannot tell them."""
+    program = """
+import os
+from functools import partial
+import numpy as np
+from refine_addon.core.processes import for_each
+from tests.core.test_processes import MUCH, row
+found = list(for_each(partial(row, np.zeros((4, 1))), 4, MUCH, threads=2))
+os.write(1, " ".join(str(pid) for pid, _ in found).encode())
+os.kill(os.getpid(), 9)
+"""
+    said = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, check=False)
+
+    pids = {int(word) for word in said.stdout.split(b"\n")[-1].split()}
+    assert len(pids) == 2
+    assert all(gone(pid) for pid in pids)
+
+
+def test_an_addon_under_another_name_finds_itself():
+    """Blender imports extensions as parts of ``bl_ext``; there is no such package to import."""
+    program = f"""
+import sys, types, importlib
+for name in ("bl_ext", "bl_ext.user_default"):
+    sys.modules[name] = types.ModuleType(name)
+    sys.modules[name].__path__ = []
+name = "bl_ext.user_default.refine"
+package = sys.modules[name] = types.ModuleType(name)
+package.__path__ = [{str(Path(processes.__file__).parents[1])!r}]
+processes = importlib.import_module(name + ".core.processes")
+Budget = importlib.import_module(name + ".core.selection").Budget
+number_of = importlib.import_module(name + ".core.report").size_in_words
+print(*processes.for_each(number_of, 3, {MUCH}, threads=2), sep=";")
+print(len(processes._idle))
+"""
+    said = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
+
+    assert said.stdout.split(b"\n")[1].strip() == b"2"
+    assert said.stdout.startswith(b"0")
+
+
+@pytest.mark.parametrize("absorb", [False, True])
+def test_processes_keep_the_same_splats_as_one_thread(absorb, monkeypatch):
+    """To the bit, with every view measured in a process however little work it is."""
+    monkeypatch.setattr(processes, "WORTH", 0.0)
+    monkeypatch.setattr(processes, "WORTH_READY", 0.0)
+    splats = read_ply(ROOM / "point_cloud.ply").splats().take(np.arange(0, 39755, 20))
+    views = read_cameras(ROOM / "cameras.json").spread(20)
+
+    one, two = (
+        prune(splats, views, Budget(ratio=0.5), Settings(), absorb=absorb, threads=threads)
+        for threads in (1, 2)
+    )
+
+    assert len(processes._idle) == 2
+    assert one.scores.values.tobytes() == two.scores.values.tobytes()
+    assert one.keep.tobytes() == two.keep.tobytes()
