@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-IDLE = 30.0
-"""Seconds without work after which a process ends."""
+IDLE = 8.0
+"""Seconds without work after which a process ends, and gives back its memory; others start fast."""
 
 WORTH, WORTH_READY = 2.0, 0.2
 """Seconds of work, on one core, from which on it is worth doing in processes: if they are yet to be
@@ -343,7 +343,7 @@ def _unpacked(pickled: bytes, path: str, places: list[tuple[int, int]]) -> Calla
 def serve() -> None:
     """Do what another process asks for, until it ends or falls silent."""
     told, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # whatever is printed is no answer
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # whatever is printed is no answer
     work: Callable[[int], Any] | None = None
     while True:
         message = _next(told)
