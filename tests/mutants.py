@@ -42,7 +42,7 @@ MUTANTS = {
     "processes.py": [
         ("work(begin + piece.start)", "work(piece.start)", "what is left begins anew"),
         ("                begin += 1\n", "", "what was done is done again"),
-        ("            for process in team:\n                process.give(None)\n", "", "work kept"),
+        ("            _tell_all(team, None)\n", "", "work kept"),
         (
             "progress=progress, what=what, threads=number, stop=stop",
             "progress=progress, what=what, threads=number",

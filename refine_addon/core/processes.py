@@ -4,7 +4,7 @@ NumPy's loops run without Python's lock, but work made of many short loops keeps
 threads of such work are a fifth faster than one, two processes nearly twice as fast. The processes
 run this same Python and this same package, wherever it lies, and nothing of the calling program, so
 no script needs a guard around its main part. They are kept for the next call, and end when they
-have had nothing to do for `IDLE` seconds, or when this process ends.
+have had nothing to do for `IDLE` seconds, or when this process ends. What they print is lost.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ import threading
 import time
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeVar
 
+from .whole_file import REPLACES_MAPPED
 from .work import Progress, default_threads, each_chunk, for_chunks, part, silent
 
 if TYPE_CHECKING:
@@ -57,6 +58,24 @@ part of other packages, and runs none of the packages' own code."""
 _ALIGNED = 64  # bytes, of arrays in a file
 _idle: list[_Process] = []
 _lock = threading.Lock()
+
+
+class _Task(NamedTuple):
+    """Work for a process.
+
+    Attributes
+    ----------
+    pickled : bytes
+        All but the arrays.
+    path : str
+        Of the file that holds these.
+    places : list of (int, int)
+        Where each array begins in the file, and ends.
+    """
+
+    pickled: bytes
+    path: str
+    places: list[tuple[int, int]]
 
 
 class _LostError(Exception):
@@ -112,7 +131,7 @@ def for_each(
     left = count - begin
     yield from each_chunk(
         lambda piece: work(begin + piece.start), left, 1,
-        progress=part(progress, begin / count, 1.0), what=what, threads=threads,
+        progress=part(progress, begin / max(count, 1), 1.0), what=what, threads=threads,
     )  # fmt: skip
 
 
@@ -154,36 +173,54 @@ def _apart(
     _LostError
         If they, or the file that they share, cannot be had.
     """
-    team = _taken(number)
-    free: queue.SimpleQueue[_Process] = queue.SimpleQueue()
-    for process in team:
-        free.put(process)
-
-    def call(piece: slice) -> Result:
-        process = free.get()
-        try:
-            return process.call(piece.start)  # type: ignore[no-any-return]
-        finally:
+    with _shared(work) as (task, folder):
+        team = _taken(number)
+        free: queue.SimpleQueue[_Process] = queue.SimpleQueue()
+        for process in team:
             free.put(process)
 
-    def stop() -> None:
-        for process in team:
-            process.kill()
+        def call(piece: slice) -> Result:
+            process = free.get()
+            try:
+                process.tell(piece.start)
+                return process.answer()  # type: ignore[no-any-return]
+            finally:
+                free.put(process)
 
-    try:
-        with _shared(work) as task:
+        def stop() -> None:
             for process in team:
-                process.give(task)
+                process.kill()
+
+        try:
+            _tell_all(team, task)
+            if REPLACES_MAPPED:
+                folder.cleanup()  # nothing is left if this process is killed now
             yield from each_chunk(
                 call, count, 1, progress=progress, what=what, threads=number, stop=stop
             )
-            for process in team:
-                process.give(None)
-    except BaseException:
-        stop()
-        raise
+            _tell_all(team, None)
+        except BaseException:
+            stop()
+            raise
     with _lock:
         _idle.extend(team)
+
+
+def _tell_all(team: list[_Process], task: object) -> None:
+    """Tell all of a team what to call from now on, and wait until they know; None: nothing more.
+
+    Raises
+    ------
+    _LostError
+        If one cannot do that: it has ended, or does not find a module that this process has.
+    """
+    for process in team:
+        process.tell(task)
+    for process in team:
+        try:
+            process.answer()
+        except Exception as error:
+            raise _LostError from error
 
 
 def _taken(number: int) -> list[_Process]:
@@ -233,13 +270,16 @@ class _Process:
         if sys.platform == "win32":
             flags = subprocess.CREATE_NO_WINDOW | subprocess.CREATE_NEW_PROCESS_GROUP
             away = {"creationflags": flags}
-        path = [str(Path(entry or ".").resolve()) for entry in sys.path]
+        # Imports ignore what is no string. `Path.resolve` raises on loops of links, this does not.
+        path = [os.path.abspath(each) for each in sys.path if isinstance(each, str)]  # noqa: PTH100
         told = json.dumps([_PACKAGE, str(_FOLDER), path])
+        unwritten = ["-B"] * sys.dont_write_bytecode
         # Each uses one core.
         single = {f"{library}_NUM_THREADS": "1" for library in ("OPENBLAS", "OMP", "MKL")}
         self._popen = subprocess.Popen(  # noqa: S603 - this same Python
-            [sys.executable, "-I", "-S", "-c", _BEGIN, told],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, env={**os.environ, **single}, **away,
+            [sys.executable, "-I", "-S", *unwritten, "-c", _BEGIN, told],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
+            env={**os.environ, **single}, **away,
         )  # fmt: skip
         assert self._popen.stdin  # noqa: S101 - as asked for
         assert self._popen.stdout  # noqa: S101
@@ -251,32 +291,32 @@ class _Process:
         """Whether it will still be there when it gets something to do."""
         return self._popen.poll() is None and time.monotonic() - self._used < IDLE / 2
 
-    def give(self, task: object) -> None:
-        """Tell it what to call from now on; None lets it forget that.
-
-        Raises
-        ------
-        _LostError
-        """
-        self._used = time.monotonic()
-        try:
-            pickle.dump(task, self._to, protocol=5)
-            self._to.flush()
-        except (OSError, ValueError) as error:  # ended, or killed here
-            raise _LostError from error
-
-    def call(self, number: int) -> Any:  # noqa: ANN401 - whatever the work returns
-        """Return what the work returns, or raise what it raises.
+    def tell(self, message: object) -> None:
+        """Send a task, None for none any more, or the number of a call; see `answer`.
 
         Raises
         ------
         _LostError
             If the process has ended.
         """
-        self.give(number)
+        self._used = time.monotonic()
+        try:
+            pickle.dump(message, self._to, protocol=5)
+            self._to.flush()
+        except (OSError, ValueError) as error:  # ended, or killed here
+            raise _LostError from error
+
+    def answer(self) -> Any:  # noqa: ANN401 - whatever the work returns
+        """Wait for the answer to what was told; return what the work returns, or raise its error.
+
+        Raises
+        ------
+        _LostError
+            If the process has ended, or its answer means nothing here.
+        """
         try:
             done, result = pickle.load(self._from)  # noqa: S301 - our own process
-        except (OSError, EOFError, ValueError, pickle.UnpicklingError) as error:
+        except Exception as error:
             raise _LostError from error
         self._used = time.monotonic()
         if not done:
@@ -293,16 +333,15 @@ class _Process:
 
 
 @contextmanager
-def _shared(work: object) -> Iterator[tuple[bytes, str, list[tuple[int, int]]]]:
+def _shared(work: object) -> Iterator[tuple[_Task, tempfile.TemporaryDirectory[str]]]:
     """Write the arrays of `work` to a file, which all processes map.
 
     Yields
     ------
-    pickled : bytes
-        All but the arrays.
-    path : str
-    places : list of (int, int)
-        Where each array begins in the file, and ends.
+    task : tuple
+        See `_Task`.
+    folder : TemporaryDirectory
+        Where the file is.
 
     Raises
     ------
@@ -314,11 +353,9 @@ def _shared(work: object) -> Iterator[tuple[bytes, str, list[tuple[int, int]]]]:
     places = []
     with ExitStack() as held:
         try:
-            # Windows deletes no file that a process still maps.
-            folder = held.enter_context(
-                tempfile.TemporaryDirectory(prefix="refine-", ignore_cleanup_errors=True)
-            )
-            path = Path(folder) / "arrays"
+            folder = tempfile.TemporaryDirectory(prefix="refine-", ignore_cleanup_errors=True)
+            held.enter_context(folder)
+            path = Path(folder.name) / "arrays"
             with path.open("wb") as stream:
                 for array in arrays:
                     stream.write(bytes(-stream.tell() % _ALIGNED))
@@ -328,32 +365,33 @@ def _shared(work: object) -> Iterator[tuple[bytes, str, list[tuple[int, int]]]]:
                 stream.write(bytes(1))  # an empty file cannot be mapped
         except OSError as error:
             raise _LostError from error
-        yield pickled, str(path), places
+        yield _Task(pickled, str(path), places), folder
 
 
-def _unpacked(pickled: bytes, path: str, places: list[tuple[int, int]]) -> Callable[[int], Any]:
+def _unpacked(task: _Task) -> Callable[[int], Any]:
     """Return the work that `_shared` has written."""
-    with Path(path).open("rb") as stream:
+    with Path(task.path).open("rb") as stream:
         mapped = memoryview(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_COPY))
-    arrays = [mapped[start:end] for start, end in places]
-    work: Callable[[int], Any] = pickle.loads(pickled, buffers=arrays)  # noqa: S301 - our own
+    arrays = [mapped[start:end] for start, end in task.places]
+    work: Callable[[int], Any] = pickle.loads(task.pickled, buffers=arrays)  # noqa: S301 - our own
     return work
 
 
 def serve() -> None:
     """Do what another process asks for, until it ends or falls silent."""
     told, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # whatever is printed is no answer
+    os.dup2(2, 1)  # whatever is printed is no answer
     work: Callable[[int], Any] | None = None
     while True:
         message = _next(told)
-        if not isinstance(message, int):
-            work = None  # first, so that the arrays of both never are there at once
-            work = _unpacked(*message) if message else None
-            continue
-        assert work  # noqa: S101 - it is told first
         try:
-            result = True, _called(work, message)
+            if isinstance(message, int):
+                assert work  # noqa: S101 - it is told first
+                result = True, _called(work, message)
+            else:
+                work = None  # first, so that the arrays of both never are there at once
+                work = _unpacked(message) if message else None
+                result = True, None
         except BaseException as error:  # noqa: BLE001 - raised again where it was asked for
             result = False, error
         pickle.dump(result, answers, protocol=5)
