@@ -17,7 +17,7 @@ import numpy as np
 from . import selection
 from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
-from .quality import FEWEST, left_to_lose, out_of_reach
+from .quality import FEWEST, left_to_lose, needed, out_of_reach
 from .report import Clock, make_report, size_in_words
 from .scoring import auto, closed_form, occlusion, sight_lines
 from .scoring.alignment import alignment
@@ -69,6 +69,7 @@ def score(  # noqa: PLR0913 - as `prune`
     protected: NDArray[np.bool_] | None = None,
     removed: NDArray[np.bool_] | None = None,
     quality: bool = False,
+    settled: int | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
@@ -89,6 +90,9 @@ def score(  # noqa: PLR0913 - as `prune`
     quality : bool
         Whether the scores get an estimate of the pictures' quality even if that takes longer than
         scoring by the closed form; scores by occlusion always have one.
+    settled : int, optional
+        How many splats must be in their final order, those that are `removed` left out: scoring by
+        occlusion takes less time where these are few. By default all.
     progress : callable, optional
         ``progress(fraction, what)``; returning ``False`` cancels.
     threads : int, optional
@@ -110,7 +114,7 @@ def score(  # noqa: PLR0913 - as `prune`
         found = score(
             splats.take(rest), views, settings,
             protected=None if protected is None else protected[rest],
-            quality=quality, progress=progress, threads=threads,
+            quality=quality, settled=settled, progress=progress, threads=threads,
         )  # fmt: skip
         return found.for_all(rest)
     whole, estimates = progress, quality or settings.estimates
@@ -120,12 +124,13 @@ def score(  # noqa: PLR0913 - as `prune`
         used = views.spread(settings.views)
         if settings.method == "occlusion":
             scores = occlusion.score(
-                splats, used, settings.occlusion, progress=progress, threads=threads
-            )
+                splats, used, settings.occlusion,
+                settled=settled, progress=progress, threads=threads,
+            )  # fmt: skip
         elif settings.method == "auto":
             scores = auto.score(
                 splats, used, settings.tolerance, settings.occlusion,
-                progress=progress, threads=threads,
+                settled=settled, progress=progress, threads=threads,
             )  # fmt: skip
         else:
             scores = closed_form.score(
@@ -160,8 +165,9 @@ def with_quality(
     if scores.sights is None:
         return scores
     curve = scores.sights.curve(
-        scores.values, protected=protected, progress=progress, threads=threads
-    )
+        scores.values, protected=protected, settled=scores.settled,
+        progress=progress, threads=threads,
+    )  # fmt: skip
     return replace(scores, quality=curve)
 
 
@@ -502,10 +508,22 @@ def _scores_of(
         task.settings,
         protected=task.protected,
         quality=task.budget.psnr is not None,
+        settled=_settled(task),
         progress=progress,
         threads=threads,
     )
     return scores, None
+
+
+def _settled(task: Task) -> int | None:
+    """Return how many splats a task needs in their final order; None for all."""
+    if task.reusable:
+        return None
+    total = len(task.scene()[0])
+    held = 0 if task.protected is None else int(np.count_nonzero(task.protected))
+    found = needed(task.budget.removals(total, task.row_bytes, task.fixed_bytes), total)
+    # Those that are protected stay, wherever in the order they are.
+    return None if found is None else min(found + held, total)
 
 
 def _score_once(

@@ -154,10 +154,31 @@ class Quality:
         return cls(shares, psnr, absorbed, foretold, views) if whole else None
 
 
+def needed(gone: int | None, count: int) -> int | None:
+    """Return how many of `count` splats the curve must be known for where `gone` are removed.
+
+    That is up to the next of `TAKEN_OVER`, so that nothing it says up to there differs from what
+    the whole curve says. None if the whole is needed.
+
+    Parameters
+    ----------
+    gone : int or None
+        None where that is not known before.
+    count : int
+
+    Examples
+    --------
+    >>> needed(40, 100), needed(50, 100), needed(95, 100)
+    (50, 50, None)
+    """
+    places = (math.floor(share * count) for share in TAKEN_OVER)
+    return None if gone is None else next((place for place in places if place >= gone), None)
+
+
 def absorbed_from(
     psnr: NDArray[np.float64], gains: NDArray[np.float64], count: int
 ) -> NDArray[np.float64]:
-    """Return about what absorbing reaches at `SHARES`, (L,), without absorbing; dB.
+    """Return about what absorbing reaches at the first L of `SHARES`, without absorbing; dB.
 
     On lines of sight it is known what the pictures would be if what goes stayed as opaque as it is
     and took the colour of the nearest splat that stays. That is neither an upper nor a lower bound
@@ -166,16 +187,18 @@ def absorbed_from(
     Parameters
     ----------
     psnr : (L,) float64
-        With the splats deleted, at `SHARES`.
-    gains : (4,) float64
-        By how much it is higher with them taken over in that way, at `TAKEN_OVER`.
+        With the splats deleted, at those shares.
+    gains : (G,) float64
+        By how much it is higher with them taken over in that way, at the first G of `TAKEN_OVER`,
+        which go as far.
     count : int
         How many splats there are.
     """
-    constant, part = np.array(GAIN)
+    constant, part, fewer = np.array([*GAIN, FEWER])[:, : len(gains)]
     halvings = max(math.log2(ENOUGH / max(count, 1)), 0.0)
-    found = (constant + part * gains - halvings * np.array(FEWER)).clip(0.0)
-    gain = np.interp(SHARES, (PLAIN, *TAKEN_OVER), np.concatenate([[0.0], found]))
+    found = (constant + part * gains - halvings * fewer).clip(0.0)
+    known = (PLAIN, *TAKEN_OVER[: len(gains)])
+    gain = np.interp(SHARES[: len(psnr)], known, np.concatenate([[0.0], found]))
     return np.minimum.accumulate(np.minimum(psnr + gain, PSNR_CAP))
 
 

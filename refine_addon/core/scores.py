@@ -54,6 +54,9 @@ class Scores:
         How close the pictures stay with ever more of these removed in the order of the scores.
     alignment : Alignment, optional
         How the views stand to the splats.
+    settled : int, optional
+        How many splats, from those with the lowest scores on, are in their final order; None for
+        all. Scores that were computed for one budget end where that does.
     """
 
     values: NDArray[np.float32]
@@ -68,6 +71,7 @@ class Scores:
     sights: SightLines | None = None
     quality: Quality | None = None
     alignment: Alignment | None = None
+    settled: int | None = None
 
     def for_all(self, rest: NDArray[np.bool_]) -> Scores:
         """Return scores of what was left of N splats as scores of them all.
@@ -78,7 +82,8 @@ class Scores:
             Which were left. The others, which the scene has without them, get the score 0.
         """
         values, seen = among_all(self.values, rest), among_all(self.seen, rest)
-        return replace(self, values=values, seen=seen)
+        settled = None if self.settled is None else self.settled + len(rest) - len(self.values)
+        return replace(self, values=values, seen=seen, settled=settled)
 
     def of(self, rest: NDArray[np.bool_]) -> Scores:
         """Return the scores of some splats; the reverse of `for_all` where those had been left.
@@ -103,7 +108,10 @@ class Scores:
         sights = self.sights
         if sights is not None and len(sights.splats) != count:
             sights = None  # of a scene with other splats
-        return replace(self, values=values, seen=self.seen[rest], sights=sights)
+        settled = self.settled
+        if settled is not None:
+            settled = max(settled - (len(rest) - count), 0)
+        return replace(self, values=values, seen=self.seen[rest], sights=sights, settled=settled)
 
 
 def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:

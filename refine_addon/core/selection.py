@@ -205,7 +205,8 @@ def select(
     ------
     RefineError
         If the budget has no meaning for these scores (`Budget.refuse_meaningless`), if it is a PSNR
-        and the scores have no estimate of it, or if no splat would be left.
+        and the scores have no estimate of it, if it removes more than the scores were computed for
+        (`Scores.settled`), or if no splat would be left.
     """
     budget.refuse_meaningless(scores.method, frustum=scores.frustum)
     values = scores.values
@@ -222,7 +223,10 @@ def select(
         lengths = np.asarray(row_bytes, np.int64)
         excess = int(lengths.sum()) - budget.room(fixed_bytes)
         _remove_lowest(keep, values, free, excess, lengths)
-    refuse_none_left(budget, len(values), int(np.count_nonzero(keep)))
+    left = int(np.count_nonzero(keep))
+    refuse_none_left(budget, len(values), left)
+    if budget.min_seen is None:
+        _refuse_unsettled(scores, len(values) - left, len(values) - int(np.count_nonzero(free)))
     return keep
 
 
@@ -326,6 +330,23 @@ def refuse_none_left(budget: Budget, before: int, after: int) -> None:
     """Raise `RefineError` if none of the splats would stay."""
     if not after:
         msg = f"{budget.kind} would remove all {before} splats; nothing was removed"
+        raise RefineError(msg)
+
+
+def _refuse_unsettled(scores: Scores, gone: int, held: int) -> None:
+    """Raise `RefineError` if scores were computed for a budget that removes fewer splats.
+
+    Parameters
+    ----------
+    scores : Scores
+    gone, held : int
+        How many splats are removed, and how many are protected.
+    """
+    if scores.settled is not None and gone + held > scores.settled:
+        msg = (
+            f"these scores were computed to remove at most {max(scores.settled - held, 0)} of "
+            f"{len(scores.values)} splats, not {gone}: score again, for all budgets"
+        )
         raise RefineError(msg)
 
 

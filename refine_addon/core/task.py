@@ -134,6 +134,9 @@ class Task:
         See `Budget.removals`.
     origin : Origin or None
         To absorb: what the splats were before they absorbed others; None where they did not.
+    reusable : bool
+        Whether the scores are to serve other budgets too. Else scoring by occlusion ends where this
+        budget does.
     """
 
     budget: Budget
@@ -147,6 +150,7 @@ class Task:
     row_bytes: RowBytes = 0.0
     fixed_bytes: int = 0
     origin: Origin | None = None
+    reusable: bool = False
 
     def scene(self) -> tuple[Splats, ViewSet]:
         """Return splats and views.
@@ -198,8 +202,9 @@ class Result:
     keep : (N,) bool
         Which splats stay.
     scores : Scores
-        The scores that decided which splats stay. With `absorbed`: the scores that decided how many
-        survive, or else which tenth was deleted first.
+        The scores that decided which splats stay; of those that stay they may tell less, see
+        `Scores.settled`. With `absorbed`: the scores that decided how many survive, or else which
+        tenth was deleted first.
     absorbed : Absorbed or None
         The survivors with what they absorbed.
     report : dict

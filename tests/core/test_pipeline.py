@@ -590,3 +590,49 @@ def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, vi
     for sums, expected in seen:
         np.testing.assert_allclose(sums.contribution, 1.0 + 0.75 * expected.contribution)
         np.testing.assert_allclose(sums.error, 2.0 + 0.75 * expected.error)
+
+
+@pytest.mark.parametrize("method", ["occlusion", "auto"])
+@pytest.mark.parametrize("ratio", [0.05, 0.3, 0.55, 0.7, 0.93])
+@pytest.mark.parametrize("zoned", [False, True])
+def test_scoring_for_one_budget_decides_what_scores_for_all_would(
+    small, views, method, ratio, zoned
+):
+    """Scoring ends with the round that removes the last of its splats: the same report, too."""
+    splats = read_ply(small).splats()
+    every = np.arange(len(splats))
+    demands = {"protected": every % 7 == 0, "removed": every % 11 == 0} if zoned else {}
+    task = Task(Budget(ratio=ratio), Settings(method, views=24), splats, views, **demands)
+    some = decide(task)
+
+    whole = decide(replace(task, reusable=True))
+
+    assert whole.scores.settled is None
+    np.testing.assert_array_equal(some.keep, whole.keep)
+    for name in ("estimated_psnr", "estimated_psnr_absorbed", "splats", "notes"):
+        assert some.report[name] == whole.report[name]
+    known = len(some.report["quality"]["shares"])
+    for name in ("shares", "psnr", "absorbed"):
+        assert some.report["quality"][name] == whole.report["quality"][name][:known]
+    assert some.report["quality"]["shares"][-1] >= ratio
+    assert known == 10 if ratio > 0.9 else known < 10
+
+
+def test_scores_of_one_budget_are_refused_for_a_larger_one(small, views):
+    """What they say of the splats that stayed is not final; views seen are."""
+    splats = read_ply(small).splats()
+    protected = np.arange(len(splats)) % 5 == 0
+    scores = prune(
+        splats, views, Budget(ratio=0.2), Settings("occlusion", views=8), protected=protected
+    ).scores
+    settled = int(0.3 * len(splats)) + np.count_nonzero(protected)
+
+    assert scores.settled == settled
+    assert select(scores, Budget(keep=len(splats) - settled)).sum() == len(splats) - settled
+    assert select(scores, Budget(min_seen=50)).any()
+    with pytest.raises(RefineError, match=rf"remove at most {settled} of {len(splats)}"):
+        select(scores, Budget(keep=len(splats) - settled - 1))
+    with pytest.raises(RefineError, match="score again, for all budgets"):
+        select(scores, Budget(ratio=0.35), protected=protected)
+    with pytest.raises(RefineError, match="score again"):
+        select(scores, Budget(threshold=0.9))

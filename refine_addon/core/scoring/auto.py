@@ -19,7 +19,7 @@ import numpy as np
 
 from ..quality import UNSEEN
 from ..work import Progress, part, silent
-from .occlusion import FIRST_END, Rounds, Run
+from .occlusion import Rounds, Run
 
 if TYPE_CHECKING:
     from ..scores import Scores
@@ -42,12 +42,13 @@ LOOKING = 0.05
 display of progress."""
 
 
-def score(
+def score(  # noqa: PLR0913 - as `occlusion.score`, and the tolerance
     splats: Splats,
     views: ViewSet,
     tolerance: float,
     settings: Occlusion,
     *,
+    settled: int | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
@@ -55,7 +56,7 @@ def score(
 
     Parameters
     ----------
-    splats, settings, progress, threads
+    splats, settings, settled, progress, threads
         See `occlusion.score`.
     views : ViewSet
         Those that may be used.
@@ -77,11 +78,17 @@ def score(
         splats, views, settings, members=blocks_of(views),
         progress=part(progress, 0.0, 0.1), threads=threads,
     )  # fmt: skip
-    return scored(run, tolerance, progress=part(progress, 0.1, 1.0), threads=threads)
+    ahead = part(progress, 0.1, 1.0)
+    return scored(run, tolerance, settled=settled, progress=ahead, threads=threads)
 
 
 def scored(
-    run: Rounds, tolerance: float, *, progress: Progress = silent, threads: int | None = None
+    run: Rounds,
+    tolerance: float,
+    *,
+    settled: int | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
 ) -> Scores:
     """Return the scores of a run that has measured nothing yet.
 
@@ -89,17 +96,17 @@ def scored(
     ----------
     run : Rounds
         With the blocks of `blocks_of`, if these are not None.
-    tolerance, progress, threads
+    tolerance, settled, progress, threads
         See `score`.
     """
-    end = FIRST_END if run.rounds > 1 else 1.0
+    end = run.first_end(settled)
     ahead = part(progress, 0.0, end)
     if len(run.measuring.views) < LEAST_VIEWS or not tolerance:
         run.measure(range(run.measuring.count), ahead)
         loss, judged = 0.0, dict[str, list[float]]()
     else:
         loss, judged = _measure(run, tolerance, ahead, threads)
-    scores = run.rank(part(progress, end, 1.0))
+    scores = run.rank(part(progress, end, 1.0), settled)
     own = {"views": scores.views_used, "loss": loss, "tolerance": tolerance, "judged": judged}
     facts = {**scores.facts, "auto": own}
     return replace(scores, facts=facts, method="auto")

@@ -11,11 +11,13 @@ rises with the share removed (`coverage`).
 
 Splats hide each other, so they are removed in rounds: a part of the splats goes, the rest is scored
 again, until a tenth is left. The result is one order of removal, so a larger budget also removes
-all that a smaller one does.
+all that a smaller one does. Scoring for one budget ends with the round that removes the last of its
+splats.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -52,9 +54,6 @@ COMMON = 0.1
 
 FIRST_COST = 0.5
 """Share of the time that is still ahead that a round takes, for the display of progress."""
-
-FIRST_END = 0.55
-"""Where the first of several rounds ends, as a share of all the time, for the same."""
 
 PRIOR = closed_form.ClosedForm("distance", frustum=False, local=False)
 """Model of the floor. It has no frustum test, since splats that no view shows also need a floor."""
@@ -93,6 +92,7 @@ def score(
     views: ViewSet,
     settings: Occlusion = Occlusion(),
     *,
+    settled: int | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
@@ -105,6 +105,9 @@ def score(
     views : ViewSet
         All of them are used.
     settings : Occlusion
+    settled : int, optional
+        How many splats to put in their final order, the first to be removed first; the others get
+        scores of the last round that this takes. By default all.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
     threads : int, optional
@@ -128,9 +131,9 @@ def score(
     (`froxels.MAX_POINTS`); only a view that shows more than 3 million splats has more.
     """
     run = Run(splats, views, settings, progress=part(progress, 0.0, 0.1), threads=threads)
-    end = FIRST_END if settings.rounds > 1 else 1.0
+    end = run.first_end(settled)
     run.measure(range(run.measuring.count), part(progress, 0.1, end))
-    return run.rank(part(progress, end, 1.0))
+    return run.rank(part(progress, end, 1.0), settled)
 
 
 def score_once(
@@ -316,8 +319,19 @@ class Rounds:
         removal.add(self.gaussians.index[order])
         return removal.values
 
-    def rank(self, progress: Progress) -> Scores:
+    def first_end(self, settled: int | None = None) -> float:
+        """Return where the first round ends, as a share of all the time, to show progress."""
+        later = len(_survivors(len(self.prior), self.rounds, settled)) - 1
+        return 1.0 / (1.0 + ROUND_COST * later)
+
+    def rank(self, progress: Progress, settled: int | None = None) -> Scores:
         """Return the scores, by the blocks measured; can be called once.
+
+        Parameters
+        ----------
+        progress : callable
+        settled : int, optional
+            See `score`.
 
         Raises
         ------
@@ -338,8 +352,9 @@ class Rounds:
         weights = self._floor_weights(measured, list(blocks), part(progress, 0.0, 0.0))
         used = sum(len(self.measuring.members[k]) for k in blocks)
         left, done = self.gaussians, 0.0
-        for number, stay in enumerate(_survivors(len(self.prior), self.rounds)):
-            end = 1.0 if number == self.rounds - 1 else done + (1.0 - done) * FIRST_COST
+        stays = _survivors(len(self.prior), self.rounds, settled)
+        for number, stay in enumerate(stays):
+            end = 1.0 if number == len(stays) - 1 else done + (1.0 - done) * FIRST_COST
             ahead, done = part(progress, done, end), end
             if number:
                 measured = self._measure_again(left, blocks, ahead)
@@ -348,7 +363,7 @@ class Rounds:
             order = self._order(left, measured, weights, removal, go)
             removal.add(left.index[order[:go]])
             rows = np.sort(order[go:])
-            if number < self.rounds - 1:
+            if number < len(stays) - 1:
                 left = left.take(rows)
                 for k in blocks:
                     blocks[k] = blocks[k].take(rows)
@@ -361,6 +376,7 @@ class Rounds:
             facts={"floor": weights},
             method="occlusion",
             sights=self.sights,
+            settled=settled,
         )
 
     def _removal(self) -> _Removal:
@@ -535,9 +551,14 @@ class _Removal:
         self.gone = end
 
 
-def _survivors(count: int, rounds: int) -> list[int]:
-    """Return how many of `count` splats stay after each round: `LEAST` before the last, then 0."""
-    return [round(count * LEAST ** (number / (rounds - 1))) for number in range(1, rounds)] + [0]
+def _survivors(count: int, rounds: int, settled: int | None = None) -> list[int]:
+    """Return how many of `count` splats stay after each round: `LEAST` before the last, then 0.
+
+    The last is the first round that removes `settled` splats or more together with those before.
+    """
+    rest = 0 if settled is None else max(count - settled, 0)
+    stays = (round(count * LEAST ** (number / (rounds - 1))) for number in range(1, rounds))
+    return [*itertools.takewhile(lambda stay: stay > rest, stays), 0]
 
 
 def combined(measured: Measured, gone: float) -> NDArray[np.float64]:

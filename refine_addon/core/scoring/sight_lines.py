@@ -299,6 +299,7 @@ class SightLines:
         values: NDArray[np.float32],
         *,
         protected: NDArray[np.bool_] | None = None,
+        settled: int | None = None,
         progress: Progress = silent,
         threads: int | None = None,
     ) -> Quality | None:
@@ -310,6 +311,8 @@ class SightLines:
             The lowest are removed first; of equal ones the first in the file.
         protected : (N,) bool, optional
             Splats that are removed after all others.
+        settled : int, optional
+            How many splats are in their final order, see `Scores`: the curve ends there.
         progress : callable, optional
         threads : int, optional
 
@@ -319,24 +322,25 @@ class SightLines:
             If `progress` answers ``False``.
         """
         place = _places(values, protected)[self.index]
-        counts = [math.floor(share * len(values)) for share in SHARES]
+        last = len(values) if settled is None else settled
+        if settled is not None and protected is not None:
+            last -= int(np.count_nonzero(protected))
+        places = [[math.floor(share * len(values)) for share in of] for of in (SHARES, TAKEN_OVER)]
+        counts, taken = ([count for count in some if count <= last] for some in places)
+        if not taken:
+            return None
         seen = self._seen()
         single = self._removing(place, counts, seen, part(progress, 0.0, 0.5), threads)
         if single is None:
             return None
-        gains = self._taking_over(
-            place,
-            [math.floor(share * len(values)) for share in TAKEN_OVER],
-            part(progress, 0.5, 1.0),
-            threads,
-        )
+        gains = self._taking_over(place, taken, part(progress, 0.5, 1.0), threads)
         assert gains is not None  # noqa: S101 - the same lines tell it
         found = np.minimum.accumulate(self._mean(single, seen))
         names = [self.views[number][0].name for number in seen]
         views = dict(zip(names, np.minimum.accumulate(single, axis=1), strict=True))
         absorbed = absorbed_from(found, gains, len(values))
         foretold = len(values) >= FEWEST
-        return Quality(np.array(SHARES), found, absorbed, foretold, views)
+        return Quality(np.array(SHARES[: len(counts)]), found, absorbed, foretold, views)
 
     def judged(
         self,

@@ -17,6 +17,7 @@ from .. import radix
 from ..errors import RefineError
 from ..formats.ply_header import with_count
 from ..pipeline import FIRST, MEASURES, conclude, remark
+from ..quality import needed
 from ..report import Clock, Files, complete_report, make_report
 from ..scoring.closed_form_block import ROWS
 from ..selection import Budget, least_seen, quality_of, refuse_none_left, select, single
@@ -195,7 +196,9 @@ class _Run:
         elif settings.method == "closed-form":
             scores = by_closed_form(self.job, self.units, self._workers, ahead)[0]
         else:
-            scores = by_occlusion(self.job, self.units, settings, self._workers, ahead)
+            amount, by_bytes = _amount(budget, self.tiles)
+            settled = None if amount is None or by_bytes else needed(amount, self.total)
+            scores = by_occlusion(self.job, self.units, settings, settled, self._workers, ahead)
         notes = (*scores.notes, views.note) if views.note else scores.notes
         scores = replace(scores, notes=notes, views_given=len(views))
         clock.lap("score_s")
@@ -315,7 +318,8 @@ class _Run:
             share = quality_of(scores).share(budget.psnr)
             amount, by_bytes = math.floor(share * self.total), False
         else:
-            amount, by_bytes = _amount(budget, self.tiles)
+            found, by_bytes = _amount(budget, self.tiles)
+            amount = found or 0
         if not amount:
             return Rule(left=(0,) * len(self.units))
 
@@ -328,8 +332,8 @@ class _Run:
         return Rule(edge=edge, left=tuple((amount - below - before).tolist()), by_bytes=by_bytes)
 
 
-def _amount(budget: Budget, tiles: Sequence[Tile]) -> tuple[int, bool]:
-    """Return how many splats a budget removes; or how many bytes, and True.
+def _amount(budget: Budget, tiles: Sequence[Tile]) -> tuple[int | None, bool]:
+    """Return how many splats a budget removes, if it tells; or how many bytes, and True.
 
     Raises
     ------
@@ -340,7 +344,7 @@ def _amount(budget: Budget, tiles: Sequence[Tile]) -> tuple[int, bool]:
     total, fixed = sum(tile.splats for tile in tiles), sum(tile.fixed_bytes for tile in tiles)
     removals = budget.removals(total, min(lengths), fixed)
     if budget.max_mb is None or len(lengths) == 1:
-        return removals or 0, False
+        return removals, False
     excess = sum(tile.splats * tile.row_bytes for tile in tiles) - budget.room(fixed)
     return max(excess, 0), True
 

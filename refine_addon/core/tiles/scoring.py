@@ -11,7 +11,7 @@ from ..pipeline import with_quality
 from ..scene import Scene, principal_axes
 from ..scores import Scores
 from ..scoring import auto, closed_form
-from ..scoring.occlusion import FIRST_END, PRIOR, Rounds
+from ..scoring.occlusion import PRIOR, Rounds
 from ..work import Progress, part
 from .seen import MeasuringTiles, SceneJob, StoredLines, place
 from .steps import Job, Shared
@@ -137,7 +137,12 @@ class Seen:
 
 
 def by_occlusion(
-    job: Job, units: Sequence[Unit], settings: Settings, workers: Workers, progress: Progress
+    job: Job,
+    units: Sequence[Unit],
+    settings: Settings,
+    settled: int | None,
+    workers: Workers,
+    progress: Progress,
 ) -> Scores:
     """Score units by occlusion or auto: the same as in memory.
 
@@ -148,6 +153,8 @@ def by_occlusion(
     job : Job
     units : sequence of Unit
     settings : Settings
+    settled : int or None
+        See `occlusion.score`.
     workers, progress : callable
         See `prune.prune_tiles`.
 
@@ -167,7 +174,10 @@ def by_occlusion(
     run = _Scoring(job, units, how, workers, members, part(progress, 0.0, 0.2))
     ahead = part(progress, 0.2, 0.98)
     with np.errstate(under="ignore"):
-        scores = auto.scored(run, settings.tolerance, progress=ahead) if by_auto else run.all(ahead)
+        if by_auto:
+            scores = auto.scored(run, settings.tolerance, settled=settled, progress=ahead)
+        else:
+            scores = run.all(ahead, settled)
     return run.estimated(scores, part(progress, 0.98, 1.0))
 
 
@@ -225,11 +235,11 @@ class _Scoring(Rounds):
         super().__init__(gaussians, measuring, settings.rounds, values, ~good, sights)  # type: ignore[arg-type]
         self._folder, self._units = job.folder, units
 
-    def all(self, progress: Progress) -> Scores:
-        """Measure all blocks of views, and return the scores."""
-        end = FIRST_END if self.rounds > 1 else 1.0
+    def all(self, progress: Progress, settled: int | None = None) -> Scores:
+        """Measure all blocks of views, and return the scores; see `occlusion.score`."""
+        end = self.first_end(settled)
         self.measure(range(self.measuring.count), part(progress, 0.0, end))
-        return self.rank(part(progress, end, 1.0))
+        return self.rank(part(progress, end, 1.0), settled)
 
     def estimated(self, scores: Scores, progress: Progress) -> Scores:
         """Return scores with the curve of the estimated PSNR, and write those of each unit."""
