@@ -139,7 +139,7 @@ MUTANTS = {
         ("if target in targets[:place]:", "if False:", "one output for two tiles"),
     ],
     "tiles/seen.py": [
-        ("index=some.index + start", "index=some.index", "rows of the first chunk"),
+        ("index=some.index + number * CHUNK", "index=some.index", "rows of the first chunk"),
         (
             "np.concatenate(colors)[at]",
             "np.concatenate(colors)",
@@ -199,10 +199,19 @@ MUTANTS = {
     ],
     "scoring/sight_lines.py": [
         ("front = through - self.dark", "front = through", "a splat hides itself"),
+        ("    front -= before\n", "", "a splat hides itself from ranking"),
+        ("lost /= after", "lost *= after", "the colour behind is not laid open"),
+        ("number + len(views) if ranking", "number if ranking", "judged by what ranks"),
         (" - 5.0 / math.log(10.0) * relative", "", "chance not mended"),
         ("np.where(back < on, before, after)", "after", "only those behind take over"),
         ('order[np.argsort(protected[order], kind="stable")]', "order", "protection forgotten"),
         ("weights @ values / weights.sum()", "values.mean(axis=0)", "views count alike"),
+    ],
+    "scoring/thinning.py": [
+        ("weight * view.width", "view.width", "weight of views forgotten"),
+        (".keeping(keep)\n            with", "\n            with", "what has gone hides"),
+        ("(met * now[0] + KNOWN * error)", "(met * now[0] + KNOWN * own[0])", "no growth"),
+        ("before + prior", "before + 1.0", "growth of few lines believed"),
     ],
     "scoring/alignment.py": [
         (" or there >= WHOLE * count", "", "rings around all are judged"),
@@ -334,8 +343,8 @@ MUTANTS = {
     ],
     "cameras/colmap.py": [("if left:", "if left < 0:", "what is not announced skipped")],
     "scoring/occlusion.py": [
-        ("return 0.25 + 0.5 * gone", "return 0.25", "what has gone forgotten"),
-        ("        self._turn += count\n", "", "the same views in every round"),
+        ("stay > rest, stays", "stay >= rest, stays", "a round too many"),
+        ("max(count - settled, 0)", "settled", "what stays taken for what goes"),
         (
             "LEAST ** (number / (rounds - 1))",
             "LEAST ** ((number - 1) / (rounds - 1))",
@@ -364,7 +373,6 @@ MUTANTS = {
             "self.contribution[seen.rows] += seen.contribution",
             "weight of views forgotten",
         ),
-        ("self.error * error", "self.error", "errors before what hid them went"),
         ("seen.rows[seen.inside]", "seen.rows", "seen beside the image"),
         ("            seen *= seen\n", "", "transmittance not squared"),
     ],
@@ -602,7 +610,8 @@ MUTANTS = {
         ("if format_named(path) is None:", "if False:", "a plain PLY compared"),
     ],
     "quality.py": [
-        (" - halvings * np.array(FEWER)", "", "few splats that gain as much"),
+        (" - halvings * fewer", "", "few splats that gain as much"),
+        ("if place >= gone", "if place > gone", "a share too many"),
     ],
     "report.py": [
         ("missing = made.left_out(keep)", "missing = 0", "splats that no file holds"),

@@ -17,6 +17,7 @@ from refine_addon.core import (
     prune,
     read_cameras,
     read_ply,
+    score,
     select,
 )
 from refine_addon.core.affine import transformed
@@ -61,7 +62,7 @@ def room():
 def kept(splats, views, ratio, *, absorb, method="occlusion"):
     if absorb:
         return prune(splats, views, Budget(ratio=ratio), absorb=True).keep
-    scores = prune(splats, views, Budget(ratio=ratio), Settings(method)).scores
+    scores = score(splats, views, Settings(method))
     return np.stack([select(scores, Budget(ratio=share)) for share in (0.5, 0.9)])
 
 

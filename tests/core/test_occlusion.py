@@ -14,7 +14,6 @@ from refine_addon.core.scoring import coverage, froxels, measuring, occlusion, p
 from refine_addon.core.scoring.measuring import Measured, Measuring
 from refine_addon.core.scoring.occlusion import Occlusion
 from refine_addon.core.splats import SH_C0, rotation_matrices
-from refine_addon.core.work import silent
 
 ONCE = Occlusion(rounds=1)
 CUT = 1.0 / 255.0
@@ -447,11 +446,10 @@ def test_what_lies_below_a_wide_image_is_not_seen():
 
 
 def test_the_score_is_the_error_times_a_power_of_the_contribution():
-    """P = 1/4 + 1/2 of what has gone: 3 x 16^(1/4) = 6, and 3 x 16^(1/2) = 12 from half on."""
+    """3 x 16^(1/4) = 6."""
     sums = Measured(np.array([16.0]), np.array([3.0]), np.array([1], np.int32))
 
-    assert occlusion.combined(sums, 0.0) == pytest.approx([6.0])
-    assert occlusion.combined(sums, 0.5) == pytest.approx([12.0])
+    assert occlusion.combined(sums) == pytest.approx([6.0])
 
 
 def test_a_view_of_thrice_the_weight_counts_thrice():
@@ -485,11 +483,8 @@ def test_parts_of_the_views_take_turns_and_make_up_the_whole():
     assert occlusion.measure_part(splats, ring(1), ONCE, 5, 3)[1] == 1.0
 
 
-def test_rounds_measure_blocks_of_views_in_turns(monkeypatch):
-    """At first all 8; then as many as .16 of that costs, in pairs, and half of them at most.
-
-    Of 63, 40, 25, 16 and 10 % of the splats these are 2, 3.2, 5.1, 8 and 13 blocks.
-    """
+def test_views_are_measured_once_and_lines_of_sight_tell_the_rest(monkeypatch):
+    """All rounds after the first ask the lines that were noted then."""
     asked = []
 
     def blocks(self, *args, which=None, original=Measuring.blocks, **changes):
@@ -499,43 +494,34 @@ def test_rounds_measure_blocks_of_views_in_turns(monkeypatch):
     monkeypatch.setattr(Measuring, "blocks", blocks)
     occlusion.score(cloud(1000), ring(11), threads=1)
 
-    after = [sorted(which) for which in asked[1:]]
-    assert list(asked[0]) == list(range(8))
-    assert after == [[0, 1], [2, 3, 4, 5], [0, 1, 6, 7], [2, 3, 4, 5], [0, 1, 6, 7]]
+    assert [list(which) for which in asked] == [list(range(8))]
 
 
-def test_blocks_of_views_that_were_not_measured_again_are_raised():
-    """Eight times the same view: what one block has grown by, all have grown by.
-
-    A third of a cloud goes, which showed less of the rest.
-    """
-    splats = cloud(300)
-    views = ViewSet(tuple(replace(ring()[0], name=str(k)) for k in range(8)))
-    run = occlusion.Run(splats, views, Occlusion(), threads=1)
-    run.measure(range(8))
-    left = np.flatnonzero(np.arange(len(run.gaussians)) % 3 > 0)
-    blocks = {k: run.measured([k]).take(left) for k in range(8)}
-    before = blocks[7].error.sum()
-
-    run._measure_again(run.gaussians.take(left), blocks, silent)
-
-    assert blocks[0].error.sum() > 1.05 * before
-    for name in ("contribution", "error"):
-        sums = [getattr(block, name).sum() for block in blocks.values()]
-        np.testing.assert_allclose(sums, sums[0], rtol=1e-9)
-
-
-def test_two_rounds_order_nine_tenths_at_first_and_measure_the_last_tenth_anew():
-    """That tenth is all that is left by then; what hid it has gone."""
+def test_a_round_orders_what_it_removes_and_the_next_one_the_rest_anew():
+    """Of three rounds the first removes .684; until then it orders as the first of two, of .9."""
     splats, views = cloud(), ring()
 
-    once = occlusion.score(splats, views, ONCE).values
-    twice = occlusion.score(splats, views, Occlusion(rounds=2)).values
+    two, three = (
+        np.argsort(occlusion.score(splats, views, Occlusion(rounds=rounds)).values)
+        for rounds in (2, 3)
+    )
 
-    order, anew = np.argsort(once), np.argsort(twice)
-    np.testing.assert_array_equal(order[:270], anew[:270])
-    assert set(order[270:]) == set(anew[270:])
-    assert (order[270:] != anew[270:]).any()
+    np.testing.assert_array_equal(two[:205], three[:205])
+    assert (two[205:270] != three[205:270]).any()
+    assert set(two) == set(three) == set(range(300))
+
+
+def test_a_budget_ends_the_rounds_and_changes_no_place_up_to_it():
+    """Of three rounds two are done for .7 removed, one for half, each with all of its order."""
+    splats, views = cloud(), ring()
+    whole = np.argsort(occlusion.score(splats, views, Occlusion(rounds=3)).values)
+
+    for settled, same in ((150, 205), (210, 270), (300, 300)):
+        found = occlusion.score(splats, views, Occlusion(rounds=3), settled=settled)
+        order = np.argsort(found.values)
+        assert found.settled == settled
+        np.testing.assert_array_equal(order[:same], whole[:same])
+        assert (order[same:] != whole[same:]).any() == (same < 300)
 
 
 def test_what_no_renderer_draws_goes_first_the_least_first():

@@ -275,7 +275,7 @@ def test_a_view_loads_no_chunk_behind_it(tmp_path, tiles, views, monkeypatch):
     monkeypatch.setattr(
         SceneJob,
         "_chunk",
-        lambda job, number, rows: loaded.append(number) or load(job, number, rows),
+        lambda job, number: loaded.append(number) or load(job, number),
     )
     once = Settings(method="occlusion", views=12, occlusion=replace(OCCLUSION.occlusion, rounds=1))
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from ..quality import UNSEEN
 from ..work import Progress, part, silent
-from .occlusion import Rounds, Run
+from .occlusion import FIRST_END, Rounds, Run
 
 if TYPE_CHECKING:
     from ..scores import Scores
@@ -99,7 +99,7 @@ def scored(
     tolerance, settled, progress, threads
         See `score`.
     """
-    end = run.first_end(settled)
+    end = FIRST_END if run.rounds > 1 else 1.0
     ahead = part(progress, 0.0, end)
     if len(run.measuring.views) < LEAST_VIEWS or not tolerance:
         run.measure(range(run.measuring.count), ahead)

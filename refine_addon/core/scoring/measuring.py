@@ -22,7 +22,7 @@ from . import froxels, projection
 from .sight_lines import met
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, MutableMapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -113,10 +113,6 @@ class Measured:
         """Return the sums of some Gaussians."""
         return Measured(self.contribution[rows], self.error[rows], self.seen[rows])
 
-    def times(self, contribution: NDArray[np.float64], error: NDArray[np.float64]) -> Measured:
-        """Return the sums multiplied by factors, (M,) each."""
-        return Measured(self.contribution * contribution, self.error * error, self.seen)
-
     def add(self, other: Measured) -> None:
         """Add the sums of other views."""
         self.contribution[:] += other.contribution
@@ -188,10 +184,6 @@ class Measuring:
         """Number of blocks."""
         return len(self.members)
 
-    def none(self) -> MutableMapping[int, Measured]:
-        """Return where sums of blocks are kept, by their numbers: in memory."""
-        return {}
-
     def part(self, turn: int, parts: int) -> range:
         """Return the blocks of one of `parts` parts of the views; see `occlusion.measure_part`."""
         parts = min(parts, self.count)
@@ -205,7 +197,7 @@ class Measuring:
 
     def measure(
         self, gaussians: Gaussians, which: Sequence[int], progress: Progress
-    ) -> MutableMapping[int, Measured]:
+    ) -> Mapping[int, Measured]:
         """Return the sums over some blocks of views; see `blocks`."""
         none = np.empty(0, np.int64)
         return self.blocks(gaussians, none, progress, which=which)[0]
@@ -216,8 +208,8 @@ class Measuring:
         sample: NDArray[np.int64],
         progress: Progress,
         which: Sequence[int] | None = None,
-        sights: SightLines | None = None,
-    ) -> tuple[MutableMapping[int, Measured], dict[int, NDArray[np.float64]]]:
+        sights: Sequence[SightLines] = (),
+    ) -> tuple[Mapping[int, Measured], dict[int, NDArray[np.float64]]]:
         """Return the sums over each block of views, and the errors of a sample in each view.
 
         Parameters
@@ -228,8 +220,8 @@ class Measuring:
         progress : callable
         which : sequence of int, optional
             The blocks to measure; by default all `count` of them.
-        sights : SightLines, optional
-            Notes what its lines meet.
+        sights : sequence of SightLines
+            Note what their lines meet.
 
         Returns
         -------
@@ -238,7 +230,9 @@ class Measuring:
         """
         chosen = range(self.count) if which is None else which
         numbers = [number for k in chosen for number in self.members[k]]
-        missing = {n for n in numbers if sights is not None and sights.lacks(n)}
+        missing = [
+            (each.ranking, {number for number in numbers if each.lacks(number)}) for each in sights
+        ]
         found = for_each(
             _Looking(gaussians, self.scene, self.views, self.sampling, numbers, missing),
             len(numbers), SECONDS * len(gaussians) * len(numbers),
@@ -254,8 +248,9 @@ class Measuring:
                 before = total.error[sample]  # (m,)
                 total.add_view(seen, self.views[number][1])
                 grown.append(total.error[sample] - before)
-                if sights is not None and lines is not None:
-                    sights.lines[number] = lines
+                for each, noted in zip(sights, lines, strict=True):
+                    if noted is not None:
+                        each.lines[number] = noted
             errors[k] = np.array(grown)
         for _ in found:
             pass  # lets it end
@@ -275,8 +270,9 @@ class _Looking:
     sampling : Sampling
     numbers : list of int
         Of those that measure.
-    missing : set of int
-        Numbers of the views whose lines of sight are wanted.
+    missing : list of (bool, set of int)
+        Of several kinds of lines of sight: whether they order splats, and the numbers of the views
+        of which they are wanted.
     """
 
     gaussians: Gaussians
@@ -284,15 +280,19 @@ class _Looking:
     views: list[tuple[View, float]]
     sampling: Sampling
     numbers: list[int]
-    missing: set[int]
+    missing: list[tuple[bool, set[int]]]
 
-    def __call__(self, place: int) -> tuple[Seen, Lines | None]:
+    def __call__(self, place: int) -> tuple[Seen, list[Lines | None]]:
         """Return what a view sees, and what its lines of sight meet."""
         number = self.numbers[place]
         footprints, seen = measure_view(
             self.gaussians, self.scene, self.views[number][0], self.sampling
         )
-        return seen, met(self.views, number, footprints) if number in self.missing else None
+        with np.errstate(under="ignore"):
+            return seen, [
+                met(self.views, number, footprints, ranking=ranking) if number in wanted else None
+                for ranking, wanted in self.missing
+            ]
 
 
 def measure_view(

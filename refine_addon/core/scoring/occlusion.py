@@ -1,24 +1,24 @@
 """Scores that take into account what hides what, computed without a renderer.
 
-    score_i = error_i  contribution_i^p,   p = 1/4 + 1/2 (share removed before)
+    score_i = error_i  contribution_i^(1/4)
 
 `measuring` defines the error and the contribution. The error is exact for one splat that is removed
 while all others stay. The contribution also counts what the splat hides, which matters once its
-neighbours are removed too. From half removed on, the product ranks better than the error alone.
+neighbours are removed too.
 
 A floor is added to every score, for views that were not given: the closed form, with a weight that
 rises with the share removed (`coverage`).
 
 Splats hide each other, so they are removed in rounds: a part of the splats goes, the rest is scored
-again, until a tenth is left. The result is one order of removal, so a larger budget also removes
-all that a smaller one does. Scoring for one budget ends with the round that removes the last of its
+again, until a tenth is left. The views are measured once; what the rest is worth later is told by
+lines of sight (`thinning`). The result is one order of removal, so a larger budget also removes all
+that a smaller one does. Scoring for one budget ends with the round that removes the last of its
 splats.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -32,9 +32,10 @@ from ..work import Progress, part, report, silent
 from . import closed_form, coverage, projection
 from .measuring import SECONDS, Measured, Measuring, Sampling
 from .sight_lines import SightLines
+from .thinning import Thinning
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, MutableMapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -45,15 +46,14 @@ if TYPE_CHECKING:
 LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
 
-ROUND_COST = 0.16
-"""A round after the first measures about as many blocks of views as cost this share of the first;
-at least two, at most about half of them."""
+EXPONENT = 0.25
+"""Exponent of the contribution."""
 
-COMMON = 0.1
-"""Weight of what all splats have grown by, as a share of a splat's sum over all views."""
+FIRST_END = 0.75
+"""Where measuring ends and rounds begin, as a share of all the time, to show progress."""
 
-FIRST_COST = 0.5
-"""Share of the time that is still ahead that a round takes, for the display of progress."""
+ROUND_COST = 0.3
+"""Share of the time that is still ahead that a round takes, to show progress."""
 
 PRIOR = closed_form.ClosedForm("distance", frustum=False, local=False)
 """Model of the floor. It has no frustum test, since splats that no view shows also need a floor."""
@@ -71,7 +71,7 @@ class Occlusion(Sampling):
         How often scores are computed: once, or again after each part of the removal.
     """
 
-    rounds: int = 6
+    rounds: int = 8
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -129,9 +129,10 @@ def score(
     Memory: about 300 bytes a splat, plus a third of that for each thread beyond the first; and 100
     bytes for each point of a view, per thread. A view has at most about 4 million points
     (`froxels.MAX_POINTS`); only a view that shows more than 3 million splats has more.
+    What lines of sight meet takes 16 bytes each, see `thinning.Thinning`.
     """
     run = Run(splats, views, settings, progress=part(progress, 0.0, 0.1), threads=threads)
-    end = run.first_end(settled)
+    end = FIRST_END if settings.rounds > 1 else 1.0
     run.measure(range(run.measuring.count), part(progress, 0.1, end))
     return run.rank(part(progress, end, 1.0), settled)
 
@@ -262,6 +263,8 @@ class Rounds:
     measuring : Measuring
     sights : SightLines or None
         Note what the lines of sight of the views meet that measure all splats.
+    ranking : SightLines or None
+        The same with those lines that order splats; None in a single round.
     prior : (N,) float32
         Orders the splats that are not among the Gaussians, and is the floor of all others.
     undrawable : (N,) bool
@@ -279,11 +282,11 @@ class Rounds:
     ) -> None:
         self.gaussians, self.measuring, self.rounds = gaussians, measuring, rounds
         self.prior, self.undrawable, self.sights = prior, undrawable, sights
+        self.ranking: SightLines | None = None
         self._sample = coverage.sample(gaussians)  # (m,)
-        self._blocks = measuring.none()
+        self._blocks: dict[int, Mapping[int, Measured]] = {}  # what holds the sums of each
         self._errors: dict[int, NDArray[np.float64]] = {}  # of the sample, by blocks
         self._weights: dict[tuple[int, ...], list[float]] = {}  # of the floor, by blocks
-        self._turn = 0  # how many blocks were measured again
 
     def measure(self, which: Sequence[int], progress: Progress = silent) -> Measured:
         """Measure all splats in some more blocks of views; return the sums over all so far, (M,).
@@ -294,16 +297,17 @@ class Rounds:
             If `progress` answers ``False``.
         """
         found, errors = self.measuring.blocks(
-            self.gaussians, self._sample, progress, which=which, sights=self.sights
-        )
-        self._blocks.update(found)
+            self.gaussians, self._sample, progress, which=which,
+            sights=[lines for lines in (self.sights, self.ranking) if lines is not None],
+        )  # fmt: skip
+        self._blocks |= dict.fromkeys(found, found)
         self._errors |= errors
         return self.measured()
 
     def measured(self, which: Sequence[int] | None = None) -> Measured:
         """Return the sums over some of the blocks that were measured, by default all, (M,)."""
         chosen = sorted(self._blocks if which is None else which)
-        return Measured.sum(self._blocks[k] for k in chosen)
+        return Measured.sum(self._blocks[k][k] for k in chosen)
 
     def once(self, which: Sequence[int], progress: Progress = silent) -> NDArray[np.float32]:
         """Return the values of all N splats, in one round, by some of the blocks measured.
@@ -315,14 +319,10 @@ class Rounds:
         """
         removal, measured = self._removal(), self.measured(which)
         weights = self._floor_weights(measured, which, progress)
-        order = self._order(self.gaussians, measured, weights, removal, len(self.gaussians))
+        every = np.arange(len(self.gaussians))
+        order = self._order(every, measured, weights, removal, len(every))
         removal.add(self.gaussians.index[order])
         return removal.values
-
-    def first_end(self, settled: int | None = None) -> float:
-        """Return where the first round ends, as a share of all the time, to show progress."""
-        later = len(_survivors(len(self.prior), self.rounds, settled)) - 1
-        return 1.0 / (1.0 + ROUND_COST * later)
 
     def rank(self, progress: Progress, settled: int | None = None) -> Scores:
         """Return the scores, by the blocks measured; can be called once.
@@ -351,22 +351,19 @@ class Rounds:
         blocks = self._blocks
         weights = self._floor_weights(measured, list(blocks), part(progress, 0.0, 0.0))
         used = sum(len(self.measuring.members[k]) for k in blocks)
-        left, done = self.gaussians, 0.0
-        stays = _survivors(len(self.prior), self.rounds, settled)
-        for number, stay in enumerate(stays):
-            end = 1.0 if number == len(stays) - 1 else done + (1.0 - done) * FIRST_COST
+        left, done, thinning = np.arange(len(self.gaussians)), 0.3, None
+        if self.ranking is not None:
+            ahead = part(progress, 0.0, done)
+            thinning = Thinning(self.ranking, measured, ahead, self.measuring.threads)
+        for stay in _survivors(len(self.prior), self.rounds, settled):
+            end = 1.0 if not stay else done + (1.0 - done) * ROUND_COST
             ahead, done = part(progress, done, end), end
-            if number:
-                measured = self._measure_again(left, blocks, ahead)
+            now = measured if thinning is None else thinning.measured(left, ahead)
             report(ahead, 1.0, "scoring")
             go = max(len(left) - stay, 0)
-            order = self._order(left, measured, weights, removal, go)
-            removal.add(left.index[order[:go]])
-            rows = np.sort(order[go:])
-            if number < len(stays) - 1:
-                left = left.take(rows)
-                for k in blocks:
-                    blocks[k] = blocks[k].take(rows)
+            order = self._order(left, now, weights, removal, go)
+            removal.add(self.gaussians.index[left[order[:go]]])
+            left = np.sort(left[order[go:]])
         removal.values[self.undrawable] = 0.0
         return Scores(
             values=removal.values,
@@ -386,54 +383,22 @@ class Rounds:
         removal.add(undrawn[np.argsort(self.prior[undrawn], kind="stable")])
         return removal
 
-    def _measure_again(
-        self, left: Gaussians, blocks: MutableMapping[int, Measured], progress: Progress
-    ) -> Measured:
-        """Measure the splats left in some blocks of views, which take turns; return all sums.
-
-        The sums of the other blocks are from an earlier round, when more was hidden. Those of each
-        splat are raised by what its sums over these blocks have grown by, see `_growth`.
-
-        Parameters
-        ----------
-        left : Gaussians
-        blocks : dict of int to Measured
-            The sums of the splats left over each block of views, as measured last; changed.
-        progress : callable
-        """
-        numbers = sorted(blocks)
-        # In pairs of blocks, as the figures of docs/decisions.md were measured.
-        share = ROUND_COST * len(self.gaussians) / max(len(left), 1)
-        pairs = max(round(share * len(numbers) / 2), 1)
-        half = math.ceil(len(numbers) / 4)  # in pairs
-        count = min(2 * min(pairs, half), len(numbers))
-        which = [numbers[(self._turn + step) % len(numbers)] for step in range(count)]
-        self._turn += count
-        found = self.measuring.measure(left, which, progress)
-        before, now = (Measured.sum(some[k] for k in which) for some in (blocks, found))
-        every = Measured.sum(blocks[k] for k in numbers)
-        contribution = _growth(now.contribution, before.contribution, every.contribution)
-        error = _growth(now.error, before.error, every.error)
-        for k in set(numbers) - set(which):
-            blocks[k] = blocks[k].times(contribution, error)
-        blocks.update(found)
-        return Measured.sum(blocks[k] for k in numbers)
-
     def _order(
         self,
-        left: Gaussians,
+        left: NDArray[np.int64],
         measured: Measured,
         weights: Sequence[float],
         removal: _Removal,
         go: int,
     ) -> NDArray[np.int64]:
-        """Return the rows of the n splats left, in the order of removal.
+        """Return the places in `left` of the n splats left, in the order of removal.
 
         Parameters
         ----------
-        left : Gaussians
+        left : (n,) int64
+            Rows of the Gaussians.
         measured : Measured
-            Of the splats left.
+            What these are worth now.
         weights : sequence of float
             Of the floor, up to each of `coverage.SHARES`.
         removal : _Removal
@@ -441,13 +406,13 @@ class Rounds:
         go : int
             How many are removed in this round; the order of the others is not exact.
         """
-        prior, count, gone = self.prior[left.index], len(removal.values), removal.gone
-        share = gone / count
-        floors = coverage.floor(prior.astype(np.float64), measured.seen, 1.0 + _exponent(share))
+        prior = self.prior[self.gaussians.index[left]]  # (n,)
+        count, gone = len(removal.values), removal.gone
+        floors = coverage.floor(prior.astype(np.float64), measured.seen, 1.0 + EXPONENT)
         # How many of these splats have been removed when each of the shares is reached.
         stops = np.clip(np.rint(np.multiply(coverage.SHARES, count)) - gone, 0, go).astype(int)
         stops[-1] = go
-        return coverage.order(combined(measured, share), floors, prior, weights, stops)
+        return coverage.order(combined(measured), floors, prior, weights, stops)
 
     def _floor_weights(
         self, measured: Measured, which: Sequence[int], progress: Progress
@@ -467,15 +432,15 @@ class Rounds:
         def folds() -> Iterator[tuple[NDArray[np.float64], ...]]:
             for number in blocks if len(blocks) > 1 else ():
                 report(progress, 0.0, "scoring")
-                block, errors = self._blocks[number], self._errors[number]
+                block, errors = self._blocks[number][number], self._errors[number]
                 others = Measured(
                     # Rounding can leave a negative difference.
                     np.maximum(measured.contribution[sample] - block.contribution[sample], 0.0),
                     np.maximum(measured.error[sample] - block.error[sample], 0.0),
                     measured.seen[sample] - block.seen[sample],
                 )
-                floors = coverage.floor(worth, others.seen, 1.0 + _exponent(0.0))
-                yield combined(others, 0.0), floors, errors
+                floors = coverage.floor(worth, others.seen, 1.0 + EXPONENT)
+                yield combined(others), floors, errors
 
         if blocks not in self._weights:
             self._weights[blocks] = coverage.floor_weights(folds())
@@ -527,6 +492,8 @@ class Run(Rounds):
         ).values
         sights = SightLines(measuring.views, gaussians, splats, judges=judges)
         super().__init__(gaussians, measuring, settings.rounds, prior, ~good, sights)
+        if settings.rounds > 1:
+            self.ranking = SightLines(measuring.views, gaussians, splats, ranking=True)
 
 
 class _Removal:
@@ -561,35 +528,10 @@ def _survivors(count: int, rounds: int, settled: int | None = None) -> list[int]
     return [*itertools.takewhile(lambda stay: stay > rest, stays), 0]
 
 
-def combined(measured: Measured, gone: float) -> NDArray[np.float64]:
-    """Return ``error contribution^p``, (M,); p rises with the share `gone` that went before.
+def combined(measured: Measured) -> NDArray[np.float64]:
+    """Return ``error contribution^p``, (M,).
 
     The error is exact for one splat. The more of its neighbours go too, the more it matters how
     much of the picture the splat covers, whatever lies behind it.
     """
-    return np.asarray(measured.error * measured.contribution ** _exponent(gone))
-
-
-def _growth(
-    now: NDArray[np.float64], before: NDArray[np.float64], every: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return by which factor the sum of each splat has grown, (n,), as some blocks of views tell.
-
-    Where these blocks hardly saw a splat, it is the factor of all splats.
-
-    Parameters
-    ----------
-    now, before : (n,) float64
-        The sums over these blocks.
-    every : (n,) float64
-        The sums over all blocks, as measured before.
-    """
-    total = float(before.sum())
-    common = float(now.sum()) / total if total > 0.0 else 1.0
-    prior = COMMON * every  # (n,)
-    return np.divide(now + prior * common, before + prior, out=np.ones_like(now), where=prior > 0.0)
-
-
-def _exponent(gone: float) -> float:
-    """Return the exponent of the contribution, given the share that went before."""
-    return 0.25 + 0.5 * gone
+    return np.asarray(measured.error * measured.contribution**EXPONENT)

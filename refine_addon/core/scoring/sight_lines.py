@@ -44,6 +44,16 @@ LINES = 1 << 14
 MOST_MET = 1 << 24
 """About how many splats all lines together may meet; there are fewer lines in dense scenes."""
 
+RANKED = 1 << 16
+"""How many other lines of sight all views together have that order splats, see `thinning`: what is
+ordered by some lines, others have to judge."""
+
+MOST_RANKED = 3 << 24
+"""About how many splats all of those may meet. Each takes 16 bytes."""
+
+MOST_LINES = 60_000
+"""A view has at most so many lines: NumPy sorts numbers of 16 bits by radix, in linear time."""
+
 LEAST_LINES = 16
 """A view has at least this many lines, if it has as many pixels."""
 
@@ -57,6 +67,7 @@ DARK = -9.3
 """Logarithm of the transmittance below which nothing is seen, 1e-4."""
 
 _BLOCK = 1 << 17  # pairs of footprint and pixel at a time, which limits temporary memory
+_PIECE = 1 << 15  # of what lines meet, at a time: what stays in the second-level cache
 _LARGE = 1 << 14  # pixels; for images no larger, a table says how many lines lie before each
 
 
@@ -143,6 +154,46 @@ class Lines:
         channels = [np.bincount(line, weight * channel.take(owner), count) for channel in colors]
         return np.stack(channels).clip(0.0, 1.0)
 
+    @property
+    def count(self) -> int:
+        """How many lines there are."""
+        return len(self.columns) * len(self.rows)
+
+    def losses(
+        self, colors: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return what all lines together would lose with each splat that they meet, (u,) each.
+
+        Parameters
+        ----------
+        colors : (3, u) float32
+            Of the splats that are met.
+
+        Returns
+        -------
+        error : (u,) float64
+            The squared change of the colours of the lines without this one, all channels:
+            ``(T alpha)^2 |c - B|^2``, with T what is left of the light in front of the splat, and B
+            the colour behind it.
+        contribution : (u,) float64
+            What part of the colours it makes up: ``T alpha``.
+        """
+        first = self._first()
+        ends = np.append(first, len(self.line))
+        cuts = np.unique(np.searchsorted(ends, [*range(0, len(self.line), _PIECE), len(self.line)]))
+        error, weight = np.empty((2, len(self.line)), np.float32)
+        owner = self.owner.astype(np.intp)
+        for begin, end in pairwise(cuts.tolist()):
+            checkpoint()
+            piece = slice(int(ends[begin]), int(ends[end]))
+            error[piece], weight[piece] = _losses(
+                self.alpha[piece], self.dark[piece], colors.take(owner[piece], axis=1),
+                np.diff(ends[begin : end + 1]),
+            )  # fmt: skip
+        sums = (np.bincount(owner, each, len(self.met)) for each in (error, weight))
+        errors, parts = (np.asarray(each, np.float64) for each in sums)
+        return errors, parts
+
     def contributions(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
         """Return what the lines see: r of the things that they meet.
 
@@ -214,7 +265,9 @@ class Lines:
 
     def _first(self) -> NDArray[np.int64]:
         """Return where each line that meets something begins."""
-        return np.flatnonzero(np.diff(self.line, prepend=-1))
+        new = np.ones(len(self.line), np.bool_)
+        np.not_equal(self.line[1:], self.line[:-1], out=new[1:])
+        return np.flatnonzero(new)
 
 
 class SightLines:
@@ -231,6 +284,8 @@ class SightLines:
     judges : bool
         Whether only about `JUDGES` of the views are looked from: enough for `against`, not for
         `curve`.
+    ranking : bool
+        Whether the lines are those that order splats; see `RANKED`.
 
     Attributes
     ----------
@@ -249,8 +304,9 @@ class SightLines:
         splats: Splats,
         *,
         judges: bool = False,
+        ranking: bool = False,
     ) -> None:
-        self.views, self.splats = views, splats
+        self.views, self.splats, self.ranking = views, splats, ranking
         self.every = max(math.ceil(len(views) / JUDGES), 1) if judges else 1
         self.index = self.rows = gaussians.index
         self.lines: list[Lines | None] = [None] * len(views)
@@ -258,6 +314,9 @@ class SightLines:
     def colors(self, lines: Lines, view: View) -> NDArray[np.float64]:
         """Return the colours in which a view sees what its lines meet, (3, u)."""
         return colors_from(self.splats, self.rows[lines.met], view)
+
+    def load(self) -> None:
+        """Make ready what the lines meet, where that does not lie in memory."""
 
     def lacks(self, number: int) -> bool:
         """Return whether what the lines of a view meet is wanted, and not yet known."""
@@ -278,7 +337,7 @@ class SightLines:
             if self.lacks(number):
                 with np.errstate(under="ignore"):
                     footprints = projection.project(gaussians, scene, self.views[number][0])
-                    self.lines[number] = met(self.views, number, footprints)
+                    self.lines[number] = met(self.views, number, footprints, ranking=self.ranking)
 
         for_chunks(work, len(numbers), 1, progress=progress, what="looking", threads=threads)
 
@@ -538,11 +597,20 @@ def _places(
     return place
 
 
-def met(views: Sequence[tuple[View, float]], number: int, footprints: Footprints) -> Lines:
-    """Return what the lines of sight of one of some views meet."""
+def met(
+    views: Sequence[tuple[View, float]],
+    number: int,
+    footprints: Footprints,
+    *,
+    ranking: bool = False,
+) -> Lines:
+    """Return what the lines of sight of one of some views meet; see `SightLines`."""
     view = views[number][0]
-    count = min(LINES, MOST_MET / max(crowding(footprints, view), 1.0)) / len(views)
-    return meet(footprints, *pixels(view, number, count))
+    most, lines = (MOST_RANKED, RANKED) if ranking else (MOST_MET, LINES)
+    count = min(lines, most / max(crowding(footprints, view), 1.0)) / len(views)
+    # Other pixels than those of the lines that judge.
+    place = number + len(views) if ranking else number
+    return meet(footprints, *pixels(view, place, min(count, MOST_LINES)))
 
 
 def pixels(view: View, number: int, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -574,6 +642,53 @@ def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[
     away /= np.maximum(np.linalg.norm(away, axis=1), np.finfo(np.float64).tiny)[:, None]
     found = spherical_harmonics.colors(away, splats.sh_dc[rows], splats.sh_rest[rows])
     return np.ascontiguousarray(found.T.clip(0.0, projection.BRIGHTEST))
+
+
+def _losses(
+    alpha: NDArray[np.float32],
+    dark: NDArray[np.float32],
+    colors: NDArray[np.float32],
+    counts: NDArray[np.int64],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return for all that some lines meet what they would lose without it; see `Lines.losses`.
+
+    Parameters
+    ----------
+    alpha, dark : (h,) float32
+        See `Lines`.
+    colors : (3, h) float32
+    counts : (n,) int64
+        How much each line meets, at least one.
+
+    Returns
+    -------
+    error, contribution : (h,) float32
+        0 where nothing is seen.
+    """
+    last = np.cumsum(counts) - 1  # of each line
+    before = dark.astype(np.float64)
+    front = np.cumsum(before)
+    front -= before
+    front -= np.repeat(front.take(last - counts + 1), counts)
+    through = np.exp(front.astype(np.float32))
+    through[front < DARK] = 0.0
+    weight = through * alpha
+    after = np.maximum(through - weight, np.float32(1e-8))
+    pair = np.empty(len(alpha), np.complex128)  # two running sums in the time of one
+    pair.real, pair.imag = weight * colors[0], weight * colors[1]
+    third = (weight * colors[2]).astype(np.float64)
+    pair, third = (
+        np.repeat(sums.take(last), counts) - sums for sums in (np.cumsum(pair), np.cumsum(third))
+    )
+    error = np.zeros(len(alpha), np.float32)
+    for own, behind in zip(colors, (pair.real, pair.imag, third), strict=True):
+        lost = behind.astype(np.float32)
+        lost /= after
+        lost -= own
+        lost *= weight
+        lost *= lost
+        error += lost
+    return error, weight
 
 
 def psnr_of(seen: NDArray[np.float64], whole: NDArray[np.float64], view: View) -> float:

@@ -11,7 +11,7 @@ from ..pipeline import with_quality
 from ..scene import Scene, principal_axes
 from ..scores import Scores
 from ..scoring import auto, closed_form
-from ..scoring.occlusion import PRIOR, Rounds
+from ..scoring.occlusion import FIRST_END, PRIOR, Rounds
 from ..work import Progress, part
 from .seen import MeasuringTiles, SceneJob, StoredLines, place
 from .steps import Job, Shared
@@ -233,11 +233,13 @@ class _Scoring(Rounds):
         measuring = MeasuringTiles(self.job, workers, members)
         # Those in the folder have what `Rounds` asks of Gaussians in memory.
         super().__init__(gaussians, measuring, settings.rounds, values, ~good, sights)  # type: ignore[arg-type]
+        if settings.rounds > 1:
+            self.ranking = StoredLines(self.job, workers, units, gaussians, ranking=True)
         self._folder, self._units = job.folder, units
 
     def all(self, progress: Progress, settled: int | None = None) -> Scores:
         """Measure all blocks of views, and return the scores; see `occlusion.score`."""
-        end = self.first_end(settled)
+        end = FIRST_END if self.rounds > 1 else 1.0
         self.measure(range(self.measuring.count), part(progress, 0.0, end))
         return self.rank(part(progress, end, 1.0), settled)
 

@@ -8,7 +8,7 @@ together, as in memory: what it finds is the same to the bit, wherever the tiles
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, MutableMapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -25,7 +25,7 @@ from ..work import Progress, part, silent
 from .workers import Call
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -142,33 +142,32 @@ class SceneJob:
 
     def look(
         self,
-        turn: int,
         block: int,
         numbers: list[int],
+        kinds: list[bool],
         *,
         progress: Progress = silent,
         threads: int | None = 1,
     ) -> None:
-        """Measure what a block of views sees of the splats that are left.
+        """Measure what a block of views sees of the splats, and note what their lines meet.
 
         Parameters
         ----------
-        turn : int
-            How often splats have been removed.
         block : int
             Its number.
         numbers : list of int
             Of its views, in the order of `ViewSet.by_distance`.
+        kinds : list of bool
+            Of the lines to note: whether they order splats, see `SightLines`.
         progress, threads
         """
-        name = seen_name(turn, block)
+        name = seen_name(block)
         if self.folder.has(name):
             return
-        sample = self.folder.noted("sample")[1] if turn == 0 else np.empty(0, np.int64)
-        count = len(self.folder.mapped(f"left-{turn}"))
+        sample, count = self.folder.noted("sample")[1], int(self.folder.noted("count")[1])
         total, errors = Measured.zero(count), []
         found = for_each(
-            _Looking(self, turn, numbers), len(numbers), SECONDS * count * len(numbers),
+            _Looking(self, numbers, kinds), len(numbers), SECONDS * count * len(numbers),
             progress=progress, what="scoring", threads=threads,
         )  # fmt: skip
         for seen, weight in found:
@@ -177,17 +176,16 @@ class SceneJob:
             errors.append(total.error[sample] - before)
         self.folder.note(name, (total.contribution, total.error, total.seen, np.array(errors)))
 
-    def measure_view(self, turn: int, number: int) -> tuple[Seen, float]:
-        """Return what a view sees of the splats that are left, and its weight; note its lines."""
-        boxes, left = self.folder.noted("boxes")[1], self.folder.mapped(f"left-{turn}")
+    def measure_view(self, number: int, kinds: list[bool]) -> tuple[Seen, float]:
+        """Return what a view sees of the splats, and its weight; note its lines."""
         view, weight = self.views.by_distance()[number]
-        footprints, colors = self._footprints(view, boxes, left)
-        if turn == 0:
-            self._note_lines(number, footprints)
+        footprints, colors = self._footprints(view)
+        for ranking in kinds:
+            self._note_lines(number, footprints, ranking=ranking)
         return of_view(footprints, colors, view, self.sampling), weight
 
     def meet(self, number: int, pixels: tuple[NDArray[np.int64], ...] | None = None) -> None:
-        """Note what the lines of sight of a view meet, before any splats are removed.
+        """Note what the lines of sight of a view meet.
 
         Parameters
         ----------
@@ -196,22 +194,23 @@ class SceneJob:
         pixels : (C,), (R,) int64, optional
             Columns and rows that the lines go through, if they are not to be chosen.
         """
-        boxes, left = self.folder.noted("boxes")[1], self.folder.mapped("left-0")
         view, _ = self.views.by_distance()[number]
-        self._note_lines(number, self._footprints(view, boxes, left)[0], pixels)
+        self._note_lines(number, self._footprints(view)[0], pixels)
 
     def _note_lines(
         self,
         number: int,
         footprints: projection.Footprints,
         pixels: tuple[NDArray[np.int64], ...] | None = None,
+        *,
+        ranking: bool = False,
     ) -> None:
-        name = lines_name(number)
+        name = lines_name(number, ranking=ranking)
         if self.folder.has(name):
             return
         with np.errstate(under="ignore"):
             if pixels is None:
-                lines = met(self.views.by_distance(), number, footprints)
+                lines = met(self.views.by_distance(), number, footprints, ranking=ranking)
             else:
                 lines = meet(footprints, *pixels)
         self.folder.note(name, tuple(vars(lines).values()))
@@ -220,18 +219,15 @@ class SceneJob:
         """Return some splats of a source."""
         return source.splats().take(rows)
 
-    def _footprints(
-        self, view: View, boxes: NDArray[np.float32], left: NDArray[np.int64]
-    ) -> tuple[projection.Footprints, NDArray[np.float32]]:
+    def _footprints(self, view: View) -> tuple[projection.Footprints, NDArray[np.float32]]:
         """Return the n footprints in a view, front to back, and their colours, (n, 3)."""
         found, colors = [], [np.empty((0, 3), np.float32)]
+        boxes = self.folder.noted("boxes")[1]
         with np.errstate(under="ignore"):
             for number in np.flatnonzero(projection.boxes_touch(boxes, self.scene, view)).tolist():
-                edges = np.array([number, number + 1]) * CHUNK
-                start, stop = np.searchsorted(left, edges).tolist()
-                chunk = self._chunk(number, np.asarray(left[start:stop]) - edges[0])
+                chunk = self._chunk(number)
                 some, depth = projection.reaching(chunk, self.scene, view)
-                found.append((replace(some, index=some.index + start), depth))
+                found.append((replace(some, index=some.index + number * CHUNK), depth))
                 colors.append(chunk.colors[some.index])
             footprints = projection.front_to_back(found)
         # Ascending, since chunks are.
@@ -239,64 +235,49 @@ class SceneJob:
         at = np.searchsorted(rows, footprints.index)
         return footprints, np.concatenate(colors)[at]
 
-    def _chunk(self, number: int, rows: NDArray[np.int64]) -> Gaussians:
-        """Return some of the Gaussians of a chunk."""
+    def _chunk(self, number: int) -> Gaussians:
+        """Return the Gaussians of a chunk."""
         whole = self.folder.load(number, ["chunk"])["chunk"]
-        some = whole if len(rows) == whole.shape[1] else np.take(whole, rows, axis=1)
         return Gaussians(
-            rows, some[_MEANS], some[_COVARIANCES], some[_LARGEST], some[_ALPHAS],
-            np.ascontiguousarray(some[_COLORS].T),
+            np.arange(whole.shape[1]), whole[_MEANS], whole[_COVARIANCES], whole[_LARGEST],
+            whole[_ALPHAS], np.ascontiguousarray(whole[_COLORS].T),
         )  # fmt: skip
 
 
-def lines_name(number: int) -> str:
+def lines_name(number: int, *, ranking: bool = False) -> str:
     """Return under which name the lines of sight of a view are noted."""
-    return f"lines-{number:06d}"
+    return f"{'ranking' if ranking else 'lines'}-{number:06d}"
 
 
-def seen_name(turn: int, block: int) -> str:
+def seen_name(block: int) -> str:
     """Return under which name a block of views notes what it sees."""
-    return f"{turn:02d}-{block}.seen"
+    return f"{block}.seen"
 
 
-class Stored(MutableMapping[int, Measured]):
+class Stored(Mapping[int, Measured]):
     """Sums of blocks of views, in a folder.
 
     Parameters
     ----------
     folder : Folder
-    names : dict of int to str, optional
-        Under which names those lie that are there already.
+    blocks : iterable of int
+        The numbers of those that lie there.
     """
 
-    def __init__(self, folder: Folder, names: dict[int, str] | None = None) -> None:
-        self._folder, self.names = folder, names or {}
+    def __init__(self, folder: Folder, blocks: Iterable[int]) -> None:
+        self._folder, self._blocks = folder, [*blocks]
 
     def __getitem__(self, block: int) -> Measured:
         """Return the sums of a block."""
-        return Measured(*self._folder.noted(self.names[block])[1][:3])
-
-    def __setitem__(self, block: int, sums: Measured) -> None:
-        """Keep other sums of a block; those that were noted stay for a run after this one."""
-        name = f"sums-{block}"
-        self._folder.note(name, (sums.contribution, sums.error, sums.seen))
-        self.names[block] = name
-
-    def __delitem__(self, block: int) -> None:
-        """Forget a block."""
-        del self.names[block]
+        return Measured(*self._folder.noted(seen_name(block))[1][:3])
 
     def __iter__(self) -> Iterator[int]:
         """Return the numbers of the blocks."""
-        return iter(self.names)
+        return iter(self._blocks)
 
     def __len__(self) -> int:
         """Return how many blocks there are."""
-        return len(self.names)
-
-    def update(self, other: Stored) -> None:  # type: ignore[override]
-        """Take over the blocks of another, which lie in the same folder."""
-        self.names |= other.names
+        return len(self._blocks)
 
 
 class Placed:
@@ -307,35 +288,19 @@ class Placed:
     folder : Folder
     index : (M,) int64
         Rows of the splats, see `Gaussians`.
-    turn : int
-        How often splats have been removed.
-    left : (m,) int64, optional
-        Which of the Gaussians are left.
 
     Attributes
     ----------
-    index : (m,) int64
-        Rows of those that are left.
+    index : (M,) int64
     """
 
-    def __init__(
-        self,
-        folder: Folder,
-        index: NDArray[np.int64],
-        turn: int = 0,
-        left: NDArray[np.int64] | None = None,
-    ) -> None:
-        self.index, self.turn, self._folder = index, turn, folder
-        self._left = np.arange(len(index)) if left is None else left
-        folder.note(f"left-{turn}", self._left)
+    def __init__(self, folder: Folder, index: NDArray[np.int64]) -> None:
+        self.index, self._folder = index, folder
+        folder.note("count", np.array(len(index)))
 
     def __len__(self) -> int:
-        """Return how many are left."""
+        """Return how many there are."""
         return len(self.index)
-
-    def take(self, rows: NDArray[np.int64]) -> Placed:
-        """Return some of those that are left."""
-        return Placed(self._folder, self.index[rows], self.turn + 1, self._left[rows])
 
     @property
     def alphas(self) -> NDArray[np.float32]:
@@ -349,7 +314,7 @@ class Placed:
 
     def _chunks(self) -> Iterator[NDArray[np.float32]]:
         yield np.empty((14, 0), np.float32)
-        for number in range(-(-len(self._left) // CHUNK)):
+        for number in range(-(-len(self) // CHUNK)):
             yield self._folder.map(number, "chunk")
 
 
@@ -360,18 +325,18 @@ class _Looking:
     Attributes
     ----------
     job : SceneJob
-    turn : int
     numbers : list of int
+    kinds : list of bool
         See `SceneJob.look`.
     """
 
     job: SceneJob
-    turn: int
     numbers: list[int]
+    kinds: list[bool]
 
     def __call__(self, place: int) -> tuple[Seen, float]:
         """Return what a view sees, and its weight."""
-        return self.job.measure_view(self.turn, self.numbers[place])
+        return self.job.measure_view(self.numbers[place], self.kinds)
 
 
 class MeasuringTiles(Measuring):
@@ -392,34 +357,30 @@ class MeasuringTiles(Measuring):
         super().__init__(job.scene, job.views, job.sampling, None, members)
         self._job, self._workers = job, workers
 
-    def none(self) -> Stored:
-        """Return where sums of blocks are kept, by their numbers: in the folder."""
-        return Stored(self._job.folder)
-
     def blocks(  # type: ignore[override]
         self,
-        gaussians: Placed,
+        gaussians: Placed,  # noqa: ARG002 - as those in memory, and the folder holds them
         sample: NDArray[np.int64],
         progress: Progress,
         which: Sequence[int] | None = None,
-        sights: SightLines | None = None,
+        sights: Sequence[SightLines] = (),
     ) -> tuple[Stored, dict[int, NDArray[np.float64]]]:
         """Return the sums over each block of views, and the errors of a sample in each view."""
-        folder, turn = self._job.folder, gaussians.turn
+        folder = self._job.folder
         chosen = range(self.count) if which is None else which
-        if turn == 0:
-            folder.note("sample", sample)
+        folder.note("sample", sample)
+        kinds = [lines.ranking for lines in sights]
         calls = [
-            Call("look", (turn, block, self.members[block]), 1 / len(chosen), chunked=True)
+            Call("look", (block, self.members[block], kinds), 1 / len(chosen), chunked=True)
             for block in chosen
         ]
         for _ in self._workers(self._job, calls, progress, "scoring"):
             pass
-        if isinstance(sights, StoredLines):
-            sights.noted.update(itertools.chain(*(self.members[block] for block in chosen)))
-        names = {block: seen_name(turn, block) for block in chosen}
-        errors = {block: folder.noted(name)[1][3] for block, name in names.items()}
-        return Stored(folder, names), errors
+        for lines in sights:
+            assert isinstance(lines, StoredLines)  # noqa: S101 - as those of `_Scoring` are
+            lines.noted.update(itertools.chain(*(self.members[block] for block in chosen)))
+        errors = {block: folder.noted(seen_name(block))[1][3] for block in chosen}
+        return Stored(folder, chosen), errors
 
 
 class StoredLines(SightLines):
@@ -433,6 +394,8 @@ class StoredLines(SightLines):
     sources : sequence of Source
         All splats.
     gaussians : Placed
+    ranking : bool
+        See `SightLines`.
 
     Attributes
     ----------
@@ -441,9 +404,15 @@ class StoredLines(SightLines):
     """
 
     def __init__(
-        self, job: SceneJob, workers: Workers, sources: Sequence[Source], gaussians: Placed
+        self,
+        job: SceneJob,
+        workers: Workers,
+        sources: Sequence[Source],
+        gaussians: Placed,
+        *,
+        ranking: bool = False,
     ) -> None:
-        self.views = job.views.by_distance()
+        self.views, self.ranking = job.views.by_distance(), ranking
         self.index = self.rows = gaussians.index
         self.lines = [None] * len(self.views)
         self.noted: set[int] = set()
@@ -495,7 +464,9 @@ class StoredLines(SightLines):
         """Load the lines that were noted, and what they meet."""
         folder = self._job.folder
         for number in sorted(self.noted):
-            columns, rows, line, owner, alpha, dark, owners = folder.noted(lines_name(number))[1]
+            columns, rows, line, owner, alpha, dark, owners = folder.noted(
+                lines_name(number, ranking=self.ranking)
+            )[1]
             self.lines[number] = Lines(columns, rows, line, owner, alpha, dark, owners)
         some = [lines.met for lines in self.lines if lines is not None]
         rows = np.unique(np.concatenate([np.empty(0, np.int64), *(self.index[m] for m in some)]))
