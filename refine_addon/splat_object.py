@@ -453,7 +453,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
         absorb=absorb,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
-        reusable=save,  # they are stored
+        reusable=save and not dry_run,  # they are stored
     )
     clock.lap("read_s")
     result = pipeline.decide(task, clock=clock, progress=part(progress, 0.0, 0.8))

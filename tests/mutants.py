@@ -201,7 +201,12 @@ MUTANTS = {
         ("front = through - self.dark", "front = through", "a splat hides itself"),
         ("    front -= before\n", "", "a splat hides itself from ranking"),
         ("lost /= after", "lost *= after", "the colour behind is not laid open"),
-        ("number + len(views) if ranking", "number if ranking", "judged by what ranks"),
+        (
+            "pixels(view, number + len(views), count)",
+            "pixels(view, number, count)",
+            "judged by what ranks",
+        ),
+        ("max(len(views), FEW)", "len(views)", "one view notes all"),
         (" - 5.0 / math.log(10.0) * relative", "", "chance not mended"),
         ("np.where(back < on, before, after)", "after", "only those behind take over"),
         ('order[np.argsort(protected[order], kind="stable")]', "order", "protection forgotten"),

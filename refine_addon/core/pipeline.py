@@ -523,7 +523,7 @@ def _settled(task: Task) -> int | None:
     held = 0 if task.protected is None else int(np.count_nonzero(task.protected))
     found = needed(task.budget.removals(total, task.row_bytes, task.fixed_bytes), total)
     # Those that are protected stay, wherever in the order they are.
-    return None if found is None else min(found + held, total)
+    return None if found is None or found + held >= total else found + held
 
 
 def _score_once(

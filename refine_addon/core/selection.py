@@ -225,8 +225,8 @@ def select(
         _remove_lowest(keep, values, free, excess, lengths)
     left = int(np.count_nonzero(keep))
     refuse_none_left(budget, len(values), left)
-    if budget.min_seen is None:
-        _refuse_unsettled(scores, len(values) - left, len(values) - int(np.count_nonzero(free)))
+    if scores.settled is not None and budget.min_seen is None:
+        _refuse_unsettled(scores, budget, ~keep)
     return keep
 
 
@@ -333,19 +333,24 @@ def refuse_none_left(budget: Budget, before: int, after: int) -> None:
         raise RefineError(msg)
 
 
-def _refuse_unsettled(scores: Scores, gone: int, held: int) -> None:
+def _refuse_unsettled(scores: Scores, budget: Budget, gone: NDArray[np.bool_]) -> None:
     """Raise `RefineError` if scores were computed for a budget that removes fewer splats.
 
     Parameters
     ----------
     scores : Scores
-    gone, held : int
-        How many splats are removed, and how many are protected.
+        Of which some are settled.
+    budget : Budget
+    gone : (N,) bool
+        What it removes.
     """
-    if scores.settled is not None and gone + held > scores.settled:
+    settled = scores.settled or 0
+    # A PSNR that all of the curve reaches may be reached beyond its end, too.
+    beyond = budget.psnr is not None and budget.psnr <= quality_of(scores).psnr[-1]
+    if beyond or gone[np.argsort(scores.values, kind="stable")[settled:]].any():
         msg = (
-            f"these scores were computed to remove at most {max(scores.settled - held, 0)} of "
-            f"{len(scores.values)} splats, not {gone}: score again, for all budgets"
+            f"these scores were computed for a budget that removes up to {settled} of "
+            f"{len(gone)} splats, and this one removes more: score again, for all budgets"
         )
         raise RefineError(msg)
 

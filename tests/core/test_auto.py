@@ -42,7 +42,7 @@ def scene():
 def test_pictures_lose_no_more_than_the_tolerance(tolerance):
     """On the committed room: judged by the lines of sight of the views that `split.json` holds out.
 
-    All of 63 views and six rounds against those that auto chooses, fewer at either tolerance.
+    All of 63 views against those that auto chooses, fewer at either tolerance.
     """
     splats = read_ply(ROOM / "point_cloud.ply").splats()
     views = read_cameras(ROOM / "cameras.json")

@@ -594,14 +594,15 @@ def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, vi
 
 @pytest.mark.parametrize("method", ["occlusion", "auto"])
 @pytest.mark.parametrize("ratio", [0.05, 0.3, 0.55, 0.7, 0.93])
-@pytest.mark.parametrize("zoned", [False, True])
+@pytest.mark.parametrize("zoned", ["", "a seventh stays", "half stays"])
 def test_scoring_for_one_budget_decides_what_scores_for_all_would(
     small, views, method, ratio, zoned
 ):
     """Scoring ends with the round that removes the last of its splats: the same report, too."""
     splats = read_ply(small).splats()
     every = np.arange(len(splats))
-    demands = {"protected": every % 7 == 0, "removed": every % 11 == 0} if zoned else {}
+    held = every % 2 == 0 if zoned.startswith("half") else every % 7 == 0
+    demands = {"protected": held, "removed": every % 11 == 0} if zoned else {}
     task = Task(Budget(ratio=ratio), Settings(method, views=24), splats, views, **demands)
     some = decide(task)
 
@@ -615,7 +616,8 @@ def test_scoring_for_one_budget_decides_what_scores_for_all_would(
     for name in ("shares", "psnr", "absorbed"):
         assert some.report["quality"][name] == whole.report["quality"][name][:known]
     assert some.report["quality"]["shares"][-1] >= ratio
-    assert known == 10 if ratio > 0.9 else known < 10
+    if not zoned.startswith("half"):
+        assert (known == 10) == (ratio > 0.9)
 
 
 def test_scores_of_one_budget_are_refused_for_a_larger_one(small, views):
@@ -630,9 +632,14 @@ def test_scores_of_one_budget_are_refused_for_a_larger_one(small, views):
     assert scores.settled == settled
     assert select(scores, Budget(keep=len(splats) - settled)).sum() == len(splats) - settled
     assert select(scores, Budget(min_seen=50)).any()
-    with pytest.raises(RefineError, match=rf"remove at most {settled} of {len(splats)}"):
+    assert select(scores, Budget(ratio=0.35), protected=protected).sum() > 0
+    assert select(scores, Budget(ratio=0.0), protected=~protected).all()
+    with pytest.raises(RefineError, match=rf"removes up to {settled} of {len(splats)}"):
         select(scores, Budget(keep=len(splats) - settled - 1))
     with pytest.raises(RefineError, match="score again, for all budgets"):
-        select(scores, Budget(ratio=0.35), protected=protected)
+        select(scores, Budget(ratio=0.45), protected=protected)
+    with pytest.raises(RefineError, match="score again"):
+        select(scores, Budget(psnr=scores.quality.psnr[-1] - 0.1))
+    assert not select(scores, Budget(psnr=scores.quality.psnr[-1] + 0.1)).all()
     with pytest.raises(RefineError, match="score again"):
         select(scores, Budget(threshold=0.9))

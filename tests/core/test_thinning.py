@@ -204,3 +204,40 @@ def test_one_round_needs_no_lines_that_order():
     run = occlusion.Run(cloud(), ring(), occlusion.Occlusion(rounds=1))
 
     assert run.ranking is None
+
+
+@pytest.mark.parametrize(("width", "height"), [(200_000, 1), (1, 200_000), (300, 200)])
+def test_lines_are_no_more_than_asked_for_in_images_of_any_shape(width, height):
+    view = replace(ring()[0], width=width, height=height)
+
+    columns, rows = sight_lines.pixels(view, 0, 60_000)
+
+    assert 30_000 < len(columns) * len(rows) <= 60_200
+
+
+def test_a_single_view_has_no_more_to_note_than_one_of_eight(monkeypatch):
+    """Of 65,536 lines an eighth of what may be met leaves fewer, where each meets much."""
+    view = replace(ring()[0], width=2000, height=1500, fx=900.0, fy=900.0, cx=1000.0, cy=750.0)
+    gaussians, frame, _ = projection.prepare(cloud(), ViewSet((view,)))
+    footprints = projection.project(gaussians, frame, view)
+    crowd = sight_lines.crowding(footprints, view)
+    monkeypatch.setattr(sight_lines, "MOST_RANKED", 80_000 * crowd)
+
+    one, of_eight = (
+        sight_lines.met([(view, 1.0)] * count, 0, footprints, ranking=True).count
+        for count in (1, 8)
+    )
+
+    assert one == pytest.approx(10_000, rel=0.02)
+    assert of_eight == pytest.approx(65_536 / 8, rel=0.02)
+
+
+def test_lines_are_let_go_as_splats_go():
+    """16 bytes for each thing met, not twice that."""
+    run = occlusion.Run(cloud(), ring(), occlusion.Occlusion(rounds=2))
+    run.measure(range(run.measuring.count))
+    assert run.ranking is not None
+
+    run.rank(silent)
+
+    assert run.ranking is None

@@ -244,7 +244,7 @@ def measure_part(  # noqa: PLR0913 - as `measure`, and which part
 
 
 class Rounds:
-    """One scoring: the views measure all splats, then rounds of removing and measuring again.
+    """One scoring: the views measure all splats, then rounds of removing and ordering anew.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ class Rounds:
     sights : SightLines or None
         Note what the lines of sight of the views meet that measure all splats.
     ranking : SightLines or None
-        The same with those lines that order splats; None in a single round.
+        The same with those lines that order splats; None in a single round, and once it ranks.
     prior : (N,) float32
         Orders the splats that are not among the Gaussians, and is the floor of all others.
     undrawable : (N,) bool
@@ -355,6 +355,7 @@ class Rounds:
         if self.ranking is not None:
             ahead = part(progress, 0.0, done)
             thinning = Thinning(self.ranking, measured, ahead, self.measuring.threads)
+            self.ranking = None  # its lines are let go as splats go
         for stay in _survivors(len(self.prior), self.rounds, settled):
             end = 1.0 if not stay else done + (1.0 - done) * ROUND_COST
             ahead, done = part(progress, done, end), end

@@ -51,6 +51,9 @@ ordered by some lines, others have to judge."""
 MOST_RANKED = 3 << 24
 """About how many splats all of those may meet. Each takes 16 bytes."""
 
+FEW = 8
+"""Fewer views have no more of what may be met than if they were so many."""
+
 MOST_LINES = 60_000
 """A view has at most so many lines: NumPy sorts numbers of 16 bits by radix, in linear time."""
 
@@ -371,7 +374,8 @@ class SightLines:
         protected : (N,) bool, optional
             Splats that are removed after all others.
         settled : int, optional
-            How many splats are in their final order, see `Scores`: the curve ends there.
+            How many splats are in their final order, see `Scores`: the curve ends there, and is
+            None if that is before the first of its shares.
         progress : callable, optional
         threads : int, optional
 
@@ -386,7 +390,7 @@ class SightLines:
             last -= int(np.count_nonzero(protected))
         places = [[math.floor(share * len(values)) for share in of] for of in (SHARES, TAKEN_OVER)]
         counts, taken = ([count for count in some if count <= last] for some in places)
-        if not taken:
+        if not counts:
             return None
         seen = self._seen()
         single = self._removing(place, counts, seen, part(progress, 0.0, 0.5), threads)
@@ -606,11 +610,13 @@ def met(
 ) -> Lines:
     """Return what the lines of sight of one of some views meet; see `SightLines`."""
     view = views[number][0]
-    most, lines = (MOST_RANKED, RANKED) if ranking else (MOST_MET, LINES)
-    count = min(lines, most / max(crowding(footprints, view), 1.0)) / len(views)
+    crowd = max(crowding(footprints, view), 1.0)
+    if not ranking:
+        return meet(footprints, *pixels(view, number, min(LINES, MOST_MET / crowd) / len(views)))
+    # What a view notes at a time takes six times the memory of what is noted.
+    count = min(RANKED / len(views), MOST_RANKED / max(len(views), FEW) / crowd, MOST_LINES)
     # Other pixels than those of the lines that judge.
-    place = number + len(views) if ranking else number
-    return meet(footprints, *pixels(view, place, min(count, MOST_LINES)))
+    return meet(footprints, *pixels(view, number + len(views), count))
 
 
 def pixels(view: View, number: int, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -619,7 +625,8 @@ def pixels(view: View, number: int, count: float) -> tuple[NDArray[np.int64], ND
     Those of each `number` are others: multiples of the plastic number's powers are spread evenly.
     """
     count = max(count, LEAST_LINES)
-    columns = min(max(round(math.sqrt(count * view.width / view.height)), 1), view.width)
+    columns = max(round(math.sqrt(count * view.width / view.height)), 1)
+    columns = min(columns, view.width, max(int(count), 1))
     rows = min(max(round(count / columns), 1), view.height)
     return (
         spread(view.width, columns, (number * 0.7548776662466927) % 1.0),

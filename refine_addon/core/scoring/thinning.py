@@ -8,7 +8,8 @@ small splat, so what they tell is weighed against what the views measured of all
 
     error_i = (n_i  error of the lines now  +  KNOWN  error measured, grown) / (n_i + KNOWN)
 
-n_i is how many lines meet the splat. A measured sum grows as the lines tell, see `_grown`.
+n_i is how many lines met the splat while all were there. A measured sum grows as the lines tell,
+see `_grown`.
 """
 
 from __future__ import annotations
@@ -81,8 +82,8 @@ class Thinning:
 
     Notes
     -----
-    Memory: 16 bytes for everything that a line meets, of which there are about
-    `sight_lines.MOST_RANKED`.
+    Memory: 16 bytes for everything that a line meets, of which there are at most about
+    `sight_lines.MOST_RANKED`; while a view notes it, 100 bytes for each of its own.
     """
 
     def __init__(

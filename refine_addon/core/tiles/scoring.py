@@ -165,7 +165,8 @@ def by_occlusion(
 
     Notes
     -----
-    Memory of this process: about 120 bytes a splat. A worker needs 20 bytes a splat, and for each
+    Memory of this process: about 120 bytes a splat, and what lines of sight meet, see
+    `thinning.Thinning`. A worker needs 20 bytes a splat, and for each
     view at work what it shows: about 160 bytes a splat, and its points, see `occlusion.score`.
     """
     by_auto = settings.method == "auto"
