@@ -614,7 +614,9 @@ def test_scoring_for_one_budget_decides_what_scores_for_all_would(
         assert some.report[name] == whole.report[name]
     known = len(some.report["quality"]["shares"])
     for name in ("shares", "psnr", "absorbed"):
-        assert some.report["quality"][name] == whole.report["quality"][name][:known]
+        # Means over the views are products of matrices, whose last digit depends on their shape.
+        expected = whole.report["quality"][name][:known]
+        assert some.report["quality"][name] == pytest.approx(expected, rel=1e-12)
     assert some.report["quality"]["shares"][-1] >= ratio
     if not zoned.startswith("half"):
         assert (known == 10) == (ratio > 0.9)
