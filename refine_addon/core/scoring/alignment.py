@@ -292,4 +292,4 @@ def _fineness_of(
         square /= FINE**2 * view.width * view.height
         _, owner, weight = lines.contributions()
         total = float((weight / (1.0 + square[lines.met[owner]])).sum())
-    return total / (len(lines.columns) * len(lines.rows))
+    return total / lines.count

@@ -646,7 +646,7 @@ def thickness(covered: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(np.negative(left, out=left))
 
 
-def _paired(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[Any]:
+def paired(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[Any]:
     """Return two real arrays as the real and imaginary parts of one complex array, (m,).
 
     A running sum over the pair is two running sums in the time of one.
@@ -660,14 +660,14 @@ def in_front(
     thick: NDArray[np.float32], even: NDArray[np.float32], columns: NDArray[np.int64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the sums of two thicknesses, (m,) each, over the points in front in the same cell."""
-    values = _paired(thick, even)
+    values = paired(thick, even)
     sums = np.cumsum(values)
     sums -= values
     sums -= np.repeat(sums.take(np.cumsum(columns) - columns), columns)
     return sums.real.astype(np.float32), sums.imag.astype(np.float32)
 
 
-def _behind(values: NDArray[Any], columns: NDArray[np.int64]) -> NDArray[Any]:
+def behind(values: NDArray[Any], columns: NDArray[np.int64]) -> NDArray[Any]:
     """Return for each of `values`, (m,), the sum of those behind it in its column."""
     sums = np.cumsum(values)
     return np.asarray(np.repeat(sums.take(np.cumsum(columns) - 1), columns) - sums)
@@ -728,11 +728,11 @@ def squared_contrast(
     # Limited, since a colour behind less transmittance than this cannot be seen anyway.
     left = np.maximum(shown * (np.float32(1.0) - covered), np.float32(1e-4))  # T_{k+1}
     shown *= covered  # T_k a_k
-    pair = _behind(_paired(shown * colors[:, 0], shown * colors[:, 1]), columns)
-    last = _behind((shown * colors[:, 2]).astype(np.float64), columns)
+    pair = behind(paired(shown * colors[:, 0], shown * colors[:, 1]), columns)
+    last = behind((shown * colors[:, 2]).astype(np.float64), columns)
     squared = np.zeros_like(front)
-    for channel, behind in enumerate((pair.real, pair.imag, last)):
-        contrast = behind.astype(np.float32)
+    for channel, light in enumerate((pair.real, pair.imag, last)):
+        contrast = light.astype(np.float32)
         contrast /= left
         contrast -= colors[:, channel]
         contrast *= contrast

@@ -26,6 +26,7 @@ from ..quality import FEWEST, PSNR_CAP, SHARES, TAKEN_OVER, Quality, absorbed_fr
 from ..rendering import ALPHA_CUT, ALPHA_MAX
 from ..work import Progress, checkpoint, for_chunks, part, silent
 from . import projection
+from .froxels import behind, paired
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -152,9 +153,10 @@ class Lines:
         colors : (3, u) float64
             Of the splats that are met.
         """
-        count = len(self.columns) * len(self.rows)
         line, owner, weight = self.contributions()
-        channels = [np.bincount(line, weight * channel.take(owner), count) for channel in colors]
+        channels = [
+            np.bincount(line, weight * channel.take(owner), self.count) for channel in colors
+        ]
         return np.stack(channels).clip(0.0, 1.0)
 
     @property
@@ -207,10 +209,9 @@ class Lines:
         weight : (r,) float32
             Transmittance times alpha: what part of the pixel it makes up.
         """
-        count = len(self.columns) * len(self.rows)
         through = np.cumsum(self.dark, dtype=np.float64)
         last = np.flatnonzero(self.line[1:] != self.line[:-1])  # of each line but the last
-        before = np.zeros(count)  # the sum over all lines before each
+        before = np.zeros(self.count)  # the sum over all lines before each
         before[self.line[last + 1]] = through[last]
         front = through - self.dark  # logarithm of the transmittance in front
         front -= before.take(self.line)
@@ -672,24 +673,19 @@ def _losses(
     error, contribution : (h,) float32
         0 where nothing is seen.
     """
-    last = np.cumsum(counts) - 1  # of each line
     before = dark.astype(np.float64)
     front = np.cumsum(before)
     front -= before
-    front -= np.repeat(front.take(last - counts + 1), counts)
+    front -= np.repeat(front.take(np.cumsum(counts) - counts), counts)
     through = np.exp(front.astype(np.float32))
     through[front < DARK] = 0.0
     weight = through * alpha
     after = np.maximum(through - weight, np.float32(1e-8))
-    pair = np.empty(len(alpha), np.complex128)  # two running sums in the time of one
-    pair.real, pair.imag = weight * colors[0], weight * colors[1]
-    third = (weight * colors[2]).astype(np.float64)
-    pair, third = (
-        np.repeat(sums.take(last), counts) - sums for sums in (np.cumsum(pair), np.cumsum(third))
-    )
+    pair = behind(paired(weight * colors[0], weight * colors[1]), counts)
+    third = behind((weight * colors[2]).astype(np.float64), counts)
     error = np.zeros(len(alpha), np.float32)
-    for own, behind in zip(colors, (pair.real, pair.imag, third), strict=True):
-        lost = behind.astype(np.float32)
+    for own, light in zip(colors, (pair.real, pair.imag, third), strict=True):
+        lost = light.astype(np.float32)
         lost /= after
         lost -= own
         lost *= weight
