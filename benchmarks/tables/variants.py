@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from refine_addon.core import pipeline
 from refine_addon.core.pipeline import Settings
-from refine_addon.core.scoring.closed_form import ClosedForm
+from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.scoring.occlusion import Occlusion
 
 if TYPE_CHECKING:
