@@ -469,7 +469,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     result.report["notes"] += made.notes(result.keep)
     if save and not dry_run:
         with mesh_edit.all_or_nothing(checked.obj):
-            store(checked, result.scores, settings, forced=result.report["splats"]["forced"])
+            store(checked, result.scores, settings)
             _reduce(checked, result.keep, columns)
             _save(target)
     clock.lap("write_s")
