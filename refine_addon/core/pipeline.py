@@ -283,6 +283,8 @@ def decide(
     """
     clock, forced = clock or Clock(), task.forced()
     if forced is None:
+        if task.scores is not None:
+            task.scores.refuse_unscored()
         result = _decide(task, clock, progress, threads)
     else:
         result = _decide(task.without(forced), clock, progress, threads).for_all(~forced)

@@ -28,8 +28,8 @@ class Scores:
     Attributes
     ----------
     values : (N,) float32
-        Finite, >= 0; 0 only for undrawable splats and those that had gone before (`for_all`). Each
-        method has its own scale.
+        Finite, >= 0; 0 only for undrawable splats and those that were not scored. Each method has
+        its own scale.
     seen : (N,) int32
         In how many of the views used the splat's centre lies.
     views_used : int
@@ -56,6 +56,8 @@ class Scores:
     settled : int, optional
         How many splats, from those with the lowest scores on, are in their final order; None for
         all. Scores that were computed for one budget end where that does.
+    scored : (N,) bool, optional
+        Which splats were scored; None for all. The others were forced out (`for_all`).
     """
 
     values: NDArray[np.float32]
@@ -71,6 +73,7 @@ class Scores:
     quality: Quality | None = None
     alignment: Alignment | None = None
     settled: int | None = None
+    scored: NDArray[np.bool_] | None = None
 
     def for_all(self, rest: NDArray[np.bool_]) -> Scores:
         """Return scores of what was left of N splats as scores of them all.
@@ -82,7 +85,8 @@ class Scores:
         """
         values, seen = among_all(self.values, rest), among_all(self.seen, rest)
         settled = None if self.settled is None else self.settled + len(rest) - len(self.values)
-        return replace(self, values=values, seen=seen, settled=settled)
+        scored = rest if self.scored is None else among_all(self.scored, rest)
+        return replace(self, values=values, seen=seen, settled=settled, scored=scored)
 
     def of(self, rest: NDArray[np.bool_]) -> Scores:
         """Return the scores of some splats; the reverse of `for_all` where those had been left.
@@ -96,14 +100,8 @@ class Scores:
         RefineError
             If some of them were not scored.
         """
+        self.refuse_unscored(rest)
         values, count = self.values[rest], int(np.count_nonzero(rest))
-        unscored = int(np.count_nonzero(values == 0.0)) - self.undrawable
-        if unscored > 0:
-            msg = (
-                f"{unscored} splats had to go when the others were scored, and need not go now; "
-                "score again"
-            )
-            raise RefineError(msg)
         ray_sample = self.ray_sample
         if ray_sample is not None and len(ray_sample.splats) != count:
             ray_sample = None  # of a scene with other splats
@@ -111,8 +109,28 @@ class Scores:
         if settled is not None:
             settled = max(settled - (len(rest) - count), 0)
         return replace(
-            self, values=values, seen=self.seen[rest], ray_sample=ray_sample, settled=settled
+            self,
+            values=values,
+            seen=self.seen[rest],
+            ray_sample=ray_sample,
+            settled=settled,
+            scored=None,
         )
+
+    def refuse_unscored(self, rest: NDArray[np.bool_] | None = None) -> None:
+        """Raise `RefineError` if some of the splats in question, (N,) bool, have no score.
+
+        By default all are.
+        """
+        if self.scored is None:
+            return
+        unscored = ~self.scored if rest is None else rest & ~self.scored
+        if unscored.any():
+            msg = (
+                f"{np.count_nonzero(unscored)} splats had to go when the others were scored, and "
+                "need not go now; score again"
+            )
+            raise RefineError(msg)
 
 
 def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:

@@ -110,9 +110,9 @@ def test_the_first_groups_are_half_of_the_views_spread_evenly():
     order = [view for view, _ in views.by_distance()]
     groups = auto.groups_of(views)
 
-    assert [len(block) for group in groups] == [8] * 8
+    assert [len(group) for group in groups] == [8] * 8
     assert sorted(number for group in groups for number in group) == list(range(64))
-    half = sorted(order[number].center[0] for group in groups[:4] for number in block)
+    half = sorted(order[number].center[0] for group in groups[:4] for number in group)
     assert max(np.diff(half)) <= 3
     assert half[0] <= 2
     assert half[-1] >= 61
@@ -122,7 +122,7 @@ def test_a_view_given_many_times_is_in_one_group_each_time():
     """All 16 the same: half of them are in the first four groups."""
     groups = auto.groups_of(ViewSet((ring(1).views[0],) * 16))
 
-    assert [len(block) for group in groups] == [2] * 8
+    assert [len(group) for group in groups] == [2] * 8
     assert sorted(number for group in groups for number in group) == list(range(16))
 
 

@@ -951,7 +951,7 @@ def test_points_lie_where_their_lattices_put_them_in_and_across_the_image():
     assert 0.1 < np.mean(inside < 0.99) < 0.9
     np.testing.assert_allclose(points.inside, inside, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(points.squares, squares, rtol=1e-4, atol=1e-6)
-    of_cells = np.add.reduceat(points.shares, np.cumsum(points.counts) - points.columns)
+    of_cells = np.add.reduceat(points.shares, np.cumsum(points.counts) - points.counts)
     cells = sorted({cell for _, cell in expected})
     totals = [sum(s for (_, c), s in expected.items() if c == cell) for cell in cells]
     np.testing.assert_allclose(of_cells, totals, rtol=1e-4)
