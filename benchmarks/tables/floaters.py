@@ -7,7 +7,7 @@
 Of 2,000 floaters, 1,100 stand in front of a camera, each by itself; 800 form blobs of 5 to 59 in
 free space; 100 are huge veils. Size, opacity, colour and place vary. Free space is what lies in
 front of the depth at which half of a line of sight's light is gone. The train views place floaters
-and decide; the test views only judge, against renders of the unpolluted scene and real pictures.
+and decide; the test views only compare with renders of the unpolluted scene and real pictures.
 """
 
 from __future__ import annotations
@@ -153,10 +153,10 @@ def main() -> int:
         gone = ~found.keep[count:]
         recalls = " ".join(f"{gone[kinds == kind].mean():.1%}" for kind in range(3))
         true = float(np.mean(~found.keep[:count]))
-        judge = Evaluator(scene.splats, scene.test, scene.pictures, metrics=("psnr",))
+        evaluator = Evaluator(scene.splats, scene.test, scene.pictures, metrics=("psnr",))
         cells = []
         for splats in (scene.splats, dirty, dirty.take(found.keep)):
-            quality = judge.evaluate(splats)
+            quality = evaluator.evaluate(splats)
             pictures = quality.pictures.mean["psnr"] if quality.pictures else float("nan")
             cells.append(f"{quality.renders.mean['psnr']:.2f} ({pictures:.2f})")
         print(

@@ -76,7 +76,7 @@ class Line:
 def measure(
     variants: Mapping[str, Settings], task: Task, evaluator: Evaluator, ratios: Sequence[float]
 ) -> list[Line]:
-    """Score by each of the settings and judge what stays."""
+    """Score by each of the settings and compare what stays."""
     lines = []
     for name, settings in variants.items():
         start = time.perf_counter()
