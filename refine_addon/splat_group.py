@@ -15,7 +15,7 @@ import numpy as np
 
 from . import demands, splat_object
 from .core.errors import RefineError
-from .core.quality import Quality
+from .core.estimate.quality import Quality
 from .core.selection import rank
 from .core.splats import joined
 from .core.task import DEFAULTS, Task

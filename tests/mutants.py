@@ -74,7 +74,7 @@ MUTANTS = {
         ("rows[rest] if isinstance", "rows if isinstance", "rows of all"),
         ("self.budget.after(int(np.count_nonzero(forced)), len(forced))", "self.budget", "twice"),
     ],
-    "frustum.py": [
+    "seeing/frustum.py": [
         ("-view.rotation @ center", "view.rotation @ center", "sign of translation"),
         ("depth[:count] >= self._near[views[:count]]", "depth[:count] >= 0.0", "no near plane"),
         ("(outside < reach * self.steepness)", "(outside <= 0.0)", "what reaches inside left out"),
@@ -197,7 +197,7 @@ MUTANTS = {
     "scoring/adaptive.py": [
         ("math.log(geometry)", "math.log(1 + geometry)", "wrong logarithm"),
     ],
-    "scoring/sight_lines.py": [
+    "seeing/sight_lines.py": [
         ("front = through - self.dark", "front = through", "a splat hides itself"),
         ("    front -= before\n", "", "a splat hides itself from ranking"),
         ("lost /= after", "lost *= after", "the colour behind is not laid open"),
@@ -212,13 +212,13 @@ MUTANTS = {
         ('order[np.argsort(protected[order], kind="stable")]', "order", "protection forgotten"),
         ("weights @ values / weights.sum()", "values.mean(axis=0)", "views count alike"),
     ],
-    "scoring/thinning.py": [
+    "scoring/removal_rounds.py": [
         ("weight * view.width", "view.width", "weight of views forgotten"),
         (".keeping(keep)\n            with", "\n            with", "what has gone hides"),
         ("(met * now[0] + KNOWN * error)", "(met * now[0] + KNOWN * own[0])", "no growth"),
         ("before + prior", "before + 1.0", "growth of few lines believed"),
     ],
-    "scoring/alignment.py": [
+    "estimate/alignment.py": [
         (" or there >= WHOLE * count", "", "rings around all are judged"),
         ("spans.max() < SMALL", "spans.min() < SMALL", "what is thin is far"),
         ("            if view.weight:", "            if True:", "views of weight 0 are far"),
@@ -367,7 +367,7 @@ MUTANTS = {
         ),
         ("        removal.values[self.undrawable] = 0.0\n", "", "undrawable not lowest"),
     ],
-    "scoring/measuring.py": [
+    "seeing/measuring.py": [
         (
             "number = self.numbers[place]",
             "number = self.numbers[0]",
@@ -381,7 +381,7 @@ MUTANTS = {
         ("seen.rows[seen.inside]", "seen.rows", "seen beside the image"),
         ("            seen *= seen\n", "", "transmittance not squared"),
     ],
-    "scoring/froxels.py": [
+    "seeing/froxels.py": [
         ("max(FEW_CELLS, len(", "min(MAX_CELLS, 9**9 + len(", "cells of 4 px whatever they cost"),
         (
             "    np.log(left, out=left)\n",
@@ -421,7 +421,7 @@ MUTANTS = {
             "a dot covers evenly",
         ),
     ],
-    "scoring/projection.py": [
+    "seeing/projection.py": [
         ("(r[a, j] * r[b, i] if i != j else 0.0)", "0.0", "covariance off the diagonal"),
         (
             "(across * shape[5] - 2 * shape[2])",
@@ -606,7 +606,7 @@ MUTANTS = {
             "survivors of other rows",
         ),
     ],
-    "written.py": [
+    "estimate/written.py": [
         (
             "if not np.array_equal(matrix, np.eye(4)):",
             "if False:",
@@ -614,7 +614,7 @@ MUTANTS = {
         ),
         ("if format_named(path) is None:", "if False:", "a plain PLY compared"),
     ],
-    "quality.py": [
+    "estimate/quality.py": [
         (" - halvings * fewer", "", "few splats that gain as much"),
         ("if place >= gone", "if place > gone", "a share too many"),
     ],
@@ -707,11 +707,11 @@ MUTANTS = {
 """Module of core -> lines to change, what they become, and what is wrong then."""
 
 TESTS = {
-    "closed_form": ["frustum.py", "scoring/adaptive.py", "scoring/closed_form_block.py"],
+    "closed_form": ["seeing/frustum.py", "scoring/adaptive.py", "scoring/closed_form_block.py"],
     "occlusion": [
-        "scoring/measuring.py",
-        "scoring/froxels.py",
-        "scoring/projection.py",
+        "seeing/measuring.py",
+        "seeing/froxels.py",
+        "seeing/projection.py",
         "scoring/coverage.py",
     ],
     "absorb": ["absorbing/merge_field.py", "absorbing/merging.py", "absorbing/merge_graph.py"],

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from refine_addon.core.cleaning.clean import clean
-from refine_addon.core.scoring import projection, sight_lines
+from refine_addon.core.seeing import projection, sight_lines
 from refine_addon.core.splats import SH_C0, Splats, joined
 
 from .evaluate import Evaluator, read_scene

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import frustum
 from .rendering import ALPHA_MAX, NEAR_RELATIVE
-from .scoring import projection
-from .scoring.sight_lines import DARK, boxes, colors_from, mahalanobis, psnr_of, reaches
+from .seeing import frustum, projection
+from .seeing.sight_lines import DARK, boxes, colors_from, mahalanobis, psnr_of, reaches
 from .views import ViewSet
 from .work import Progress, checkpoint, for_chunks, part, silent
 
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .scene import Scene
-    from .scoring.projection import Footprints, Gaussians
+    from .seeing.projection import Footprints, Gaussians
     from .splats import Splats
     from .views import View
 

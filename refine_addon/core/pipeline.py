@@ -17,10 +17,11 @@ import numpy as np
 from . import selection
 from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
-from .quality import FEWEST, left_to_lose, needed, out_of_reach
+from .estimate.alignment import alignment
+from .estimate.quality import FEWEST, left_to_lose, needed, out_of_reach
 from .report import Clock, make_report, size_in_words
-from .scoring import auto, closed_form, occlusion, sight_lines
-from .scoring.alignment import alignment
+from .scoring import auto, closed_form, occlusion
+from .seeing import sight_lines
 from .selection import Budget
 from .task import DEFAULTS, Result, Settings, Task
 from .volumes import refuse_all
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
     from .absorbing.absorb import Absorbed, Counts
     from .scores import Scores
-    from .scoring.measuring import Measured
+    from .seeing.measuring import Measured
     from .selection import RowBytes
     from .splats import Splats
     from .views import ViewSet

@@ -13,9 +13,9 @@ from .volumes import among_all
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .quality import Quality
-    from .scoring.alignment import Alignment
-    from .scoring.sight_lines import SightLines
+    from .estimate.alignment import Alignment
+    from .estimate.quality import Quality
+    from .seeing.sight_lines import SightLines
 
 _DISTINCT = 1 << 24
 """Largest number of equal steps from 0 to 1 that are distinct in float32."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from .absorbing.absorb import Absorbed
     from .scores import Scores
-    from .scoring.sight_lines import SightLines
+    from .seeing.sight_lines import SightLines
     from .selection import Budget, RowBytes
     from .splats import Splats
     from .views import ViewSet

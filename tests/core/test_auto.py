@@ -23,7 +23,8 @@ from refine_addon.core import (
     score,
     select,
 )
-from refine_addon.core.scoring import auto, occlusion, sight_lines
+from refine_addon.core.scoring import auto, occlusion
+from refine_addon.core.seeing import sight_lines
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 COARSE = Occlusion(cell=16.0, density=1.0, rounds=2)

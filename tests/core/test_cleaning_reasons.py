@@ -11,8 +11,8 @@ from refine_addon.core import Cleaning, View, ViewSet, clean
 from refine_addon.core.cleaning import clean as cleaning
 from refine_addon.core.cleaning import sight
 from refine_addon.core.cleaning.clean import REASONS
-from refine_addon.core.scoring import projection
-from refine_addon.core.scoring.sight_lines import SightLines
+from refine_addon.core.seeing import projection
+from refine_addon.core.seeing.sight_lines import SightLines
 
 from .test_cleaning import FLOATER, SIDE, cameras, joined, made, wall
 

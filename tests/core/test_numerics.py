@@ -27,8 +27,8 @@ from refine_addon.core import (
 )
 from refine_addon.core.absorbing import merge_field, merge_graph
 from refine_addon.core.pipeline import absorb_removed
-from refine_addon.core.scoring import froxels, projection
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
+from refine_addon.core.seeing import froxels, projection
 from refine_addon.core.splats import drawable, opacity
 
 FINITE = [

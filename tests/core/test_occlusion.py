@@ -10,9 +10,10 @@ import pytest
 
 from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet, work
 from refine_addon.core.affine import transformed
-from refine_addon.core.scoring import coverage, froxels, measuring, occlusion, projection
-from refine_addon.core.scoring.measuring import Measured, Measuring
+from refine_addon.core.scoring import coverage, occlusion
 from refine_addon.core.scoring.occlusion import Occlusion
+from refine_addon.core.seeing import froxels, measuring, projection
+from refine_addon.core.seeing.measuring import Measured, Measuring
 from refine_addon.core.splats import SH_C0, rotation_matrices
 
 ONCE = Occlusion(rounds=1)

@@ -16,8 +16,8 @@ from refine_addon.core.errors import Cancelled
 from refine_addon.core.picture_files import KINDS, PictureFiles, chosen, in_words
 from refine_addon.core.pictures import AMPLIFIED, Comparison, compare, fitted
 from refine_addon.core.png import png
-from refine_addon.core.scoring import projection
-from refine_addon.core.scoring.sight_lines import colors_from, meet
+from refine_addon.core.seeing import projection
+from refine_addon.core.seeing.sight_lines import colors_from, meet
 from refine_addon.core.views import View, ViewSet
 
 C0 = 0.28209479177387814

@@ -22,9 +22,10 @@ from refine_addon.core import (
     score,
     select,
 )
+from refine_addon.core.estimate.quality import PSNR_CAP, SHARES, Quality, absorbed_from
 from refine_addon.core.pipeline import decide
-from refine_addon.core.quality import PSNR_CAP, SHARES, Quality, absorbed_from
-from refine_addon.core.scoring import occlusion, projection, sight_lines
+from refine_addon.core.scoring import occlusion
+from refine_addon.core.seeing import projection, sight_lines
 from refine_addon.core.splats import opacity
 from refine_addon.core.task import Task
 from tests.core.test_invariance import MOTIONS, moved

@@ -9,10 +9,11 @@ import pytest
 
 from refine_addon.core import ViewSet
 from refine_addon.core.errors import Cancelled
-from refine_addon.core.scoring import occlusion, projection, sight_lines
-from refine_addon.core.scoring.measuring import Measured
-from refine_addon.core.scoring.sight_lines import Lines, SightLines
-from refine_addon.core.scoring.thinning import KNOWN, Thinning
+from refine_addon.core.scoring import occlusion
+from refine_addon.core.scoring.removal_rounds import KNOWN, Thinning
+from refine_addon.core.seeing import projection, sight_lines
+from refine_addon.core.seeing.measuring import Measured
+from refine_addon.core.seeing.sight_lines import Lines, SightLines
 from refine_addon.core.work import silent
 from tests.core.test_occlusion import cloud, ring
 

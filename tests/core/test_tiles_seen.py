@@ -20,7 +20,8 @@ from refine_addon.core import (
     read_cameras,
     read_ply,
 )
-from refine_addon.core.scoring import closed_form, projection, sight_lines
+from refine_addon.core.scoring import closed_form
+from refine_addon.core.seeing import projection, sight_lines
 from refine_addon.core.splats import joined
 from refine_addon.core.tiles import absorbing, seen, units
 from refine_addon.core.tiles.seen import SceneJob

@@ -11,7 +11,7 @@ import pytest
 from refine_addon.command import main
 from refine_addon.core import Budget, Settings, prune_file, read_splats
 from refine_addon.core.affine import transformed
-from refine_addon.core.written import written_facts
+from refine_addon.core.estimate.written import written_facts
 
 from .test_cleaning import cameras, wall
 from .test_command_clean import files  # noqa: F401 - a fixture

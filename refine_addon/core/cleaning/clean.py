@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from ..errors import RefineError
-from ..scoring import projection
-from ..scoring.measuring import BLOCKS
-from ..scoring.sight_lines import SightLines
+from ..seeing import projection
+from ..seeing.measuring import BLOCKS
+from ..seeing.sight_lines import SightLines
 from ..splats import refuse_undrawable
 from ..volumes import among_all, refuse_all
 from ..work import Progress, for_chunks, part, silent
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..scene import Scene
-    from ..scoring.projection import Footprints, Gaussians
+    from ..seeing.projection import Footprints, Gaussians
     from ..splats import Splats
     from ..views import ViewSet
 

@@ -20,14 +20,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..scoring import projection, sight_lines
+from ..seeing import projection, sight_lines
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..scene import Scene
-    from ..scoring.projection import Footprints, Gaussians
-    from ..scoring.sight_lines import Lines, SightLines
+    from ..seeing.projection import Footprints, Gaussians
+    from ..seeing.sight_lines import Lines, SightLines
     from ..views import View
 
 LINES = 2500

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from ..quality import PSNR_CAP
-from ..scoring import projection, sight_lines
-from ..scoring.sight_lines import ENOUGH, colors_from
+from ..estimate.quality import PSNR_CAP
+from ..seeing import projection, sight_lines
+from ..seeing.sight_lines import ENOUGH, colors_from
 from ..work import Progress, for_chunks, part, silent
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from ..errors import RefineError
+from ..estimate.quality import PSNR_CAP
 from ..formats.registry import SUFFIXES, as_written, read_splats, without_suffix
-from ..quality import PSNR_CAP
 from ..report import Clock, held, scoring_notes, seen_by
 from ..selection import Budget
 from ..survivors import survivor_columns

@@ -14,8 +14,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from ..errors import RefineError
+from ..estimate.quality import PSNR_CAP
 from ..pipeline import decide, score
-from ..quality import PSNR_CAP
 from ..selection import Budget
 from ..task import DEFAULTS, Origin, Task
 from ..volumes import among_all

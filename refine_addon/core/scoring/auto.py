@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..quality import UNSEEN
+from ..estimate.quality import UNSEEN
 from ..work import Progress, part, silent
 from .occlusion import FIRST_END, Rounds, Run
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from .. import radix
-from ..frustum import Frustums
+from ..seeing.frustum import Frustums
 from ..splats import base_color, drawable, opacity
 from ..work import for_chunks, part, silent
 from . import adaptive

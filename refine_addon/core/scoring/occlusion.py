@@ -27,21 +27,22 @@ import numpy as np
 from .. import processes
 from ..errors import RefineError
 from ..scores import Scores, shares_gone
+from ..seeing import projection
+from ..seeing.measuring import SECONDS, Measured, Measuring, Sampling
+from ..seeing.sight_lines import SightLines
 from ..splats import refuse_undrawable
 from ..work import Progress, part, report, silent
-from . import closed_form, coverage, projection
-from .measuring import SECONDS, Measured, Measuring, Sampling
-from .sight_lines import SightLines
-from .thinning import Thinning
+from . import closed_form, coverage
+from .removal_rounds import Thinning
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from ..seeing.projection import Gaussians
     from ..splats import Splats
     from ..views import ViewSet
-    from .projection import Gaussians
 
 LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""

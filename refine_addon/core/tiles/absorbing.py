@@ -18,7 +18,7 @@ from ..absorbing.absorb import ALONE, STAGE, Counts, mergeable, patience, reduce
 from ..absorbing.merge_field import Field, ViewSums
 from ..absorbing.merge_graph import MergeGraph
 from ..pipeline import PARTS
-from ..scoring.measuring import Measured
+from ..seeing.measuring import Measured
 from ..splats import Splats, joined
 from ..work import Progress, part, silent
 from .seen import MeasuringTiles, StoredLines, place

@@ -15,9 +15,9 @@ import numpy as np
 from ...version import VERSION
 from .. import radix
 from ..errors import RefineError
+from ..estimate.quality import needed
 from ..formats.ply_header import with_count
 from ..pipeline import FIRST, MEASURES, conclude, remark
-from ..quality import needed
 from ..report import Clock, Files, complete_report, make_report
 from ..scoring.closed_form_block import ROWS
 from ..selection import Budget, least_seen, quality_of, refuse_none_left, select, single

@@ -20,8 +20,8 @@ from .workers import Call
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from ..scoring.measuring import Measured
     from ..scoring.occlusion import Occlusion
+    from ..seeing.measuring import Measured
     from ..task import Settings
     from .units import Unit
     from .workers import Workers

@@ -16,10 +16,10 @@ import numpy as np
 
 from ..processes import for_each
 from ..scene import code_order, moments, spatial_code, splat_fingerprint
-from ..scoring import projection
-from ..scoring.measuring import SECONDS, Measured, Measuring, of_view
-from ..scoring.projection import Gaussians
-from ..scoring.sight_lines import Lines, SightLines, meet, met, psnr_of
+from ..seeing import projection
+from ..seeing.measuring import SECONDS, Measured, Measuring, of_view
+from ..seeing.projection import Gaussians
+from ..seeing.sight_lines import Lines, SightLines, meet, met, psnr_of
 from ..splats import drawable, joined
 from ..work import Progress, part, silent
 from .workers import Call
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..scene import Scene
-    from ..scoring.measuring import Sampling, Seen
+    from ..seeing.measuring import Sampling, Seen
     from ..splats import Splats
     from ..views import View, ViewSet
     from .folder import Folder

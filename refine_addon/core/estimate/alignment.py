@@ -21,11 +21,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .. import frustum
 from ..affine import QUARTERS
+from ..seeing import frustum, projection
+from ..seeing.sight_lines import meet, pixels
 from ..work import Progress, for_chunks, part, report, silent
-from . import projection
-from .sight_lines import meet, pixels
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,9 +33,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..scene import Scene
+    from ..seeing.projection import Gaussians
     from ..splats import Splats
     from ..views import View, ViewSet
-    from .projection import Gaussians
 
 SAMPLE = 4096
 """About so many splats stand for all, each as much larger as it stands for others."""

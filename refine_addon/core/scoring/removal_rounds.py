@@ -19,13 +19,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..seeing.measuring import Measured
 from ..work import Progress, for_chunks, part
-from .measuring import Measured
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .sight_lines import Lines, SightLines
+    from ..seeing.sight_lines import Lines, SightLines
 
     Sums = tuple[NDArray[np.float64], NDArray[np.float64]]
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .. import spherical_harmonics
-from ..quality import FEWEST, PSNR_CAP, SHARES, TAKEN_OVER, Quality, absorbed_from
+from ..estimate.quality import FEWEST, PSNR_CAP, SHARES, TAKEN_OVER, Quality, absorbed_from
 from ..rendering import ALPHA_CUT, ALPHA_MAX
 from ..work import Progress, checkpoint, for_chunks, part, silent
 from . import projection

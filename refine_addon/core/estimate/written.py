@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .affine import is_uniform, transformed
-from .formats.registry import format_named, read_splats
+from ..affine import is_uniform, transformed
+from ..formats.registry import format_named, read_splats
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from .scores import Scores
-    from .views import ViewSet
+    from ..scores import Scores
+    from ..views import ViewSet
 
 
 def written_facts(
