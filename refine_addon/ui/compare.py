@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import bpy
 import numpy as np
 
-from .. import splat_group
 from ..cameras.sets import Choice
 from ..core import pipeline
 from ..core.estimate.quality import in_words
@@ -18,6 +17,7 @@ from ..core.picture_files import KINDS
 from ..core.pictures import AMPLIFIED, Comparison, compare
 from ..core.views import ViewSet
 from ..core.work import part
+from ..objects import splat_group
 from .on_thread import Answer, OnThread
 from .operators import OnScored, apply_task
 

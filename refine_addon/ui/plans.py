@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from .. import demands, splat_group, splat_object
 from ..core import pipeline
 from ..core.errors import RefineError
 from ..core.estimate.alignment import Alignment
@@ -26,6 +25,7 @@ from ..core.selection import Tally, quality_of
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.notes import parsed
+from ..objects import demands, splat_group, splat_object
 from . import camera_list, price
 from .chart import Place
 

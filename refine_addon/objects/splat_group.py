@@ -13,30 +13,30 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
+from ..core.errors import RefineError
+from ..core.estimate.quality import Quality
+from ..core.selection import rank
+from ..core.splats import joined
+from ..core.task import DEFAULTS, Task
+from ..core.volumes import FREE, Forced
+from ..mesh import edit as mesh_edit
+from ..mesh import layout as mesh_layout
+from ..mesh import scores as mesh_scores
 from . import demands, splat_object
-from .core.errors import RefineError
-from .core.estimate.quality import Quality
-from .core.selection import rank
-from .core.splats import joined
-from .core.task import DEFAULTS, Task
-from .core.volumes import FREE, Forced
 from .demands import Demands
-from .mesh import edit as mesh_edit
-from .mesh import layout as mesh_layout
-from .mesh import scores as mesh_scores
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from .core.absorbing.absorb import Absorbed
-    from .core.scores import Scores
-    from .core.selection import Budget
-    from .core.splats import Splats
-    from .core.task import Result, Settings
-    from .core.views import ViewSet
-    from .mesh.layout import SplatObject
+    from ..core.absorbing.absorb import Absorbed
+    from ..core.scores import Scores
+    from ..core.selection import Budget
+    from ..core.splats import Splats
+    from ..core.task import Result, Settings
+    from ..core.views import ViewSet
+    from ..mesh.layout import SplatObject
     from .splat_object import Plan
 
 Members = list["SplatObject"]
