@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..affine import is_uniform, transformed
-from ..formats.registry import format_named, read_splats
+from ..formats.registry import format_named, read_written
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -44,20 +44,23 @@ def written_facts(
     -------
     dict
         ``written_psnr``: the estimated PSNR in dB against the pictures of all splats, with what the
-        format rounds and leaves out; None where nothing tells it, or
-        the matrix scales directions differently, which harmonics cannot express.
+        format rounds and leaves out; None where nothing tells it, where the file may not be read
+        (see `read_written`), or the matrix scales directions differently, which harmonics cannot
+        express.
 
     Raises
     ------
     RefineError
-        See `read_splats`.
+        See `read_written`.
     """
     if format_named(path) is None:
         return {}
     matrix = np.eye(4) if matrix is None else matrix
     if scores.sights is None or not is_uniform(matrix):
         return {"written_psnr": None}
-    splats = read_splats(path).splats()
+    splats = read_written(path)
+    if splats is None:
+        return {"written_psnr": None}
     if not np.array_equal(matrix, np.eye(4)):
         splats = transformed(splats, matrix)
     psnr = scores.sights.against(splats, views, threads=threads)

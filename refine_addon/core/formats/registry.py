@@ -84,6 +84,31 @@ def read_splats(path: Path | str) -> SplatFile:
     return form.read(path, np.frombuffer(whole, np.uint8))
 
 
+def read_written(path: Path) -> Splats | None:
+    """Return what a file holds that was just written in a format that rounds.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    Splats or None
+        None for a plain PLY, which is exact, and for a file that may not be read: one that replaced
+        another has its permissions.
+
+    Raises
+    ------
+    RefineError
+        See `read_splats`.
+    """
+    try:
+        path.open("rb").close()
+    except PermissionError:
+        return None
+    return None if format_named(path) is None else read_splats(path).splats()
+
+
 def _beginning(path: Path) -> bytes:
     """Return the first bytes of a file; none where it cannot be read, which `read_ply` explains."""
     try:
