@@ -99,9 +99,9 @@ class SceneJob:
 
     def _placed(self, source: Source, progress: Progress, threads: int | None) -> NDArray[np.int64]:
         splats = source.splats()
-        good, opaque = projection.judge(splats, threads=threads)
+        good, opaque = projection.classify(splats, threads=threads)
         with np.errstate(under="ignore"):
-            rows, place = projection.near(splats, opaque, self.scene)
+            rows, place = projection.near_scene(splats, opaque, self.scene)
             found = projection.activate(splats, rows, place, self.scene, progress, threads)
             code = spatial_code(place)
         packed = np.empty((len(rows), 14), np.float32)
