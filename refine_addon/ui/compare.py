@@ -18,8 +18,9 @@ from ..core.quality import in_words
 from ..core.views import ViewSet
 from ..core.work import part
 from ..objects import splat_group
-from .on_thread import Answer, OnThread
-from .operators import OnScored, apply_task
+from .on_thread import OnThread
+from .operator_bases import Answer, OnScored
+from .operators import apply_task
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

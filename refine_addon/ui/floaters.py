@@ -16,8 +16,9 @@ from ..mesh import layout as mesh_layout
 from ..objects import splat_object
 from ..objects.demands import Demands
 from . import plans
-from .on_thread import FAILURES, Answer, OnThread, fail
-from .operators import OnSplats, chosen_views
+from .on_thread import OnThread
+from .operator_bases import Answer, AtOnce, OnSplats
+from .operators import chosen_views
 
 if TYPE_CHECKING:
     from ..core.splats import Splats
@@ -74,39 +75,33 @@ class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_delete_floaters(OnSplats, bpy.types.Operator):
+def _searched(context: bpy.types.Context) -> str:
+    """Return that floaters are to be looked for, "" if they were."""
+    return "Find floaters first" if floaters.counts(context.object.data) is None else ""
+
+
+class REFINE_OT_delete_floaters(AtOnce, OnSplats, bpy.types.Operator):
     """Delete the floaters that were found, for the reasons that are switched on"""
 
     bl_idname = "refine.delete_floaters"
     bl_label = "Delete Floaters"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's way to set options
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run, and if not, why."""
-        if not super().poll(context):
-            return False
-        if floaters.counts(context.object.data) is None:
-            cls.poll_message_set("Find floaters first")
-            return False
-        return True
+    needs = (*OnSplats.needs, _searched)
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> Answer:
         """Delete them, but for those that must stay by now."""
-        try:
-            checked = mesh_layout.check(context.object)
-            goes = floaters.mask(checked, context.scene.refine.reasons)
-            protected = Demands.of_scene(context.scene).forced(checked).protected
-            spared = ""
-            if protected is not None and (stays := int(np.count_nonzero(goes & protected))):
-                goes &= ~protected
-                spared = f"; {stays:,} more are protected by now"
-            if not goes.any():
-                self.report({"INFO"}, f"There are no floaters to delete{spared}")
-                return {"CANCELLED"}
-            done = splat_object.delete_splats(checked, ~goes)
-        except FAILURES as error:
-            return fail(self, error)
+        checked = mesh_layout.check(context.object)
+        goes = floaters.mask(checked, context.scene.refine.reasons)
+        protected = Demands.of_scene(context.scene).forced(checked).protected
+        spared = ""
+        if protected is not None and (stays := int(np.count_nonzero(goes & protected))):
+            goes &= ~protected
+            spared = f"; {stays:,} more are protected by now"
+        if not goes.any():
+            self.report({"INFO"}, f"There are no floaters to delete{spared}")
+            return {"CANCELLED"}
+        done = splat_object.delete_splats(checked, ~goes)
         plans.forget(checked.mesh)
         plans.refresh(context)
         self.report(

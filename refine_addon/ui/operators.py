@@ -1,4 +1,4 @@
-"""Operators on splat objects: each reads what the user chose and makes one call.
+"""Operators that score, prune and convert splat objects.
 
 Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* is clicked.
 """
@@ -6,42 +6,44 @@ Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* 
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
-from bpy.props import BoolProperty, EnumProperty, StringProperty
-from bpy_extras.io_utils import ExportHelper
 
 from ..cameras.sets import Choice
 from ..core import frustum, pipeline
-from ..core.formats.registry import FORMATS, Packed, without_suffix
 from ..core.levels.lod import Level, Levels, lod
 from ..core.quality import in_words
 from ..core.report import scoring_notes, sizes_in_words
-from ..core.work import part, report
+from ..core.work import part
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
 from ..objects import level_objects, splat_group, splat_object
 from ..objects.demands import Demands
-from ..viewport import draw
-from . import plans, preview, running, staleness
+from . import plans, staleness
 from .adjust import Adjustable
-from .import_operators import FILE_NAMES
-from .on_thread import FAILURES, Answer, AskedFirst, OnThread, fail
+from .on_thread import OnThread
+from .operator_bases import (
+    Answer,
+    AtOnce,
+    Needing,
+    OnSplats,
+    in_object_mode,
+    on_splats,
+    out_of_edit_mode,
+    scored,
+)
 from .running import Sketch
 from .wrapped import counted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..core.formats.ply import SplatFile
     from ..core.scores import Scores
     from ..core.splats import Splats
     from ..core.task import Result, Settings, Task
@@ -49,49 +51,6 @@ if TYPE_CHECKING:
     from ..core.volumes import Forced
     from ..core.work import Progress
     from ..mesh.layout import SplatObject
-
-
-_FORMATS = (
-    (".ply", ".ply", "In the layout that was imported"),
-    *((form.suffix, form.suffix, f"It {form.loss}") for form in FORMATS),
-)
-"""The formats of an export as Blender lists them, with tooltips."""
-
-
-class OnSplats:
-    """An operator on the active object, which must hold splats."""
-
-    waits = True
-    """Whether it waits until another one is over that works on a thread."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run, and if not, why."""
-        if cls.waits and (why := running.refusal()):
-            cls.poll_message_set(why)
-            return False
-        obj = context.object
-        if not mesh_layout.looks_like_splats(obj):
-            cls.poll_message_set("Select an object that holds splats: import a file of splats")
-            return False
-        if obj.mode == "EDIT":
-            cls.poll_message_set("Leave edit mode first")
-            return False
-        return True
-
-
-class OnScored(OnSplats):
-    """An operator on the active object, which must be scored."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run, and if not, why."""
-        if not super().poll(context):
-            return False
-        if mesh_scores.record(context.object.data) is None:
-            cls.poll_message_set("Score the splats first")
-            return False
-        return True
 
 
 def chosen_views(context: bpy.types.Context) -> ViewSet:
@@ -117,16 +76,6 @@ def apply_task(context: bpy.types.Context, group: splat_group.Members, found: li
 def _of_objects(group: splat_group.Members) -> str:
     """Return how many objects were worked on, if more than one."""
     return f" of {len(group)} objects" if len(group) > 1 else ""
-
-
-def _new_name(obj: bpy.types.Object) -> str:
-    """Return a name for an export that no file beside the .blend has yet."""
-    mesh = obj.data
-    pruned = mesh_scores.RANK in mesh.attributes and mesh_scores.record(mesh) is None
-    name = f"{obj.name}_{'pruned' if pruned else 'copy'}"
-    names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
-    folder = Path(bpy.path.abspath("//"))  # where the file browser starts
-    return next(f"{new}.ply" for new in names if not (folder / f"{new}.ply").exists())
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,13 +191,13 @@ def _sketched(job: _Scoring, progress: Progress) -> Scores:
     )
 
 
-class REFINE_OT_plan(OnScored, bpy.types.Operator):
+class REFINE_OT_plan(Needing, bpy.types.Operator):
     """Work out again how many splats stay and go"""
 
     bl_idname = "refine.plan"
     bl_label = "Update"
     bl_options = {"INTERNAL"}
-    waits = False
+    needs = (on_splats, out_of_edit_mode, scored)
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Work it out."""
@@ -265,6 +214,14 @@ class _Applying:
     forced: list[Forced]
 
 
+def _scored_or_applied(context: bpy.types.Context) -> str:
+    """Return that scores are needed, "" if there are any.
+
+    Also where they led to an *Apply*: to adjust that, Blender asks before it undoes it.
+    """
+    return "" if mesh_scores.RANK in context.object.data.attributes else scored(context)
+
+
 class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
     """Delete the splats that the budget does not keep; with Absorb, survivors take them over"""
 
@@ -273,19 +230,7 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
     doing = "Absorbing splats"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run, and if not, why.
-
-        Also where it has run: to adjust it, Blender asks before it undoes it.
-        """
-        if not super().poll(context):
-            return False
-        mesh = context.object.data
-        if mesh_scores.record(mesh) is None and mesh_scores.RANK not in mesh.attributes:
-            cls.poll_message_set("Score the splats first")
-            return False
-        return True
+    needs = (*OnSplats.needs, _scored_or_applied)
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Do all of it at once; adjusted, by another budget than that of the panel."""
@@ -373,15 +318,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
     doing = "Making levels"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run, and if not, why."""
-        if not super().poll(context):
-            return False
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Go to object mode first")
-            return False
-        return True
+    needs = (*OnSplats.needs, in_object_mode)
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Detail:
         """Gather splats, views and settings."""
@@ -422,183 +359,19 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_preview(OnSplats, bpy.types.Operator):
-    """Show the splats as points, or in renders as they are, without changing them"""
-
-    bl_idname = "refine.preview"
-    bl_label = "Preview"
-    bl_options = {"REGISTER", "UNDO"}
-    waits = False
-
-    mode: EnumProperty(
-        name="Show",
-        description="What the points show",
-        items=(
-            ("HEAT", "Heat Map", "Rank of each splat: dark goes first, yellow last"),
-            ("COLOR", "Colour", "The splat's own colour"),
-            ("OFF", "Off", "Show the plain mesh again"),
-        ),
-    )
-    hide_removed: BoolProperty(
-        name="Hide What Goes", description="Hide the splats that the budget removes"
-    )
-    style: EnumProperty(
-        name="Style",
-        description="What is made of each splat",
-        items=(
-            ("POINTS", "Points", "A sphere, for the viewport"),
-            ("SPLATS", "For Renders", "The Gaussian itself, for pictures that Cycles renders"),
-        ),
-        options={"SKIP_SAVE"},
-    )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: Any) -> str:  # noqa: ANN401
-        """Return the tooltip of a button."""
-        if properties.style == "SPLATS" and properties.mode != "OFF":
-            return (
-                "Let renders show the splats as they are; sets the scene to Cycles, without light "
-                "and with the view transform Standard"
-            )
-        if properties.mode == "OFF":
-            return "Show the plain mesh again"
-        if properties.hide_removed:
-            return "Hide the splats that would be removed; nothing is deleted"
-        return {
-            "HEAT": "Colour each splat by its rank: dark goes first, yellow goes last",
-            "COLOR": "Show each splat in its own colour",
-        }[properties.mode]
-
-    def execute(self, context: bpy.types.Context) -> Answer:
-        """Add, change or remove the preview."""
-        obj = context.object
-        try:
-            if self.mode == "OFF":
-                preview.hide(obj)
-            else:
-                hide, style = self.hide_removed, self.style
-                preview.show(obj, self.mode, hide_removed=hide, style=style)
-        except FAILURES as error:
-            return fail(self, error)
-        if self.mode != "OFF" and self.style == "SPLATS":
-            preview.set_up_render(context.scene)
-            return {"FINISHED"}  # too slow for the viewport, which draws them by itself
-        draw.stop()
-        shading = getattr(context.space_data, "shading", None)
-        # Solid mode draws every point in one grey.
-        if self.mode != "OFF" and shading and shading.type in {"SOLID", "WIREFRAME"}:
-            shading.type = "MATERIAL"
-        overlay = getattr(context.space_data, "overlay", None)
-        if overlay:  # outlines of a million selected points hide their colours
-            overlay.show_outline_selected = self.mode == "OFF"
-        return {"FINISHED"}
-
-
-class REFINE_OT_convert(OnSplats, bpy.types.Operator):
+class REFINE_OT_convert(AtOnce, OnSplats, bpy.types.Operator):
     """Turn a splat mesh into a point cloud of Blender's own splats, or such a point cloud back"""
 
     bl_idname = "refine.convert"
     bl_label = "Convert Splats"
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> Answer:
         """Put the other form in the place of the active object."""
-        try:
-            obj, notes = converted(mesh_layout.check(context.object))
-        except FAILURES as error:
-            return fail(self, error)
+        obj, notes = converted(mesh_layout.check(context.object))
         plans.refresh(context)
         for note in notes:
             self.report({"WARNING"}, note)
         kind = "a point cloud" if obj.type == "POINTCLOUD" else "a mesh"
         self.report({"INFO"}, f"'{obj.name}' is {kind} now")
-        return {"FINISHED"}
-
-
-@dataclass(frozen=True, eq=False)
-class _Export:
-    """What is to be written where."""
-
-    file: SplatFile
-    target: Path
-    overwrite: bool
-
-
-class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelper):
-    """Write the active object's splats to a file, in the format that its suffix names"""
-
-    bl_idname = "refine.export_ply"
-    bl_label = "Export Splats"
-    bl_options = {"REGISTER", "PRESET"}
-    doing = "Writing splats"
-
-    filename_ext = ".ply"
-    filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
-    suffix: EnumProperty(
-        name="Format",
-        description="Of the file that is picked here; a suffix that is typed chooses it",
-        items=_FORMATS,
-        options={"SKIP_SAVE"},
-    )
-    settled: StringProperty(default=_FORMATS[0][0], options={"HIDDEN", "SKIP_SAVE"})
-    apply_transform: BoolProperty(
-        name="Apply Transform",
-        description="Write the splats as they stand in the world: positions, rotations, scales "
-        "and view-dependent colour follow the object",
-    )
-    overwrite: BoolProperty(
-        name="Overwrite",
-        description="Replace the file if it exists",
-        options={"SKIP_SAVE"},
-    )
-
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
-        """Ask for the file; whoever picks an existing one in the browser means to replace it."""
-        if not self.filepath:
-            self.filepath = _new_name(context.object)
-        self.overwrite = True
-        return ExportHelper.invoke(self, context, event)
-
-    def check(self, _context: bpy.types.Context) -> bool:
-        """Bring name and format together, whichever was changed; return whether either changed."""
-        before = self.filepath, self.suffix
-        name = without_suffix(self.filepath)
-        typed = self.filepath[len(name) :].lower()
-        if typed and self.suffix == self.settled:
-            self.suffix = typed
-        self.filepath = name + self.suffix
-        self.settled = self.suffix
-        return before != (self.filepath, self.suffix)
-
-    def written(
-        self, _context: bpy.types.Context, _checked: SplatObject | None
-    ) -> list[SplatObject]:
-        """Return none: the object is only read."""
-        return []
-
-    def prepare(self, _context: bpy.types.Context, checked: SplatObject) -> _Export:
-        """Refuse what cannot be written, and gather what is."""
-        target = splat_object.export_target(
-            bpy.path.abspath(self.filepath), overwrite=self.overwrite
-        )
-        file = splat_object.export_source(checked, apply_transform=self.apply_transform)
-        return _Export(file, target, self.overwrite)
-
-    @staticmethod
-    def work(job: _Export, progress: Progress) -> SplatFile | Packed:
-        """Write the file."""
-        report(progress, 0.0, job.target.name)
-        return splat_object.write_export(job.file, job.target, overwrite=job.overwrite)
-
-    def finish(
-        self,
-        _context: bpy.types.Context,
-        _checked: SplatObject | None,
-        _job: _Export,
-        file: SplatFile | Packed,
-    ) -> Answer:
-        """Say what was written."""
-        if isinstance(file, Packed):
-            self.report({"INFO"}, "; ".join(file.notes(np.ones(len(file.file), np.bool_))))
-        self.report({"INFO"}, f"Wrote the splats to {self.filepath}")
         return {"FINISHED"}

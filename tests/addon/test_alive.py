@@ -438,7 +438,7 @@ def test_work_that_listens_to_nobody_is_left_behind_within_a_second(start, addon
 @pytest.mark.parametrize("suffix", [".ply", ".sog"])
 def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, few, tmp_path, suffix):
     """The same bytes, images of a SOG by Blender's library on the main thread included."""
-    export, read = addon.ui.operators.REFINE_OT_export_ply, addon.ui.import_operators
+    export, read = addon.ui.export_operators.REFINE_OT_export_ply, addon.ui.import_operators
     at_once, later = (tmp_path / f"{name}{suffix}" for name in ("now", "later"))
     bpy.ops.refine.export_ply(filepath=str(at_once))
     options = {"overwrite": False, "apply_transform": False}
@@ -467,7 +467,7 @@ def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, 
 
     held = SimpleNamespace(suffix=".splat", degree=form.degree, write=write, loss="", sizes=None)
     monkeypatch.setattr(registry, "format_named", lambda _path: held)
-    export = addon.ui.operators.REFINE_OT_export_ply
+    export = addon.ui.export_operators.REFINE_OT_export_ply
     options = {"overwrite": False, "apply_transform": False}
     operator, context, _ = start(export, filepath=str(tmp_path / "out.splat"), **options)
     begun.wait(10.0)
