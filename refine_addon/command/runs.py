@@ -22,10 +22,10 @@ from ..core import (
     score,
 )
 from ..core.errors import printable
+from ..core.estimate.quality import UNSEEN, in_words
 from ..core.formats.registry import without_suffix
 from ..core.pace import Pace
 from ..core.picture_files import PictureFiles
-from ..core.quality import UNSEEN, in_words
 from ..core.report import held, kept_and_removed, scoring_notes, seen_by, what_was_seen
 from ..core.tiles.storage import located
 from ..core.urls import Url

@@ -13,9 +13,9 @@ from .volumes import among_all
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .quality import Quality
-    from .scoring.alignment import Alignment
-    from .scoring.sight_lines import SightLines
+    from .estimate.alignment import Alignment
+    from .estimate.quality import Quality
+    from .seeing.ray_sample import RaySample
 
 _DISTINCT = 1 << 24
 """Largest number of equal steps from 0 to 1 that are distinct in float32."""
@@ -47,9 +47,8 @@ class Scores:
         counts for every splat.
     views_given : int
         How many views were given; those used were chosen from them.
-    sights : SightLines, optional
-        What the views' lines of sight meet, from which any choice of the splats that were scored
-        can be judged.
+    ray_sample : RaySample, optional
+        Validation rays, which tell the PSNR of any choice of the splats that were scored.
     quality : Quality, optional
         How close the pictures stay with ever more of these removed in the order of the scores.
     alignment : Alignment, optional
@@ -70,7 +69,7 @@ class Scores:
     method: str = ""
     frustum: bool = True
     views_given: int = 0
-    sights: SightLines | None = None
+    ray_sample: RaySample | None = None
     quality: Quality | None = None
     alignment: Alignment | None = None
     settled: int | None = None
@@ -103,14 +102,19 @@ class Scores:
         """
         self.refuse_unscored(rest)
         values, count = self.values[rest], int(np.count_nonzero(rest))
-        sights = self.sights
-        if sights is not None and len(sights.splats) != count:
-            sights = None  # of a scene with other splats
+        ray_sample = self.ray_sample
+        if ray_sample is not None and len(ray_sample.splats) != count:
+            ray_sample = None  # of a scene with other splats
         settled = self.settled
         if settled is not None:
             settled = max(settled - (len(rest) - count), 0)
         return replace(
-            self, values=values, seen=self.seen[rest], sights=sights, settled=settled, scored=None
+            self,
+            values=values,
+            seen=self.seen[rest],
+            ray_sample=ray_sample,
+            settled=settled,
+            scored=None,
         )
 
     def refuse_unscored(self, rest: NDArray[np.bool_] | None = None) -> None:

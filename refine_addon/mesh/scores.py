@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..core.errors import RefineError
-from ..core.quality import Quality
+from ..core.estimate.quality import Quality
 from ..core.scores import Scores
 from ..core.selection import rank
 from . import attributes as mesh_attributes

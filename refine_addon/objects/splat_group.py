@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 
 from ..core.errors import RefineError
-from ..core.quality import Quality
+from ..core.estimate.quality import Quality
 from ..core.selection import rank
 from ..core.splats import joined
 from ..core.task import DEFAULTS, Task

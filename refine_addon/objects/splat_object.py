@@ -18,6 +18,7 @@ from ..cameras.objects import world_matrix
 from ..core import pipeline
 from ..core.affine import is_uniform, transformed
 from ..core.errors import RefineError
+from ..core.estimate.written import written_facts
 from ..core.file_to_file import picture_facts
 from ..core.formats.ply import columns_from_splats
 from ..core.formats.registry import as_written, format_named, refuse_unknown_size
@@ -27,7 +28,6 @@ from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.volumes import FREE, Forced
 from ..core.whole_file import expanded, refuse_existing
 from ..core.work import Progress, part, silent
-from ..core.written import written_facts
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters

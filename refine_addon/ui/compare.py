@@ -12,9 +12,9 @@ import numpy as np
 
 from ..cameras.sets import Choice
 from ..core import pipeline
+from ..core.estimate.quality import in_words
 from ..core.picture_files import KINDS
 from ..core.pictures import AMPLIFIED, Comparison, compare
-from ..core.quality import in_words
 from ..core.views import ViewSet
 from ..core.work import part
 from ..objects import splat_group

@@ -14,10 +14,11 @@ import bpy
 import numpy as np
 
 from ..cameras.sets import Choice
-from ..core import frustum, pipeline
+from ..core import pipeline
+from ..core.estimate.quality import in_words
 from ..core.levels.lod import Level, Levels, lod
-from ..core.quality import in_words
 from ..core.report import scoring_notes, sizes_in_words
+from ..core.seeing import frustum
 from ..core.work import part
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout

@@ -18,9 +18,9 @@ import numpy as np
 
 from ..core import pipeline
 from ..core.errors import RefineError
-from ..core.quality import in_words, out_of_reach
+from ..core.estimate.alignment import Alignment
+from ..core.estimate.quality import in_words, out_of_reach
 from ..core.report import sizes_in_words
-from ..core.scoring.alignment import Alignment
 from ..core.selection import Tally, quality_of
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
