@@ -59,16 +59,18 @@ def chosen_views(context: bpy.types.Context) -> ViewSet:
     return Choice.of_scene(context.scene).views(context, context.object)
 
 
-def apply_task(context: bpy.types.Context, group: splat_group.Members, found: list[Forced]) -> Task:
+def apply_task(
+    context: bpy.types.Context, group: splat_group.Members, forced: list[Forced]
+) -> Task:
     """Return what *Apply* has to decide of the selected objects by the settings of the panel.
 
-    `found` is what must stay and what must go of each.
+    `forced` is what must stay and what must go of each.
     """
     settings = context.scene.refine
     return splat_group.stored_task(
         group,
         settings.to_budget(),
-        found,
+        forced,
         settings=settings.to_settings(),
         views=chosen_views(context) if settings.absorb else None,
     )
@@ -81,10 +83,7 @@ def _of_objects(group: splat_group.Members) -> str:
 
 @dataclass(frozen=True, eq=False)
 class _Scoring:
-    """What is to be scored, by which views and how; where all of it stood (`staleness.origin`).
-
-    What has to go is left out.
-    """
+    """What is to be scored, by which views and how; where all of it stood (`staleness.origin`)."""
 
     splats: Splats
     forced: Forced
@@ -112,7 +111,7 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         quality = settings.estimates or context.scene.refine.budget == "psnr"
         splats = splat_group.gather(group, whole=None if quality else False)
         origins = [staleness.origin(context, member.obj) for member in group]
-        forced = splat_group.forced_of(splat_group.forced(context.scene, group), group)
+        forced = splat_group.joined_forced(splat_group.forced_of_each(context.scene, group), group)
         uids = splat_group.uids_of(group)
         return _Scoring(splats, forced, views, settings, quality, uids, origins)
 
@@ -124,7 +123,7 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         """Score by the closed form first, which takes a fraction of the time."""
         if job.settings.method == "closed-form":
             return None
-        work = partial(_sketched, job)
+        work = partial(_sketch, job)
         left = "the scores are the closed form's"
         return Sketch(work, "Refining scores", "keeps the closed form's", left)
 
@@ -134,61 +133,63 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     ) -> None:
         """Store the closed form's scores, to be looked at until those asked for are there."""
         group = splat_group.by_uids(job.uids, checked)
-        noted = splat_group.Noted(_rough(job), job.origins, forced=job.forced, asked=job.settings)
+        noted = splat_group.Noted(
+            _by_closed_form(job), job.origins, forced=job.forced, asked=job.settings
+        )
         splat_group.store(group, scores, noted)
         plans.refresh(context)
 
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
         """Score, and count how many splats lie in each view."""
-        ahead = part(progress, 0.0, 0.97)
+        forced_out, means = job.forced.removed, job.splats.means
         scores = pipeline.score(
             job.splats, job.views, job.settings,
-            protected=job.forced.protected, removed=job.forced.removed,
-            quality=job.quality, progress=ahead,
+            protected=job.forced.protected, removed=forced_out,
+            quality=job.quality, progress=part(progress, 0.0, 0.97),
         )  # fmt: skip
-        ahead = part(progress, 0.97, 1.0)
-        gone, means = job.forced.removed, job.splats.means
-        means = means if gone is None else means[~gone]
-        return scores, frustum.census(means, job.views, progress=ahead)
+        means = means if forced_out is None else means[~forced_out]
+        return scores, frustum.census(means, job.views, progress=part(progress, 0.97, 1.0))
 
     def finish(
         self,
         context: bpy.types.Context,
         checked: SplatObject,
         job: _Scoring,
-        found: tuple[Scores, NDArray[np.int64]],
+        result: tuple[Scores, NDArray[np.int64]],
     ) -> Answer:
         """Store the scores on the meshes and say what came of it."""
-        scores, counts = found
+        scores, counts = result
         pairs = zip(job.views, counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
         group = splat_group.by_uids(job.uids, checked)
-        forced = job.forced.counts()["forced"]
         noted = splat_group.Noted(job.settings, job.origins, cameras, job.forced)
         splat_group.store(group, scores, noted)
         plans.refresh(context)
-        unseen = int((scores.seen == 0).sum()) - forced
-        self.report(
-            {"INFO"},
-            f"Scored {len(scores.values) - forced:,} splats{_of_objects(group)} by "
-            f"{scores.views_used} of "
-            f"{counted(scores.views_given, 'view')}; {unseen:,} lie in none",
-        )
-        modified = [note for m in group for note in splat_object.modifier_notes(m.obj)]
-        for note in (*scoring_notes(scores), *modified):
+        self.report({"INFO"}, _scored_in_words(group, scores, job.forced.counts()["forced"]))
+        modifiers = [note for each in group for note in splat_object.modifier_notes(each.obj)]
+        for note in (*scoring_notes(scores), *modifiers):
             self.report({"WARNING"}, note)
         return {"FINISHED"}
 
 
-def _rough(job: _Scoring) -> Settings:
-    """Return the settings of a sketch of the scores that a job asks for."""
+def _scored_in_words(group: splat_group.Members, scores: Scores, forced_out: int) -> str:
+    """Return how many splats were scored by how many views, and how many of them these miss."""
+    unseen = int((scores.seen == 0).sum()) - forced_out
+    return (
+        f"Scored {len(scores.values) - forced_out:,} splats{_of_objects(group)} by "
+        f"{scores.views_used} of {counted(scores.views_given, 'view')}; {unseen:,} lie in none"
+    )
+
+
+def _by_closed_form(job: _Scoring) -> Settings:
+    """Return the settings of the sketch of the scores that a job asks for."""
     return replace(job.settings, method="closed-form")
 
 
-def _sketched(job: _Scoring, progress: Progress) -> Scores:
+def _sketch(job: _Scoring, progress: Progress) -> Scores:
     return pipeline.score(
-        job.splats, job.views, _rough(job), removed=job.forced.removed, progress=progress
+        job.splats, job.views, _by_closed_form(job), removed=job.forced.removed, progress=progress
     )
 
 
@@ -253,8 +254,8 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         group = splat_group.members(context.view_layer, checked)
         for member in group:
             mesh_edit.check_deletable(member.obj)
-        found = splat_group.forced(context.scene, group)
-        return _Applying(apply_task(context, group, found), splat_group.uids_of(group), found)
+        forced = splat_group.forced_of_each(context.scene, group)
+        return _Applying(apply_task(context, group, forced), splat_group.uids_of(group), forced)
 
     def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
         """Return the objects that lose splats, the active one first."""
@@ -273,12 +274,9 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         group = splat_group.by_uids(job.uids, checked)
         if job.task.absorb:  # on a thread, while volumes can be moved
             splat_group.check_forced(context.scene, group, job.forced)
-        stay = splat_group.parts_of(job.task.protected, group)
-        pairs = zip((member.obj for member in group), stay, strict=True)
-        changed = staleness.changes_of(context, dict(pairs))
-        if result.absorbed and not job.task.budget.needs_scores:
-            changed = []  # nothing went by the scores
-        done = splat_group.apply(group, result)
+        decided = job.task.budget.needs_scores or not result.absorbed  # by the scores
+        changed = _changes_since_scoring(context, group, job) if decided else []
+        outcome = splat_group.apply(group, result)
         for member in group:
             plans.forget(member.mesh)
         plans.refresh(context)
@@ -287,8 +285,8 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
             self.report({"INFO"}, result.absorbed.note())
         self.report(
             {"INFO"},
-            f"Kept {done.kept:,} splats{_of_objects(group)}, removed {done.removed:,}: "
-            + sizes_in_words(done.bytes_before, "->", done.bytes_after)
+            f"Kept {outcome.kept:,} splats{_of_objects(group)}, removed {outcome.removed:,}: "
+            + sizes_in_words(outcome.bytes_before, "->", outcome.bytes_after)
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
         if changed:
@@ -300,8 +298,17 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         return {"FINISHED"}
 
 
+def _changes_since_scoring(
+    context: bpy.types.Context, group: splat_group.Members, job: _Applying
+) -> list[str]:
+    """Return what changed since the objects were scored, in a few words each."""
+    protected = splat_group.parts_of(job.task.protected, group)
+    pairs = zip((member.obj for member in group), protected, strict=True)
+    return staleness.changes_of(context, dict(pairs))
+
+
 @dataclass(frozen=True, eq=False)
-class _Detail:
+class _MakingLevels:
     """What levels are to be made of, by which views and how; what must stay and go."""
 
     splats: Splats
@@ -321,11 +328,11 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
 
     needs = (*OnSplats.needs, in_object_mode)
 
-    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Detail:
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _MakingLevels:
         """Gather splats, views and settings."""
         settings = context.scene.refine
         levels = settings.to_levels()
-        return _Detail(
+        return _MakingLevels(
             splat_object.gather(checked, whole=True if levels.absorb else None),
             chosen_views(context),
             levels,
@@ -334,7 +341,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         )
 
     @staticmethod
-    def work(job: _Detail, progress: Progress) -> list[Level]:
+    def work(job: _MakingLevels, progress: Progress) -> list[Level]:
         """Make the levels."""
         return lod(
             job.splats, job.views, job.levels, job.settings,
@@ -345,16 +352,16 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         self,
         _context: bpy.types.Context,
         checked: SplatObject,
-        job: _Detail,
+        job: _MakingLevels,
         levels: list[Level],
     ) -> Answer:
         """Make the objects and say what each level costs."""
         collection = level_objects.add_levels(checked, levels)
-        told = [
+        counts = [
             f"{len(level.splats):,}" + (f" ({in_words(level.psnr)})" if level.psnr else "")
             for level in levels
         ]
-        self.report({"INFO"}, f"'{collection.name}': {', '.join(told)} splats")
+        self.report({"INFO"}, f"'{collection.name}': {', '.join(counts)} splats")
         for note in job.levels.notes({level.asked: level.remark for level in levels}):
             self.report({"WARNING"}, note)
         return {"FINISHED"}

@@ -134,7 +134,7 @@ class REFINE_OT_keep_unseen(AtOnce, OnSplats, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> Answer:
         """Mark them."""
         group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
-        found = splat_group.forced(context.scene, group)
+        found = splat_group.forced_of_each(context.scene, group)
         masks = [_unseen(*pair) for pair in zip(group, found, strict=True)]
         for member in group:
             mesh_edit.check_writable(member.obj)

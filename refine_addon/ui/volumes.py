@@ -167,8 +167,8 @@ class REFINE_OT_crop(AtOnce, OnSplats, bpy.types.Operator):
         if forced_out is None or not forced_out.any():
             msg = f"object '{checked.obj.name}': no volume says of any splat that it must go"
             raise RefineError(msg)
-        done = splat_object.delete_splats(checked, ~forced_out)
+        outcome = splat_object.delete_splats(checked, ~forced_out)
         plans.forget(checked.mesh)
         plans.refresh(context)
-        self.report({"INFO"}, f"Deleted {done.removed:,} splats, {done.kept:,} stay")
+        self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, {outcome.kept:,} stay")
         return {"FINISHED"}

@@ -358,7 +358,7 @@ def test_esc_before_anything_is_shown_leaves_the_old_scores(start, addon, few, m
             time.sleep(0.01)
         raise addon.core.Cancelled
 
-    monkeypatch.setattr(module, "_sketched", slow)
+    monkeypatch.setattr(module, "_sketch", slow)
     operator, context, said = start()
     tell.wait(10.0)
     operator.modal(context, event("ESC"))
@@ -420,7 +420,7 @@ def test_what_ends_the_session_ends_the_thread(start, gate, addon, how):  # noqa
 def test_work_that_listens_to_nobody_is_left_behind_within_a_second(start, addon, few, monkeypatch):
     """What it comes to later is dropped."""
     free, expected = threading.Event(), scored_by(few, "auto")
-    monkeypatch.setattr(addon.ui.operators, "_sketched", lambda _job, _progress: free.wait(20.0))
+    monkeypatch.setattr(addon.ui.operators, "_sketch", lambda _job, _progress: free.wait(20.0))
     operator, context, _ = start()
     begun = time.monotonic()
     operator.modal(context, event("ESC"))
