@@ -13,7 +13,7 @@ import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from .errors import RefineError
+from .errors import RefineError, reason_of
 from .urls import refuse_url
 from .work import checkpoint
 
@@ -89,7 +89,7 @@ def make_folder(path: Path) -> bool:
         there = bool(mode_of(path))
         path.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
-        msg = f"{path}: cannot be made ({getattr(error, 'strerror', None) or error})"
+        msg = f"{path}: cannot be made ({reason_of(error)})"
         raise RefineError(msg) from error
     return there
 
@@ -316,5 +316,4 @@ def _explain(path: Path, error: Exception) -> str:
         return f"{path}: no space left on the disk; nothing was changed"
     if isinstance(error, FileExistsError):
         return f"{path}: another program created this file in the meantime; it was left as it is"
-    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return f"{path}: cannot be written ({reason}); nothing was changed"
+    return f"{path}: cannot be written ({reason_of(error)}); nothing was changed"

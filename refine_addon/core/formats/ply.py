@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 import plyfile
 
-from ..errors import RefineError
+from ..errors import RefineError, reason_of
 from ..whole_file import expanded, refuse_mapped, whole_file
 from .ply_body import check_counts, read_text, vertex_range
 from .ply_columns import REQUIRED, REST_COUNTS, columns_from_splats, splats_from_columns
@@ -249,7 +249,7 @@ def read_ply(path: Path | str) -> SplatFile:
             header, vertex = splat_header(path, stream)
             whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
-        msg = f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
+        msg = f"{path}: cannot be read ({reason_of(error)})"
         raise RefineError(msg) from error
     body = np.frombuffer(whole, np.uint8)[len(header.raw) :]
     check_counts(header, len(body))

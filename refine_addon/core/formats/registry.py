@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import RefineError
+from ..errors import RefineError, reason_of
 from ..foreign_files import refuse_pointer
 from ..splats import drawable
 from ..whole_file import expanded, whole_file
@@ -79,7 +79,7 @@ def read_splats(path: Path | str) -> SplatFile:
         with path.open("rb") as stream:
             whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
-        msg = f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
+        msg = f"{path}: cannot be read ({reason_of(error)})"
         raise RefineError(msg) from error
     return form.read(path, np.frombuffer(whole, np.uint8))
 
