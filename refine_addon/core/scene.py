@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .work import slices
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio: its multiples spread numbers that differ little."""
 
-_CHUNK = 1 << 16
+_CHUNK = 1 << 16  # rows that are computed together, which limits temporary memory
 _BITS = 21  # of each coordinate in `spatial_order`; three of them fit an int64
 _SPREAD_BITS = (
     (32, 0x1F00000000FFFF),
@@ -107,7 +109,7 @@ def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -
     origin, views_squared = views.middle()
     squared = np.empty(len(means))
     with np.errstate(under="ignore"):
-        for piece in _pieces(len(means)):
+        for piece in slices(len(means), _CHUNK):
             # Undrawable splats may hold any number, such as infinity.
             offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
             squared[piece] = np.einsum("ij,ij->i", offset, offset) + views_squared
@@ -149,7 +151,7 @@ def moments(
     means, drawable, scene
         See `_principal_axes`.
     """
-    for piece in _pieces(len(means)):
+    for piece in slices(len(means), _CHUNK):
         place = scene.place(means[piece][drawable[piece]])  # (n, 3)
         nearness = (1.0 + np.einsum("ij,ij->i", place, place)) ** -2.0  # (n,)
         weighted = place * nearness[:, None]
@@ -171,11 +173,6 @@ def principal_axes(second: NDArray[np.float64], first: NDArray[np.float64]) -> N
     if np.linalg.det(axes) < 0.0:
         axes[2] = -axes[2]
     return np.ascontiguousarray(axes)
-
-
-def _pieces(count: int) -> Iterator[slice]:
-    """Return slices that cover `count` rows."""
-    return (slice(start, start + _CHUNK) for start in range(0, count, _CHUNK))
 
 
 def fingerprint(*columns: NDArray[Any]) -> NDArray[np.uint64]:

@@ -26,7 +26,7 @@ from .lenses import MODELS, MODELS_BY_NAME, Model, counted, lens_note
 from .place import CameraPlace, is_file
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
 
@@ -249,23 +249,24 @@ def _binary_images(path: Path) -> list[Image]:
         return images
 
 
-def _lines(path: Path) -> list[tuple[CameraPlace, bytes]]:
-    """Return the lines of a text file, each with its place, without comments."""
+def _lines(path: Path) -> Iterator[tuple[CameraPlace, bytes]]:
+    """Yield the lines of a text file, each with its place, without comments."""
     file = CameraPlace(path)
+    empty = True
     try:
         with path.open("rb") as stream:
-            lines = [line.strip() for line in stream]
+            for number, text in enumerate(stream, 1):
+                line = text.strip()
+                if number == 1:
+                    refuse_pointer(path, line)
+                    line = line.removeprefix(codecs.BOM_UTF8)
+                empty = empty and not line
+                if not line.startswith(b"#"):
+                    yield file.at(f"line {number}"), line
     except (OSError, ValueError) as error:
         file.fail(f"cannot be read ({reason_of(error)})")
-    if not any(lines):
+    if empty:
         file.fail("the file is empty, expected a COLMAP model")
-    refuse_pointer(path, lines[0])
-    lines[0] = lines[0].removeprefix(codecs.BOM_UTF8)
-    return [
-        (file.at(f"line {number}"), line)
-        for number, line in enumerate(lines, 1)
-        if not line.startswith(b"#")
-    ]
 
 
 def _text_cameras(path: Path) -> dict[int, Lens]:
@@ -293,7 +294,7 @@ def _text_cameras(path: Path) -> dict[int, Lens]:
 def _text_images(path: Path) -> list[Image]:
     """Return the images of ``images.txt``."""
     images: list[Image] = []
-    lines = iter(_lines(path))
+    lines = _lines(path)
     for place, line in lines:
         if not line:
             continue
