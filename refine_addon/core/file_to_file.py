@@ -8,6 +8,7 @@ import numpy as np
 
 from .affine import is_uniform, transformed
 from .cleaning.clean import clean
+from .estimate.written import written_facts
 from .formats.registry import (
     Packed,
     as_written,
@@ -22,7 +23,6 @@ from .task import DEFAULTS, Result, Settings, Task
 from .volumes import forced
 from .whole_file import expanded, refuse_existing, refuse_mapped
 from .work import Progress, part, report, silent
-from .written import written_facts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
