@@ -10,7 +10,7 @@ import numpy as np
 from . import spherical_harmonics
 from .errors import RefineError
 from .splats import Splats, rotation_matrices
-from .work import slices
+from .work import chunks
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -145,7 +145,7 @@ def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 def _stretched(splats: Splats, means: NDArray[Any], linear: NDArray[np.float64]) -> Splats:
     """Return splats with these means and the covariances ``M S M'``, M being `linear`."""
     logs, quaternions = np.empty((len(splats), 3)), np.empty((len(splats), 4))
-    for piece in slices(len(splats), _CHUNK):
+    for piece in chunks(len(splats), _CHUNK):
         stored = np.asarray(splats.log_scales[piece], np.float64)
         usable = np.isfinite(stored).all(axis=1)
         largest = np.where(usable, stored.max(axis=1), 0.0)

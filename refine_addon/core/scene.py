@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .work import slices
+from .work import chunks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -109,7 +109,7 @@ def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -
     origin, views_squared = views.middle()
     squared = np.empty(len(means))
     with np.errstate(under="ignore"):
-        for piece in slices(len(means), _CHUNK):
+        for piece in chunks(len(means), _CHUNK):
             # Undrawable splats may hold any number, such as infinity.
             offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
             squared[piece] = np.einsum("ij,ij->i", offset, offset) + views_squared
@@ -151,7 +151,7 @@ def moments(
     means, drawable, scene
         See `_principal_axes`.
     """
-    for piece in slices(len(means), _CHUNK):
+    for piece in chunks(len(means), _CHUNK):
         place = scene.place(means[piece][drawable[piece]])  # (n, 3)
         nearness = (1.0 + np.einsum("ij,ij->i", place, place)) ** -2.0  # (n,)
         weighted = place * nearness[:, None]

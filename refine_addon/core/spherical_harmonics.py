@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .work import slices
+from .work import chunks
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -135,6 +135,6 @@ def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.f
         own = slice(band * band, (band + 1) ** 2)
         matrix = np.linalg.lstsq(here[:, own], before[:, own], rcond=None)[0]
         stored = slice(own.start - 1, own.stop - 1)
-        for rows in slices(len(rotated), _CHUNK):
+        for rows in chunks(len(rotated), _CHUNK):
             rotated[rows, stored] = np.einsum("ij,njc->nic", matrix, sh_rest[rows, stored])
     return rotated

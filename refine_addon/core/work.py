@@ -73,12 +73,12 @@ def default_threads() -> int:
     return min(os.cpu_count() or 1, 8)
 
 
-def slices(total: int, chunk: int) -> Iterator[slice]:
+def chunks(total: int, chunk: int) -> Iterator[slice]:
     """Yield consecutive slices of ``range(total)``, all but the last of one length.
 
     Examples
     --------
-    >>> [*slices(5, 2)]
+    >>> [*chunks(5, 2)]
     [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
     """
     for start in range(0, total, chunk):
@@ -154,7 +154,7 @@ def each_chunk(  # noqa: PLR0913 - all but three are optional
     # Freeing one 30 MB block raises glibc's mmap threshold, so chunk buffers are reused instead of
     # page-faulted. No effect on other systems.
     np.empty(_HELD, np.uint8)
-    pieces = [*slices(total, chunk)]
+    pieces = [*chunks(total, chunk)]
     threads = default_threads() if threads is None else threads
     # About a hundred reports are enough for a progress bar; each may cost a redraw.
     step = max(len(pieces) // 100, 1)

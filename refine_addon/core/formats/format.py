@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import RefineError
 from ..scene import spatial_order
-from ..work import slices
+from ..work import chunks
 from .ply import Origin, SplatFile
 from .ply_columns import empty_rows
 from .ply_header import new_header
@@ -99,7 +99,7 @@ def new_file(path: Path, origin: Origin, count: int, degree: int) -> tuple[Splat
 
 def pieces(count: int) -> Iterator[slice]:
     """Return the slices of ``range(count)`` that are converted at a time."""
-    return slices(count, CHUNK)
+    return chunks(count, CHUNK)
 
 
 def codes(shares: NDArray[Any], largest: int = 255) -> NDArray[np.uint8]:
