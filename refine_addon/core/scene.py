@@ -133,15 +133,15 @@ def _principal_axes(
         Its origin and size are used.
     """
     total = np.zeros((4, 3))
-    for found in moments(means, drawable, scene):
-        total += found
+    for sums in moments(means, drawable, scene):
+        total += sums
     return principal_axes(total[:3], total[3])
 
 
 def moments(
     means: NDArray[Any], drawable: NDArray[np.bool_], scene: Scene
 ) -> Iterator[NDArray[np.float64]]:
-    """Yield of some positions after the other what `principal_axes` takes, (4, 3) float64.
+    """Yield what `principal_axes` takes, (4, 3) float64, for one chunk of positions at a time.
 
     The first three rows are the weighted sums of the products of coordinates, the last those of the
     coordinates.
@@ -194,7 +194,7 @@ def fingerprint(*columns: NDArray[Any]) -> NDArray[np.uint64]:
 
 
 def splat_fingerprint(splats: Splats, rows: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Return the `fingerprint` of opacity and base colour of some splats, (n,)."""
+    """Return the `fingerprint` of opacity and base colour of splats by their rows, (n,)."""
     return fingerprint(splats.opacity_logits[rows], *splats.sh_dc[rows].T)
 
 

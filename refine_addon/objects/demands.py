@@ -15,7 +15,7 @@ from ..cameras.objects import world_matrix
 from ..core.affine import moved
 from ..core.errors import RefineError
 from ..core.solid import Solid
-from ..core.volumes import Box, Forced, Placed, Sphere, Zone, forced
+from ..core.volumes import Box, Forced, MovedVolume, Sphere, Zone, forced
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
@@ -142,7 +142,7 @@ def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
         shape = Sphere((0.0, 0.0, 0.0), size) if obj.empty_display_type == "SPHERE" else None
         volume = shape or Box((-size,) * 3, (size,) * 3)
         key = _digest(repr((obj.empty_display_type, size)).encode(), matrix.tobytes())
-        return Zone(role, label, _Recalled(label, key, partial(Placed, volume, matrix)), idle)
+        return Zone(role, label, _Recalled(label, key, partial(MovedVolume, volume, matrix)), idle)
     if obj.type != "MESH":
         kind = f"of type {obj.type}"
         if obj.type == "EMPTY":

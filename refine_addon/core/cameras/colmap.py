@@ -107,20 +107,20 @@ def read_colmap(folder: Path, suffix: str) -> ViewSet:
     """
     cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
     if suffix == ".bin":
-        lenses, found = _binary_cameras(cameras), _binary_images(images)
+        lenses, registered = _binary_cameras(cameras), _binary_images(images)
     else:
-        lenses, found = _text_cameras(cameras), _text_images(images)
-    if not found:
+        lenses, registered = _text_cameras(cameras), _text_images(images)
+    if not registered:
         CameraPlace(images).fail("no registered image, expected at least one")
-    for image in found:
+    for image in registered:
         if image.camera_id not in lenses:
             image.place.fail(
                 f"refers to camera {image.camera_id}, expected one of the {len(lenses)} "
                 f"in {cameras.name}"
             )
-    found.sort(key=lambda image: (image.name, image.image_id))
-    views = tuple(_view(image, lenses[image.camera_id]) for image in found)
-    used = (lenses[camera_id] for camera_id in sorted({image.camera_id for image in found}))
+    registered.sort(key=lambda image: (image.name, image.image_id))
+    views = tuple(_view(image, lenses[image.camera_id]) for image in registered)
+    used = (lenses[camera_id] for camera_id in sorted({image.camera_id for image in registered}))
     counts = Counter(lens.model for lens in used if lens.distorted)
     return ViewSet(views, lens_note(counts, "camera"))
 

@@ -102,15 +102,15 @@ class _Entry:
     ) -> None:
         self.place = place
         self.shared = shared
-        self.own = place.members(item, ("transform_matrix",))
-        self.name = place.at("'file_path'").text(self.own.get("file_path", str(index)))
+        self.frame = place.members(item, ("transform_matrix",))
+        self.name = place.at("'file_path'").text(self.frame.get("file_path", str(index)))
         self.remarks: list[str] = []
 
     def has(self, key: str) -> bool:
-        return key in self.own or key in self.shared
+        return key in self.frame or key in self.shared
 
     def get(self, key: str) -> object:
-        return self.own[key] if key in self.own else self.shared[key]
+        return self.frame[key] if key in self.frame else self.shared[key]
 
     def at(self, key: str) -> CameraPlace:
         return self.place.at(repr(key))
@@ -134,7 +134,7 @@ class _Entry:
         picture, so it is removed.
         """
         place = self.at("transform_matrix")
-        matrix = place.matrix(self.own["transform_matrix"], (3, 4), 4)
+        matrix = place.matrix(self.frame["transform_matrix"], (3, 4), 4)
         if len(matrix) > 3 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:  # noqa: PLR2004
             place.at("row 3").fail(f"expected [0, 0, 0, 1], got {matrix[3].tolist()}")
         axes, scale = without_scale(place, matrix[:3, :3])
@@ -151,8 +151,8 @@ class _Entry:
             return width, height
         place = self.at("file_path")
         base = place.path.parent / self.name.replace("\\", "/")
-        found = (image_size(Path(f"{base}{suffix}")) for suffix in IMAGE_SUFFIXES)
-        size = next(filter(None, found), None)
+        sizes = (image_size(Path(f"{base}{suffix}")) for suffix in IMAGE_SUFFIXES)
+        size = next(filter(None, sizes), None)
         if size is None:
             missing = "w" if not self.has("w") else "h"
             self.place.fail(
@@ -170,7 +170,7 @@ class _Entry:
 
     def axis_focal(self, axis: str, side: int) -> float | None:
         """Return the focal length along an axis by the first key that exists, or None."""
-        for keys in (self.own, self.shared):
+        for keys in (self.frame, self.shared):
             key = f"fl_{axis}"
             if key in keys:
                 return self.at(key).focal(keys[key])

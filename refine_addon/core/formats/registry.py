@@ -144,8 +144,8 @@ def without_suffix(name: str) -> str:
 
 def refuse_unknown_size(form: Format) -> None:
     """Raise `RefineError` if the size of a file does not follow from the number of its splats."""
-    if form.sizes(0, 0) is None:
-        fixed = ", ".join(other.suffix for other in FORMATS if other.sizes(0, 0))
+    if form.sizes is None:
+        fixed = ", ".join(other.suffix for other in FORMATS if other.sizes)
         msg = (
             f"a size cannot be kept to in {form.suffix}, which is compressed as a whole: choose "
             f"another budget, or write .ply, {fixed}"

@@ -24,7 +24,6 @@ from ..place import Place, described
 from ..splats import above_constant, opacity, opacity_logits, unit_quaternions
 from .format import (
     Format,
-    Sizes,
     codes,
     join_largest,
     near_ones_together,
@@ -450,11 +449,6 @@ def _centroids(
     return table, image.reshape(rows, _ACROSS * coefficients, 4)
 
 
-def sizes(_count: int, _degree: int) -> Sizes | None:
-    """Return None: images are compressed as a whole."""
-    return None
-
-
 FORMAT = Format(
     name=NAME,
     suffix=".sog",
@@ -463,5 +457,5 @@ FORMAT = Format(
     matches=matches,
     read=read,
     write=write,
-    sizes=sizes,
+    sizes=None,
 )
