@@ -26,7 +26,7 @@ from .survivors import survivor_columns
 from .task import METHODS, Result, Settings
 from .tiles.prune import prune_tiles
 from .views import View, ViewSet
-from .volumes import Box, Placed, Sphere, Zone, forced
+from .volumes import Box, MovedVolume, Sphere, Zone, forced
 
 __all__ = [
     "METHODS",
@@ -39,8 +39,8 @@ __all__ = [
     "ClosedForm",
     "Level",
     "Levels",
+    "MovedVolume",
     "Occlusion",
-    "Placed",
     "RefineError",
     "Result",
     "Scores",

@@ -1,8 +1,8 @@
 """Pictures of views before and after pruning, drawn on the processor: a truth beside the estimate.
 
-The rules are those of rays (`seeing.rays`), for every pixel in place of a few:
-footprints by EWA splatting, blended front to back, colours of the direction of view. They
-agree with the reference renderer of the benchmarks to 75 dB and more.
+Every pixel is computed as a ray is (`seeing.cast`): footprints by EWA splatting, blended front to
+back, colours of the direction of view. Pictures agree with those of the reference renderer of the
+benchmarks to 75 dB and more.
 """
 
 from __future__ import annotations
@@ -161,14 +161,14 @@ def _pictures(
     threads: int | None,
 ) -> list[NDArray[np.float64]]:
     """Return the picture of each view, (3, H, W), 0..1."""
-    found = []
+    pictures = []
     for number, view in enumerate(views):
-        ahead = part(progress, number / len(views), (number + 1) / len(views))
+        progress_of_view = part(progress, number / len(views), (number + 1) / len(views))
         with np.errstate(under="ignore"):
             footprints = projection.project(gaussians, scene, view)
             colors = colors_from(splats, gaussians.index[footprints.index], view)
-        found.append(_picture(footprints, colors, view, ahead, threads))
-    return found
+        pictures.append(_picture(footprints, colors, view, progress_of_view, threads))
+    return pictures
 
 
 def _picture(
@@ -266,5 +266,5 @@ def _rounded(picture: NDArray[np.float64]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(np.rint(picture * 255.0).astype(np.uint8).transpose(1, 2, 0))
 
 
-def _psnr(seen: NDArray[np.float64], whole: NDArray[np.float64], view: View) -> float:
-    return psnr_of(seen.reshape(3, -1), whole.reshape(3, -1), view)
+def _psnr(after: NDArray[np.float64], before: NDArray[np.float64], view: View) -> float:
+    return psnr_of(after.reshape(3, -1), before.reshape(3, -1), view)

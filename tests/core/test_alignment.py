@@ -233,3 +233,15 @@ def test_sentences_count_and_name_what_to_do():
         "2 cameras see the splats from so far away that they fill less than 2% of a picture"
     ]
     assert Alignment().notes() == []
+
+
+def test_a_signalling_nan_as_a_position_makes_no_warning():
+    """It lies in no view; converted to float64 it became a quiet one with a warning of NumPy's."""
+    splats = cloud()
+    means = np.array(splats.means, np.float32)
+    means.view(np.uint32)[0, 0] = 0x7FA00001
+
+    with np.errstate(all="raise"):
+        found = alignment(replace(splats, means=means), ring())
+
+    assert found == alignment(splats, ring())
