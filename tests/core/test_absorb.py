@@ -635,6 +635,54 @@ def test_when_half_have_gone_neighbours_are_found_anew():
     assert graph.deleted == 0
 
 
+def heaps(places, each, hidden):
+    """Return a field of copies of one splat at some places, each behind the one before.
+
+    What is seen of each is less than of the one before by the share `hidden`.
+    """
+    means = np.repeat(np.outer(np.arange(places) * 100.0, [1, 0, 0]), each, axis=0)
+    field = flat([0.2] * len(means), means, np.ones((len(means), 3)))
+    seen = (1.0 - hidden) ** np.tile(np.arange(each), places)
+    return replace(field, contribution=field.contribution * seen, error=field.error * seen)
+
+
+@pytest.mark.parametrize("hidden", [0.0, 0.001])
+@pytest.mark.parametrize(("places", "each"), [(1, 2000), (20, 100), (1000, 2)])
+def test_copies_of_a_splat_do_not_merge_one_by_one(monkeypatch, places, each, hidden):
+    """Rounds that remove at least a quarter of 3 % halve them in log(1/2) / log(1 - .0075) = 92.
+
+    Half as many rounds are left for the last splats, of which no whole quarter can go. Each merge
+    prices the pairs of the two anew: 8 for each, and up to as many that have a splat for neighbour.
+    """
+    graph = MergeGraph(heaps(places, each, hidden), SCENE, 1.0)
+    rounds, priced = [], []
+    carry_out, price = MergeGraph._round, MergeGraph._price
+    monkeypatch.setattr(
+        MergeGraph, "_round", lambda *args: rounds.append(carry_out(*args)) or rounds[-1]
+    )
+    monkeypatch.setattr(
+        MergeGraph, "_price", lambda *args: priced.append(len(args[1])) or price(*args)
+    )
+
+    graph.reduce(1000)
+
+    assert np.count_nonzero(graph.alive) == 1000
+    assert len(rounds) <= 92 + 46
+    assert sum(priced) <= (8 + 2 * 2 * 8) * 2000
+
+
+def test_of_pairs_in_a_chain_as_many_are_chosen_as_share_no_splat():
+    """The first of all is chosen; of two that wait for each other one is, or both wait for one."""
+    first = np.arange(500)
+
+    chosen = merge_graph._disjoint(first, first + 1)
+
+    taken = np.concatenate([chosen, chosen + 1])
+    assert chosen[0] == 0
+    assert len(np.unique(taken)) == len(taken)
+    assert (np.isin(first, taken) | np.isin(first + 1, taken)).all()
+
+
 @pytest.fixture
 def rounds(monkeypatch):
     """Fail where a round does nothing, since `reduce` would then repeat it forever."""

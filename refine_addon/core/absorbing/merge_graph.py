@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..scene import MIX
 from ..work import Progress, for_chunks, part, report, silent
 from . import merging
 from .neighbours import nearest
@@ -23,6 +24,11 @@ NEIGHBOURS = 8
 
 BATCH = 0.03
 """Share of the splats that one round removes at most; then costs are computed again."""
+
+FILLED = 0.25
+"""A round that removes less than this share of its quota also merges pairs that are not the
+cheapest operation for both of their splats. Ordinary scenes fill .64 of it or more. Of copies of a
+splat, each costs less than the one before it, so that only one pair would merge in a round."""
 
 _CHUNK = 1 << 14
 
@@ -165,29 +171,60 @@ class MergeGraph:
         """Carry out the cheapest operations that share no splat; return how many, 1 to `quota`.
 
         A pair is merged if it is the cheapest operation for both of its splats. A splat is deleted
-        if that is cheaper than all of its pairs.
+        if that is cheaper than all of its pairs. If these are few, see `FILLED`.
         """
         error = self._errors()  # (N,)
-        costs = np.concatenate([error[self.alive], self.cost[np.isfinite(self.cost)]])
-        # Look at twice the quota, since operations that share a splat exclude each other.
-        last = min(2 * quota, len(costs)) - 1
-        limit = np.partition(costs, last)[last]
+        limit = self._limit(error, quota)
         edges = np.flatnonzero(self.cost <= limit)  # (e,)
+        alone, chosen = self._cheapest(error, edges, limit)
+        if np.count_nonzero(alone) + len(chosen) < FILLED * quota:
+            chosen = self._completed(chosen, edges)
+        alone[self.first[chosen]] = alone[self.second[chosen]] = False
+        doomed = np.flatnonzero(alone)  # (d,)
+        costs = np.concatenate([error[doomed], self.cost[chosen]])  # (d + m,)
+        order = np.argsort(costs, kind="stable")[:quota]
+        is_merge = order >= len(doomed)
+        self._carry_out(doomed[order[~is_merge]], chosen[order[is_merge] - len(doomed)], progress)
+        return len(order)
+
+    def _limit(self, error: Array, quota: int) -> float:
+        """Return the cost of the most expensive operation that a round looks at.
+
+        These are twice the quota, since operations that share a splat exclude each other.
+        """
+        costs = np.concatenate([error[self.alive], self.cost[np.isfinite(self.cost)]])
+        last = min(2 * quota, len(costs)) - 1
+        return float(np.partition(costs, last)[last])
+
+    def _cheapest(
+        self, error: Array, edges: Index, limit: float
+    ) -> tuple[NDArray[np.bool_], Index]:
+        """Return which splats cost least by deleting them, (N,), and which pairs by merging, (m,).
+
+        Parameters
+        ----------
+        error : (N,) float64
+            Costs of deleting.
+        edges : (e,) int64
+            Pairs whose cost is at most `limit`.
+        limit : float
+        """
         first, second, cost = self.first[edges], self.second[edges], self.cost[edges]  # (e,) each
         best = error.copy()  # (N,), the cost of each splat's cheapest operation
         np.minimum.at(best, first, cost)
         np.minimum.at(best, second, cost)
         mutual = (cost == best[first]) & (cost == best[second])  # (e,)
-        edges = edges[mutual][_disjoint(first[mutual], second[mutual])]  # (m,)
-        alone = self.alive & (best == error) & (error <= limit)
-        alone[self.first[edges]] = False
-        alone[self.second[edges]] = False
-        doomed = np.flatnonzero(alone)  # (d,)
-        costs = np.concatenate([error[doomed], self.cost[edges]])  # (d + m,)
-        order = np.argsort(costs, kind="stable")[:quota]
-        is_merge = order >= len(doomed)
-        self._carry_out(doomed[order[~is_merge]], edges[order[is_merge] - len(doomed)], progress)
-        return len(order)
+        chosen = edges[mutual][_disjoint(first[mutual], second[mutual])]
+        return self.alive & (best == error) & (error <= limit), chosen
+
+    def _completed(self, chosen: Index, edges: Index) -> Index:
+        """Return the chosen pairs, and of the others as many as share no splat with any, (m,)."""
+        taken = np.zeros(len(self.alive), np.bool_)
+        taken[self.first[chosen]] = taken[self.second[chosen]] = True
+        free = edges[~(taken[self.first[edges]] | taken[self.second[edges]])]
+        others = free[_disjoint(self.first[free], self.second[free])]
+        every: Index = np.concatenate([chosen, others])
+        return every
 
     def _errors(self) -> Array:
         """Return the costs of deleting splats, (N,); infinite where unknown.
@@ -228,19 +265,29 @@ class MergeGraph:
 
 
 def _disjoint(first: Index, second: Index) -> Index:
-    """Return the indices of pairs that share no splat with an earlier pair, (k,).
-
-    Pairs only share a splat where their costs are equal.
+    """Return the indices of pairs that share no splat, ascending, (k,); each other pair shares one.
 
     Parameters
     ----------
     first, second : (m,) int
         Rows of the pairs.
     """
-    own = np.arange(len(first))
+    count = len(first)
+    chosen = np.zeros(count, np.bool_)
     _, ends = np.unique(np.concatenate([first, second]), return_inverse=True)  # (2 m,)
-    one, two = ends[: len(first)], ends[len(first) :]
-    earliest = np.full(len(ends), len(first))  # the first pair that holds each splat
-    np.minimum.at(earliest, one, own)
-    np.minimum.at(earliest, two, own)
-    return np.flatnonzero((earliest[one] == own) & (earliest[two] == own))
+    # Of the pairs left, (l,) each: index, both splats, and a rank by which they are chosen.
+    left, one, two = np.arange(count), ends[:count], ends[count:]
+    rank = left.astype(np.uint64)
+    while len(left):
+        lowest = np.full(2 * count, 2**64 - 1, np.uint64)  # of the pairs of each splat
+        np.minimum.at(lowest, one, rank)
+        np.minimum.at(lowest, two, rank)
+        leads = (lowest[one] == rank) & (lowest[two] == rank)
+        chosen[left[leads]] = True
+        taken = np.zeros(2 * count, np.bool_)
+        taken[one[leads]] = taken[two[leads]] = True
+        free = ~(taken[one] | taken[two])
+        left, one, two = left[free], one[free], two[free]
+        # Shuffled, since a chain of pairs in the order of their ranks would give one at a time.
+        rank = rank[free] * MIX
+    return np.flatnonzero(chosen)
