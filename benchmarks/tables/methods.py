@@ -17,7 +17,7 @@ from refine_addon.core import pipeline
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.pipeline import Settings
 from refine_addon.core.scores import Scores
-from refine_addon.core.scoring.closed_form import ClosedForm
+from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import Splats
 

@@ -18,7 +18,7 @@ from .operation.files import prune_file
 from .operation.prune import PruneRequest
 from .pipeline import prune, score
 from .scores import Scores
-from .scoring.closed_form import ClosedForm
+from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
 from .selection import Budget, rank, select
 from .solid import Solid

@@ -349,6 +349,29 @@ def test_a_volume_that_moved_asks_for_new_scores(addon, room, crop):  # noqa: AR
     assert bpy.ops.refine.apply() == {"FINISHED"}
 
 
+def test_the_best_splat_is_not_deleted_unscored_when_its_volume_moves(addon, room, room_cameras):  # noqa: ARG001
+    """Forced out at scoring it has no score; then the volume moves to one that cannot be drawn.
+
+    Now as many scores are 0 as there are splats that cannot be drawn, but not those.
+    """
+    opacity = mask(addon, room, "opacity")
+    opacity[5] = np.nan
+    addon.mesh.attributes.write_attribute(room.data, "opacity", "FLOAT", opacity)
+    bpy.ops.refine.score()
+    best = int(np.argmax(mask(addon, room, "refine_score")))
+    places = means(addon, room)
+    ball = empty(places[best], (1e-5,) * 3, "SPHERE")
+    volume(ball, "REMOVE")
+    bpy.ops.refine.score()
+    ball.location = places[5]
+    bpy.context.view_layer.update()
+
+    with pytest.raises(RuntimeError, match="39755 now, 1 of them without a score; score it again"):
+        bpy.ops.refine.apply()
+
+    assert len(room.data.vertices) == 39_755
+
+
 def test_a_volume_that_protects_alone_changes_no_score(addon, room, room_cameras):  # noqa: ARG001
     """What is protected is scored like the rest: nothing is out of date, and the plan follows."""
     bpy.ops.refine.score()
