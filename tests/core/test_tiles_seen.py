@@ -12,6 +12,7 @@ from numpy.lib.recfunctions import drop_fields
 
 from refine_addon.core import (
     Budget,
+    PruneRequest,
     RefineError,
     Settings,
     prune,
@@ -80,7 +81,9 @@ def read(folder, paths):
 def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budget, settings):
     """To the byte, and the estimates are the same but for how rounding adds up."""
     told = prune_tiles(tiles, tmp_path / "out", views, budget, settings)
-    whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", views, budget, settings)
+    whole = prune_file(
+        tmp_path / "whole.ply", tmp_path / "pruned.ply", PruneRequest(views, budget, settings)
+    )
 
     expected = read_ply(tmp_path / "pruned.ply").rows
     assert read(tmp_path / "out", tiles).tobytes() == expected.tobytes()
@@ -96,7 +99,7 @@ def test_views_of_nothing_are_refused_as_of_one_file(tmp_path, tiles, views):
     """Near planes behind all splats: the message is that of one file, and nothing is left."""
     away = ViewSet(tuple(replace(view, near=1e6) for view in views))
     with pytest.raises(RefineError) as alone:
-        prune_file(tmp_path / "whole.ply", None, away, Budget(ratio=0.5), OCCLUSION)
+        prune_file(tmp_path / "whole.ply", None, PruneRequest(away, Budget(ratio=0.5), OCCLUSION))
 
     with pytest.raises(RefineError) as together:
         prune_tiles(tiles, tmp_path / "out", away, Budget(ratio=0.5), OCCLUSION)
@@ -204,9 +207,10 @@ def test_what_is_deleted_alone_needs_no_merging(tmp_path, tiles, views):
     """Up to a tenth is deleted as in memory: the same rows, and nothing changes."""
     told = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.1), OCCLUSION, absorb=True)
     whole = prune_file(
-        tmp_path / "whole.ply", tmp_path / "pruned.ply", views, Budget(ratio=0.1), OCCLUSION,
-        absorb=True,
-    )  # fmt: skip
+        tmp_path / "whole.ply",
+        tmp_path / "pruned.ply",
+        PruneRequest(views, Budget(ratio=0.1), OCCLUSION, absorb=True),
+    )
 
     assert told["absorbed"] == whole.report["absorbed"]
     expected = read_ply(tmp_path / "pruned.ply").rows
