@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import queue
 import threading
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import Future, wait
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from .core.errors import Cancelled
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 
 Answer = TypeVar("Answer")
 
-_LOOK = 0.1
-"""Seconds between two looks at whether the work that waits for an answer was cancelled."""
+_STEP = 0.1
+"""Seconds after which waiting work asks again whether it was cancelled."""
 
 _asked: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQueue()
 
@@ -36,19 +36,13 @@ def call(function: Callable[[], Answer]) -> Answer:
         return function()
     answer: Future[Answer] = Future()
     _asked.put((function, answer))
-    while True:
-        try:
-            return answer.result(_LOOK)
-        except CancelledError:
-            raise Cancelled from None
-        except TimeoutError:
-            if answer.done():
-                raise  # the function's own
+    while not wait([answer], _STEP).done:
         try:
             checkpoint()
         except Cancelled:
             answer.cancel()
             raise
+    return answer.result()
 
 
 def serve() -> None:

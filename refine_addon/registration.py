@@ -8,7 +8,7 @@ from bpy.props import PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
-from .ui import camera_list, kept, plans, price, running, translations, volumes
+from .ui import camera_list, kept, plans, price, running, volumes
 from .ui.camera_list import REFINE_PT_camera_list, REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
@@ -105,7 +105,6 @@ def register() -> None:
     bpy.types.Scene.refine = PointerProperty(type=RefineSettings)
     bpy.types.TOPBAR_MT_file_import.append(_draw_import)
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
-    translations.register()
     camera_list.register()
     kept.register()
     volumes.register()
@@ -126,7 +125,6 @@ def unregister() -> None:
     volumes.unregister()
     kept.unregister()
     camera_list.unregister()
-    translations.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)
     bpy.types.TOPBAR_MT_file_import.remove(_draw_import)
     del bpy.types.Scene.refine

@@ -33,3 +33,18 @@ def closed_folder(files: Mapping[str, str]) -> Iterator[Path]:
             if root:
                 os.seteuid(0)
             folder.chmod(0o700)
+
+
+@contextlib.contextmanager
+def own_folder() -> Iterator[Path]:
+    """Make a folder; the root user, who may read what nobody else may, is nobody for that long."""
+    root = os.geteuid() == 0
+    with tempfile.TemporaryDirectory() as made:
+        if root:
+            os.chown(made, NOBODY, NOBODY)
+            os.seteuid(NOBODY)
+        try:
+            yield Path(made)
+        finally:
+            if root:
+                os.seteuid(0)

@@ -1,7 +1,7 @@
 """A reference renderer of 3D Gaussian splats on the CPU, and what each splat does to the picture.
 
-Every pruning method is judged by the pictures this renderer makes, and the rendered baselines take
-their statistics from it. It computes in float64 and follows the reference implementation's rules
+Every pruning method is measured in pictures of this renderer, and the rendered baselines take their
+statistics from it. It computes in float64 and follows the reference implementation's rules
 (Kerbl et al., "3D Gaussian Splatting for Real-Time Radiance Field Rendering", 2023, sections 4 to
 6; Zwicker et al., "EWA splatting", 2002, for the projection):
 

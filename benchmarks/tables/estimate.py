@@ -110,7 +110,7 @@ def measure(
             truth, curve = renders.values["psnr"], with_quality(result.scores).quality
             assert curve is not None  # noqa: S101 - there is an estimate
             of_views = curve.of_views(gone, absorb=way == ABSORB)
-            # To absorb, only those views tell it that judge.
+            # Absorbed results are compared in validation views only.
             told = [place for place, name in enumerate(renders.names) if name in of_views]
             guess = np.array([of_views[renders.names[place]] for place in told])  # (V,)
             truth = np.asarray(truth)[told]

@@ -101,13 +101,13 @@ class Evaluation:
 
 
 class Evaluator:
-    """Judges changed versions of one scene; the original is rendered once.
+    """Compares changed versions of one scene; the original is rendered once.
 
     Parameters
     ----------
     original : Splats
     views : ViewSet
-        The views to judge by.
+        The views to compare in.
     pictures : mapping of str to (H, W, 3) floating, optional
         Name of a view -> its picture, 0..1.
     metrics : sequence of str
@@ -330,7 +330,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     )
     parser.add_argument("scene", type=Path, metavar="SCENE_DIR")
     parser.add_argument("--ratios", type=float, nargs="+", default=[0.3, 0.5, 0.7, 0.9])
-    parser.add_argument("--views", choices=["test", "train"], default="test", help="judged by")
+    parser.add_argument("--views", choices=["test", "train"], default="test", help="compared in")
     parser.add_argument(
         "--method",
         nargs="+",
@@ -350,7 +350,7 @@ def _measure(options: argparse.Namespace) -> None:
     evaluator = Evaluator(scene.splats, views, scene.pictures, metrics=options.metrics)
     print(
         f"{options.scene}: {len(scene.splats)} splats, {len(scene.train)} views decide, "
-        f"{len(views)} {options.views} views judge"
+        f"{len(views)} {options.views} views are compared"
     )
     print(_heading(options.metrics, pictures=any(view.name in scene.pictures for view in views)))
     print(_line("unpruned", "0", "", evaluator.evaluate(scene.splats)))

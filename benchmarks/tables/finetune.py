@@ -1,8 +1,8 @@
 """What training on the photos wins back once splats are gone: the paper's fine-tuning table.
 
 Adam on the photos of the scoring views, one photo an iteration, all of them in turn, in an order
-drawn anew each time; judged by the held-out photos. Optimised is everything that a splat has: mean,
-log scales, rotation (as small turns), the opacity's logit, all harmonics; at the rates of the
+drawn anew each time; measured on the held-out photos. Optimised is all that a splat has: mean, log
+scales, rotation (as small turns), the opacity's logit, all harmonics; at the rates of the
 reference implementation (Kerbl et al. 2023), for positions those of its last iterations, and by its
 loss, ``0.8 L1 + 0.2 (1 - SSIM)``. Gradients are exact (`renderer/gradients.py`), in float64. No
 splat is added, split or removed meanwhile.

@@ -7,7 +7,7 @@
 Of 2,000 floaters, 1,100 stand in front of a camera, each by itself; 800 form blobs of 5 to 59 in
 free space; 100 are huge veils. Size, opacity, colour and place vary. Free space is what lies in
 front of the depth at which half of a line of sight's light is gone. The train views place floaters
-and decide; the test views only judge, against renders of the unpolluted scene and real pictures.
+and decide; the test views only compare with renders of the unpolluted scene and real pictures.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from refine_addon.core.cleaning.clean import clean
-from refine_addon.core.scoring import projection, sight_lines
+from refine_addon.core.seeing import projection
+from refine_addon.core.seeing.ray_sample import validation_rays
 from refine_addon.core.splats import SH_C0, Splats, joined
 
 from .evaluate import Evaluator, read_scene
@@ -44,23 +45,23 @@ class Places:
     """
 
     def __init__(self, splats: Splats, views: ViewSet) -> None:
-        sights = sight_lines.sights(splats, views)
+        sample = validation_rays(splats, views)
         gaussians, scene, _ = projection.prepare(splats, views)
         self.size = scene.size
         self.found: list[tuple[View, NDArray[np.float64], NDArray[np.float64]]] = []
-        for (view, _), lines in zip(sights.views, sights.lines, strict=True):
-            if lines is None or not len(lines.line):
+        for (view, _), rays in zip(sample.views, sample.rays, strict=True):
+            if rays is None or not len(rays.ray):
                 continue
-            local, _ = projection.in_camera(gaussians.take(lines.met), scene, view)
-            depth = local[2][lines.owner] * scene.size
-            dark = lines.dark.astype(np.float64)
-            first = np.flatnonzero(np.diff(lines.line, prepend=-1))
+            local, _ = projection.in_camera(gaussians.take(rays.hit), scene, view)
+            depth = local[2][rays.owner] * scene.size
+            dark = rays.log_passed.astype(np.float64)
+            first = np.flatnonzero(np.diff(rays.ray, prepend=-1))
             total = np.cumsum(dark)
             before = np.repeat(total[first] - dark[first], np.diff(np.append(first, len(dark))))
             half = np.flatnonzero(total - before < np.log(0.5))
-            line, place = np.unique(lines.line[half], return_index=True)
-            across = lines.columns[line % len(lines.columns)] + 0.5
-            down = lines.rows[line // len(lines.columns)] + 0.5
+            line, place = np.unique(rays.ray[half], return_index=True)
+            across = rays.columns[line % len(rays.columns)] + 0.5
+            down = rays.rows[line // len(rays.columns)] + 0.5
             ray = [(across - view.cx) / view.fx, (down - view.cy) / view.fy, np.ones(len(line))]
             if len(line):
                 self.found.append((view, np.stack(ray, axis=1), depth[half[place]]))
@@ -152,10 +153,10 @@ def main() -> int:
         gone = ~found.keep[count:]
         recalls = " ".join(f"{gone[kinds == kind].mean():.1%}" for kind in range(3))
         true = float(np.mean(~found.keep[:count]))
-        judge = Evaluator(scene.splats, scene.test, scene.pictures, metrics=("psnr",))
+        evaluator = Evaluator(scene.splats, scene.test, scene.pictures, metrics=("psnr",))
         cells = []
         for splats in (scene.splats, dirty, dirty.take(found.keep)):
-            quality = judge.evaluate(splats)
+            quality = evaluator.evaluate(splats)
             pictures = quality.pictures.mean["psnr"] if quality.pictures else float("nan")
             cells.append(f"{quality.renders.mean['psnr']:.2f} ({pictures:.2f})")
         print(

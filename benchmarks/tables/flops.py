@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, get_args, get_type_hints
 import numpy as np
 
 from refine_addon.core.scoring import closed_form, occlusion
-from refine_addon.core.scoring.closed_form import ClosedForm
+from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.splats import Splats
 from refine_addon.core.task import Settings
 

@@ -6,7 +6,8 @@
 
 Held-out PSNR at each level against renders of the original, and seconds of the processor: of each
 level where it is made by itself, and of all of them where they come from one run. The train views
-decide, some of the test views judge. Where splat-transform is not installed, its lines are missing.
+decide, PSNR is of some of the test views. Where splat-transform is not installed, its rows are
+missing.
 """
 
 from __future__ import annotations
@@ -68,11 +69,11 @@ def main() -> int:
     """Print a table for each scene."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE_DIR")
-    parser.add_argument("--views", type=int, default=10, help="how many judge (default 10)")
+    parser.add_argument("--views", type=int, default=10, help="how many are compared (default 10)")
     options = parser.parse_args()
     for folder in options.scenes:
         scene = read_scene(folder)
-        judge = Evaluator(scene.splats, scene.test.spread(options.views), metrics=("psnr",))
+        evaluator = Evaluator(scene.splats, scene.test.spread(options.views), metrics=("psnr",))
         source, count = folder / "point_cloud.ply", len(scene.splats)
         ways = {
             "each from the one before": from_one_another(scene),
@@ -88,7 +89,7 @@ def main() -> int:
             made = list(levels)
             seconds = time.process_time() - start
             for splats, note in made:
-                psnr = judge.evaluate(splats).renders.mean["psnr"]
+                psnr = evaluator.evaluate(splats).renders.mean["psnr"]
                 cells.append(f"{psnr:.1f}{note}")
             print(f"  {name}: {', '.join(cells)}; {seconds:.0f} s in this process", flush=True)
     return 0

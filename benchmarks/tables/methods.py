@@ -17,7 +17,7 @@ from refine_addon.core import pipeline
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.pipeline import Settings
 from refine_addon.core.scores import Scores
-from refine_addon.core.scoring.closed_form import ClosedForm
+from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.selection import Budget
 from refine_addon.core.splats import Splats
 
@@ -176,7 +176,7 @@ def _published() -> list[Method]:
         _scoring(
             f"refine-{depth}",
             LITERATURE,
-            f"REFINE's closed form, {text} (`--published --depth {depth}`)",
+            f"REFINE's closed form, {text} (`ClosedForm.published({depth!r})`)",
             Settings("closed-form", views=0, closed_form=ClosedForm.published(depth)),
         )
         for depth, text in readings.items()

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 COUNT = 1_000_000
 RATIO = 0.5
 WIDTH = 480
-JUDGED = 4
-"""Held-out views that judge: a million splats take seconds to draw."""
+COMPARED = 4
+"""Held-out views that are compared: a million splats take seconds to draw."""
 ASIDE = 0.75
 """Where the two of a split splat lie, standard deviations to either side along its longest axis."""
 SHADE = 0.02
@@ -59,7 +59,7 @@ class Command:
         Most memory of its own.
     kept : int
     psnr : float
-        Against renders of the million, mean of the views that judge, dB.
+        Against renders of the million, mean of the views that are compared, dB.
     """
 
     name: str
@@ -80,15 +80,15 @@ class Million:
         How many there were and how many were made of them.
     likeness : float
         PSNR of the renders of these against renders of those, dB.
-    judged : int
-        How many held-out views judge.
+    compared : int
+        How many held-out views are compared.
     commands : list of Command
     """
 
     source: int
     splats: int
     likeness: float
-    judged: int
+    compared: int
     commands: list[Command]
 
 
@@ -198,13 +198,13 @@ def measure(splats: Splats, views: ViewSet, test: ViewSet, count: int = COUNT) -
     views : ViewSet
         Those that score.
     test : ViewSet
-        Those that judge, `JUDGED` of them.
+        Those that are compared, `COMPARED` of them.
     count : int
     """
     many = split(splats, count)
-    judges = scaled(test.spread(JUDGED), WIDTH)
-    likeness = Evaluator(splats, judges, metrics=("psnr",)).evaluate(many).renders.mean["psnr"]
-    evaluator = Evaluator(many, judges, metrics=("psnr",))
+    held_out = scaled(test.spread(COMPARED), WIDTH)
+    likeness = Evaluator(splats, held_out, metrics=("psnr",)).evaluate(many).renders.mean["psnr"]
+    evaluator = Evaluator(many, held_out, metrics=("psnr",))
     rows = []
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
@@ -217,4 +217,4 @@ def measure(splats: Splats, views: ViewSet, test: ViewSet, count: int = COUNT) -
             rows.append(Command(name, seconds, busy, peak, len(left), psnr))
             (folder / "out.ply").unlink()
             print(f"  {rows[-1]}", flush=True)
-    return Million(len(splats), len(many), likeness, len(judges), rows)
+    return Million(len(splats), len(many), likeness, len(held_out), rows)

@@ -77,19 +77,19 @@ HALF = 0.5
 """Share removed where methods are timed only."""
 
 
-class Judge:
+class Comparison:
     """Compares reduced splats from held-out and from scoring views."""
 
     def __init__(
         self, scene: evaluate.Scene, scoring: ViewSet, options: argparse.Namespace
     ) -> None:
-        judged = {"held-out": scene.test, "scoring": scoring.spread(options.judged)}
+        compared = {"held-out": scene.test, "scoring": scoring.spread(options.compared)}
         # FLIP takes longer than all the rest, and the scoring views are not what counts.
         plain = [metric for metric in options.metrics if metric != "flip"]
         metrics = {"held-out": options.metrics, "scoring": plain or options.metrics}
         self.evaluators = {
             name: evaluate.Evaluator(scene.splats, views, scene.pictures, metrics=metrics[name])
-            for name, views in judged.items()
+            for name, views in compared.items()
         }
 
     def __call__(self, splats: Splats) -> dict[tuple[str, str], dict[str, float]]:
@@ -138,7 +138,7 @@ def _start_peak() -> int | None:
 
 
 def measure_method(
-    method: Method, task: Task, ratios: Sequence[float], judge: Judge, runs: int,
+    method: Method, task: Task, ratios: Sequence[float], compare: Comparison, runs: int,
     rendering: tuple[Statistics | None, Cost],
 ) -> list[Row]:  # fmt: skip
     """Measure one method at all ratios."""
@@ -153,7 +153,7 @@ def measure_method(
         asked = len(task.splats) - (Budget(ratio=ratio).removals(len(task.splats)) or 0)
         left, cost = _reduced(method, task, (ratio, asked), scores, runs)
         cost = cost.plus(scoring) if scores is not None else cost
-        rows.append(Row(method, ratio, len(left), asked, cost, judge(left)))
+        rows.append(Row(method, ratio, len(left), asked, cost, compare(left)))
         psnr = rows[-1].quality["held-out", "renders"]["psnr"]
         print(f"  {method.name:28} {ratio:4.0%} {psnr:7.2f} dB {cost.seconds:8.2f} s", flush=True)
     return rows
@@ -194,14 +194,14 @@ def measure(folder: Path, options: argparse.Namespace, parts: Collection[str]) -
     splats = methods.in_memory(scene.splats)
     scoring = scene.train.spread(options.views)
     task = Task(splats, scoring, folder / "point_cloud.ply")
-    about = trade_report.facts(scene, scoring, options.judged)
+    about = trade_report.facts(scene, scoring, options.compared)
     found = Measured(folder.resolve().name, about, iterations=options.iterations)
-    judge = Judge(scene, scoring, options)
+    compare = Comparison(scene, scoring, options)
     if "methods" in parts:
-        found.unpruned = judge(splats)
-        _measure_methods(task, judge, found, options)
+        found.unpruned = compare(splats)
+        _measure_methods(task, compare, found, options)
     # An hour's measurements are not lost because one of them fails; it is said, and is an error.
-    for name, part in _parts(task, scene, judge.evaluators["held-out"], options).items():
+    for name, part in _parts(task, scene, compare.evaluators["held-out"], options).items():
         if name in parts:
             with _noted(name, found.failed):
                 setattr(found, name, part())
@@ -252,7 +252,7 @@ def _noted(what: str, failed: list[str]) -> Iterator[None]:
 
 
 def _measure_methods(
-    task: Task, judge: Judge, found: Measured, options: argparse.Namespace
+    task: Task, compare: Comparison, found: Measured, options: argparse.Namespace
 ) -> None:
     """Measure all methods, or those asked for."""
     offered = methods.everything()
@@ -270,7 +270,7 @@ def _measure_methods(
     for method in chosen:
         with _noted(method.name, found.failed):
             found.rows += measure_method(
-                method, task, options.ratios, judge, options.runs, rendering
+                method, task, options.ratios, compare, options.runs, rendering
             )
 
 
@@ -317,7 +317,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
                         default=list(evaluate.METRICS))  # fmt: skip
     parser.add_argument("--runs", type=int, default=3, help="of which the median counts")
     parser.add_argument("--views", type=int, default=64, help="that decide, at most; 0: all")
-    parser.add_argument("--judged", type=int, default=8, help="of them that judge, at most")
+    parser.add_argument("--compared", type=int, default=8, help="how many of them are compared")
     parser.add_argument("--iterations", type=int, default=finetune.ITERATIONS, help="of training")
     parser.add_argument("--million", type=int, default=million.COUNT, metavar="N",
                         help="into how many splats the scene is split")  # fmt: skip

@@ -42,14 +42,14 @@ HOW = """\
 - MB is the most memory in use beyond the scene itself; of splat-transform, all of it."""
 
 
-def facts(scene: Scene, scoring: ViewSet, judged: int) -> dict[str, str]:
+def facts(scene: Scene, scoring: ViewSet, compared: int) -> dict[str, str]:
     """Return what a reader must know of a scene."""
     view = scoring[0]
     pictures = sum(v.name in scene.pictures for v in scene.test)
     return {
         "splats": f"{len(scene.splats):,}, spherical harmonics degree {scene.splats.sh_degree}",
-        "scoring views": f"{len(scoring)} of {len(scene.train)}; {min(judged, len(scoring))} of "
-        "them judge",
+        "scoring views": f"{len(scoring)} of {len(scene.train)}; {min(compared, len(scoring))} of "
+        "them are compared",
         "held-out views": f"{len(scene.test)}, {pictures} of them with a picture",
         "image size": f"{view.width} x {view.height}",
     }

@@ -118,7 +118,7 @@ def _million_table(scene: Measured) -> list[str]:
             "covariance and thickness, one a little brighter and the other darker) until there "
             f"are enough. Renders of the scene before and after agree to {found.likeness:.1f} dB. "
             "Commands are whole processes, file to file, half removed, by all scoring views with "
-            f"pictures {million.WIDTH} px wide; PSNR on {found.judged} held-out views against "
+            f"pictures {million.WIDTH} px wide; PSNR on {found.compared} held-out views against "
             f"renders of the {found.splats:,}; MB of each process's own. Neighbours that were one "
             "splat are alike, which flatters everything that merges."), "",
             *table(["half removed", "PSNR", "seconds", "of the processor", "MB"], body)

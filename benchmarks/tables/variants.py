@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from refine_addon.core import pipeline
 from refine_addon.core.pipeline import Settings
-from refine_addon.core.scoring.closed_form import ClosedForm
+from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.scoring.occlusion import Occlusion
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class Line:
 def measure(
     variants: Mapping[str, Settings], task: Task, evaluator: Evaluator, ratios: Sequence[float]
 ) -> list[Line]:
-    """Score by each of the settings and judge what stays."""
+    """Score by each of the settings and compare what stays."""
     lines = []
     for name, settings in variants.items():
         start = time.perf_counter()

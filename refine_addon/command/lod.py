@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from ..core.estimate.quality import in_words
 from ..core.levels.files import lod_file
-from ..core.quality import in_words
 from ..core.report import size_in_words
 from .options import levels, settings
 from .words import by, left_unseen

@@ -22,10 +22,10 @@ from ..core import (
     score,
 )
 from ..core.errors import printable
+from ..core.estimate.quality import UNSEEN, in_words
 from ..core.formats.registry import without_suffix
 from ..core.pace import Pace
 from ..core.picture_files import PictureFiles
-from ..core.quality import UNSEEN, in_words
 from ..core.report import held, kept_and_removed, scoring_notes, seen_by, what_was_seen
 from ..core.tiles.storage import located
 from ..core.urls import Url
@@ -239,7 +239,7 @@ def _workers(options: argparse.Namespace) -> contextlib.AbstractContextManager[W
 
 
 def _prune_object(run: _Run) -> dict[str, Any]:
-    from .. import splat_object  # noqa: PLC0415 - needs Blender
+    from ..objects import splat_object  # noqa: PLC0415 - needs Blender
 
     options = run.options
     done = splat_object.prune_object(
@@ -329,7 +329,7 @@ def _score_one(run: _Run, source: Path, views: ViewSet) -> dict[str, Any]:
 
 
 def _score_object(run: _Run) -> dict[str, Any]:
-    from .. import splat_object  # noqa: PLC0415 - needs Blender
+    from ..objects import splat_object  # noqa: PLC0415 - needs Blender
 
     options = run.options
     refuse_existing(options.output, overwrite=options.overwrite)

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from .. import splat_object
 from ..cameras.sets import Choice
 from ..core import RefineError
+from ..objects import splat_object
 
 if TYPE_CHECKING:
     import argparse

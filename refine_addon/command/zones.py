@@ -11,7 +11,7 @@ from ..core.volumes import parse
 
 if TYPE_CHECKING:
     from ..core.volumes import Role, Volume
-    from ..demands import Demands
+    from ..objects.demands import Demands
 
 ROLES: dict[str, Role] = {"protect": "protect", "remove_inside": "remove", "keep_inside": "keep"}
 """Options -> what becomes of the splats in a volume."""
@@ -116,7 +116,7 @@ def of_object(options: argparse.Namespace) -> Demands:
     """
     import bpy  # noqa: PLC0415 - only there inside Blender
 
-    from .. import demands, splat_object  # noqa: PLC0415 - need Blender
+    from ..objects import demands, splat_object  # noqa: PLC0415 - need Blender
 
     obj = splat_object.find(options.object)
     names, zones = [], []
@@ -159,7 +159,7 @@ def _zone(role: Role, item: Given, also: str) -> Zone:
         return Zone(role, f"'{item.text}'", item.volume)
     import bpy  # noqa: PLC0415 - only there inside Blender
 
-    from .. import demands  # noqa: PLC0415 - needs Blender
+    from ..objects import demands  # noqa: PLC0415 - needs Blender
 
     obj = bpy.context.scene.objects.get(item.text)
     if obj is None:

@@ -17,7 +17,7 @@ from .levels.files import lod_file
 from .levels.lod import Level, Levels, lod
 from .pipeline import prune, score
 from .scores import Scores
-from .scoring.closed_form import ClosedForm
+from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
 from .selection import Budget, rank, select
 from .solid import Solid

@@ -23,6 +23,10 @@ QUARTERS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T}
 UNIFORM_TOLERANCE = 1e-4
 """Relative difference between the scales of a matrix that still counts as uniform scaling."""
 
+SMALLEST_SCALE, LARGEST_SCALE = 1e-30, 1e30
+"""Of a matrix that is applied: its determinant is in the range of float64, and usual splats stay in
+that of float32."""
+
 
 def is_uniform(matrix: NDArray[Any]) -> bool:
     """Return whether a (4, 4) or (3, 3) matrix scales all directions alike; it may mirror."""
@@ -58,7 +62,8 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
     Raises
     ------
     RefineError
-        If the matrix is not finite, not invertible or not affine; or if, with `rotate_sh`, it
+        If the matrix is not finite, not invertible or not affine, or scales by less than 1e-30 or
+        more than 1e30; or if, with `rotate_sh`, it
         scales directions differently, which harmonics cannot express.
     """
     matrix = np.asarray(matrix, np.float64)
@@ -71,6 +76,9 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
         msg = (
             f"the transform is flat or not affine (scales {scales.tolist()}): it cannot be applied"
         )
+        raise RefineError(msg)
+    if not SMALLEST_SCALE <= scales[2] <= scales[0] <= LARGEST_SCALE:
+        msg = f"the transform scales by {scales[0]:g}, expected 1e-30 to 1e30"
         raise RefineError(msg)
     means = moved(splats.means, matrix)
     if not is_uniform(matrix):

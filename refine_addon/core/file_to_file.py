@@ -8,11 +8,12 @@ import numpy as np
 
 from .affine import is_uniform, transformed
 from .cleaning.clean import clean
+from .estimate.written import written_facts
 from .formats.registry import (
     Packed,
     as_written,
-    format_named,
     read_splats,
+    read_written,
     refuse_unknown_size,
 )
 from .pipeline import decide
@@ -22,7 +23,6 @@ from .task import DEFAULTS, Result, Settings, Task
 from .volumes import forced
 from .whole_file import expanded, refuse_existing, refuse_mapped
 from .work import Progress, part, report, silent
-from .written import written_facts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -204,10 +204,10 @@ def picture_facts(  # noqa: PLR0913 - what was pruned, and what to draw of it
         return {}
     after = result.survivors(splats)
     matrix = np.eye(4) if matrix is None else matrix
-    if written is not None and format_named(written) and is_uniform(matrix):
-        after = read_splats(written).splats()
-        if not np.array_equal(matrix, np.eye(4)):
-            after = transformed(after, matrix)
+    rounded = read_written(written) if written is not None and is_uniform(matrix) else None
+    if rounded is not None:
+        moved = not np.array_equal(matrix, np.eye(4))
+        after = transformed(rounded, matrix) if moved else rounded
     facts = pictures.write(splats, after, views, progress=progress, threads=threads)
     clock.lap("pictures_s")
     return {"pictures": facts}

@@ -1,22 +1,24 @@
 """Pictures of views before and after pruning, drawn on the processor: a truth beside the estimate.
 
-The rules are those of the lines of sight (`scoring.sight_lines`), for every pixel in place of a
-few: footprints by EWA splatting, blended front to back, colours of the direction of view. They
+The rules are those of rays (`seeing.rays`), for every pixel in place of a few:
+footprints by EWA splatting, blended front to back, colours of the direction of view. They
 agree with the reference renderer of the benchmarks to 75 dB and more.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import frustum
+from .estimate.psnr import psnr_of
 from .rendering import ALPHA_MAX, NEAR_RELATIVE
-from .scoring import projection
-from .scoring.sight_lines import DARK, boxes, colors_from, mahalanobis, psnr_of, reaches
+from .seeing import frustum, projection
+from .seeing.cast import boxed_pixels, boxes, mahalanobis, slices, squared_reach
+from .seeing.ray_sample import colors_from
+from .seeing.ray_sums import in_front
+from .seeing.rays import LOG_OPAQUE
 from .views import ViewSet
 from .work import Progress, checkpoint, for_chunks, part, silent
 
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .scene import Scene
-    from .scoring.projection import Footprints, Gaussians
+    from .seeing.projection import Footprints, Gaussians
     from .splats import Splats
     from .views import View
 
@@ -219,89 +221,60 @@ def _strip(
         Ascending.
     """
     pixels = len(columns) * len(rows)
-    through, image = np.zeros(pixels), np.zeros((3, pixels))  # logarithm of the transmittance
-    reach = reaches(footprints.alphas)
-    (left, wide), (top, tall) = (
+    log_left, image = np.zeros(pixels), np.zeros((3, pixels))  # logarithm of the transmittance
+    reach = squared_reach(footprints.alphas)
+    across, down = (
         boxes(footprints, reach, axis, places) for axis, places in enumerate((columns, rows))
     )
-    some = np.flatnonzero(wide * tall > 0)
-    ends = np.cumsum((wide * tall)[some])
-    cuts = np.searchsorted(ends, np.arange(0, ends[-1] if len(ends) else 0, _PAIRS)).tolist()
-    for start, end in pairwise([*cuts, len(some)] if cuts else []):
+    pairs = across[1] * down[1]
+    boxed = np.flatnonzero(pairs > 0)
+    for start, end in slices(pairs[boxed], _PAIRS):
         checkpoint()
-        block = some[start:end]
-        own, across, down = _within(block, left, wide, top, tall)
-        line = down * len(columns) + across
-        open_ = np.flatnonzero((through > DARK).take(line))
-        own, line = own[open_], line[open_]
-        squared = mahalanobis(footprints, own, columns.take(across[open_]), rows.take(down[open_]))
-        met = np.flatnonzero(squared < reach.take(own))
-        own, line = own[met], line[met]
-        alpha = footprints.alphas.take(own) * np.exp(squared[met] / np.float32(-2.0))
-        order = np.argsort(line.astype(np.min_scalar_type(pixels)), kind="stable")
-        own, line = own[order], line[order]
+        owner, column, row = boxed_pixels(boxed[start:end], across, down)
+        pixel = row * len(columns) + column
+        see_through = np.flatnonzero((log_left > LOG_OPAQUE).take(pixel))
+        owner, pixel = owner[see_through], pixel[see_through]
+        squared = mahalanobis(
+            footprints,
+            owner,
+            columns.take(column[see_through]),
+            rows.take(row[see_through]),
+        )
+        inside = np.flatnonzero(squared < reach.take(owner))
+        owner, pixel = owner[inside], pixel[inside]
+        alpha = footprints.alphas.take(owner) * np.exp(squared[inside] / np.float32(-2.0))
+        order = np.argsort(pixel.astype(np.min_scalar_type(pixels)), kind="stable")
+        owner, pixel = owner[order], pixel[order]
         alpha = np.minimum(alpha[order], np.float32(ALPHA_MAX))
-        weight = _weights(line, alpha, through)
+        weight = _weights(pixel, alpha, log_left)
         for channel in range(3):
-            image[channel] += np.bincount(line, weight * colors[channel].take(own), pixels)
+            image[channel] += np.bincount(pixel, weight * colors[channel].take(owner), pixels)
     return image
 
 
-def _within(
-    block: NDArray[np.int64],
-    left: NDArray[np.int64],
-    wide: NDArray[np.int64],
-    top: NDArray[np.int64],
-    tall: NDArray[np.int64],
-) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """Return the pairs of some footprints and the pixels in their boxes, (p,) each.
-
-    Parameters
-    ----------
-    block : (b,) int64
-        Which footprints.
-    left, wide, top, tall : (n,) int64
-        The boxes of all; see `sight_lines.boxes`.
-
-    Returns
-    -------
-    own, across, down
-        Which footprint, and the places of the pixel among columns and rows.
-    """
-    count = (wide * tall)[block]
-    own = np.repeat(block, count)
-    number = np.arange(len(own), dtype=np.int32)
-    number -= np.repeat((np.cumsum(count) - count).astype(np.int32), count)
-    down, across = np.divmod(number, np.repeat(wide[block].astype(np.int32), count))
-    across += left.astype(np.int32).take(own)
-    down += top.astype(np.int32).take(own)
-    return own, across, down
-
-
 def _weights(
-    line: NDArray[Any], alpha: NDArray[np.float32], through: NDArray[np.float64]
+    pixel: NDArray[Any], alpha: NDArray[np.float32], log_left: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return what part of its pixel each hit makes up, (h,), and darken what lies behind.
+    """Return the share of its pixel that each hit makes up, (h,), and darken what lies behind.
 
     Parameters
     ----------
-    line : (h,) integer
-        The pixel, ascending; the hits of one are front to back.
+    pixel : (h,) integer
+        Ascending; the hits of one pixel are front to back.
     alpha : (h,) float32
-    through : (P,) float64
+    log_left : (P,) float64
         Logarithm of the transmittance of each pixel in front of these hits; afterwards behind them.
     """
-    if not len(line):
+    if not len(pixel):
         return np.empty(0)
-    dark = np.log1p(-alpha)
-    behind = np.cumsum(dark, dtype=np.float64)
-    first = np.flatnonzero(np.diff(line, prepend=-1))
-    last = np.append(first[1:], len(line)) - 1
-    before = (behind - dark)[first]  # the sum over all pixels before each
-    front = behind - dark
-    front -= np.repeat(before - through[line[first]], last + 1 - first)
-    through[line[first]] += behind[last] - before
-    return np.where(front > DARK, alpha * np.exp(front), 0.0)
+    log_passed = np.log1p(-alpha).astype(np.float64)
+    first = np.flatnonzero(np.diff(pixel, prepend=-1))
+    counts = np.diff(np.append(first, len(pixel)))
+    log_front = in_front(log_passed, counts)
+    log_front += np.repeat(log_left[pixel[first]], counts)
+    last = first + counts - 1
+    log_left[pixel[first]] = log_front[last] + log_passed[last]
+    return np.where(log_front > LOG_OPAQUE, alpha * np.exp(log_front), 0.0)
 
 
 def _rounded(picture: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -17,10 +17,12 @@ import numpy as np
 from . import selection
 from .absorbing import absorb as absorbing
 from .absorbing.merging import ViewSums
-from .quality import FEWEST, left_to_lose, needed, out_of_reach
+from .estimate.alignment import alignment
+from .estimate.psnr import psnr_against, psnr_kept, quality_curve
+from .estimate.quality import FEWEST, left_to_lose, needed, out_of_reach
 from .report import Clock, make_report, size_in_words
-from .scoring import auto, closed_form, occlusion, sight_lines
-from .scoring.alignment import alignment
+from .scoring import auto, closed_form, occlusion
+from .seeing.ray_sample import validation_rays
 from .selection import Budget
 from .task import DEFAULTS, Result, Settings, Task
 from .volumes import refuse_all
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
 
     from .absorbing.absorb import Absorbed, Counts
     from .scores import Scores
-    from .scoring.measuring import Measured
+    from .seeing.measuring import Measured
     from .selection import RowBytes
     from .splats import Splats
     from .views import ViewSet
@@ -136,10 +138,9 @@ def score(  # noqa: PLR0913 - as `prune`
             scores = closed_form.score(
                 splats, used, settings.closed_form, progress=progress, threads=threads
             )
-        if quality and scores.sights is None:
-            ahead = part(whole, 0.9, 0.95)
-            lines = sight_lines.sights(splats, used, progress=ahead, threads=threads)
-            scores = replace(scores, sights=lines)
+        if quality and scores.ray_sample is None:
+            rays = validation_rays(splats, used, progress=part(whole, 0.9, 0.95), threads=threads)
+            scores = replace(scores, ray_sample=rays)
     scores = _with_views(scores, splats, views, used, part(whole, 0.95, 0.95), threads)
     ahead = part(whole, 0.95, 1.0)
     return with_quality(scores, protected=protected, progress=ahead, threads=threads)
@@ -152,7 +153,7 @@ def with_quality(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
-    """Return scores with the curve of the estimated PSNR, as far as their lines of sight tell it.
+    """Return scores with the curve of the estimated PSNR, as far as their validation rays tell it.
 
     Parameters
     ----------
@@ -162,10 +163,10 @@ def with_quality(
     progress : callable, optional
     threads : int, optional
     """
-    if scores.sights is None:
+    if scores.ray_sample is None:
         return scores
-    curve = scores.sights.curve(
-        scores.values, protected=protected, settled=scores.settled,
+    curve = quality_curve(
+        scores.ray_sample, scores.values, protected=protected, settled=scores.settled,
         progress=progress, threads=threads,
     )  # fmt: skip
     return replace(scores, quality=curve)
@@ -192,7 +193,7 @@ def _with_views(
     """
     notes = (*scores.notes, views.note) if views.note else scores.notes
     # Beside the closed form, measuring would take as long as scoring.
-    some = None if scores.sights is None else used
+    some = None if scores.ray_sample is None else used
     found = alignment(splats, views, some, progress=progress, threads=threads)
     return replace(scores, views_given=len(views), notes=notes, alignment=found)
 
@@ -282,6 +283,8 @@ def decide(
     """
     clock, forced = clock or Clock(), task.forced()
     if forced is None:
+        if task.scores is not None:
+            task.scores.refuse_unscored()
         result = _decide(task, clock, progress, threads)
     else:
         result = _decide(task.without(forced), clock, progress, threads).for_all(~forced)
@@ -374,7 +377,7 @@ def conclude(
         See `remark`.
     """
     facts |= _quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
-    if psnr is None and scores.sights is not None:
+    if psnr is None and scores.ray_sample is not None:
         facts["notes"].append(UNSEEN)
     facts["budget_remark"] = why
     if why:
@@ -393,7 +396,7 @@ def _quality_facts(
         other = curve.at(1.0 - float(np.mean(keep)), absorb=True)
     why = why_other = None
     if psnr is None:
-        why = UNESTIMATED if scores.sights is None else UNSEEN
+        why = UNESTIMATED if scores.ray_sample is None else UNSEEN
     if other is None:
         why_other = UNFORETOLD if psnr is not None else why
     return {
@@ -407,8 +410,8 @@ def _quality_facts(
 
 def _estimated(scores: Scores, keep: NDArray[np.bool_], threads: int | None) -> float | None:
     """Return the estimated PSNR with some splats deleted, dB; None where nothing tells it."""
-    if scores.sights is not None:
-        return scores.sights.psnr(keep, threads=threads)
+    if scores.ray_sample is not None:
+        return psnr_kept(scores.ray_sample, keep, threads=threads)
     if scores.quality is not None:
         return scores.quality.at(1.0 - float(np.mean(keep)))
     return None
@@ -444,7 +447,7 @@ def _absorbed(
     if goal is not None and scores.quality is None:
         scores = with_quality(scores, protected=task.protected, threads=threads)
     used, origin = views.spread(task.settings.views), task.origin
-    sights = scores.sights if origin is None else origin.sights
+    truth = scores.ray_sample if origin is None else origin.ray_sample
     best: tuple[Absorbed, float | None] | None = None
     offset, tries = 0.0, 1 if goal is None else TRIES
     if goal is not None and origin is not None:
@@ -462,9 +465,9 @@ def _absorbed(
             progress=part(ahead, 0.0, 0.95), threads=threads,
         )  # fmt: skip
         psnr = None
-        if sights is not None:
-            psnr = sights.against(
-                absorbed.splats, used, progress=part(ahead, 0.95, 1.0), threads=threads
+        if truth is not None:
+            psnr = psnr_against(
+                truth, absorbed.splats, used, progress=part(ahead, 0.95, 1.0), threads=threads
             )
         if goal is None or psnr is None:
             return absorbed, psnr
@@ -542,7 +545,7 @@ def _score_once(
     used = views.spread(settings.views)
     with np.errstate(under="ignore"):  # as in `score`
         scores, measured = occlusion.score_once(
-            splats, used, settings.occlusion, judges=not curve,
+            splats, used, settings.occlusion, few_views=not curve,
             progress=part(progress, 0.0, 0.99), threads=threads,
         )  # fmt: skip
     ahead = part(progress, 0.99, 1.0)

@@ -13,9 +13,9 @@ from .volumes import among_all
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .quality import Quality
-    from .scoring.alignment import Alignment
-    from .scoring.sight_lines import SightLines
+    from .estimate.alignment import Alignment
+    from .estimate.quality import Quality
+    from .seeing.ray_sample import RaySample
 
 _DISTINCT = 1 << 24
 """Largest number of equal steps from 0 to 1 that are distinct in float32."""
@@ -28,8 +28,8 @@ class Scores:
     Attributes
     ----------
     values : (N,) float32
-        Finite, >= 0; 0 only for undrawable splats and those that had gone before (`for_all`). Each
-        method has its own scale.
+        Finite, >= 0; 0 only for undrawable splats and those that were not scored. Each method has
+        its own scale.
     seen : (N,) int32
         In how many of the views used the splat's centre lies.
     views_used : int
@@ -47,9 +47,8 @@ class Scores:
         counts for every splat.
     views_given : int
         How many views were given; those used were chosen from them.
-    sights : SightLines, optional
-        What the views' lines of sight meet, from which any choice of the splats that were scored
-        can be judged.
+    ray_sample : RaySample, optional
+        Validation rays, which tell the PSNR of any choice of the splats that were scored.
     quality : Quality, optional
         How close the pictures stay with ever more of these removed in the order of the scores.
     alignment : Alignment, optional
@@ -57,6 +56,8 @@ class Scores:
     settled : int, optional
         How many splats, from those with the lowest scores on, are in their final order; None for
         all. Scores that were computed for one budget end where that does.
+    scored : (N,) bool, optional
+        Which splats were scored; None for all. The others were forced out (`for_all`).
     """
 
     values: NDArray[np.float32]
@@ -68,10 +69,11 @@ class Scores:
     method: str = ""
     frustum: bool = True
     views_given: int = 0
-    sights: SightLines | None = None
+    ray_sample: RaySample | None = None
     quality: Quality | None = None
     alignment: Alignment | None = None
     settled: int | None = None
+    scored: NDArray[np.bool_] | None = None
 
     def for_all(self, rest: NDArray[np.bool_]) -> Scores:
         """Return scores of what was left of N splats as scores of them all.
@@ -83,7 +85,8 @@ class Scores:
         """
         values, seen = among_all(self.values, rest), among_all(self.seen, rest)
         settled = None if self.settled is None else self.settled + len(rest) - len(self.values)
-        return replace(self, values=values, seen=seen, settled=settled)
+        scored = rest if self.scored is None else among_all(self.scored, rest)
+        return replace(self, values=values, seen=seen, settled=settled, scored=scored)
 
     def of(self, rest: NDArray[np.bool_]) -> Scores:
         """Return the scores of some splats; the reverse of `for_all` where those had been left.
@@ -97,21 +100,37 @@ class Scores:
         RefineError
             If some of them were not scored.
         """
+        self.refuse_unscored(rest)
         values, count = self.values[rest], int(np.count_nonzero(rest))
-        unscored = int(np.count_nonzero(values == 0.0)) - self.undrawable
-        if unscored > 0:
-            msg = (
-                f"{unscored} splats had to go when the others were scored, and need not go now; "
-                "score again"
-            )
-            raise RefineError(msg)
-        sights = self.sights
-        if sights is not None and len(sights.splats) != count:
-            sights = None  # of a scene with other splats
+        ray_sample = self.ray_sample
+        if ray_sample is not None and len(ray_sample.splats) != count:
+            ray_sample = None  # of a scene with other splats
         settled = self.settled
         if settled is not None:
             settled = max(settled - (len(rest) - count), 0)
-        return replace(self, values=values, seen=self.seen[rest], sights=sights, settled=settled)
+        return replace(
+            self,
+            values=values,
+            seen=self.seen[rest],
+            ray_sample=ray_sample,
+            settled=settled,
+            scored=None,
+        )
+
+    def refuse_unscored(self, rest: NDArray[np.bool_] | None = None) -> None:
+        """Raise `RefineError` if some of the splats in question, (N,) bool, have no score.
+
+        By default all are.
+        """
+        if self.scored is None:
+            return
+        unscored = ~self.scored if rest is None else rest & ~self.scored
+        if unscored.any():
+            msg = (
+                f"{np.count_nonzero(unscored)} splats had to go when the others were scored, and "
+                "need not go now; score again"
+            )
+            raise RefineError(msg)
 
 
 def shares_gone(places: NDArray[np.int64], count: int) -> NDArray[np.float32]:

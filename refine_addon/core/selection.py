@@ -11,14 +11,14 @@ import numpy as np
 
 from . import radix
 from .errors import RefineError
-from .quality import PSNR_CAP
+from .estimate.quality import PSNR_CAP
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-    from .quality import Quality
+    from .estimate.quality import Quality
     from .scores import Scores
 
     RowBytes = float | NDArray[np.int64]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from .errors import RefineError
-from .scoring.closed_form import ClosedForm
+from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
 from .volumes import among_all, refuse_all
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from .absorbing.absorb import Absorbed
     from .scores import Scores
-    from .scoring.sight_lines import SightLines
+    from .seeing.ray_sample import RaySample
     from .selection import Budget, RowBytes
     from .splats import Splats
     from .views import ViewSet
@@ -94,14 +94,14 @@ class Origin:
     ----------
     count : int
         How many there were.
-    sights : SightLines or None
+    ray_sample : RaySample or None
         What the views saw of them: the estimated PSNR is against that.
     psnr : float or None
         The estimated PSNR that is left before the task, dB.
     """
 
     count: int
-    sights: SightLines | None
+    ray_sample: RaySample | None
     psnr: float | None
 
 

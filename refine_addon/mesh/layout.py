@@ -76,7 +76,7 @@ NORMAL_PLACES = {
 _COUNT = rb"([\r\n]element[ \t]+vertex[ \t]+)[0-9]+"
 _TAKEN = {
     *("position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"),
-    *("refine_score", "refine_rank", "refine_seen"),
+    *("refine_score", "refine_rank", "refine_seen", "refine_scored"),
     *("refine_heat", "refine_color", "refine_remove"),
     *("refine_protect", "refine_force", "refine_floats"),
 }

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..core.errors import RefineError
-from ..core.quality import Quality
+from ..core.estimate.quality import Quality
 from ..core.scores import Scores
 from ..core.selection import rank
 from . import attributes as mesh_attributes
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
 
 SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
 """Point attributes: the score, its place from 0 (goes first) to 1, in how many views it lies."""
+
+SCORED = "refine_scored"
+"""Boolean point attribute: which splats have a score; not those that were forced out, and not those
+that were joined or added since, for which Blender writes False."""
 
 RECORD = "refine_scores"
 """Custom property of the mesh: how its scores came to be, as JSON."""
@@ -57,7 +61,6 @@ def store(  # noqa: PLR0913 - all that a note holds
     origin: dict[str, Any] | None = None,
     cameras: list[tuple[str, int]] | None = None,
     *,
-    forced: int = 0,
     protected: NDArray[np.bool_] | None = None,
     asked: Settings | None = None,
     together: Together | None = None,
@@ -73,8 +76,6 @@ def store(  # noqa: PLR0913 - all that a note holds
         See `staleness.origin`.
     cameras : list of (str, int), optional
         Name of each view given, and how many splats lie in it.
-    forced : int
-        How many splats had to go, and have the score 0.
     protected : (N,) bool, optional
         Which splats the curve takes to stay.
     asked : Settings, optional
@@ -111,7 +112,6 @@ def store(  # noqa: PLR0913 - all that a note holds
             "alignment": scores.alignment.facts() if scores.alignment else None,
             "origin": origin,
             "cameras": cameras,
-            "forced": forced,
             "protected": digest(protected),
             "asked": asdict(asked) if asked else None,
             "together": together and {"id": together.id, "splats": together.splats},
@@ -122,6 +122,8 @@ def store(  # noqa: PLR0913 - all that a note holds
     mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
     mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
     mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
+    scored = np.ones(len(checked), np.bool_) if scores.scored is None else scores.scored
+    mesh_attributes.write_attribute(mesh, SCORED, "BOOLEAN", scored)
     mesh[RECORD] = note
     mesh_attributes.updated(mesh)
 
@@ -164,28 +166,25 @@ def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None
     """
     mesh, label = checked.mesh, f"object '{checked.obj.name}'"
     noted = record(mesh)
-    kinds = {SCORE: "FLOAT", SEEN: "INT"}
+    kinds = {SCORE: "FLOAT", SEEN: "INT", SCORED: "BOOLEAN"}
     for name, kind in kinds.items():
         attribute = mesh.attributes.get(name)
         if noted is None or not attribute or attribute.data_type != kind:
             msg = f"{label}: has no scores; score it first"
             raise RefineError(msg)
     values = mesh_attributes.read_attribute(mesh, SCORE)
-    # Splats joined or added since hold a score of 0, as those do that no renderer can draw, and
-    # those that had to go.
-    zero = values == 0.0
-    zero = zero if removed is None else zero & ~removed
-    unscored = int(np.count_nonzero(zero)) - noted.get("undrawable", 0)
-    if len(values) > noted["splats"] or unscored > 0:
+    scored = mesh_attributes.read_attribute(mesh, SCORED)
+    unscored = ~scored if removed is None else ~scored & ~removed
+    if len(values) > noted["splats"] or unscored.any():
         msg = (
             f"{label}: scored with {noted['splats']} splats, has {len(values)} now, "
-            f"{max(unscored, 0)} of them without a score; score it again"
+            f"{np.count_nonzero(unscored)} of them without a score; score it again"
         )
         raise RefineError(msg)
-    # The curve is that of all splats that were scored.
-    gone = 0 if removed is None else int(np.count_nonzero(removed))
-    whole = (len(values), gone) == (noted["splats"], noted.get("forced", 0))
-    whole = whole and not noted.get("together")  # then it is that of several objects
+    # The curve is that of all splats that were scored: of one object, with the same forced out.
+    forced_out = np.zeros_like(scored) if removed is None else removed
+    whole = len(values) == noted["splats"] and not noted.get("together")
+    whole = whole and np.array_equal(forced_out, ~scored)
     return Scores(
         values=values,
         seen=mesh_attributes.read_attribute(mesh, SEEN),
@@ -197,4 +196,5 @@ def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None
         frustum=noted.get("frustum", True),
         views_given=noted["views_given"],
         quality=Quality.from_facts(noted.get("quality")) if whole else None,
+        scored=None if scored.all() else scored,
     )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 from bpy.props import BoolProperty, CollectionProperty, FloatProperty, IntProperty, StringProperty
 
-from ..core.quality import in_words
+from ..core.estimate.quality import in_words
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from . import price

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..core.quality import UNSEEN
+from ..core.estimate.quality import UNSEEN
 from . import pixel_font
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..core.quality import Quality
+    from ..core.estimate.quality import Quality
 
     Color = tuple[float, float, float]
     Box = tuple[float, float, float, float]  # left, top, right, bottom

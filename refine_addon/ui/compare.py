@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 import bpy
 import numpy as np
 
-from .. import splat_group
 from ..cameras.sets import Choice
 from ..core import pipeline
+from ..core.estimate.quality import in_words
 from ..core.picture_files import KINDS
 from ..core.pictures import AMPLIFIED, Comparison, compare
-from ..core.quality import in_words
 from ..core.views import ViewSet
 from ..core.work import part
+from ..objects import splat_group
 from .on_thread import Answer, OnThread
 from .operators import OnScored, apply_task
 

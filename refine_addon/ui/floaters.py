@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import bpy
 import numpy as np
 
-from .. import splat_object
 from ..core.cleaning.clean import Cleaned, Cleaning, clean
-from ..demands import Demands
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters
 from ..mesh import layout as mesh_layout
+from ..objects import splat_object
+from ..objects.demands import Demands
 from . import plans
 from .on_thread import FAILURES, Answer, OnThread, fail
 from .operators import OnSplats, chosen_views

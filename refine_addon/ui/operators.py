@@ -17,19 +17,20 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from .. import level_objects, splat_group, splat_object
 from ..cameras.sets import Choice
-from ..core import frustum, pipeline
+from ..core import pipeline
+from ..core.estimate.quality import in_words
 from ..core.formats.registry import FORMATS, Packed, without_suffix
 from ..core.levels.lod import Level, Levels, lod
-from ..core.quality import in_words
 from ..core.report import scoring_notes, sizes_in_words
+from ..core.seeing import frustum
 from ..core.work import part, report
-from ..demands import Demands
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
+from ..objects import level_objects, splat_group, splat_object
+from ..objects.demands import Demands
 from ..viewport import draw
 from . import plans, preview, running, staleness
 from .adjust import Adjustable

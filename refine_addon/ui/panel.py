@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from .. import splat_group
 from ..cameras.sets import chosen_cameras
 from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
@@ -15,6 +14,7 @@ from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
+from ..objects import splat_group
 from ..viewport import draw as viewport_draw
 from . import kept, plans, preview, price, running, staleness, wrapped
 from .properties import FLOATERS

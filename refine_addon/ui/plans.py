@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from .. import demands, splat_group, splat_object
 from ..core import pipeline
 from ..core.errors import RefineError
-from ..core.quality import in_words, out_of_reach
+from ..core.estimate.alignment import Alignment
+from ..core.estimate.quality import in_words, out_of_reach
 from ..core.report import sizes_in_words
-from ..core.scoring.alignment import Alignment
 from ..core.selection import Tally, quality_of
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.notes import parsed
+from ..objects import demands, splat_group, splat_object
 from . import camera_list, price
 from .chart import Place
 

@@ -22,7 +22,7 @@ from ..core.cleaning.clean import DEFAULT_REASONS
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED
 from ..core.levels.lod import Levels
-from ..core.scoring.closed_form import ClosedForm
+from ..core.scoring.closed_form_settings import ClosedForm
 from ..core.selection import Budget
 from ..core.task import Settings
 from ..mesh import floaters

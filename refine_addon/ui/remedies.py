@@ -11,7 +11,6 @@ import mathutils
 import numpy as np
 from bpy.props import EnumProperty, IntProperty
 
-from .. import splat_group
 from ..cameras.objects import UPRIGHT, WEIGHT, world_matrix
 from ..cameras.sets import chosen_cameras
 from ..core.errors import RefineError
@@ -19,6 +18,7 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..objects import splat_group
 from . import camera_list, plans
 from .on_thread import FAILURES, Answer, fail
 from .operators import OnSplats

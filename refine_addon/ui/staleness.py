@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from .. import demands
 from ..cameras.objects import SOURCE, WEIGHT, render_size
 from ..cameras.sets import chosen_cameras
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
+from ..objects import demands
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -10,12 +10,12 @@ import numpy as np
 from bpy.app.handlers import persistent
 from bpy.props import EnumProperty, IntProperty, PointerProperty
 
-from .. import demands, splat_object
 from ..core.errors import RefineError
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
+from ..objects import demands, splat_object
 from . import plans, running, wrapped
 from .on_thread import FAILURES, Answer, fail
 

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import blf
-import bpy
+
+if TYPE_CHECKING:
+    import bpy
 
 _TAKEN = 52
 """Pixels of a sidebar at scale 1 that are not text: margins, tabs, scroll bar."""
@@ -29,8 +32,7 @@ def label(
     points = context.preferences.ui_styles[0].widget.points * scale
     column = layout.column(align=True)
     column.scale_y = 0.8  # the lines of one sentence stand closer together than buttons
-    shown = bpy.app.translations.pgettext_iface(text)
-    for line in lines(shown, int(room), points):
+    for line in lines(text, int(room), points):
         column.label(text=line, icon=icon, translate=False)
         icon = "BLANK1" if icon != "NONE" else icon
 

@@ -43,7 +43,7 @@ def extension(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def addon(extension):
-    """Return the package with its modules as attributes: ``addon.splat_object``."""
+    """Return the package with its modules as attributes: ``addon.objects.splat_object``."""
     for path in (ROOT / "refine_addon").glob("*.py"):
         if not path.stem.startswith("__"):
             importlib.import_module(f"{MODULE}.{path.stem}")
@@ -59,8 +59,10 @@ def core(addon):
 def keep_mask(addon, obj, budget, protect=""):
     """Return which splats of a scored object stay, as *Apply* decides it; `protect` names some."""
     checked = addon.mesh.layout.check(obj)
-    found = addon.demands.Demands((protect,) if protect else ()).forced(checked)
-    return addon.core.pipeline.decide(addon.splat_object.stored_task(checked, budget, found)).keep
+    found = addon.objects.demands.Demands((protect,) if protect else ()).forced(checked)
+    return addon.core.pipeline.decide(
+        addon.objects.splat_object.stored_task(checked, budget, found)
+    ).keep
 
 
 @pytest.fixture(autouse=True)
@@ -109,7 +111,7 @@ def score(addon):
     def score(obj, views):
         settings = addon.core.Settings("closed-form")
         scores = addon.core.score(
-            addon.splat_object.gather(addon.mesh.layout.check(obj)), views, settings
+            addon.objects.splat_object.gather(addon.mesh.layout.check(obj)), views, settings
         )
         addon.mesh.scores.store(addon.mesh.layout.check(obj), scores, settings)
 

@@ -21,7 +21,7 @@ def few(addon, room, room_cameras):  # noqa: ARG001
 
 def absorbed_in_core(addon, obj, views, budget):
     return addon.core.prune(
-        addon.splat_object.gather(addon.mesh.layout.check(obj), whole=True),
+        addon.objects.splat_object.gather(addon.mesh.layout.check(obj), whole=True),
         views,
         budget,
         absorb=True,
@@ -85,7 +85,7 @@ def test_the_command_on_an_object_writes_the_same_survivors(addon, few, room_vie
     count = len(room.data.vertices)
     out = tmp_path / "out.ply"
 
-    report = addon.splat_object.prune_object(
+    report = addon.objects.splat_object.prune_object(
         room.name, room_views, budget, addon.core.Settings(), absorb=True, output=out
     )
 
@@ -102,7 +102,7 @@ def test_saving_leaves_in_the_blend_what_apply_leaves(addon, few, room_views, tm
     expected = absorbed_in_core(addon, room, room_views, budget).absorbed
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
 
-    addon.splat_object.prune_object(
+    addon.objects.splat_object.prune_object(
         room.name, room_views, budget, addon.core.Settings(), absorb=True, save=True
     )
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))

@@ -496,6 +496,34 @@ def test_the_main_thread_answers_the_thread(addon):
         served(addon, lambda: 1 // 0)
 
 
+def test_an_answer_just_after_the_time_out_is_no_time_out(addon, monkeypatch):
+    """It arrives between the end of a wait and the look at whether there is one."""
+    timed_out, answered = threading.Event(), threading.Event()
+
+    class Late(addon.main_thread.Future):
+        def result(self, timeout=None):
+            try:
+                return super().result(timeout)
+            except TimeoutError:
+                timed_out.set()
+                answered.wait(10.0)
+                raise
+
+    monkeypatch.setattr(addon.main_thread, "Future", Late)
+    worker = addon.ui.worker.Worker(lambda _progress: addon.main_thread.call(lambda: 7))
+    timed_out.wait(0.5)  # longer than a wait for an answer
+    addon.main_thread.serve()
+    answered.set()
+
+    assert worker.result() == 7
+
+
+def test_a_time_out_of_the_function_itself_is_raised(addon):
+    """It is no answer that is late."""
+    with pytest.raises(TimeoutError, match="disk"):
+        served(addon, lambda: (_ for _ in ()).throw(TimeoutError("disk")))
+
+
 def test_a_thread_that_is_cancelled_waits_for_no_answer(addon):
     """And what it asked for is not done."""
     main_thread, calls = addon.main_thread, []

@@ -25,7 +25,7 @@ def test_the_pictures_are_those_of_what_apply_leaves(addon, room, room_cameras, 
     scene.camera = room_cameras.objects[24]
     scene.refine.ratio, scene.refine.absorb, scene.refine.views = 0.7, absorb, 16
     bpy.ops.refine.score()
-    gather, check = addon.splat_object.gather, addon.mesh.layout.check
+    gather, check = addon.objects.splat_object.gather, addon.mesh.layout.check
     before = gather(check(room), whole=True)
 
     assert bpy.ops.refine.compare() == {"FINISHED"}

@@ -29,7 +29,7 @@ def test_levels_are_objects_beside_the_original(addon, few, room_views):
     """3976 splats: 1988 and 398, those that core keeps, in a collection of their own."""
     core = addon.core
     wanted = core.lod(
-        addon.splat_object.gather(addon.mesh.layout.check(few), whole=True),
+        addon.objects.splat_object.gather(addon.mesh.layout.check(few), whole=True),
         room_views,
         core.Levels((0.5, 0.1), absorb=False),
         core.Settings("closed-form"),
@@ -98,7 +98,7 @@ def test_levels_that_cannot_be_leave_the_scene_alone(few, levels):  # noqa: ARG0
 
 def test_where_an_object_cannot_be_made_none_is(addon, few, monkeypatch):  # noqa: ARG001
     """The second level fails: collection, objects and meshes are gone again."""
-    whole, calls = addon.splat_object.apply_object, []
+    whole, calls = addon.objects.splat_object.apply_object, []
 
     def failing(checked, result):
         calls.append(1)
@@ -107,7 +107,7 @@ def test_where_an_object_cannot_be_made_none_is(addon, few, monkeypatch):  # noq
             raise addon.core.RefineError(msg)
         return whole(checked, result)
 
-    monkeypatch.setattr(addon.splat_object, "apply_object", failing)
+    monkeypatch.setattr(addon.objects.splat_object, "apply_object", failing)
     before = snapshot()
 
     with pytest.raises(RuntimeError, match="no"):

@@ -497,7 +497,7 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
     """By the eye, by the monitor icon, by excluding the collection; the command reaches all."""
     views = addon.cameras.sets.views_from_scene(bpy.context, "COLLECTION", collection=room_cameras)
     expected = addon.core.prune(
-        addon.splat_object.gather(addon.mesh.layout.check(room)),
+        addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         views,
         addon.core.Budget(ratio=0.5),
         addon.core.Settings("closed-form"),
@@ -514,11 +514,11 @@ def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_came
         bpy.context.view_layer.layer_collection.children["excluded"].exclude = True
     score(room, views)
     keep = keep_mask(addon, room, addon.core.Budget(ratio=0.5))
-    task = addon.splat_object.stored_task(
+    task = addon.objects.splat_object.stored_task(
         addon.mesh.layout.check(room), addon.core.Budget(ratio=0.5)
     )
     result = addon.core.pipeline.decide(task)
-    addon.splat_object.apply_object(addon.mesh.layout.check(room), result)
+    addon.objects.splat_object.apply_object(addon.mesh.layout.check(room), result)
 
     assert np.array_equal(keep, expected)
     assert len(room.data.vertices) == expected.sum()
@@ -536,7 +536,7 @@ def test_linked_objects_are_refused(addon, room, room_cameras, score, tmp_path):
 
     with pytest.raises(addon.core.RefineError, match="is linked from"):
         score(room, views)
-    addon.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
+    addon.objects.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
     assert _bytes(tmp_path / "out.ply") == _bytes(ROOM / "point_cloud.ply")
 
 
@@ -548,7 +548,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
     core = addon.core
     views = core.read_cameras(ROOM / "cameras.json")
     with pytest.raises(core.RefineError, match=r"^~nouser/x\.ply: cannot be found"):
-        addon.splat_object.prune_object(
+        addon.objects.splat_object.prune_object(
             "room", views, core.Budget(ratio=0.5), core.Settings(), output=Path("~nouser/x.ply")
         )
 
@@ -560,7 +560,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
         ("core.pipeline", "decide", "apply", {}),
         ("ui.import_operators", "read_splats", "import_ply", {"filepath": "in.ply"}),
         ("ui.import_operators", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),
-        ("splat_object", "write_export", "export_ply", {"filepath": "out.ply"}),
+        ("objects.splat_object", "write_export", "export_ply", {"filepath": "out.ply"}),
         ("ui.preview", "show", "preview", {}),
     ],
 )

@@ -80,9 +80,9 @@ def draw(addon, monkeypatch):
         drawn = []
         with monkeypatch.context() as patch:
             for name in ("stored_scores", "gather", "apply_object"):
-                patch.setattr(addon.splat_object, name, never)
+                patch.setattr(addon.objects.splat_object, name, never)
             for name in ("members", "stored_task", "mark_removed", "gather", "apply"):
-                patch.setattr(addon.splat_group, name, never)
+                patch.setattr(addon.objects.splat_group, name, never)
             patch.setattr(addon.mesh.attributes, "read_attribute", never)
             patch.setattr(addon.mesh.attributes, "write_attribute", never)
             for cls in addon.registration.CLASSES:
@@ -220,7 +220,7 @@ def test_each_camera_is_listed_with_what_it_sees(draw, addon, room, room_cameras
     drawn = draw()
     lines = [text for text in drawn if text.startswith("0") and ": " in text]
     counts = [int(line.split(": ")[1]) for line in lines]
-    means = addon.splat_object.gather(addon.mesh.layout.check(room)).means
+    means = addon.objects.splat_object.gather(addon.mesh.layout.check(room)).means
     local = room_views[0].rotation @ (means - room_views[0].center).T
     x = room_views[0].fx * local[0] / local[2] + room_views[0].cx
     y = room_views[0].fy * local[1] / local[2] + room_views[0].cy

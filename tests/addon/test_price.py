@@ -22,7 +22,7 @@ def chart(addon):
 def curve(addon):
     """Give a straight curve: 50 dB with 20 % removed, 30 with 80 %; absorbing gains 6 dB."""
     shares, psnr = np.array([0.2, 0.5, 0.8]), np.array([50.0, 40.0, 30.0])
-    return addon.core.quality.Quality(shares, psnr, psnr + 6.0)
+    return addon.core.estimate.quality.Quality(shares, psnr, psnr + 6.0)
 
 
 def pixel(picture, x, y):

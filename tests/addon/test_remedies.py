@@ -125,7 +125,7 @@ def test_the_command_notes_what_the_panel_warns_of(addon, imported):
     """On an object of the scene, by the cameras that the panel chooses."""
     obj = imported(splats=True, cameras=False)
     views = addon.cameras.sets.Choice.of_scene(bpy.context.scene).views(bpy.context, obj)
-    report = addon.splat_object.prune_object(
+    report = addon.objects.splat_object.prune_object(
         obj.name,
         views,
         addon.core.Budget(ratio=0.5),
@@ -355,7 +355,7 @@ def test_what_must_go_is_not_kept_and_pictures_are_without_it(addon, room, room_
     bpy.context.view_layer.update()
     bpy.ops.refine.score()
     checked = addon.mesh.layout.check(room)
-    gone = addon.demands.Demands.of_scene(bpy.context.scene).forced(checked).removed
+    gone = addon.objects.demands.Demands.of_scene(bpy.context.scene).forced(checked).removed
     curve = addon.mesh.scores.stored_scores(checked, gone).quality
     removed = np.count_nonzero(read(addon, room, "refine_remove"))
     share = (removed - gone.sum()) / (len(gone) - gone.sum())

@@ -65,7 +65,7 @@ def test_both_halves_keep_what_the_whole_room_keeps(addon, halves, room_views, m
 
     assert (plan["splats"], plan["kept"]) == (COUNT, COUNT - 27_828)
     np.testing.assert_array_equal(rows(addon, halves), np.flatnonzero(expected.keep))
-    check, gather = addon.mesh.layout.check, addon.splat_object.gather
+    check, gather = addon.mesh.layout.check, addon.objects.splat_object.gather
     left = [gather(check(obj), whole=True) for obj in halves]
     wanted = expected.survivors(core.read_ply(ROOM / "point_cloud.ply").splats())
     np.testing.assert_allclose(
@@ -123,7 +123,7 @@ def test_the_curve_is_that_of_all_and_of_no_part(addon, halves):
     settings = bpy.context.scene.refine
     settings.method, settings.views = "occlusion", 8
     bpy.ops.refine.score()
-    group, scores = addon.splat_group, addon.mesh.scores
+    group, scores = addon.objects.splat_group, addon.mesh.scores
     members = group.members(bpy.context.view_layer, addon.mesh.layout.check(halves[1]))
 
     found = group.forced(bpy.context.scene, members)
@@ -227,6 +227,6 @@ def test_one_active_object_beside_a_selection_is_worked_on_alone(addon, halves):
     """As everywhere: an active object that is not selected is the only one that is meant."""
     halves[1].select_set(False)
 
-    found = addon.splat_group.chosen(bpy.context.view_layer, halves[1])
+    found = addon.objects.splat_group.chosen(bpy.context.view_layer, halves[1])
 
     assert found == [halves[1]]

@@ -51,7 +51,7 @@ def test_save_prunes_the_object_in_the_blend(addon, scene_file):
 def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):  # noqa: ARG001
     """Nor does it write."""
     unchanged.start()
-    report = addon.splat_object.prune_object(
+    report = addon.objects.splat_object.prune_object(
         "room",
         addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None),
         addon.core.Budget(keep=1000),
@@ -71,7 +71,7 @@ def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_f
     """The message lists the splat objects of the scene."""
     views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
     with pytest.raises(addon.core.RefineError, match=r"no object 'rooom'.*splat objects: room"):
-        addon.splat_object.prune_object(
+        addon.objects.splat_object.prune_object(
             "rooom", views, addon.core.Budget(ratio=0.5), addon.core.Settings(), **options
         )
 
@@ -80,7 +80,7 @@ def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_ca
     """There is no file to save to."""
     views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
     with pytest.raises(addon.core.RefineError, match="not saved in a"):
-        addon.splat_object.prune_object(
+        addon.objects.splat_object.prune_object(
             "room", views, addon.core.Budget(ratio=0.5), addon.core.Settings(), save=True
         )
     assert len(room.data.vertices) == 39755
@@ -123,14 +123,14 @@ def test_an_unevenly_scaled_object_is_scored_as_it_stands_in_the_world(addon, co
     obj = bpy.data.objects.new("stretched", mesh)
     obj.scale = (1.0, 2.0, 1.0)
     bpy.context.scene.collection.objects.link(obj)
-    splats = addon.splat_object.gather(addon.mesh.layout.check(obj))
+    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(obj))
 
     assert np.allclose(splats.means[:, 1], 2 * columns["y"])
     assert np.allclose(
         np.sort(splats.log_scales, axis=1), [-3.0, -3.0, math.log(2) - 3.0], atol=1e-5
     )
     with pytest.raises(core.RefineError, match="make the object's scale uniform"):
-        addon.splat_object.export_object(
+        addon.objects.splat_object.export_object(
             addon.mesh.layout.check(obj), tmp_path / "out.ply", apply_transform=True
         )
     assert not (tmp_path / "out.ply").exists()
@@ -144,10 +144,10 @@ def test_an_export_with_the_transform_is_the_moved_splats(addon, core, room, tmp
         @ mathutils.Matrix.Scale(2.0, 4)
     )
     bpy.context.view_layer.update()
-    addon.splat_object.export_object(
+    addon.objects.splat_object.export_object(
         addon.mesh.layout.check(room), tmp_path / "moved.ply", apply_transform=True
     )
-    addon.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "kept.ply")
+    addon.objects.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "kept.ply")
     file = core.read_ply(PLY)
     expected = core.affine.transformed(
         file.splats(), np.array(room.matrix_world, np.float64), rotate_sh=True
@@ -171,7 +171,7 @@ def test_normals_turn_with_the_transform(addon, core, make_splats, tmp_path):
     obj = bpy.data.objects.new("turned", mesh)
     obj.rotation_euler.z = math.pi / 2
     bpy.context.scene.collection.objects.link(obj)
-    addon.splat_object.export_object(
+    addon.objects.splat_object.export_object(
         addon.mesh.layout.check(obj), tmp_path / "out.ply", apply_transform=True
     )
     rows = core.read_ply(tmp_path / "out.ply").rows
@@ -183,7 +183,7 @@ def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):  # no
     """Someone deleted a vertex while the scoring ran."""
     views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
     scores = addon.core.score(
-        addon.splat_object.gather(addon.mesh.layout.check(room)),
+        addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         views,
         addon.core.Settings("closed-form"),
     )
@@ -198,7 +198,7 @@ def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):  # no
 def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, room, room_views):
     """The thread of the window: same scores; after `cancel` its result raises `Cancelled`."""
     core = addon.core
-    splats = addon.splat_object.gather(addon.mesh.layout.check(room))
+    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(room))
     worker = addon.ui.worker.Worker(
         lambda progress: core.pipeline.score(splats, room_views, progress=progress)
     )
@@ -217,7 +217,7 @@ def test_a_pruned_object_is_imported_and_pruned_again(addon, room, room_cameras,
     for _ in range(2):
         bpy.ops.refine.score()
         bpy.ops.refine.apply()
-    addon.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
+    addon.objects.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
 
     assert len(addon.core.read_ply(tmp_path / "out.ply")) == 39755 - 19877 - 9939
 
@@ -226,8 +226,8 @@ def test_modifiers_that_could_move_splats_are_mentioned(addon, room):
     """What is scored and exported is the mesh itself; our preview and KIRI's drawing move none."""
     addon.ui.preview.show(room, "COLOR")
     room.modifiers.new("KIRI_3DGS_Render_GN", "NODES")
-    quiet = addon.splat_object.modifier_notes(room)
+    quiet = addon.objects.splat_object.modifier_notes(room)
     room.modifiers.new("Wave", "WAVE")
 
     assert quiet == []
-    assert "without its modifiers (Wave)" in addon.splat_object.modifier_notes(room)[0]
+    assert "without its modifiers (Wave)" in addon.objects.splat_object.modifier_notes(room)[0]

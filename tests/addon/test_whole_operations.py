@@ -84,7 +84,7 @@ def test_an_apply_that_fails_leaves_the_mesh_as_it_was(few, fail_at, stage):
 
 def pruned(addon, room_views, tmp_path, **options):
     """Prune the object as the command does, to a file and in the .blend."""
-    return addon.splat_object.prune_object(
+    return addon.objects.splat_object.prune_object(
         "room", room_views, addon.core.Budget(ratio=0.6), addon.core.Settings(views=4),
         output=tmp_path / "out.ply", save=True, **options,
     )  # fmt: skip
@@ -171,7 +171,7 @@ def noted(addon, monkeypatch):
 
         monkeypatch.setattr(module, name, noting)
 
-    note(addon.splat_object, "gather")
+    note(addon.objects.splat_object, "gather")
     note(addon.core.pipeline, "score")
     note(addon.core.pipeline, "absorb_removed")
     return references
@@ -237,7 +237,7 @@ def test_an_operation_in_a_window_is_dropped_when_it_is_over(  # noqa: PLR0917
             raise addon.core.RefineError(msg)
 
         monkeypatch.setattr(addon.mesh.scores, "store", refuse)
-        monkeypatch.setattr(addon.splat_object, "apply_object", refuse)
+        monkeypatch.setattr(addon.objects.splat_object, "apply_object", refuse)
     operator, context, said = started(name)
     assert addon.ui.running.now().operator == f"refine.{name}"
     if how == "escape":

@@ -13,7 +13,7 @@ from benchmarks.tables import flops
 from benchmarks.tables.flops import ANALYTIC, READINGS, Counting
 from refine_addon.core.pipeline import Settings
 from refine_addon.core.scoring import closed_form
-from refine_addon.core.scoring.closed_form import ClosedForm
+from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.splats import Splats
 from refine_addon.core.views import View, ViewSet
 

@@ -176,7 +176,7 @@ def test_a_file_that_would_run_code_is_refused(tmp_path: Path) -> None:
 
 @pytest.fixture
 def few(monkeypatch: pytest.MonkeyPatch) -> evaluate.Scene:
-    """500 splats of the room and one view that judges, in place of any scene that is read."""
+    """500 splats of the room and one held-out view, in place of any scene that is read."""
     room = evaluate.read_scene(ROOM)
     few = replace(room, splats=room.splats.take(slice(500)), test=room.test.spread(1), pictures={})
     monkeypatch.setattr(evaluate, "read_scene", lambda _: few)
@@ -215,7 +215,7 @@ def test_rap_is_part_of_the_trade_where_its_weights_are_given(tmp_path: Path) ->
         "0.5",
         "--runs",
         "1",
-        "--judged",
+        "--compared",
         "1",
         "--metrics",
         "psnr",

@@ -42,7 +42,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_without_a_split_every_eighth_view_is_held_out(small: Path) -> None:
-    """Of nine views the first and the ninth judge, the seven between decide."""
+    """Of nine views the first and the ninth are held out, the others decide."""
     names = [view.name for view in read_cameras(small / "cameras.json")]
 
     scene = evaluate.read_scene(small)
@@ -90,7 +90,7 @@ def test_every_method_of_the_core_is_measured() -> None:
 def test_the_report_says_what_was_measured(small: Path, tmp_path: Path) -> None:
     """Tables for both sets of views, the plot, the machine; no path of this machine."""
     output = tmp_path / "docs/trade.md"
-    arguments = "--methods opacity closed-form ghap-moments --ratios 0.5 --runs 1 --judged 2"
+    arguments = "--methods opacity closed-form ghap-moments --ratios 0.5 --runs 1 --compared 2"
 
     code = trade.main([str(small), *arguments.split(), "--metrics", "psnr", "ssim",
                        "--parts", "methods", "cheaper", "ablation",
@@ -154,10 +154,10 @@ def test_what_fails_is_said_and_the_rest_is_kept(
 
     made = [methods.Method("broken", methods.OURS, "", score=broken), *methods.everything()]
     monkeypatch.setattr(methods, "everything", lambda: made)
-    arguments = ["--methods", "broken", "random", "--ratios", "0.5", "--runs", "1", "--judged", "1"]
+    arguments = "--methods broken random --ratios 0.5 --runs 1 --compared 1"
     output = tmp_path / "trade.md"
 
-    code = trade.main([str(small), *arguments, "--metrics", "psnr", "--parts", "methods",
+    code = trade.main([str(small), *arguments.split(), "--metrics", "psnr", "--parts", "methods",
                        "--output", str(output)])  # fmt: skip
 
     assert code == 1
@@ -175,8 +175,8 @@ def test_a_method_that_leaves_another_number_is_told_apart(
     monkeypatch.setattr(methods, "everything", lambda: [greedy])
     output = tmp_path / "trade.md"
 
-    trade.main([str(small), "--ratios", "0.5", "--runs", "1", "--judged", "1", "--metrics", "psnr",
-                "--parts", "methods", "--output", str(output)])  # fmt: skip
+    trade.main([str(small), "--ratios", "0.5", "--runs", "1", "--compared", "1",
+                "--metrics", "psnr", "--parts", "methods", "--output", str(output)])  # fmt: skip
 
     assert "- greedy left 1,509 splats at 50%, not 1,500" in output.read_text()
 

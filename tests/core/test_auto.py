@@ -23,7 +23,9 @@ from refine_addon.core import (
     score,
     select,
 )
-from refine_addon.core.scoring import auto, occlusion, sight_lines
+from refine_addon.core.estimate.psnr import psnr_kept
+from refine_addon.core.scoring import auto, occlusion
+from refine_addon.core.seeing.ray_sample import validation_rays
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 COARSE = Occlusion(cell=16.0, density=1.0, rounds=2)
@@ -40,7 +42,7 @@ def scene():
 @pytest.mark.slow
 @pytest.mark.parametrize("tolerance", [0.5, 3.0])
 def test_pictures_lose_no_more_than_the_tolerance(tolerance):
-    """On the committed room: judged by the lines of sight of the views that `split.json` holds out.
+    """On the committed room: compared on the rays of the views that `split.json` holds out.
 
     All of 63 views against those that auto chooses, fewer at either tolerance.
     """
@@ -48,7 +50,7 @@ def test_pictures_lose_no_more_than_the_tolerance(tolerance):
     views = read_cameras(ROOM / "cameras.json")
     held = json.loads((ROOM / "split.json").read_text())["test"]
     train = views.take([k for k, view in enumerate(views) if view.name not in held])
-    unseen = sight_lines.sights(splats, views.take(
+    unseen = validation_rays(splats, views.take(
         [k for k, view in enumerate(views) if view.name in held]))  # fmt: skip
     full = score(splats, train, Settings("occlusion"))
 
@@ -56,20 +58,22 @@ def test_pictures_lose_no_more_than_the_tolerance(tolerance):
 
     assert scores.views_used < len(train)
     for ratio in auto.RATIOS:
-        best, found = (unseen.psnr(select(some, Budget(ratio=ratio))) for some in (full, scores))
+        best, found = (
+            psnr_kept(unseen, select(some, Budget(ratio=ratio))) for some in (full, scores)
+        )
         assert found > best - tolerance
 
 
 @pytest.mark.slow
 def test_where_nothing_may_be_lost_all_views_measure(scene):
-    """Also where the judges expect no gain."""
+    """Also where the validation views expect no gain."""
     scores = auto.score(*scene, 0.0, COARSE)
 
     assert scores.views_used == 16
     assert scores.facts["auto"]["loss"] == 0.0
 
 
-def test_where_all_may_be_lost_five_of_eight_blocks_measure(scene):
+def test_where_all_may_be_lost_five_of_eight_groups_measure(scene):
     """Half of 16 views, and two more; the splats count only the views used."""
     scores = auto.score(*scene, 1e9, COARSE)
 
@@ -78,8 +82,8 @@ def test_where_all_may_be_lost_five_of_eight_blocks_measure(scene):
     assert scores.facts["auto"]["views"] == 10
 
 
-def test_the_report_says_what_was_judged_and_chosen(scene):
-    """How many of the views measured, what that may lose, and how the judges came to that."""
+def test_the_report_says_what_was_expected_and_chosen(scene):
+    """How many of the views measured, what that may lose, and what the validation views told."""
     settings = Settings(occlusion=COARSE, tolerance=30.0)
 
     report = prune(*scene, Budget(ratio=0.5), settings).report
@@ -100,48 +104,48 @@ def ring(count: int) -> ViewSet:
     )
 
 
-def test_the_first_blocks_are_half_of_the_views_spread_evenly():
-    """Of 64 in a line every gap is 1 or 2, at the ends as well; each view is in one block."""
+def test_the_first_groups_are_half_of_the_views_spread_evenly():
+    """Of 64 in a line every gap is 1 or 2, at the ends as well; each view is in one group."""
     views = ring(64)
     order = [view for view, _ in views.by_distance()]
-    blocks = auto.blocks_of(views)
+    groups = auto.groups_of(views)
 
-    assert [len(block) for block in blocks] == [8] * 8
-    assert sorted(number for block in blocks for number in block) == list(range(64))
-    half = sorted(order[number].center[0] for block in blocks[:4] for number in block)
+    assert [len(group) for group in groups] == [8] * 8
+    assert sorted(number for group in groups for number in group) == list(range(64))
+    half = sorted(order[number].center[0] for group in groups[:4] for number in group)
     assert max(np.diff(half)) <= 3
     assert half[0] <= 2
     assert half[-1] >= 61
 
 
-def test_a_view_given_many_times_is_in_one_block_each_time():
-    """All 16 the same: half of them are in the first four blocks."""
-    blocks = auto.blocks_of(ViewSet((ring(1).views[0],) * 16))
+def test_a_view_given_many_times_is_in_one_group_each_time():
+    """All 16 the same: half of them are in the first four groups."""
+    groups = auto.groups_of(ViewSet((ring(1).views[0],) * 16))
 
-    assert [len(block) for block in blocks] == [2] * 8
-    assert sorted(number for block in blocks for number in block) == list(range(16))
+    assert [len(group) for group in groups] == [2] * 8
+    assert sorted(number for group in groups for number in group) == list(range(16))
 
 
 def test_few_views_all_measure(scene):
-    """Of 15 too few would be left to judge: the scores are those of occlusion to the bit."""
+    """Of 15 too few would be left to validate: the scores are those of occlusion to the bit."""
     splats, views = scene
     few = views.take(range(15))
 
     scores = auto.score(splats, few, 1e9, COARSE)
 
-    assert auto.blocks_of(few) is None
+    assert auto.groups_of(few) is None
     expected = occlusion.score(splats, few, COARSE)
     np.testing.assert_array_equal(scores.values, expected.values)
     assert scores.method == "auto"
 
 
 class Told:
-    """Judges that say what they are told: the PSNR after each number of views, dB."""
+    """Validation views that say what they are told: the PSNR after each number of views, dB."""
 
     def __init__(self, monkeypatch, *psnr) -> None:
-        """Take the place of the judges."""
+        """Take the place of the validation views."""
         self.left = [None if one is None else np.array(one, float) for one in psnr]
-        monkeypatch.setattr(sight_lines.SightLines, "judged", lambda *_, **__: self.left.pop(0))
+        monkeypatch.setattr(auto, "psnr_by_views", lambda *_, **__: self.left.pop(0))
 
 
 @pytest.mark.parametrize(
@@ -167,29 +171,29 @@ def test_what_an_eighth_gained_tells_what_the_rest_would(
 
 
 @pytest.mark.parametrize("known", [(None, [30.0] * 4), ([30.0] * 4, None), (None, None)])
-def test_judges_that_see_too_little_leave_it_to_all_views(monkeypatch, scene, known):
+def test_validation_views_that_see_too_little_leave_it_to_all_views(monkeypatch, scene, known):
     """Whatever may be lost."""
     Told(monkeypatch, *known)
 
     assert auto.score(*scene, 1e9, COARSE).views_used == 16
 
 
-def test_rankings_are_judged_by_views_that_did_not_measure(monkeypatch, scene):
-    """Two blocks of eight judge what five measured; what they meet is noted before."""
-    judged = []
+def test_rankings_are_compared_by_views_that_did_not_measure(monkeypatch, scene):
+    """Two groups of eight validate what five measured; their rays are cast before."""
+    compared = []
 
-    def note(self, _values, shares, views, **_):
-        judged.append(views)
+    def note(sample, _values, shares, views, **_):
+        compared.append(views)
         assert shares == auto.RATIOS
-        assert all(self.lines[number] is not None for number in views)
+        assert all(sample.rays[number] is not None for number in views)
         return np.array([30.0] * 4)
 
-    monkeypatch.setattr(sight_lines.SightLines, "judged", note)
+    monkeypatch.setattr(auto, "psnr_by_views", note)
 
     auto.score(*scene, 1.0, COARSE)
 
-    blocks = auto.blocks_of(scene[1])
-    assert judged == [blocks[5] + blocks[6]] * 2
+    groups = auto.groups_of(scene[1])
+    assert compared == [groups[5] + groups[6]] * 2
 
 
 def test_a_threshold_is_refused(scene):
@@ -219,7 +223,7 @@ def test_progress_never_goes_back(scene):
 
 
 def test_scores_depend_on_no_order_of_views(scene):
-    """Backwards: the same views measure first, and the same judge."""
+    """Backwards: the same views measure first, and the same validate."""
     splats, views = scene
     backwards = views.take(range(15, -1, -1))
 

@@ -11,8 +11,8 @@ from refine_addon.core import Cleaning, View, ViewSet, clean
 from refine_addon.core.cleaning import clean as cleaning
 from refine_addon.core.cleaning import sight
 from refine_addon.core.cleaning.clean import REASONS
-from refine_addon.core.scoring import projection
-from refine_addon.core.scoring.sight_lines import SightLines
+from refine_addon.core.seeing import projection
+from refine_addon.core.seeing.ray_sample import RaySample
 
 from .test_cleaning import FLOATER, SIDE, cameras, joined, made, wall
 
@@ -224,15 +224,15 @@ def test_a_splat_lies_where_it_is_densest_on_a_line(monkeypatch):
     views = ViewSet((View(np.eye(3), np.zeros(3), 60, 60, 8, 8, 16, 16, name="a"),))
     gaussians, scene, _ = projection.prepare(splats, views)
     footprints = projection.project(gaussians, scene, views.views[0])
-    sights, told, depths = SightLines(views.by_distance(), gaussians, splats), [], sight._depths
+    sample, told, depths = RaySample(views.by_distance(), gaussians, splats), [], sight._depths
 
-    def noted(camera, view, own, lines, there):
-        told.append((lines.columns[lines.line[there] % len(lines.columns)], camera[0][2]))
-        told.append(depths(camera, view, own, lines, there))
+    def noted(camera, view, own, rays, there):
+        told.append((rays.columns[rays.ray[there] % len(rays.columns)], camera[0][2]))
+        told.append(depths(camera, view, own, rays, there))
         return told[-1]
 
     monkeypatch.setattr(sight, "_depths", noted)
-    sight.look(gaussians, footprints, scene, sights, 0, np.zeros(1, np.bool_))
+    sight.look(gaussians, footprints, scene, sample, 0, np.zeros(1, np.bool_))
 
     (columns, center), found = told
     np.testing.assert_allclose(found / center[0], 1.0 + (columns + 0.5 - 8.0) / 60.0, rtol=0.001)

@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core import ClosedForm, RefineError, Splats, View, ViewSet
-from refine_addon.core.frustum import Frustums
 from refine_addon.core.scene import principal_axes
 from refine_addon.core.scoring import closed_form, closed_form_block
+from refine_addon.core.seeing.frustum import Frustums
 
 READINGS = [
     ClosedForm(),
@@ -387,7 +387,7 @@ def test_scaling_moving_and_turning_the_scene_keeps_the_scores(seed, exponent, m
 
 @pytest.mark.parametrize(("chunk", "threads", "block"), [(7, 1, 64), (64, 3, 2), (4096, 2, 1)])
 def test_chunks_threads_and_view_blocks_change_nothing(monkeypatch, chunk, threads, block):
-    """Only sums of float64 are split differently, and runs are seen by other views."""
+    """Chunks and blocks split sums of float64 differently; threads change no bit."""
     splats, views = random_scene(5)
     expected = closed_form.score(splats, views, threads=1)
     monkeypatch.setattr(closed_form_block, "_CHUNK", chunk)
@@ -397,6 +397,8 @@ def test_chunks_threads_and_view_blocks_change_nothing(monkeypatch, chunk, threa
     scores = closed_form.score(splats, views, threads=threads)
 
     np.testing.assert_allclose(scores.values, expected.values, rtol=1e-6)
+    alone = closed_form.score(splats, views, threads=1)
+    np.testing.assert_array_equal(scores.values, alone.values)
     np.testing.assert_array_equal(scores.seen, expected.seen)
 
 

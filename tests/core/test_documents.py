@@ -19,6 +19,8 @@ FILES = [
     for path in (ROOT / folder).rglob("*")
     if path.is_file()
 ] + ["/" + path.name for path in ROOT.iterdir() if path.is_file()]
+MOST_WORDS = 120
+"""Of an entry of docs/decisions.md."""
 TESTS = {
     name
     for path in (ROOT / "tests").rglob("test_*.py")
@@ -71,3 +73,34 @@ def test_every_link_leads_somewhere(document):
             lines = file.read_text(encoding="utf-8").splitlines()
             headings = [line.lstrip("# ").lower() for line in lines if line.startswith("#")]
             assert heading in [re.sub(r"[^\w -]", "", line).replace(" ", "-") for line in headings]
+
+
+def decisions():
+    """Return the subjects of docs/decisions.md, and its entries: their headings and texts."""
+    text = (ROOT / "docs/decisions.md").read_text(encoding="utf-8")
+    parts = re.split(r"^(##+) (.+)\n", text, flags=re.MULTILINE)[1:]
+    heads = list(zip(*[iter(parts)] * 3, strict=True))
+    subjects = [head for level, head, _ in heads if level == "##"]
+    return text, subjects, {head: body for level, head, body in heads if level == "###"}
+
+
+def test_each_decision_is_dated_and_short():
+    """Two to five sentences and what was rejected: 120 words, links counted by their texts."""
+    _, _, entries = decisions()
+
+    wrong = [
+        head
+        for head, body in entries.items()
+        if not re.search(r"\(\d{4}-\d\d-\d\d\)$", head)
+        or len(re.sub(r"\]\([^)]*\)", "]", body).split()) > MOST_WORDS
+    ]
+
+    assert entries
+    assert wrong == []
+
+
+def test_the_table_of_decisions_has_every_subject():
+    """In the order of the page."""
+    text, subjects, _ = decisions()
+
+    assert re.findall(r"^\| \[([^]]+)\]", text, re.MULTILINE) == subjects

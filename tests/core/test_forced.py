@@ -129,7 +129,7 @@ def test_scores_of_what_is_left_decide_as_well_as_a_pruning_that_scores(
 
     assert np.array_equal(scores.values == 0.0, removed)
     expected = prune(splats, views, budget, settings, removed=removed)
-    for given in (scores, replace(scores, sights=None)):
+    for given in (scores, replace(scores, ray_sample=None)):
         assert np.array_equal(decide(replace(task, scores=given)).keep, expected.keep)
 
 
@@ -141,6 +141,27 @@ def test_what_was_forced_out_when_scored_and_is_no_more_has_no_score(splats, vie
 
     with pytest.raises(RefineError, match=r"splats had to go when the others were scored"):
         decide(task)
+
+
+@pytest.mark.parametrize("now", ["another", "none"])
+def test_a_splat_without_a_score_is_known_by_its_row_not_by_their_number(splats, views, now):
+    """The best splat is forced out, one cannot be drawn; then that one is forced out, or none is.
+
+    One zero is then that of a splat that was never scored, as many as there are undrawable ones.
+    """
+    logits = splats.opacity_logits.copy()
+    logits[5] = np.nan
+    splats = replace(splats, opacity_logits=logits)
+    settings = Settings("closed-form")
+    best = int(np.argmax(score(splats, views, settings).values))
+    every = np.arange(COUNT)
+    scores = score(splats, views, settings, removed=every == best)
+    removed = every == 5 if now == "another" else None
+
+    with pytest.raises(RefineError, match=r"^1 splats had to go when the others were scored"):
+        decide(Task(Budget(ratio=0.5), scores=scores, removed=removed))
+
+    assert not decide(Task(Budget(ratio=0.5), scores=scores, removed=every == best)).keep[best]
 
 
 def test_more_than_was_forced_out_when_scored_goes_by_the_scores_there_are(splats, views, removed):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import struct
 from importlib.util import find_spec
@@ -23,8 +24,10 @@ from refine_addon.core import (
 )
 from refine_addon.core.formats import registry
 from refine_addon.core.formats.registry import SUFFIXES
+from refine_addon.core.picture_files import PictureFiles
 from refine_addon.core.splats import base_color, opacity, opacity_logits, rotation_matrices
 from tests.strategies import ply_of, splat_names
+from tests.users import own_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -278,6 +281,30 @@ def test_survivors_that_absorbed_are_written_as_they_became(tmp_path, suffix, ca
     assert len(kept) == len(plain) == 300
     for name in ("opacity", "color"):
         assert differences(kept, plain)[name] <= 2 * BOUNDS[suffix][name], name
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs permissions")
+def test_a_file_that_may_not_be_read_is_replaced(cameras):
+    """The new one may not be read either: what it rounds is not told, where the run had failed.
+
+    Pictures are those of what was written before it was rounded.
+    """
+    with own_folder() as folder:
+        (folder / "in.ply").write_bytes(ply_of(scene()))
+        output = folder / "out.splat"
+        output.write_bytes(b"old")
+        output.chmod(0o200)
+
+        report = prune_file(
+            folder / "in.ply", output, cameras, Budget(keep=300), overwrite=True,
+            pictures=PictureFiles(folder, "a"), threads=1,
+        ).report  # fmt: skip
+
+        assert report["written_psnr"] is None
+        assert len(report["pictures"]["views"]) == 2
+        assert output.stat().st_mode & 0o777 == 0o200
+        output.chmod(0o600)
+        assert len(read_splats(output)) == 300
 
 
 @pytest.fixture(scope="module")

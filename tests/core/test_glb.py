@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import RefineError, read_splats
+from refine_addon.core.formats.glb_document import Document
 from refine_addon.core.spherical_harmonics import colors
 from refine_addon.core.splats import rotation_matrices
 
@@ -217,15 +218,15 @@ FAULTS = {
     "a huge number": (_set("nodes", 0, "scale", [10**400] * 3), "nodes[0]: scale: a number too l"),
     "flat": (
         _set("nodes", 0, "scale", [1, 1, 0]),
-        "meshes[0].primitives[0]: its node: the transfo",
+        "nodes[0]: the transform is flat",
     ),
     "stretched": (
         _set("nodes", 0, "scale", [1, 2, 1]),
-        "meshes[0].primitives[0]: its node: the tr",
+        "nodes[0]: the transform scales",
     ),
     "not finite": (
         _set("nodes", 0, "translation", [float("inf"), 0, 0]),
-        "meshes[0].primitives[0]: its node: expected a finite",
+        "nodes[0]: expected a finite",
     ),
     "triangles": (_set(*PRIMITIVE, "mode", 4), "meshes[0].primitives[0]: mode is 4, expected 0"),
     "a kernel": (
@@ -303,15 +304,78 @@ def test_what_is_wrong_is_named_with_its_place(tmp_path, name):
 
 
 def test_a_few_bytes_do_not_become_many_splats(tmp_path):
-    """300 nodes that show one mesh of 100 splats are 30,000 in 15 KB, which is refused."""
+    """300 nodes that show one mesh of 100 splats are 30,000 in 16 KB, refused on the way."""
     content, binary = document({name: rows * 50 for name, rows in VALUES.items()})
     content["nodes"] = [{"mesh": 0}] * 300
     content["scenes"] = [{"nodes": list(range(300))}]
     path = tmp_path / "a.glb"
     path.write_bytes(packed(content, binary))
 
-    with pytest.raises(RefineError, match=r"its nodes show 30000 splats, expected at most \d{5}$"):
+    with pytest.raises(
+        RefineError, match=r"its nodes show 16\d00 splats or more, expected at most 16\d{3}, t"
+    ):
         read_splats(path)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_mesh_is_read_once_however_many_nodes_show_it(tmp_path, monkeypatch, count):
+    """200 nodes with 20 primitives of 8 attributes each: 160 accessors are read, not 32,000.
+
+    Those without splats were built, and then not counted; those with splats before they were.
+    """
+    content, binary = document()
+    for accessor in content["accessors"]:
+        accessor["count"] = count
+    content["meshes"][0]["primitives"] *= 20
+    content["nodes"] *= 200
+    content["scenes"] = [{"nodes": list(range(200))}]
+    path = tmp_path / "a.glb"
+    path.write_bytes(packed(content, binary))
+    accessors = []
+    accessor = Document.accessor
+    monkeypatch.setattr(
+        Document, "accessor", lambda *given: accessors.append(1) or accessor(*given)
+    )
+
+    assert len(read_splats(path)) == 200 * 20 * count
+    assert len(accessors) == 20 * 8
+
+
+def test_every_node_shows_the_mesh_where_it_stands(read):
+    """Three nodes with one mesh: moved by 5 along x, not moved, moved by 7; x then changes sign."""
+    content, binary = document()
+    content["nodes"] = [{"mesh": 0, "translation": [x, 0, 0]} for x in (5, 0, 7)]
+    content["scenes"] = [{"nodes": [0, 1, 2]}]
+
+    splats = read(content, binary)
+
+    assert splats.means[:, 0].tolist() == [-6.0, -9.0, -1.0, -4.0, -8.0, -11.0]
+    assert (splats.sh_dc[:2] == splats.sh_dc[4:]).all()
+
+
+@pytest.mark.parametrize("scale", [1e200, 1e-200])
+def test_a_scale_that_no_splat_can_have_is_refused(tmp_path, scale):
+    """Its third power is no number of 64 bits: there was a warning of NumPy's, or a traceback."""
+    content, binary = document()
+    content["nodes"][0]["scale"] = [scale] * 3
+    (tmp_path / "a.glb").write_bytes(packed(content, binary))
+
+    with (
+        np.errstate(all="raise"),
+        pytest.raises(RefineError, match=r"nodes\[0\]: the transform sc"),
+    ):
+        read_splats(tmp_path / "a.glb")
+
+
+def test_positions_that_a_node_moves_beyond_float32_are_infinite(read):
+    """Which cannot be drawn; 4e38 is beyond."""
+    content, binary = document()
+    content["nodes"][0]["translation"] = [4e38, 0, 0]
+
+    with np.errstate(all="raise"):
+        splats = read(content, binary)
+
+    assert splats.means[:, 0].tolist() == [-np.inf, -np.inf]
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,7 @@ from refine_addon.core import (
     read_splats,
 )
 from refine_addon.core.absorbing import absorb as absorbing
+from refine_addon.core.estimate.psnr import psnr_against
 from refine_addon.core.formats.ply import SplatFile
 from refine_addon.core.levels import distance
 from refine_addon.core.levels.distance import Lookout, Reach
@@ -183,9 +184,9 @@ def test_the_psnr_of_a_level_is_against_the_original():
     """The estimate of the second level is that of its splats against all, not against the first."""
     splats, views = colourful(), cameras()
     levels = lod(splats, views, Levels((0.5, 0.2)))
-    sights = pipeline.score(splats, views, Settings("occlusion")).sights
+    sample = pipeline.score(splats, views, Settings("occlusion")).ray_sample
 
-    assert levels[1].psnr == pytest.approx(sights.against(levels[1].splats, views), abs=0.01)
+    assert levels[1].psnr == pytest.approx(psnr_against(sample, levels[1].splats, views), abs=0.01)
 
 
 @pytest.mark.parametrize(

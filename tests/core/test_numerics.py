@@ -27,8 +27,8 @@ from refine_addon.core import (
 )
 from refine_addon.core.absorbing import merge_field, merge_graph
 from refine_addon.core.pipeline import absorb_removed
-from refine_addon.core.scoring import froxels, projection
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
+from refine_addon.core.seeing import points, projection
 from refine_addon.core.splats import drawable, opacity
 
 FINITE = [
@@ -579,7 +579,7 @@ def test_the_size_of_the_pieces_of_work_changes_nothing_with_occlusion(monkeypat
     expected = score(splats, views, settings, threads=1)
     survivors = absorb_removed(splats, views, 100, settings, threads=1)
     for module, name, size in (
-        (froxels, "_BLOCK", 50),
+        (points, "_BLOCK", 50),
         (projection, "_CHUNK", 7),
         (merge_field, "_CHUNK", 11),
         (merge_graph, "_CHUNK", 13),

@@ -10,9 +10,11 @@ import pytest
 
 from refine_addon.core import Cancelled, RefineError, Splats, View, ViewSet, work
 from refine_addon.core.affine import transformed
-from refine_addon.core.scoring import coverage, froxels, measuring, occlusion, projection
-from refine_addon.core.scoring.measuring import Measured, Measuring
+from refine_addon.core.scoring import coverage, occlusion
 from refine_addon.core.scoring.occlusion import Occlusion
+from refine_addon.core.seeing import froxels, lattices, measuring, projection
+from refine_addon.core.seeing import points as points_module
+from refine_addon.core.seeing.measuring import Measured, Measuring
 from refine_addon.core.splats import SH_C0, rotation_matrices
 
 ONCE = Occlusion(rounds=1)
@@ -227,7 +229,7 @@ def test_a_splat_as_narrow_as_a_cell_is_half_even():
 
 def test_every_lattice_has_the_moments_of_the_normal_distribution():
     """Shares sum to 1, means are 0, variances 1, or 0 of a single point."""
-    for lattice in froxels.lattices()[:-1]:
+    for lattice in lattices.lattices()[:-1]:
         points, shares = lattice.points.astype(float), lattice.shares.astype(float)
 
         assert shares.sum() == pytest.approx(1.0, abs=1e-5)
@@ -483,18 +485,18 @@ def test_parts_of_the_views_take_turns_and_make_up_the_whole():
     assert occlusion.measure_part(splats, ring(1), ONCE, 5, 3)[1] == 1.0
 
 
-def test_views_are_measured_once_and_lines_of_sight_tell_the_rest(monkeypatch):
-    """All rounds after the first ask the lines that were noted then."""
+def test_views_are_measured_once_and_scoring_rays_tell_the_rest(monkeypatch):
+    """All rounds after the first ask the rays that were cast then."""
     asked = []
 
-    def blocks(self, *args, which=None, original=Measuring.blocks, **changes):
-        asked.append(which)
-        return original(self, *args, which=which, **changes)
+    def measure_groups(self, gaussians, groups, *args, original=Measuring.measure_groups):
+        asked.append(groups)
+        return original(self, gaussians, groups, *args)
 
-    monkeypatch.setattr(Measuring, "blocks", blocks)
+    monkeypatch.setattr(Measuring, "measure_groups", measure_groups)
     occlusion.score(cloud(1000), ring(11), threads=1)
 
-    assert [list(which) for which in asked] == [list(range(8))]
+    assert [list(groups) for groups in asked] == [list(range(8))]
 
 
 def test_a_round_orders_what_it_removes_and_the_next_one_the_rest_anew():
@@ -764,13 +766,13 @@ def test_cells_grow_until_the_points_of_a_view_fit_the_memory(monkeypatch):
     means = rng.uniform([-0.7, -0.5, 2], [0.7, 0.5, 2], size=(4000, 3))
     splats, view = splats_of(means, scales=0.15), look_along_z()
     footprints = projection.project(*projection.prepare(splats, ViewSet((view,)))[:2], view)
-    free = froxels.cell_size(footprints, view, 4.0, 3.2)
-    monkeypatch.setattr(froxels, "MAX_POINTS", 20_000)
+    free = points_module.cell_size(footprints, view, 4.0, 3.2)
+    monkeypatch.setattr(points_module, "MAX_POINTS", 20_000)
 
-    side = froxels.cell_size(footprints, view, 4.0, 3.2)
+    side = points_module.cell_size(footprints, view, 4.0, 3.2)
 
     assert free == 4.0
-    assert len(froxels.scatter(footprints, view, side, 3.2).owners) <= 2 * 20_000
+    assert len(points_module.scatter(footprints, view, side, 3.2).owners) <= 2 * 20_000
 
 
 @pytest.mark.parametrize("scale", [1, 4, 16])
@@ -787,9 +789,9 @@ def test_cells_follow_the_footprints_not_the_pixels(count, scale):
     )
     view = look_along_z(width=400 * scale, height=300 * scale)
 
-    side = froxels.cell_size(footprints, view, 4.0, 1.0)
+    side = points_module.cell_size(footprints, view, 4.0, 1.0)
 
-    cells = max(froxels.FEW_CELLS, count / froxels.FOOTPRINTS)
+    cells = max(points_module.FEW_CELLS, count / points_module.FOOTPRINTS)
     assert side == pytest.approx(max(4.0, 1.01 * math.sqrt(view.width * view.height / cells)))
 
 
@@ -800,7 +802,7 @@ def test_a_view_of_many_splats_is_cancelled_within(monkeypatch):
     1 + 6 of them, and whichever answers ``False`` is the last.
     """
     monkeypatch.setattr(projection, "_CHUNK", 50)
-    monkeypatch.setattr(froxels, "_BLOCK", 50)
+    monkeypatch.setattr(points_module, "_BLOCK", 50)
     monkeypatch.setattr(work, "_REPORT_INTERVAL", 0.0)
     steps = []
 
@@ -859,7 +861,7 @@ def test_cells_stop_growing_where_each_footprint_needs_a_point_of_its_own(large,
         np.arange(count), both, both, both, both, np.ones(count, bool), sigmas
     )
 
-    side = froxels.cell_size(footprints, look_along_z(), 4.0, 2.0)
+    side = points_module.cell_size(footprints, look_along_z(), 4.0, 2.0)
 
     assert side == pytest.approx(4.0 * 2.0 ** (steps / 4))
 
@@ -872,9 +874,9 @@ def test_an_image_of_any_shape_has_few_enough_cells():
         view = replace(ring()[0], width=width, height=height, cx=width / 2, cy=height / 2)
         footprints = projection.project(*projection.prepare(splats, ViewSet((view,)))[:2], view)
 
-        side = froxels.cell_size(footprints, view, 4.0, 3.2)
+        side = points_module.cell_size(footprints, view, 4.0, 3.2)
 
-        assert math.ceil(width / side) * math.ceil(height / side) <= froxels.MAX_CELLS
+        assert math.ceil(width / side) * math.ceil(height / side) <= points_module.MAX_CELLS
         assert np.isfinite(occlusion.score(splats, ViewSet((view,)), ONCE).values).all()
 
 
@@ -913,9 +915,9 @@ def test_weights_that_are_nearly_as_good_do_not_jump():
 def plain_points(footprints, view, side, density) -> dict[tuple[int, int], float]:
     """Return the share of each footprint, front to back, that lies in each cell, point by point."""
     found: dict[tuple[int, int], float] = {}
-    kinds = froxels._kinds(footprints, view, density / side)
+    kinds = points_module._kinds(footprints, view, density / side)
     for row, kind in enumerate(kinds):
-        lattice = froxels.lattices()[kind]
+        lattice = lattices.lattices()[kind]
         axes = np.stack([footprints.major[:, row], footprints.minor[:, row]], axis=1)
         place = footprints.centers[:, row][:, None] + axes @ lattice.points  # (2, k)
         for (x, y), share in zip(place.T, lattice.shares, strict=True):
@@ -937,7 +939,7 @@ def test_points_lie_where_their_lattices_put_them_in_and_across_the_image():
     splats.means[:, 2] = np.maximum(splats.means[:, 2], -1.0)  # none fills the image
     footprints = projection.project(*projection.prepare(splats, ViewSet((view,)))[:2], view)
 
-    points = froxels.scatter(footprints, view, 4.0, 3.7)
+    points = points_module.scatter(footprints, view, 4.0, 3.7)
 
     expected = plain_points(footprints, view, 4.0, 3.7)
     assert sorted(points.owners[points.shares > 0].tolist()) == sorted(row for row, _ in expected)
@@ -949,7 +951,7 @@ def test_points_lie_where_their_lattices_put_them_in_and_across_the_image():
     assert 0.1 < np.mean(inside < 0.99) < 0.9
     np.testing.assert_allclose(points.inside, inside, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(points.squares, squares, rtol=1e-4, atol=1e-6)
-    of_cells = np.add.reduceat(points.shares, np.cumsum(points.columns) - points.columns)
+    of_cells = np.add.reduceat(points.shares, np.cumsum(points.counts) - points.counts)
     cells = sorted({cell for _, cell in expected})
     totals = [sum(s for (_, c), s in expected.items() if c == cell) for cell in cells]
     np.testing.assert_allclose(of_cells, totals, rtol=1e-4)

@@ -16,8 +16,9 @@ from refine_addon.core.errors import Cancelled
 from refine_addon.core.picture_files import KINDS, PictureFiles, chosen, in_words
 from refine_addon.core.pictures import AMPLIFIED, Comparison, compare, fitted
 from refine_addon.core.png import png
-from refine_addon.core.scoring import projection
-from refine_addon.core.scoring.sight_lines import colors_from, meet
+from refine_addon.core.seeing import projection
+from refine_addon.core.seeing.cast import cast
+from refine_addon.core.seeing.ray_sample import colors_from
 from refine_addon.core.views import View, ViewSet
 
 C0 = 0.28209479177387814
@@ -96,8 +97,8 @@ def test_a_picture_is_what_the_lines_of_sight_through_all_its_pixels_see(size):
     footprints = projection.project(gaussians, scene, view)
     expected = np.empty((3, size[1], size[0]))
     for row in range(size[1]):
-        lines = meet(footprints, np.arange(size[0]), np.array([row]))
-        expected[:, row] = lines.colors(colors_from(splats, gaussians.index[lines.met], view))
+        rays = cast(footprints, np.arange(size[0]), np.array([row]))
+        expected[:, row] = rays.colors(colors_from(splats, gaussians.index[rays.hit], view))
 
     (found,) = compare(splats, splats, views)
 

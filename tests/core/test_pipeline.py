@@ -33,10 +33,10 @@ from refine_addon.core import (
 )
 from refine_addon.core.pipeline import decide
 from refine_addon.core.scene import principal_axes
-from refine_addon.core.scoring import froxels, projection
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
-from refine_addon.core.scoring.closed_form import LUMA
-from refine_addon.core.scoring.measuring import Measured
+from refine_addon.core.scoring.closed_form_block import LUMA
+from refine_addon.core.seeing import froxels, lattices, points, projection, ray_sums
+from refine_addon.core.seeing.measuring import Measured
 from refine_addon.core.selection import rank
 from refine_addon.core.task import Task
 from tests.strategies import plain_header, ply_of, splat_names
@@ -283,7 +283,7 @@ def test_occlusion_in_floats_keeps_the_splats_that_doubles_keep(
     some = views.take(range(0, len(views), every))
     settings = Settings("occlusion", occlusion=Occlusion(rounds=rounds))
     scores = score(file.splats(), some, settings)
-    for module in (projection, froxels):
+    for module in (projection, lattices, points, froxels, ray_sums):
         monkeypatch.setattr(module, "np", Doubles())
     monkeypatch.setattr(projection, "_by_depth", lambda depth: np.argsort(depth, kind="stable"))
     gaussians, frame, _ = projection.prepare(wide(file.splats()), some)

@@ -6,6 +6,7 @@ import io
 import mmap
 import os
 import re
+import time
 import tracemalloc
 import warnings
 from pathlib import Path
@@ -16,7 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from refine_addon.core import RefineError, read_ply
+from refine_addon.core import RefineError, read_ply, read_splats
 from refine_addon.core.formats.ply import REQUIRED, columns_from_splats, splats_from_columns
 from refine_addon.core.formats.ply_write import longest_line, text_lines
 from tests.strategies import (
@@ -707,6 +708,39 @@ def test_a_header_line_of_a_hundred_megabytes_costs_one(tmp_path):
     tracemalloc.stop()
 
     assert peak < 4e6
+
+
+def seconds(work, size):
+    """Return the processor time of one thread that `work(size)` takes, the least of three tries."""
+    times = []
+    for _ in range(3):
+        start = time.thread_time()
+        work(size)
+        times.append(time.thread_time() - start)
+    return min(times)
+
+
+def test_a_header_of_empty_lines_is_refused_in_time_that_grows_with_its_length(tmp_path):
+    """For eight times the length about eight times the time; it was the square, 64 times."""
+
+    def refused(size):
+        (tmp_path / "a.ply").write_bytes(b"ply" + b"\n" * size)
+        with pytest.raises(RefineError, match="header without end"):
+            read_splats(tmp_path / "a.ply")
+
+    assert seconds(refused, 32_000) < 24 * max(seconds(refused, 4_000), 1e-3)
+
+
+def test_a_row_that_ends_in_spaces_is_edited_in_time_that_grows_with_its_length():
+    """Likewise; the spaces stay, and the new number comes before them."""
+    rows = np.array([(1.0,)], [("x", "f4")])
+
+    def edit(size):
+        columns = {"n": np.array([2.0], np.float32)}
+        line = b"1" + b" " * size + b"\n"
+        assert [*text_lines(rows, [line], None, columns)] == [b"1 2.0" + b" " * size + b"\n"]
+
+    assert seconds(edit, 8_000) < 24 * max(seconds(edit, 1_000), 1e-3)
 
 
 def test_what_is_no_file_is_refused(tmp_path):

@@ -22,9 +22,13 @@ from refine_addon.core import (
     score,
     select,
 )
+from refine_addon.core.estimate.psnr import psnr_against, psnr_kept, psnr_of, quality_curve
+from refine_addon.core.estimate.quality import PSNR_CAP, SHARES, Quality, absorbed_from
 from refine_addon.core.pipeline import decide
-from refine_addon.core.quality import PSNR_CAP, SHARES, Quality, absorbed_from
-from refine_addon.core.scoring import occlusion, projection, sight_lines
+from refine_addon.core.scoring import occlusion
+from refine_addon.core.seeing import cast, projection, ray_sample
+from refine_addon.core.seeing.ray_sample import validation_rays
+from refine_addon.core.seeing.rays import Rays
 from refine_addon.core.splats import opacity
 from refine_addon.core.task import Task
 from tests.core.test_invariance import MOTIONS, moved
@@ -83,67 +87,67 @@ def half(count: int) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_lines_through_all_pixels_tell_the_psnr_of_the_picture():
-    """Five views of 80 x 60 have 24,000 pixels; with as many lines nothing is left to chance."""
+def test_rays_through_all_pixels_tell_the_psnr_of_the_picture():
+    """Five views of 80 x 60 have 24,000 pixels; with as many rays nothing is left to chance."""
     splats, views, keep = cloud(), ring(), half(300)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(sight_lines, "LINES", 1 << 20)
-        found = sight_lines.sights(splats, views)
+        patched.setattr(ray_sample, "VALIDATION_RAYS", 1 << 20)
+        found = validation_rays(splats, views)
 
-    assert [len(lines.columns) * len(lines.rows) for lines in found.lines] == [80 * 60] * 5
-    assert found.psnr(keep) == pytest.approx(psnr(splats, keep, views), abs=0.01)
+    assert [len(rays.columns) * len(rays.rows) for rays in found.rays] == [80 * 60] * 5
+    assert psnr_kept(found, keep) == pytest.approx(psnr(splats, keep, views), abs=0.01)
 
 
 @pytest.mark.slow
 def test_a_third_of_the_pixels_tell_it_nearly(monkeypatch):
     """8,192 of 24,000 pixels, of an error that is smooth over many pixels: within a quarter dB."""
     splats, views, keep = cloud(), ring(), half(300)
-    monkeypatch.setattr(sight_lines, "LINES", 1 << 13)
+    monkeypatch.setattr(ray_sample, "VALIDATION_RAYS", 1 << 13)
 
-    found = sight_lines.sights(splats, views)
+    found = validation_rays(splats, views)
 
-    assert sum(len(lines.columns) * len(lines.rows) for lines in found.lines) < 8800
-    assert found.psnr(keep) == pytest.approx(psnr(splats, keep, views), abs=0.25)
+    assert sum(len(rays.columns) * len(rays.rows) for rays in found.rays) < 8800
+    assert psnr_kept(found, keep) == pytest.approx(psnr(splats, keep, views), abs=0.25)
 
 
-def test_lines_meet_what_their_pixels_show():
-    """Each line sees the colour of its pixel in the whole picture."""
+def test_rays_hit_what_their_pixels_show():
+    """Each ray sees the colour of its pixel in the whole picture."""
     splats, views = cloud(), ring()
     gaussians, scene, _ = projection.prepare(splats, views)
     view = views[1]
-    columns, rows = sight_lines.spread(80, 9, 0.3), sight_lines.spread(60, 7, 0.8)
+    columns, rows = cast.spread(80, 9, 0.3), cast.spread(60, 7, 0.8)
 
-    lines = sight_lines.meet(projection.project(gaussians, scene, view), columns, rows)
+    rays = cast.cast(projection.project(gaussians, scene, view), columns, rows)
 
-    colors = np.array([color(splats, row, view) for row in gaussians.index[lines.met]])
+    colors = np.array([color(splats, row, view) for row in gaussians.index[rays.hit]])
     whole = picture(splats, view, views)
-    assert np.allclose(lines.colors(colors.T).T, whole[rows][:, columns].reshape(-1, 3), atol=1e-5)
+    assert np.allclose(rays.colors(colors.T).T, whole[rows][:, columns].reshape(-1, 3), atol=1e-5)
 
 
-def test_few_lines_are_right_on_average():
+def test_few_rays_are_right_on_average():
     """Minus the logarithm of a mean is too high, by half the mean's relative variance, on average.
 
     The square of an exponential variable has 5 times its squared mean as variance (24 - 4 over 4),
-    so the mean of 50 lines is too high by 10 / ln 10 * 5 / 50 / 2 = .22 dB, and mended.
+    so the mean of 50 rays is too high by 10 / ln 10 * 5 / 50 / 2 = .22 dB, and mended.
     """
     errors = np.random.default_rng(0).exponential(size=(2000, 50)) ** 2 / 2e4
     view = look_along_z(width=1000, height=1000)
     colors = np.sqrt(errors)[:, None, :] * np.ones((3, 1))
     true = -10 * math.log10(np.mean(errors))
 
-    found = np.mean([sight_lines.psnr_of(seen, 0 * seen, view) for seen in colors])
+    found = np.mean([psnr_of(seen, 0 * seen, view) for seen in colors])
     plain = np.mean([-10 * math.log10(np.mean(row)) for row in errors])
 
     assert plain - true == pytest.approx(0.22, abs=0.06)
     assert found == pytest.approx(true, abs=0.1)
 
 
-def test_lines_that_differ_from_place_to_place_are_not_taken_for_chance():
+def test_rays_that_differ_from_place_to_place_are_not_taken_for_chance():
     """An error that rises evenly from one end of the picture to the other is well sampled."""
     errors = np.linspace(0.0, 2e-4, 50)
     colors = np.sqrt(errors) * np.ones((3, 1))
 
-    found = sight_lines.psnr_of(colors, 0 * colors, look_along_z(width=1000, height=1000))
+    found = psnr_of(colors, 0 * colors, look_along_z(width=1000, height=1000))
 
     assert found == pytest.approx(40.0, abs=0.01)
 
@@ -154,58 +158,58 @@ def test_a_splat_behind_others_counts_by_what_shows_through():
     Both splats are much wider than the picture, so all pixels change by .25 c = .125.
     """
     splats = splats_of([[0, 0, 2.0], [0, 0, 3.0]], alphas=0.5, scales=100.0, gray=0.5)
-    found = sight_lines.sights(splats, ViewSet((look_along_z(),)))
+    found = validation_rays(splats, ViewSet((look_along_z(),)))
 
     for keep in ([True, False], [False, True]):
-        assert found.psnr(np.array(keep)) == pytest.approx(-20 * math.log10(0.125), abs=0.01)
+        assert psnr_kept(found, np.array(keep)) == pytest.approx(-20 * math.log10(0.125), abs=0.01)
 
 
 def test_where_nothing_goes_the_estimate_is_the_cap():
     """Equal pictures count as 100 dB."""
-    assert sight_lines.sights(cloud(), ring()).psnr(np.ones(300, np.bool_)) == PSNR_CAP
+    assert psnr_kept(validation_rays(cloud(), ring()), np.ones(300, np.bool_)) == PSNR_CAP
 
 
 def test_views_count_by_their_weights_and_those_that_see_nothing_do_not():
     """A view of weight 3 counts three times; one that looks away is no equal picture."""
     splats, (one, other, *_), keep = cloud(), ring(), half(300)
-    each = [sight_lines.sights(splats, ViewSet((view,))).psnr(keep) for view in (one, other)]
+    each = [psnr_kept(validation_rays(splats, ViewSet((view,))), keep) for view in (one, other)]
     away = replace(one, rotation=np.diag([-1.0, 1.0, -1.0]) @ one.rotation, name="away")
     weighted = ViewSet((replace(one, weight=3.0, name="one"), replace(other, name="other"), away))
 
-    found = sight_lines.sights(splats, weighted).psnr(keep)
+    found = psnr_kept(validation_rays(splats, weighted), keep)
 
     assert found == pytest.approx((3 * each[0] + each[1]) / 4, abs=0.3)
 
 
-def test_where_too_few_lines_meet_a_splat_nothing_is_estimated():
-    """One small splat in the picture is met by a few dozen of 4,800 lines: too few to say."""
+def test_where_too_few_rays_meet_a_splat_nothing_is_estimated():
+    """One small splat in the picture is hit by a few dozen of 4,800 rays: too few to say."""
     splats = splats_of([[0, 0, 2.0]], scales=0.02)
     views = ViewSet((look_along_z(),))
 
-    assert sight_lines.sights(splats, views).psnr(np.zeros(1, np.bool_)) is None
+    assert psnr_kept(validation_rays(splats, views), np.zeros(1, np.bool_)) is None
     result = prune(splats_of([[0, 0, 2.0]] * 4, scales=0.02), views, Budget(ratio=0.5),
                    Settings("occlusion"))  # fmt: skip
     assert result.report["estimated_psnr"] is None
     assert any("too little" in note for note in result.report["notes"])
 
 
-def test_in_dense_scenes_there_are_fewer_lines(monkeypatch):
-    """300 splats wider than the picture: each line meets all of them."""
+def test_in_dense_scenes_there_are_fewer_rays(monkeypatch):
+    """300 splats wider than the picture: each ray hits all of them."""
     splats = splats_of(np.tile([[0, 0, 2.0]], (300, 1)), scales=100.0)
     views = ViewSet((look_along_z(),))
-    monkeypatch.setattr(sight_lines, "MOST_MET", 300 * 500)
+    monkeypatch.setattr(ray_sample, "MAX_VALIDATION_HITS", 300 * 500)
 
-    (lines,) = sight_lines.sights(splats, views).lines
+    (rays,) = validation_rays(splats, views).rays
 
-    assert len(lines.line) == pytest.approx(300 * 500, rel=0.1)
+    assert len(rays.ray) == pytest.approx(300 * 500, rel=0.1)
 
 
 @pytest.mark.parametrize("count", [0, 1, 16, 200])
-def test_a_view_has_lines_whatever_its_shape(count):
+def test_a_view_has_rays_whatever_its_shape(count):
     """Between one and all of its pixels, each once."""
     for width, height in ((1, 1), (1, 5000), (5000, 1), (17, 3)):
         view = look_along_z(width=width, height=height)
-        columns, rows = sight_lines.pixels(view, 0, float(count))
+        columns, rows = cast.pixels(view, 0, float(count))
         assert 1 <= len(columns) * len(rows) <= width * height
         assert len(set(columns.tolist())) == len(columns)
         assert set(columns.tolist()) <= set(range(width))
@@ -222,11 +226,11 @@ def test_the_curve_is_what_each_share_reaches():
     scores = score(splats, views, Settings("occlusion"))
 
     assert scores.quality is not None
-    assert scores.sights is not None
+    assert scores.ray_sample is not None
     assert scores.quality.shares.tolist() == list(SHARES)
     for share, value in zip(SHARES, scores.quality.psnr, strict=True):
         keep = select(scores, Budget(ratio=share))
-        assert scores.sights.psnr(keep) == pytest.approx(value, abs=1e-9)
+        assert psnr_kept(scores.ray_sample, keep) == pytest.approx(value, abs=1e-9)
 
 
 def test_the_curve_is_the_mean_of_those_of_single_views():
@@ -258,9 +262,9 @@ def test_a_view_whose_splats_stay_is_not_changed():
         replace(look_along_z(), center=center, name=name)
         for center, name in zip(away, "ab", strict=True)
     ))  # fmt: skip
-    found = sight_lines.sights(splats, views)
+    found = validation_rays(splats, views)
 
-    curve = found.curve(np.arange(20, dtype=np.float32))
+    curve = quality_curve(found, np.arange(20, dtype=np.float32))
 
     assert curve.of_views(0.5) == {"a": pytest.approx(curve.views["a"][4]), "b": PSNR_CAP}
     assert curve.of_views(0.5)["a"] < 30.0
@@ -351,20 +355,20 @@ def test_fewer_splats_are_expected_to_gain_less_by_absorbing():
     assert few[0] == many[0]
 
 
-def test_on_a_line_the_nearest_that_stays_takes_over():
+def test_on_a_ray_the_nearest_kept_hit_stands_in():
     """Red, green, blue, one behind the other, alpha .5: weights .5, .25, .125 of what is seen.
 
     Without green, red or blue is as near: the one behind takes over. Without red and green, blue.
     Without all, nothing does.
     """
     line, alpha = np.zeros(3, np.int32), np.full(3, 0.5, np.float32)
-    lines = sight_lines.Lines(
+    rays = Rays(
         np.arange(1), np.arange(1), line, np.arange(3, dtype=np.int32), alpha, np.log1p(-alpha),
         np.arange(3),
     )  # fmt: skip
 
     def seen(*keep):
-        return lines.taken_over(np.eye(3), np.array(keep))[:, 0].tolist()
+        return rays.colors_by_nearest_kept(np.eye(3), np.array(keep))[:, 0].tolist()
 
     assert seen(True, True, True) == pytest.approx([0.5, 0.25, 0.125])
     assert seen(True, False, True) == pytest.approx([0.5, 0.0, 0.375])
@@ -492,44 +496,46 @@ def test_the_closed_form_says_that_it_made_no_estimate():
     assert done["notes"] == []
 
 
-def test_absorbing_looks_from_no_more_views_than_judge_it():
-    """Of 60 views every third is one of at most 24 judges: the same estimate as with all lines."""
+def test_absorbing_casts_rays_of_no_more_views_than_validate_it():
+    """Of 60 views every third validates, at most 24: the same estimate as with the rays of all."""
     splats, views = cloud(), ring(60)
     settings = occlusion.Occlusion()
-    some, _ = occlusion.score_once(splats, views, settings, judges=True)
+    some, _ = occlusion.score_once(splats, views, settings, few_views=True)
     every, _ = occlusion.score_once(splats, views, settings)
     other = replace(splats, sh_dc=splats.sh_dc + 0.1)
 
-    assert [lines is not None for lines in some.sights.lines] == [True, False, False] * 20
-    assert all(every.sights.lines)
-    assert some.sights.against(other, views) == every.sights.against(other, views)
+    assert [rays is not None for rays in some.ray_sample.rays] == [True, False, False] * 20
+    assert all(every.ray_sample.rays)
+    assert psnr_against(some.ray_sample, other, views) == psnr_against(
+        every.ray_sample, other, views
+    )
 
 
-def test_merged_splats_are_judged_against_the_original():
+def test_merged_splats_are_compared_with_the_original():
     """Those that stay as they are change nothing; with other harmonics they do."""
     splats, views = cloud(), ring()
-    found = sight_lines.sights(splats, views)
+    found = validation_rays(splats, views)
     other = replace(splats, sh_rest=splats.sh_rest + 0.5)
 
-    assert found.against(splats, views) == PSNR_CAP
-    assert found.against(other, views) < 40.0
+    assert psnr_against(found, splats, views) == PSNR_CAP
+    assert psnr_against(found, other, views) < 40.0
 
 
 def test_estimating_can_be_cancelled():
     """Wherever it is."""
     splats, views = cloud(), ring()
-    found = sight_lines.sights(splats, views)
+    found = validation_rays(splats, views)
     values = np.arange(300, dtype=np.float32)
 
     def stop(_fraction, _what):
         return False
 
     with pytest.raises(Cancelled):
-        sight_lines.sights(splats, views, progress=stop)
+        validation_rays(splats, views, progress=stop)
     with pytest.raises(Cancelled):
-        found.curve(values, progress=stop)
+        quality_curve(found, values, progress=stop)
     with pytest.raises(Cancelled):
-        found.against(splats, views, progress=stop)
+        psnr_against(found, splats, views, progress=stop)
 
 
 @pytest.mark.filterwarnings("error")
@@ -554,17 +560,17 @@ def test_extreme_splats_make_no_warning():
 
 
 def test_images_of_millions_of_pixels_a_side_are_looked_at_as_small_ones(monkeypatch):
-    """Which lines lie in a footprint is told by a table or by searching, with one result."""
+    """Which rays hit a footprint is told by a table or by searching, with one result."""
     splats, views = cloud(), ring()
-    found = sight_lines.sights(splats, views).lines
+    found = validation_rays(splats, views).rays
 
-    monkeypatch.setattr(sight_lines, "_LARGE", 0)
-    again = sight_lines.sights(splats, views).lines
+    monkeypatch.setattr(cast, "_MAX_TABLE", 0)
+    again = validation_rays(splats, views).rays
 
     for one, other in zip(found, again, strict=True):
-        np.testing.assert_array_equal(one.line, other.line)
+        np.testing.assert_array_equal(one.ray, other.ray)
         np.testing.assert_array_equal(one.owner, other.owner)
     lens = {"fx": 1e7, "fy": 1e7, "cx": 4e6, "cy": 3e6, "width": 8_000_000, "height": 6_000_000}
-    wide = sight_lines.sights(splats, ViewSet((replace(views[0], **lens),)))
-    assert wide.psnr(np.ones(len(splats), bool)) == PSNR_CAP
-    assert wide.psnr(half(len(splats))) < PSNR_CAP
+    wide = validation_rays(splats, ViewSet((replace(views[0], **lens),)))
+    assert psnr_kept(wide, np.ones(len(splats), bool)) == PSNR_CAP
+    assert psnr_kept(wide, half(len(splats))) < PSNR_CAP

@@ -174,6 +174,16 @@ def test_what_is_wrong_is_named_with_its_place(sog, name):
     tracemalloc.stop()
 
 
+def test_an_archive_without_meta_json_is_refused(sog):
+    """By its name it is a SOG file."""
+    files = content(sog)
+    del files["meta.json"]
+    pack(sog, files)
+
+    with pytest.raises(RefineError, match=re.escape(f"{sog}: no meta.json in the archive")):
+        read_splats(sog)
+
+
 def test_a_bomb_in_the_archive_is_refused(sog):
     """100 MB of zeros in 100 KB, as an image."""
     files = content(sog)

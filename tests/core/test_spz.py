@@ -7,6 +7,7 @@ import importlib
 import re
 import struct
 import tracemalloc
+import zlib
 
 import numpy as np
 import pytest
@@ -95,7 +96,10 @@ def test_version_4_says_what_is_missing(tmp_path, monkeypatch):
             "a damaged SPZ file: its gzip stream breaks at ",
         ),
         (gzip.compress(header(4) + bytes(99)), "SPZ version 4 inside of gzip"),
-        (header(4, 2**32 - 1, streams=6) + struct.pack("<I12x", 32) + bytes(96), "stream 'mean'"),
+        (
+            header(4, 2**32 - 1, streams=6) + struct.pack("<I12x", 32) + bytes(96),
+            "truncated: 4294967295 splats need ",
+        ),
         (header(4, streams=2) + struct.pack("<I12x", 32) + bytes(96), "byte 15: 2 streams, expect"),
         (header(4, streams=6) + struct.pack("<I12x", 2**32 - 1), "truncated: the table of streams"),
         (header(4, streams=6), "truncated: the first bytes of an SPZ file of version 4 need 32 b"),
@@ -188,14 +192,56 @@ def test_a_stream_that_holds_more_than_it_announces_is_refused(tmp_path):
     tracemalloc.stop()
 
 
+def test_a_count_that_the_file_is_too_small_for_is_refused(tmp_path):
+    """Zstd packs zeros 30,000 times as small: 400,000 splats of 29 bytes are 11.6 MB in 1 kB."""
+    widths = [len(part) for part in body(4)]
+    path = tmp_path / "a.spz"
+    path.write_bytes(version_4([bytes(400_000 * width) for width in widths], count=400_000))
+    assert path.stat().st_size < 2000
+    tracemalloc.start()
+
+    with pytest.raises(RefineError, match="truncated: 400000 splats need 11600000 bytes unpacked"):
+        read_splats(path)
+
+    assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    tracemalloc.stop()
+
+
+def test_what_follows_the_splats_is_read_once(tmp_path, monkeypatch):
+    """Extensions may, up to the checksum: what is left was copied for every piece of them."""
+    path = tmp_path / "a.spz"
+    extension = np.random.default_rng(0).bytes(3_000_000)
+    path.write_bytes(gzip.compress(header(3) + bytes(29) + extension, compresslevel=0))
+    handed = []
+    real = zlib.decompressobj
+
+    class Engine:
+        def __init__(self, *window, **keywords):
+            self._real = real(*window, **keywords)
+
+        def __getattr__(self, name):
+            return getattr(self._real, name)
+
+        def decompress(self, data, *limit):
+            handed.append(len(data))
+            return self._real.decompress(data, *limit)
+
+    monkeypatch.setattr(zlib, "decompressobj", Engine)
+
+    assert len(read_splats(path)) == 1
+    assert sum(handed) < 4 * path.stat().st_size
+
+
 @pytest.mark.parametrize(
-    ("scale", "fraction"), [(0.001, 23), (1.0, 17), (40.0, 12), (10_000.0, 9), (5e6, 0)]
+    ("scale", "fraction"),
+    [(0.001, 23), (1.0, 17), (40.0, 12), (10_000.0, 9), (5e6, 0), (8388607.0, 0)],
 )
 def test_the_steps_of_positions_follow_the_scene(tmp_path, scale, fraction):
     """The largest coordinate is below 2^b: 23 - b bits behind the point fit, 18 - b are enough.
 
     Between the two it is 12. .001 is below 2^-9, where 23 is the most; 1 is below 2^1, 40 below
-    2^6, 10,000 below 2^14 and 5,000,000 below 2^23.
+    2^6, 10,000 below 2^14 and 5,000,000 below 2^23. 8,388,607 is the largest whole number of 24
+    bits with a sign.
     """
     (tmp_path / "in.ply").write_bytes(plain_ply(50))
     file = read_splats(tmp_path / "in.ply")
@@ -211,12 +257,13 @@ def test_the_steps_of_positions_follow_the_scene(tmp_path, scale, fraction):
 
 
 def test_a_position_that_spz_cannot_hold_is_refused(tmp_path):
-    """24 bits with a sign end at 2^23; nothing is written."""
+    """24 bits with a sign end at 2^23 - 1, and 8388607.5 is beyond; nothing is written."""
     (tmp_path / "in.ply").write_bytes(plain_ply(3))
     file = read_splats(tmp_path / "in.ply")
 
-    with pytest.raises(RefineError, match=r"a coordinate is 1e\+07: SPZ holds coordinates up to 8"):
-        as_written(file, tmp_path / "a.spz").write(
-            tmp_path / "a.spz", columns={"x": np.full(3, 1e7, np.float32)}
-        )
+    for x, shown in ((1e7, "10000000"), (8388607.5, "8388607.5")):
+        with pytest.raises(RefineError, match=f"a coordinate is {shown}: SPZ holds coordinates up"):
+            as_written(file, tmp_path / "a.spz").write(
+                tmp_path / "a.spz", columns={"x": np.full(3, x, np.float32)}
+            )
     assert not (tmp_path / "a.spz").exists()

@@ -20,7 +20,10 @@ from refine_addon.core import (
     read_cameras,
     read_ply,
 )
-from refine_addon.core.scoring import closed_form, projection, sight_lines
+from refine_addon.core.estimate.psnr import psnr_against
+from refine_addon.core.scoring import closed_form
+from refine_addon.core.seeing import projection
+from refine_addon.core.seeing.ray_sample import validation_rays
 from refine_addon.core.splats import joined
 from refine_addon.core.tiles import absorbing, seen, units
 from refine_addon.core.tiles.seen import SceneJob
@@ -113,8 +116,10 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(
     Interrupted once, and four times in one job, when a tenth, three tenths, ... are done.
     """
     budget, settings, done = Budget(ratio=0.5), replace(OCCLUSION, views=8), []
-    measure = seen.of_view
-    monkeypatch.setattr(seen, "of_view", lambda *some: done.append(some) or measure(*some))
+    measure = seen.measure_footprints
+    monkeypatch.setattr(
+        seen, "measure_footprints", lambda *some: done.append(some) or measure(*some)
+    )
 
     def measured(folder, *stops):
         """Return how many views are measured until a job is done that is stopped some times."""
@@ -162,12 +167,14 @@ def test_absorbing_tiles_is_as_good_as_absorbing_one_file(tmp_path, views, monke
     splats = file.splats()
     whole = prune(splats, views, Budget(ratio=ratio), settings, absorb=True)
 
-    sights = sight_lines.sights(splats, views.spread(64))
+    sample = validation_rays(splats, views.spread(64))
     made = joined([read_ply(tmp_path / "out" / path.name).splats() for path in tiles])
-    one = sights.against(whole.absorbed.splats, views.spread(64))
-    assert sights.against(made, views.spread(64)) > one - 0.3
+    one = psnr_against(sample, whole.absorbed.splats, views.spread(64))
+    assert psnr_against(sample, made, views.spread(64)) > one - 0.3
     assert len(made) == told["splats"]["kept"] == whole.report["splats"]["kept"]
-    assert told["estimated_psnr"] == pytest.approx(sights.against(made, views.spread(64)), abs=0.1)
+    assert told["estimated_psnr"] == pytest.approx(
+        psnr_against(sample, made, views.spread(64)), abs=0.1
+    )
 
 
 @pytest.mark.slow
@@ -179,7 +186,7 @@ def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views,
     monkeypatch.setattr(absorbing, "REGION", 10_000)
     few, others = ViewSet(views.views[:3]), ViewSet(views.views[10::4])
     splats = read_ply(ROOM / "point_cloud.ply").splats()
-    sights = sight_lines.sights(splats, others)
+    sample = validation_rays(splats, others)
     whole = prune(splats, few, Budget(ratio=0.5), OCCLUSION, absorb=True)
 
     prune_tiles(
@@ -188,8 +195,8 @@ def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views,
 
     made = read_ply(tmp_path / "point_cloud.ply").splats()
     assert np.count_nonzero(whole.scores.seen) < 0.3 * len(splats)
-    one = sights.against(whole.absorbed.splats, others)
-    assert sights.against(made, others) > one - 0.3
+    one = psnr_against(sample, whole.absorbed.splats, others)
+    assert psnr_against(sample, made, others) > one - 0.3
 
 
 @pytest.mark.slow

@@ -11,7 +11,8 @@ import pytest
 from refine_addon.command import main
 from refine_addon.core import Budget, Settings, prune_file, read_splats
 from refine_addon.core.affine import transformed
-from refine_addon.core.written import written_facts
+from refine_addon.core.estimate.psnr import psnr_against
+from refine_addon.core.estimate.written import written_facts
 
 from .test_cleaning import cameras, wall
 from .test_command_clean import files  # noqa: F401 - a fixture
@@ -32,12 +33,12 @@ def source(tmp_path):
 
 @pytest.mark.slow
 def test_what_the_file_holds_is_compared_with_all_splats(source, tmp_path):
-    """As `SightLines.against` says of what is read from it again."""
+    """As `psnr_against` says of what is read from it again."""
     out = tmp_path / "out.splat"
 
     result = prune_file(source, out, cameras(), Budget(ratio=0.1), OCCLUSION)
 
-    wanted = result.scores.sights.against(read_splats(out).splats(), cameras())
+    wanted = psnr_against(result.scores.ray_sample, read_splats(out).splats(), cameras())
     assert result.report["written_psnr"] == pytest.approx(wanted, abs=0.006)
 
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .. import frustum, spherical_harmonics
+from .. import spherical_harmonics
 from ..rendering import LOW_PASS, NEAR_RELATIVE
+from ..seeing import frustum
 from ..splats import opacity, rotation_matrices
 from ..work import Progress, for_chunks, part, silent
 

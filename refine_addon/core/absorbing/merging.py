@@ -8,7 +8,7 @@ of their pixels; T is the transmittance in front of the splat::
 
 E is the cost of deleting the splat. The cost of replacing i and j by m is the squared error of the
 picture. The inner products ``<f, g>`` of Gaussians have a closed form, in a plane at right angles
-to the direction that the pair is viewed along (derived in docs/method.md, section 5)::
+to the direction that the pair is viewed along (derived in docs/method.md, section 7)::
 
     p = f_i - l_i f_m,  q = f_j - l_j f_m                l: share of the colour, l_i + l_j = 1
     cost = tau (|s_i|^2 <p, p> + 2 s_i.s_j <p, q> + |s_j|^2 <q, q>)

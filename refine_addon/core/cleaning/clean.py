@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from ..errors import RefineError
-from ..scoring import projection
-from ..scoring.measuring import BLOCKS
-from ..scoring.sight_lines import SightLines
+from ..seeing import projection
+from ..seeing.measuring import VIEW_GROUPS
+from ..seeing.ray_sample import RaySample
 from ..splats import refuse_undrawable
 from ..volumes import among_all, refuse_all
 from ..work import Progress, for_chunks, part, silent
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..scene import Scene
-    from ..scoring.projection import Footprints, Gaussians
+    from ..seeing.projection import Footprints, Gaussians
     from ..splats import Splats
     from ..views import ViewSet
 
@@ -265,7 +265,9 @@ def clean(  # noqa: PLR0913 - as `pipeline.prune`
     past, seen = np.zeros((2, count), np.int32)
     past[gaussians.index], seen[gaussians.index] = run.evidence.past, run.seen
     undrawable = count - int(np.count_nonzero(good))
-    return Cleaned(keep, masks, past, seen, undrawable, len(views), len(run.sights.views), settings)
+    return Cleaned(
+        keep, masks, past, seen, undrawable, len(views), len(run.ray_sample.views), settings
+    )
 
 
 class _Run:
@@ -280,7 +282,7 @@ class _Run:
         threads: int | None,
     ) -> None:
         self.gaussians, self.scene, self.threads = gaussians, scene, threads
-        self.sights = SightLines(views.by_distance(), gaussians, splats)
+        self.ray_sample = RaySample(views.by_distance(), gaussians, splats)
         self.evidence = sight.Evidence.zero(len(gaussians))
         self.seen = np.zeros(len(gaussians), np.int32)
         with np.errstate(invalid="ignore"):
@@ -325,9 +327,9 @@ class _Run:
                 if looked is not None:
                     hits, wide = looked
                     taken, held = sight.own_support(hits)
-                    light[hits.met] += taken
-                    supported[hits.met] += held
-                    widest[hits.met] = np.maximum(widest[hits.met], wide)
+                    light[hits.hit] += taken
+                    supported[hits.hit] += held
+                    widest[hits.hit] = np.maximum(widest[hits.hit], wide)
             return light, supported, widest, inside
 
         blocks = self._blocks(block, progress, "looking")
@@ -337,11 +339,11 @@ class _Run:
         self.seen = insides.sum(axis=0).astype(np.int32)
         light = lights.sum(axis=0)
         lit = light > 0.0
-        if len(self.sights.splats) and not lit.any():
+        if len(self.ray_sample.splats) and not lit.any():
             msg = (
-                f"no camera sees the splats: none of {count} that show is met from any of "
-                f"{len(self.sights.views)} views; check that cameras and splats share their frame "
-                "and unit"
+                f"no camera sees the splats: none of {count} that show is hit by a ray of "
+                f"any of {len(self.ray_sample.views)} views; check that cameras and splats share "
+                "their frame and unit"
             )
             raise RefineError(msg)
         support = supports.sum(axis=0) / np.where(lit, light, 1.0)
@@ -373,18 +375,18 @@ class _Run:
         self, number: int, absent: NDArray[np.bool_]
     ) -> tuple[Footprints, tuple[sight.Hits, NDArray[np.float32]] | None]:
         """Return the footprints of all Gaussians in a view, and `sight.look`."""
-        view = self.sights.views[number][0]
+        view = self.ray_sample.views[number][0]
         footprints = projection.project(self.gaussians, self.scene, view)
-        looked = sight.look(self.gaussians, footprints, self.scene, self.sights, number, absent)
+        looked = sight.look(self.gaussians, footprints, self.scene, self.ray_sample, number, absent)
         return footprints, looked
 
     def _blocks(
         self, work: Callable[[range], Result], progress: Progress, what: str
     ) -> list[Result]:
         """Return what `work` makes of the numbers of the views in each of some blocks."""
-        count = min(BLOCKS, len(self.sights.views))
+        count = min(VIEW_GROUPS, len(self.ray_sample.views))
         return for_chunks(
-            lambda piece: work(range(piece.start, len(self.sights.views), count)),
+            lambda piece: work(range(piece.start, len(self.ray_sample.views), count)),
             count, 1, progress=progress, what=what, threads=self.threads,
         )  # fmt: skip
 

@@ -12,7 +12,7 @@ from ..work import Progress, silent
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..scoring.projection import Gaussians
+    from ..seeing.projection import Gaussians
 
 NEIGHBOURS = 8
 """With how many near neighbours a splat may touch."""

@@ -1,6 +1,6 @@
-"""How much light stops where a splat is, on lines of sight: by itself, and beside other splats.
+"""How much light stops where a splat is, on rays: by itself, and beside other splats.
 
-A line of sight meets splats front to back. Of the light that reaches a place on it, a share stops
+A ray hits splats front to back. Of the light that reaches a place on it, a share stops
 near that place, the rest goes on to what lies behind. At a surface nearly all of it stops; at a
 floater most goes on::
 
@@ -20,21 +20,24 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..scoring import projection, sight_lines
+from ..seeing import projection
+from ..seeing.cast import cast, depth_complexity, pixels
+from ..seeing.ray_sums import in_front
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..scene import Scene
-    from ..scoring.projection import Footprints, Gaussians
-    from ..scoring.sight_lines import Lines, SightLines
+    from ..seeing.projection import Footprints, Gaussians
+    from ..seeing.ray_sample import RaySample
+    from ..seeing.rays import Rays
     from ..views import View
 
-LINES = 2500
-"""Lines of sight of a view."""
+RAYS = 2500
+"""Rays of a view."""
 
-MOST_MET = 1 << 20
-"""About how many splats the lines of a view may meet; there are fewer lines in dense scenes."""
+MAX_HITS = 1 << 20
+"""About how many hits the rays of a view may have; there are fewer rays in dense scenes."""
 
 WINDOW = 0.1
 """Share of the nearness by which places on a line differ that count as one."""
@@ -60,12 +63,12 @@ _FRACTION = 0.999  # of a line's number: nearness is packed below it
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What the lines of sight of one view meet: line by line, near to far.
+    """What the rays of one view hit: ray by ray, near to far.
 
     Attributes
     ----------
-    met : (u,) int64
-        The Gaussians that any line meets.
+    hit : (u,) int64
+        The Gaussians that any ray hits.
     owner : (h,) int32
         Which of them each hit is.
     alpha, reaching, light : (h,) float64
@@ -78,7 +81,7 @@ class Hits:
     line : (h,) float64
     """
 
-    met: NDArray[np.int64]
+    hit: NDArray[np.int64]
     owner: NDArray[np.int32]
     alpha: NDArray[np.float64]
     reaching: NDArray[np.float64]
@@ -98,19 +101,19 @@ class Hits:
         )
 
     def sums(self, rows: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return for each of `met` the sum of values, (r,), of some hits, (u,)."""
-        return np.asarray(np.bincount(self.owner[rows], values, len(self.met)), np.float64)
+        """Return for each of `hit` the sum of values, (r,), of some hits, (u,)."""
+        return np.asarray(np.bincount(self.owner[rows], values, len(self.hit)), np.float64)
 
 
 def look(
     gaussians: Gaussians,
     footprints: Footprints,
     scene: Scene,
-    sights: SightLines,
+    sample: RaySample,
     number: int,
     absent: NDArray[np.bool_],
 ) -> tuple[Hits, NDArray[np.float32]] | None:
-    """Return what the lines of sight of one view meet; None if nothing.
+    """Return what the rays of one view hit; None if nothing.
 
     Parameters
     ----------
@@ -118,45 +121,44 @@ def look(
     footprints : Footprints
         Of these in the view.
     scene : Scene
-    sights : SightLines
-        Has the views, and tells where their lines lie.
+    sample : RaySample
+        Has the views, and tells where their rays lie.
     number : int
         Of the view.
     absent : (M,) bool
-        Gaussians that take no light, though they are met.
+        Gaussians that take no light, though they are hit.
 
     Returns
     -------
     hits : Hits
     wide : (u,) float32
-        The longer standard deviation of the footprints met, as a share of the longer side.
+        The longer standard deviation of the footprints hit, as a share of the longer side.
     """
-    view = sights.views[number][0]
-    count = min(LINES, MOST_MET / max(sight_lines.crowding(footprints, view), 1.0))
-    lines = sight_lines.meet(footprints, *sight_lines.pixels(view, number, count))
-    if not len(lines.line):
+    view = sample.views[number][0]
+    count = min(RAYS, MAX_HITS / max(depth_complexity(footprints, view), 1.0))
+    rays = cast(footprints, *pixels(view, number, count))
+    if not len(rays.ray):
         return None
-    present = ~absent[lines.met].take(lines.owner)
-    dark = lines.dark * present.astype(np.float64)
-    first = np.flatnonzero(np.diff(lines.line, prepend=-1))
-    passed = np.cumsum(dark) - dark  # over all hits before, those of other lines included
-    passed -= np.repeat(passed[first], np.diff(np.append(first, len(dark))))
+    present = ~absent[rays.hit].take(rays.owner)
+    first = np.flatnonzero(np.diff(rays.ray, prepend=-1))
+    counts = np.diff(np.append(first, len(rays.ray)))
+    passed = in_front(rays.log_passed * present.astype(np.float64), counts)
     there = np.flatnonzero(passed > math.log(REACHED))
     place = np.empty(len(gaussians), np.int64)
     place[footprints.index] = np.arange(len(footprints.index))
-    own = footprints.take(place[lines.met])
-    met = gaussians.take(lines.met)
-    camera = (*projection.in_camera(met, scene, view), met.largest)
-    nearness = 1.0 / _depths(camera, view, own, lines, there)
+    own = footprints.take(place[rays.hit])
+    hit = gaussians.take(rays.hit)
+    camera = (*projection.in_camera(hit, scene, view), hit.largest)
+    nearness = 1.0 / _depths(camera, view, own, rays, there)
     scale = _FRACTION / float(nearness.max())
-    line = lines.line[there].astype(np.float64)
+    line = rays.ray[there].astype(np.float64)
     key = line + _FRACTION - scale * nearness
     order = np.argsort(key, kind="stable")
     there = there[order]
-    alpha, reaching = lines.alpha[there].astype(np.float64), np.exp(passed[there])
+    alpha, reaching = rays.alpha[there].astype(np.float64), np.exp(passed[there])
     hits = Hits(
-        lines.met,
-        lines.owner[there],
+        rays.hit,
+        rays.owner[there],
         alpha,
         reaching,
         reaching * alpha * present[there],
@@ -171,7 +173,7 @@ def _depths(
     camera: tuple[NDArray[np.float32], ...],
     view: View,
     footprints: Footprints,
-    lines: Lines,
+    rays: Rays,
     there: NDArray[np.int64],
 ) -> NDArray[np.float64]:
     """Return how deep splats lie on lines, scene sizes, (r,): where they are densest there.
@@ -184,22 +186,22 @@ def _depths(
     Parameters
     ----------
     camera : (3, u), (6, u), (u,) float32
-        Centres and covariances of what is met in camera coordinates, and its longest deviation.
+        Centres and covariances of what is hit in camera coordinates, and its longest deviation.
     view : View
     footprints : Footprints
-        Of what is met.
-    lines : Lines
+        Of what is hit.
+    rays : Rays
     there : (r,) int64
-        Which hits of the lines.
+        Which hits of the rays.
     """
     local, shape, largest = (values.astype(np.float64) for values in camera)
     x, y, z = local
     across = view.fx / z * (shape[2] - x / z * shape[5])  # (u,), covariance with the depth
     down = view.fy / z * (shape[4] - y / z * shape[5])
-    owner, line = lines.owner[there], lines.line[there]
+    owner, ray = rays.owner[there], rays.ray[there]
     step = [
-        lines.columns[line % len(lines.columns)] + 0.5 - footprints.centers[0, owner],
-        lines.rows[line // len(lines.columns)] + 0.5 - footprints.centers[1, owner],
+        rays.columns[ray % len(rays.columns)] + 0.5 - footprints.centers[0, owner],
+        rays.rows[ray // len(rays.columns)] + 0.5 - footprints.centers[1, owner],
     ]
     depth = z[owner]
     for axes, sigmas in zip((footprints.major, footprints.minor), footprints.sigmas, strict=True):
@@ -212,7 +214,7 @@ def _depths(
 
 
 def own_support(hits: Hits) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the light that each of `met` takes, and that times its support by others, (u,) each.
+    """Return the light that each of `hit` takes, and that times its support by others, (u,) each.
 
     It is the support if this one splat were gone: then what lies behind it gets ``1 / (1 - alpha)``
     of the light.
@@ -264,13 +266,13 @@ class Evidence:
         suspects : (M,) bool
         colors : (M, 3) float32
         """
-        rows = np.flatnonzero(suspects[hits.met].take(hits.owner))
+        rows = np.flatnonzero(suspects[hits.hit].take(hits.owner))
         total = np.append(0.0, np.cumsum(hits.light))
         first, last, end = hits.around(rows)
         alpha = hits.alpha[rows]
         near, behind = total[last] - total[first], total[end] - total[last]
         squared = np.zeros(len(rows))
-        for channel in colors[hits.met].T.astype(np.float64):
+        for channel in colors[hits.hit].T.astype(np.float64):
             sums = np.append(0.0, np.cumsum(hits.light * channel.take(hits.owner)))
             color = (sums[end] - sums[last]) / np.maximum(behind, 1e-30)
             squared += (channel.take(hits.owner[rows]) - color) ** 2
@@ -278,12 +280,12 @@ class Evidence:
         mass, stops, passes = (
             hits.sums(rows, alpha * v) for v in (np.ones_like(near), near, behind)
         )
-        self.near[hits.met] += stops
-        self.behind[hits.met] += passes
-        self.contrast[hits.met] += hits.sums(rows, alpha * behind * contrast)
+        self.near[hits.hit] += stops
+        self.behind[hits.hit] += passes
+        self.contrast[hits.hit] += hits.sums(rows, alpha * behind * contrast)
         sees = (stops + passes > SEEN * mass) & (mass > 0.0)
-        self.views[hits.met[sees]] += 1
-        self.past[hits.met[sees & (stops < PAST * (stops + passes))]] += 1
+        self.views[hits.hit[sees]] += 1
+        self.past[hits.hit[sees & (stops < PAST * (stops + passes))]] += 1
 
     def merge(self, other: Evidence) -> None:
         """Add the sums of other views."""

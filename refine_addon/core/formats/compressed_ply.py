@@ -9,7 +9,6 @@ that those of a chunk are near each other.
 from __future__ import annotations
 
 import io
-import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,7 +28,7 @@ from .format import (
 from .ply import Origin, SplatFile
 from .ply_body import check_counts
 from .ply_columns import REST_COUNTS
-from .ply_header import HEADER_LIMIT, TEXT, Header, read_header, shown
+from .ply_header import HEADER_LIMIT, TEXT, Header, raw_header, read_header, shown
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -71,8 +70,9 @@ REST_RANGE = 8.0
 
 def matches(_path: Path, head: bytes) -> bool:
     """Return whether a file is one: a PLY whose header has packed positions."""
-    header = re.match(rb"ply[\r\n].*?[\r\n]\s*end_header", head, re.DOTALL)
-    return bool(header and re.search(rb"[\r\n]\s*property\s+\w+\s+packed_position\s", header[0]))
+    header = raw_header(head) or b""
+    words = (line.split() for line in header.splitlines())
+    return any(line[:1] == [b"property"] and line[2:] == [b"packed_position"] for line in words)
 
 
 def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:

@@ -8,7 +8,7 @@ about z into each other, which changes signs only. What nodes do to a primitive 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -78,53 +78,65 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         with the place in the JSON.
     """
     document = opened(path, data)
-    parts = [_Part(document, *found) for found in _primitives(document)]
-    if not parts:
+    meshes = _shown(document, len(data))
+    if not meshes:
         msg = f"{path}: no splats: no node of its scene shows a primitive with {EXTENSION}"
         raise RefineError(msg)
-    count, degree = sum(map(len, parts)), max(part.degree for part in parts)
-    if count > len(data):  # each takes 40 bytes or more; one mesh may be shown by many nodes
-        msg = f"{path}: its nodes show {count} splats, expected at most {len(data)}"
-        raise RefineError(msg)
+    count = sum(len(mesh) * len(mesh.nodes) for mesh in meshes)
+    degree = max(mesh.degree for mesh in meshes)
     file, splats = new_file(path, Origin(f"{NAME} with {EXTENSION}", len(data)), count, degree)
-    at = 0
-    for part in parts:
-        part.fill(splats.take(slice(at, at + len(part))))
-        at += len(part)
+    for mesh in meshes:
+        mesh.fill(splats)
     return file
 
 
-def _primitives(
-    document: Document,
-) -> Iterator[tuple[dict[str, Any], str, NDArray[np.float64]]]:
-    """Yield every primitive with splats that a scene shows, its place, and its matrix (4, 4)."""
+def _shown(document: Document, most: int) -> list[_Mesh]:
+    """Return the meshes with splats that the nodes of a scene show, and by which nodes.
+
+    Raises
+    ------
+    RefineError
+        If the nodes show more splats than `most`: one mesh may be shown by many of them.
+    """
+    meshes: dict[int, _Mesh] = {}
+    count = 0
+    for index, place, matrix in _nodes(document):
+        if index not in meshes:
+            meshes[index] = _Mesh(document, index, place)
+        mesh = meshes[index]
+        if len(mesh):
+            mesh.nodes.append(_Node(count, place, matrix))
+        count += len(mesh)
+        if count > most:
+            msg = (
+                f"{document.path}: its nodes show {count} splats or more, expected at most {most}, "
+                "the bytes of the file"
+            )
+            raise RefineError(msg)
+    return [mesh for mesh in meshes.values() if mesh.parts]
+
+
+def _nodes(document: Document) -> Iterator[tuple[int, str, NDArray[np.float64]]]:
+    """Yield the mesh of each node of a scene that has one, the node's place, its matrix (4, 4)."""
     if "scenes" not in document.content:
         return
     scene = document.item("scenes", document.content.get("scene", 0), "scene")
     left = [(index, np.eye(4)) for index in document.indices(scene, "nodes", "scene")]
     left.reverse()
-    seen: set[int] = set()
+    visited: set[int] = set()
     while left:
         index, above = left.pop()
         node = document.item("nodes", index, "a node")
         place = f"nodes[{index}]"
-        if index in seen:
+        if index in visited:
             raise document.wrong(place, "belongs to two nodes, expected a tree")
-        seen.add(index)
+        visited.add(index)
         with np.errstate(over="ignore", invalid="ignore", under="ignore"):
             matrix = above @ _matrix(document, node, place)
         left += [(child, matrix) for child in reversed(document.indices(node, "children", place))]
-        if "mesh" not in node:
-            continue
-        mesh = document.item("meshes", node["mesh"], place)
-        for number, primitive in enumerate(document.indices(mesh, "primitives", place)):
-            where = f"meshes[{node['mesh']}].primitives[{number}]"
-            if not isinstance(primitive, dict):
-                raise document.wrong(where, f"expected an object, got {shown(primitive)}")
-            extensions = primitive.get("extensions")
-            if isinstance(extensions, dict) and EXTENSION in extensions:
-                _check(document, extensions[EXTENSION], where)
-                yield primitive, where, matrix
+        if "mesh" in node:
+            document.item("meshes", node["mesh"], place)
+            yield node["mesh"], place, matrix
 
 
 def _matrix(document: Document, node: dict[str, Any], place: str) -> NDArray[np.float64]:
@@ -152,6 +164,92 @@ def _check(document: Document, extension: Any, place: str) -> None:  # noqa: ANN
         raise document.wrong(place, f"splats by {name}, expected plain accessors")
 
 
+@dataclass(frozen=True)
+class _Node:
+    """A node that shows a mesh.
+
+    Attributes
+    ----------
+    start : int
+        Where its splats begin among those of the file.
+    place : str
+        For messages.
+    matrix : (4, 4) float64
+        From the frame of the mesh to that of the scene.
+    """
+
+    start: int
+    place: str
+    matrix: NDArray[np.float64]
+
+
+class _Mesh:
+    """The splats of a mesh.
+
+    Parameters
+    ----------
+    document : Document
+    index : int
+        Of the mesh.
+    place : str
+        Of the node that shows it first, for messages.
+
+    Attributes
+    ----------
+    parts : list of _Part
+        Its primitives of splats.
+    nodes : list of _Node
+        Those that show it, in the order of their splats; none if it has no splats.
+    degree : int
+        Highest of the harmonics.
+    """
+
+    def __init__(self, document: Document, index: int, place: str) -> None:
+        self._document = document
+        self.parts: list[_Part] = []
+        self.nodes: list[_Node] = []
+        primitives = document.indices(document.item("meshes", index, place), "primitives", place)
+        for number, primitive in enumerate(primitives):
+            where = f"meshes[{index}].primitives[{number}]"
+            if not isinstance(primitive, dict):
+                raise document.wrong(where, f"expected an object, got {shown(primitive)}")
+            extensions = primitive.get("extensions")
+            if isinstance(extensions, dict) and EXTENSION in extensions:
+                _check(document, extensions[EXTENSION], where)
+                self.parts.append(_Part(document, primitive, where))
+        self.degree = max((part.degree for part in self.parts), default=0)
+        self._count = sum(map(len, self.parts))
+
+    def __len__(self) -> int:
+        return self._count
+
+    def fill(self, splats: Splats) -> None:
+        """Set the values of all splats that its nodes show; `splats` are those of the file."""
+        if not self.nodes:
+            return
+        first, *others = (splats.take(slice(n.start, n.start + len(self))) for n in self.nodes)
+        at = 0
+        with np.errstate(all="ignore"):  # any number may stand in a file
+            for part in self.parts:
+                part.fill(first.take(slice(at, at + len(part))))
+                at += len(part)
+            # The first node's splats last, since the others are made of them as they stand.
+            for node, target in reversed([*zip(self.nodes, (first, *others), strict=True)]):
+                for piece in pieces(len(self)):
+                    shown_there = self._moved(first.take(piece), node)
+                    for field in fields(Splats):
+                        getattr(target, field.name)[piece] = getattr(shown_there, field.name)
+
+    def _moved(self, splats: Splats, node: _Node) -> Splats:
+        """Return splats as a node shows them, in the frame of captures."""
+        if np.array_equal(node.matrix, np.eye(4)):
+            return _half_turned(splats)
+        try:
+            return transformed(splats, _HALF_TURN @ node.matrix)
+        except RefineError as error:
+            raise self._document.wrong(node.place, str(error)) from error
+
+
 class _Part:
     """The splats of one primitive.
 
@@ -161,18 +259,10 @@ class _Part:
     primitive : dict
     place : str
         For messages.
-    matrix : (4, 4) float64
-        From its frame to that of the scene.
     """
 
-    def __init__(
-        self,
-        document: Document,
-        primitive: dict[str, Any],
-        place: str,
-        matrix: NDArray[np.float64],
-    ) -> None:
-        self._document, self._place, self._matrix = document, place, matrix
+    def __init__(self, document: Document, primitive: dict[str, Any], place: str) -> None:
+        self._document, self._place = document, place
         attributes = primitive.get("attributes")
         if not isinstance(attributes, dict):
             raise document.wrong(place, f"attributes are {shown(attributes)}, expected an object")
@@ -209,38 +299,18 @@ class _Part:
         return lambda piece: values[piece]
 
     def fill(self, splats: Splats) -> None:
-        """Set the values of as many splats; what this has no harmonics for is 0."""
+        """Set the values of as many splats, in the frame of the file; absent harmonics are 0."""
         for piece in pieces(len(splats)):
-            some = splats.take(piece)
-            some.sh_rest[:] = 0.0
-            turned = self._turned(piece)
-            some.means[:] = turned.means
-            some.log_scales[:] = turned.log_scales
-            some.quaternions[:] = turned.quaternions
-            some.opacity_logits[:] = turned.opacity_logits
-            some.sh_dc[:] = turned.sh_dc
-            some.sh_rest[:, : turned.sh_rest.shape[1]] = turned.sh_rest
-
-    def _turned(self, piece: slice) -> Splats:
-        """Return some of the splats in the frame of captures."""
-        harmonics = [values(piece) for values in self._harmonics]
-        with np.errstate(all="ignore"):  # any number may stand in a file
-            splats = Splats(
-                means=np.asarray(self._means(piece), np.float32),
-                log_scales=np.log(self._scales(piece), dtype=np.float32),
-                quaternions=np.asarray(self._turns(piece), np.float32)[:, _WXYZ],
-                opacity_logits=opacity_logits(self._opacities(piece)[:, 0], SINGLE_MARGIN),
-                sh_dc=np.asarray(harmonics[0], np.float32),
-                sh_rest=np.stack([*harmonics[1:]], axis=1)
-                if self.degree
-                else np.zeros((len(harmonics[0]), 0, 3), np.float32),
-            )
-            if np.array_equal(self._matrix, np.eye(4)):
-                return _half_turned(splats)
-            try:
-                return transformed(splats, _HALF_TURN @ self._matrix)
-            except RefineError as error:
-                raise self._document.wrong(self._place, f"its node: {error}") from error
+            target = splats.take(piece)
+            target.means[:] = self._means(piece)
+            target.log_scales[:] = np.log(self._scales(piece), dtype=np.float32)
+            target.quaternions[:] = self._turns(piece)[:, _WXYZ]
+            target.opacity_logits[:] = opacity_logits(self._opacities(piece)[:, 0], SINGLE_MARGIN)
+            target.sh_rest[:] = 0.0
+            constant, *others = self._harmonics
+            target.sh_dc[:] = constant(piece)
+            for index, values in enumerate(others):
+                target.sh_rest[:, index] = values(piece)
 
 
 _XYZW, _WXYZ = [1, 2, 3, 0], [3, 0, 1, 2]

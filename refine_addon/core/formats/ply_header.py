@@ -78,11 +78,10 @@ def read_header(path: Path | Url, stream: BinaryIO) -> Header:
         refuse_foreign_splats(path, head)
         msg = f"{path}: not a PLY: it starts with {head[:8]!r}, expected 'ply' and a line end"
         raise RefineError(msg)
-    found = _END[_line_end(head)].search(head)
-    if not found:
+    raw = raw_header(head)
+    if raw is None:
         msg = f"{path}: header without end: no 'end_header' line in the first {len(head)} bytes"
         raise RefineError(msg)
-    raw = head[: found.end()]
     plain, counts = _plain(path, raw)
     try:
         data = plyfile.PlyData.read(io.BytesIO(plain))
@@ -91,6 +90,14 @@ def read_header(path: Path | Url, stream: BinaryIO) -> Header:
         raise RefineError(msg) from error
     order = TEXT if data.text else data.byte_order
     return Header(path, raw, tuple(data.elements), tuple(counts), order)
+
+
+def raw_header(head: bytes) -> bytes | None:
+    """Return the header at the beginning of a file; None if this is no PLY, or it has no end."""
+    if not re.match(rb"ply[\r\n]", head):
+        return None
+    end = _END[_line_end(head)].search(head)
+    return head[: end.end()] if end else None
 
 
 def new_header(properties: Iterable[tuple[str, str]], count: int) -> bytes:

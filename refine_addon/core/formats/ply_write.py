@@ -152,9 +152,10 @@ def _differs(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
 
 def _edited(line: bytes, words: Mapping[int, bytes], added: Sequence[bytes]) -> bytes:
     """Return a line with some words replaced and others added at its end; its spaces stay."""
-    parts = re.findall(rb"(\s*)(\S+)", line)
+    numbers = line.rstrip()  # no space at its end, or the pattern would be tried at each of them
+    parts = re.findall(rb"(\s*)(\S+)", numbers)
     text = b"".join(space + words.get(index, word) for index, (space, word) in enumerate(parts))
-    return b" ".join([text, *added]) + line[len(line.rstrip()) :]
+    return b" ".join([text, *added]) + line[len(numbers) :]
 
 
 def declarations(

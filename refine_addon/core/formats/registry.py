@@ -42,8 +42,8 @@ SUFFIXES = (".ply", *(form.suffix for form in FORMATS))
 
 _LONGEST_FIRST = sorted(SUFFIXES, key=len, reverse=True)
 
-NOT_WRITTEN = (".ksplat", ".gltf", ".lcc")
-"""Endings of other splat formats: a PLY of such a name would mislead."""
+NOT_WRITTEN = (".ksplat", ".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
+"""Endings of other splat formats and of compressed files: a PLY of such a name would mislead."""
 
 _HEAD = 1 << 16
 """Bytes by which a format is known; the header of a compressed PLY has fewer."""
@@ -82,6 +82,31 @@ def read_splats(path: Path | str) -> SplatFile:
         msg = f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
         raise RefineError(msg) from error
     return form.read(path, np.frombuffer(whole, np.uint8))
+
+
+def read_written(path: Path) -> Splats | None:
+    """Return what a file holds that was just written in a format that rounds.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    Splats or None
+        None for a plain PLY, which is exact, and for a file that may not be read: one that replaced
+        another has its permissions.
+
+    Raises
+    ------
+    RefineError
+        See `read_splats`.
+    """
+    try:
+        path.open("rb").close()
+    except PermissionError:
+        return None
+    return None if format_named(path) is None else read_splats(path).splats()
 
 
 def _beginning(path: Path) -> bytes:

@@ -181,7 +181,11 @@ def _opened(path: Path, data: NDArray[np.uint8]) -> zipfile.ZipFile:
 
 
 def _bundle(path: Path, archive: zipfile.ZipFile, size: int) -> _Bundle:
-    name = next(name for name in archive.namelist() if name.split("/")[-1] == "meta.json")
+    names = (name for name in archive.namelist() if name.split("/")[-1] == "meta.json")
+    name = next(names, None)
+    if name is None:
+        msg = f"{path}: no meta.json in the archive, which a SOG file has"
+        raise RefineError(msg)
     try:
         meta = json.loads(_entry(path, archive, name, _META_LIMIT))
     except (ValueError, RecursionError) as error:

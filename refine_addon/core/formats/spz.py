@@ -53,13 +53,18 @@ _SCALE_STEPS, _LOWEST_SCALE = 16.0, -10.0
 _BUCKETS = (8, 16)
 """Harmonics are rounded to multiples of these, in 1/128: of degree 1, and of all others."""
 
+_LARGEST_CODE = (1 << 23) - 1
+"""Of a position: of its 24 bits, one is the sign."""
+
 _INFLATION = 1032
-"""gzip makes no stream this many times as small."""
+"""A file holds no more than this many times its bytes: gzip makes nothing smaller. Zstd does, but
+not of splats that differ."""
 
 _PIECE = 1 << 20
+"""Bytes that a zstd stream is unpacked to at a time."""
 
 _STEP = 1 << 12
-"""Bytes of a damaged stream that are tried at a time."""
+"""Bytes of a gzip stream that are unpacked at a time where what they hold is not used."""
 
 
 @dataclass(frozen=True)
@@ -135,10 +140,21 @@ def _parsed(path: Path, head: bytes) -> _Header:
     if degree >= _DEGREES:
         msg = f"{path}: byte 12: harmonics of degree {degree}, expected 0 to {_DEGREES - 1}"
         raise RefineError(msg)
-    if fraction > 23:  # noqa: PLR2004 - of 24 bits, one is the sign
+    if fraction > _LARGEST_CODE.bit_length():
         msg = f"{path}: byte 13: {fraction} fractional bits, expected 0 to 23"
         raise RefineError(msg)
     return _Header(version, count, degree, fraction, streams)
+
+
+def _refuse_many(path: Path, header: _Header, size: int) -> None:
+    """Raise `RefineError` if a file of `size` bytes cannot hold as many splats as it announces."""
+    needed, most = sum(header.blocks().values()), _INFLATION * size
+    if needed > most:
+        msg = (
+            f"{path}: truncated: {header.count} splats need {needed} bytes unpacked, a file of "
+            f"{size} bytes holds at most {most}"
+        )
+        raise RefineError(msg)
 
 
 def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict[str, NDArray[np.uint8]]]:
@@ -149,13 +165,11 @@ def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict[str, N
         if header.version == _ZSTD:
             msg = f"{path}: SPZ version 4 inside of gzip, expected its own header first"
             raise RefineError(msg)
+        _refuse_many(path, header, len(data))
         needed = sum(header.blocks().values())
-        refuse_short(path, needed, _INFLATION * len(data), f"{header.count} splats")
         body = engine.decompress(engine.unconsumed_tail, needed) if needed else b""
         if len(body) == needed:
-            # Extensions may follow; at the end of the stream its checksum is tested.
-            while not engine.eof and engine.decompress(engine.unconsumed_tail, _PIECE):
-                pass
+            _test_checksum(engine)
     except zlib.error as error:
         at = _damaged_at(data)
         msg = f"{path}: a damaged SPZ file: its gzip stream breaks at byte {at} ({error})"
@@ -165,6 +179,15 @@ def _unpacked(path: Path, data: NDArray[np.uint8]) -> tuple[_Header, dict[str, N
         msg = f"{path}: truncated: the gzip stream has no end"
         raise RefineError(msg)
     return header, blocks
+
+
+def _test_checksum(engine: Any) -> None:  # noqa: ANN401 - zlib's type has no name
+    """Unpack the rest of a gzip stream, extensions that are not read: its end has the checksum."""
+    rest = memoryview(engine.unconsumed_tail)
+    for at in range(0, len(rest) + 1, _STEP):  # no bytes at last: what zlib still holds comes out
+        if engine.eof:
+            return
+        engine.decompress(rest[at : at + _STEP])
 
 
 def _damaged_at(data: NDArray[np.uint8]) -> int:
@@ -202,6 +225,7 @@ def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> dict[str, 
     first = _HEADER.size + _TABLE_AT.size
     refuse_short(path, first, len(data), "the first bytes of an SPZ file of version 4")
     (at,) = _TABLE_AT.unpack(data[_HEADER.size : first].tobytes())
+    _refuse_many(path, header, len(data))
     lengths = {name: length for name, length in header.blocks().items() if length}
     if header.streams < len(lengths):
         msg = f"{path}: byte 15: {header.streams} streams, expected {len(lengths)}"
@@ -289,7 +313,7 @@ def write(stream: BinaryIO, splats: Splats) -> None:
     Raises
     ------
     RefineError
-        If a coordinate is beyond 8388607, the largest that the format holds.
+        If a coordinate is beyond 8388607 either way, the largest that the format holds.
     """
     count, rest = len(splats), 3 * splats.sh_rest.shape[1]
     fraction = _fraction(splats)
@@ -321,12 +345,14 @@ def _fraction(splats: Splats) -> int:
     fewer, small ones as many as divide them into a quarter of a million steps.
     """
     farthest = float(np.abs(splats.means).max())
-    # One step beyond, since the largest may be rounded up.
-    _, bits = math.frexp(farthest * (1.0 + 1e-6))
-    if bits > 23:  # noqa: PLR2004 - of 24 bits, one is the sign
-        msg = f"a coordinate is {farthest:g}: {NAME} holds coordinates up to 8388607"
+    _, bits = math.frexp(farthest)  # before the point
+    most = _LARGEST_CODE.bit_length() - bits
+    if np.rint(math.ldexp(farthest, most)) > _LARGEST_CODE:
+        most -= 1
+    if most < 0:
+        msg = f"a coordinate is {farthest:.10g}: {NAME} holds coordinates up to {_LARGEST_CODE}"
         raise RefineError(msg)
-    return min(max(12, 18 - bits), 23 - bits, 23)
+    return min(max(12, 18 - bits), most, _LARGEST_CODE.bit_length())
 
 
 def _packed_rotations(quaternions: NDArray[Any]) -> NDArray[np.uint32]:

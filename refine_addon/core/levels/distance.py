@@ -3,7 +3,7 @@
 A camera k times as far away sees a thing k times as small: one of its pixels shows what k x k show
 from near. So the pictures of the views, averaged over squares of k x k pixels, stand for those from
 k times the distance, by a renderer that filters what is smaller than a pixel. Their PSNR comes from
-lines of sight through all pixels of some squares.
+rays through all pixels of some squares.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from ..quality import PSNR_CAP
-from ..scoring import projection, sight_lines
-from ..scoring.sight_lines import ENOUGH, colors_from
+from ..estimate.psnr import MIN_RAYS_WITH_HITS
+from ..estimate.quality import PSNR_CAP
+from ..seeing import projection
+from ..seeing.cast import cast
+from ..seeing.ray_sample import colors_from
 from ..work import Progress, for_chunks, part, silent
 
 if TYPE_CHECKING:
@@ -161,18 +163,18 @@ class Lookout:
         if changed is not None:
             new = _width_of_most(splats, changed, _total(now, len(splats)))
             error = max(error, new)
-        if sum(seen.meeting for seen in self._seen) < ENOUGH:
+        if sum(seen.hitting for seen in self._seen) < MIN_RAYS_WITH_HITS:
             return Reach(error, (), self.focal)
         rows, weights = [], []
         for (_, weight), before, after in zip(self._views, self._seen, now, strict=True):
-            if before.meeting:
+            if before.hitting:
                 rows.append([_psnr(after.picture - before.picture, size) for size in FACTORS])
                 weights.append(weight)
         psnr = np.average(rows, axis=0, weights=weights)
         steps = [factor * self.distance for factor in FACTORS]
         return Reach(error, tuple(zip(steps, psnr.tolist(), strict=True)), self.focal)
 
-    def _look(self, splats: Splats, progress: Progress) -> list[_Seen]:
+    def _look(self, splats: Splats, progress: Progress) -> list[_ViewSample]:
         """Return what each of the views sees of some splats."""
         threads = self._threads
         with np.errstate(under="ignore"):
@@ -180,18 +182,18 @@ class Lookout:
                 splats, self._chosen, progress=part(progress, 0.0, 0.2), threads=threads
             )
 
-        def look(piece: slice) -> _Seen:
+        def look(piece: slice) -> _ViewSample:
             view = self._views[piece.start][0]
             columns, rows = _patches(view.width), _patches(view.height)
             with np.errstate(under="ignore"):
                 footprints = projection.project(gaussians, scene, view)
-                lines = sight_lines.meet(footprints, columns, rows)
-                index = gaussians.index[lines.met]
-                colors = lines.colors(colors_from(splats, index, view))
-            _, owner, weight = lines.contributions()
+                rays = cast(footprints, columns, rows)
+                index = gaussians.index[rays.hit]
+                colors = rays.colors(colors_from(splats, index, view))
+            _, owner, weight = rays.contributions()
             contribution = np.bincount(owner, weight, len(index)).astype(np.float64)
             picture = colors.reshape(3, len(rows), len(columns))
-            return _Seen(index, contribution, picture, lines.meeting)
+            return _ViewSample(index, contribution, picture, rays.hitting)
 
         ahead = part(progress, 0.2, 1.0)
         return for_chunks(
@@ -200,8 +202,8 @@ class Lookout:
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """What the lines of one view see.
+class _ViewSample:
+    """What the rays of one view see.
 
     Attributes
     ----------
@@ -211,14 +213,14 @@ class _Seen:
         How many pixels each of them makes up.
     picture : (3, R, C) float64
         Patches of the picture, side by side.
-    meeting : int
-        How many lines meet a splat.
+    hitting : int
+        How many rays hit a splat.
     """
 
     index: NDArray[np.int64]
     contribution: NDArray[np.float64]
     picture: NDArray[np.float64]
-    meeting: int
+    hitting: int
 
 
 def _patches(size: int) -> NDArray[np.int64]:
@@ -251,7 +253,7 @@ def _psnr(change: NDArray[np.float64], size: int) -> float:
     return PSNR_CAP if error <= 10.0 ** (-PSNR_CAP / 10.0) else -10.0 * math.log10(error)
 
 
-def _total(views: list[_Seen], count: int) -> NDArray[np.float64]:
+def _total(views: list[_ViewSample], count: int) -> NDArray[np.float64]:
     """Return how many pixels of all views each of `count` splats makes up, (count,)."""
     total = np.zeros(count)
     for seen in views:

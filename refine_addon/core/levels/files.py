@@ -9,8 +9,8 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 from ..errors import RefineError
+from ..estimate.quality import PSNR_CAP
 from ..formats.registry import SUFFIXES, as_written, read_splats, without_suffix
-from ..quality import PSNR_CAP
 from ..report import Clock, held, scoring_notes, seen_by
 from ..selection import Budget
 from ..survivors import survivor_columns
@@ -195,7 +195,7 @@ def _unlisted(folder: Path) -> list[Path]:
     try:
         told = json.loads(path.read_bytes())
         names = [str(entry["file"]) for entry in told["levels"]]
-    except (OSError, ValueError, LookupError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):  # none that we wrote
         names = []
     path.unlink(missing_ok=True)
     return [folder / name for name in names if _LEVEL.fullmatch(name)]

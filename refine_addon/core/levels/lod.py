@@ -14,8 +14,8 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from ..errors import RefineError
+from ..estimate.quality import PSNR_CAP
 from ..pipeline import decide, score
-from ..quality import PSNR_CAP
 from ..selection import Budget
 from ..task import DEFAULTS, Origin, Task
 from ..volumes import among_all
@@ -316,7 +316,7 @@ def _absorbing(
     scene: Task, budgets: Sequence[Budget], progress: Progress, threads: int | None
 ) -> Iterator[_Made]:
     """Make levels each from the one before."""
-    count, sights, whole = len(scene.scene()[0]), None, None
+    count, ray_sample, whole = len(scene.scene()[0]), None, None
     task = replace(scene, absorb=True)
     for number, budget in enumerate(budgets):
         ahead = part(progress, number / len(budgets), (number + 1) / len(budgets))
@@ -326,12 +326,12 @@ def _absorbing(
         whole = result.absorbed if whole is None else _both(whole, result.absorbed)
         yield whole.keep, whole.splats, result, whole
         if number == 0:
-            sights = result.scores.sights
+            ray_sample = result.scores.ray_sample
         task = replace(
             task,
             splats=whole.splats,
             protected=None if scene.protected is None else scene.protected[whole.keep],
-            origin=Origin(count, sights, psnr),
+            origin=Origin(count, ray_sample, psnr),
         )
 
 

@@ -1,11 +1,11 @@
 """Method *auto*: occlusion with no more views than the pictures need.
 
-Half of the views, spread evenly, measure the splats first, then an eighth more. Others judge: their
-lines of sight tell how good the pictures are that each of the two rankings leaves. The error of a
-mean over k views falls as 1 / k, so the PSNR is about ``limit - slope / k``, and what the eighth
-has gained tells what the rest would gain. Where that is within the tolerance, the rest is not
-measured. All that is measured to find out is used, so finding out costs no more than two rankings
-and the lines of sight of the judges.
+Half of the views, spread evenly, measure the splats first, then an eighth more. Others validate:
+their rays tell the PSNR of the pictures that each of the two rankings leaves. The error of a mean
+over k views falls as 1 / k, so the PSNR is about ``limit - slope / k``, and what the eighth has
+gained tells what the rest would gain. Where that is within the tolerance, the rest is not measured.
+All that is measured to find out is used, so finding out costs no more than two rankings and the
+rays of the validation views.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..quality import UNSEEN
+from ..estimate.psnr import psnr_by_views
+from ..estimate.quality import UNSEEN
 from ..work import Progress, part, silent
-from .occlusion import FIRST_END, Rounds, Run
+from .occlusion import FIRST_END, MemoryScoring, OcclusionScoring
 
 if TYPE_CHECKING:
     from ..scores import Scores
@@ -28,18 +29,18 @@ if TYPE_CHECKING:
     from .occlusion import Occlusion
 
 RATIOS = (0.3, 0.5, 0.7, 0.9)
-"""Shares removed at which rankings are judged; the largest loss counts."""
+"""Shares removed at which rankings are compared; the largest loss counts."""
 
 LEAST_VIEWS = 16
-"""Fewer views are all used: too few would be left to judge."""
+"""Fewer views are all used: too few would be left to validate."""
 
-FIRST, MORE, JUDGES = (0, 1, 2, 3), (4,), (5, 6)
-"""Blocks of views, of eight: those that measure first, those that measure next, and those that
-judge. The judges and the eighth block measure if the others are not enough."""
+FIRST, MORE, VALIDATING = (0, 1, 2, 3), (4,), (5, 6)
+"""Groups of views, of eight: those that measure first, those that measure next, and those that
+validate. The latter and the eighth group measure too if the others are not enough."""
 
-LOOKING = 0.05
-"""Share of the time of the first round that looking from the views that judge takes, for the
-display of progress."""
+CASTING = 0.05
+"""Share of the time of the first round that the rays of the validation views take, to show
+progress."""
 
 
 def score(  # noqa: PLR0913 - as `occlusion.score`, and the tolerance
@@ -66,7 +67,7 @@ def score(  # noqa: PLR0913 - as `occlusion.score`, and the tolerance
     Returns
     -------
     Scores
-        ``facts["auto"]`` tells what the judges expect and what is estimated to be lost;
+        ``facts["auto"]`` tells what the validation views expect and what is estimated to be lost;
         ``views_used`` how many views measured.
 
     Raises
@@ -74,48 +75,48 @@ def score(  # noqa: PLR0913 - as `occlusion.score`, and the tolerance
     RefineError, Cancelled
         See `occlusion.score`.
     """
-    run = Run(
-        splats, views, settings, members=blocks_of(views),
+    scoring = MemoryScoring(
+        splats, views, settings, groups=groups_of(views),
         progress=part(progress, 0.0, 0.1), threads=threads,
     )  # fmt: skip
-    ahead = part(progress, 0.1, 1.0)
-    return scored(run, tolerance, settled=settled, progress=ahead, threads=threads)
+    return finish(
+        scoring, tolerance, settled=settled, progress=part(progress, 0.1, 1.0), threads=threads
+    )
 
 
-def scored(
-    run: Rounds,
+def finish(
+    scoring: OcclusionScoring,
     tolerance: float,
     *,
     settled: int | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Scores:
-    """Return the scores of a run that has measured nothing yet.
+    """Return the scores of a scoring that has measured nothing yet.
 
     Parameters
     ----------
-    run : Rounds
-        With the blocks of `blocks_of`, if these are not None.
+    scoring : OcclusionScoring
+        With the groups of `groups_of`, if these are not None.
     tolerance, settled, progress, threads
         See `score`.
     """
-    end = FIRST_END if run.rounds > 1 else 1.0
-    ahead = part(progress, 0.0, end)
-    if len(run.measuring.views) < LEAST_VIEWS or not tolerance:
-        run.measure(range(run.measuring.count), ahead)
-        loss, judged = 0.0, dict[str, list[float]]()
+    end = FIRST_END if scoring.rounds > 1 else 1.0
+    measuring_progress = part(progress, 0.0, end)
+    if len(scoring.measuring.views) < LEAST_VIEWS or not tolerance:
+        scoring.measure(range(scoring.measuring.count), measuring_progress)
+        loss, expected = 0.0, dict[str, list[float]]()
     else:
-        loss, judged = _measure(run, tolerance, ahead, threads)
-    scores = run.rank(part(progress, end, 1.0), settled)
-    own = {"views": scores.views_used, "loss": loss, "tolerance": tolerance, "judged": judged}
-    facts = {**scores.facts, "auto": own}
-    return replace(scores, facts=facts, method="auto")
+        loss, expected = _measure(scoring, tolerance, measuring_progress, threads)
+    scores = scoring.rank(part(progress, end, 1.0), settled)
+    facts = {"views": scores.views_used, "loss": loss, "tolerance": tolerance, "judged": expected}
+    return replace(scores, facts={**scores.facts, "auto": facts}, method="auto")
 
 
-def blocks_of(views: ViewSet) -> list[list[int]] | None:
-    """Return the numbers of the views of each of eight blocks, as in `ViewSet.by_distance`.
+def groups_of(views: ViewSet) -> list[list[int]] | None:
+    """Return the numbers of the views of each of eight groups, as in `ViewSet.by_distance`.
 
-    The first four blocks are half of the views, spread evenly over all.
+    The first four groups are half of the views, spread evenly over all.
 
     Parameters
     ----------
@@ -139,14 +140,14 @@ def blocks_of(views: ViewSet) -> list[list[int]] | None:
 
 
 def _measure(
-    run: Rounds, tolerance: float, progress: Progress, threads: int | None
+    scoring: OcclusionScoring, tolerance: float, progress: Progress, threads: int | None
 ) -> tuple[float, dict[str, list[float]]]:
     """Measure the splats from as many views as are needed.
 
     Parameters
     ----------
-    run : Rounds
-        With the blocks of `blocks_of`.
+    scoring : OcclusionScoring
+        With the groups of `groups_of`.
     tolerance, progress, threads
         See `score`.
 
@@ -154,39 +155,37 @@ def _measure(
     -------
     loss : float
         What the views that were left out are estimated to gain, dB.
-    judged : dict of str to list of float
-        What the judges expect of the two rankings at `RATIOS`, dB.
+    expected : dict of str to list of float
+        The PSNR that the validation views tell of the two rankings at `RATIOS`, dB.
 
     Raises
     ------
     Cancelled
         If `progress` answers ``False``.
     """
-    members = run.measuring.members
-    judges = [number for k in JUDGES for number in members[k]]
-    ahead = part(progress, 0.0, LOOKING)
-    assert run.sights is not None  # noqa: S101 - as the judges need
-    run.sights.look_from(judges, run.gaussians, run.measuring.scene, ahead, threads)
-    run.measure(FIRST, part(progress, LOOKING, 0.55))
-    run.measure(MORE, part(progress, 0.55, 0.7))
-    blocks = (FIRST, FIRST + MORE, range(len(members)))
-    few, some, every = (sum(len(members[k]) for k in which) for which in blocks)
-    found = {
-        count: run.sights.judged(
-            run.once(which, part(progress, 0.7, 0.7)), RATIOS, judges, threads=threads
-        )
-        for count, which in zip((few, some), blocks, strict=False)
-    }
-    known = {count: psnr for count, psnr in found.items() if psnr is not None}
-    judged = {
-        f"{count} views": [round(psnr, 2) for psnr in known[count].tolist()] for count in known
-    }
+    groups, rays = scoring.measuring.groups, scoring.validation_rays
+    validating = [number for k in VALIDATING for number in groups[k]]
+    assert rays is not None  # noqa: S101 - a scoring of several views has them
+    casting_progress = part(progress, 0.0, CASTING)
+    rays.cast(validating, scoring.gaussians, scoring.measuring.scene, casting_progress, threads)
+    scoring.measure(FIRST, part(progress, CASTING, 0.55))
+    scoring.measure(MORE, part(progress, 0.55, 0.7))
+    few, more, every = (
+        sum(len(groups[k]) for k in chosen) for chosen in (FIRST, FIRST + MORE, range(len(groups)))
+    )
+    psnr = {}
+    for count, chosen in ((few, FIRST), (more, FIRST + MORE)):
+        values = scoring.once(chosen, part(progress, 0.7, 0.7))
+        told = psnr_by_views(rays, values, RATIOS, validating, threads=threads)
+        if told is not None:
+            psnr[count] = told
+    expected = {f"{count} views": told.round(2).tolist() for count, told in psnr.items()}
     loss = math.inf
-    if len(known) == len(found):
+    if len(psnr) == 2:  # noqa: PLR2004 - both were told
         # No eye tells apart what is above `UNSEEN`.
-        gain = np.minimum(known[some], UNSEEN) - np.minimum(known[few], UNSEEN)
-        loss = max(float(gain.max()), 0.0) * (1 / some - 1 / every) / (1 / few - 1 / some)
+        gain = np.minimum(psnr[more], UNSEEN) - np.minimum(psnr[few], UNSEEN)
+        loss = max(float(gain.max()), 0.0) * (1 / more - 1 / every) / (1 / few - 1 / more)
     if loss <= tolerance:
-        return loss, judged
-    run.measure(range(len(FIRST + MORE), len(members)), part(progress, 0.7, 1.0))
-    return 0.0, judged
+        return loss, expected
+    scoring.measure(range(len(FIRST + MORE), len(groups)), part(progress, 0.7, 1.0))
+    return 0.0, expected

@@ -18,7 +18,7 @@ with D in units of its mean, and m_i its mean over the splats in the same cell o
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,7 +30,8 @@ from ..scores import Scores
 from ..splats import refuse_undrawable
 from ..work import Progress, part, silent
 from . import adaptive
-from .closed_form_block import CELLS, HIGHEST, LUMA, ROWS, Block, Frame
+from .closed_form_block import CELLS, HIGHEST, ROWS, Frame, RowBlock
+from .closed_form_settings import DEFAULTS, ETA_RELATIVE, ClosedForm
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -43,74 +44,14 @@ if TYPE_CHECKING:
 
     Each = Callable[..., Iterable[Any]]
 
-__all__ = ["LUMA", "ClosedForm", "score", "steps"]
-
-ETA_RELATIVE = 0.005
-"""Default eta over the squared size of the scene: the paper's .05 at a viewing distance of 3 m."""
-
 SHARES = {"read": 0.2, "count": 0.0, "sum_views": 0.75, "add": 0.0, "compare": 0.0}
 """How much of the time each step takes, for progress; the rest is not worth a report."""
-
-
-@dataclass(frozen=True)
-class ClosedForm:
-    """Settings of the closed form; the default ranks the same whatever the scene's unit.
-
-    Attributes
-    ----------
-    depth : {"z", "distance"}
-        Depth along the view's axis, or distance to its centre.
-    eta : float or None
-        Added to the squared depth, squared world units; None takes `ETA_RELATIVE` times the squared
-        size of the scene.
-    anisotropy_offset : float or None
-        Added to the shortest axis in F_gem, world units; None adds nothing, so that F_gem has no
-        unit.
-    frustum : bool
-        Whether only views that a splat lies in, or reaches into, count for it.
-    local : bool
-        Whether a splat counts relative to those around it.
-    visibility, projection, equal_weights : bool
-        The paper's ablations: H without alpha, H without 1 / (d^2 + eta), lambda = 1/3 each.
-    """
-
-    depth: Literal["z", "distance"] = "z"
-    eta: float | None = None
-    anisotropy_offset: float | None = None
-    frustum: bool = True
-    local: bool = True
-    visibility: bool = True
-    projection: bool = True
-    equal_weights: bool = False
-
-    def __post_init__(self) -> None:
-        """Check the values.
-
-        Raises
-        ------
-        RefineError
-            If a value is out of range.
-        """
-        if self.depth not in ("z", "distance"):
-            msg = f"depth is {self.depth!r}, expected 'z' or 'distance'"
-            raise RefineError(msg)
-        for name in ("eta", "anisotropy_offset"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 < value < np.inf:
-                msg = f"{name} is {value}, expected a positive number"
-                raise RefineError(msg)
-
-    @classmethod
-    def published(cls, depth: Literal["z", "distance"], **changes: Any) -> ClosedForm:  # noqa: ANN401
-        """Return the published constants: the paper's for "z", its authors' code's otherwise."""
-        eta, offset = (0.05, 0.05) if depth == "z" else (0.5, 1e-6)
-        return cls(depth, eta, offset, frustum=False, local=False, **changes)
 
 
 def score(
     splats: Splats,
     views: ViewSet,
-    settings: ClosedForm = ClosedForm(),
+    settings: ClosedForm = DEFAULTS,
     *,
     progress: Progress = silent,
     threads: int | None = None,
@@ -142,7 +83,7 @@ def score(
     """
     total, middle = len(splats), views.middle()
     blocks = [
-        Block(splats.take(slice(start, start + ROWS)), views, settings, middle, threads=threads)
+        RowBlock(splats.take(slice(start, start + ROWS)), views, settings, middle, threads=threads)
         for start in range(0, total, ROWS)
     ]
     done, whole = 0.0, progress
@@ -197,14 +138,14 @@ def steps(
     *,
     remember: Callable[[str, Callable[[], Any]], Any] = lambda _name, make: make(),
 ) -> Found:
-    """Score splats block by block; each `Block` has its scores afterwards.
+    """Score splats block by block; each `RowBlock` has its scores afterwards.
 
     Parameters
     ----------
     each : callable
-        ``each(step, *arguments)`` does a step with every block, and returns what came of it in the
-        order of the blocks. Results are put together in that order, so they are the same bits
-        wherever and whenever blocks are computed.
+        ``each(step, *arguments)`` does a step with every block of rows, and returns what came of
+        it in the order of the blocks. Results are put together in that order, so they are the
+        same bits wherever and whenever blocks are computed.
     total : int
         How many splats there are.
     views, settings
@@ -270,7 +211,7 @@ def _frame(
     good : int
         How many splats can be drawn.
     moments : (4, 3) float64
-        As `Block.read` returns them, of all splats.
+        As `RowBlock.read` returns them, of all splats.
     highest : (1, 65536) int64
         What the step "count" would return of the highest digit, of all splats.
     settings : ClosedForm
@@ -288,7 +229,7 @@ def _frame(
 def _powers(
     crowds: Iterable[Crowds | None], *, local: bool
 ) -> tuple[NDArray[np.float64] | None, float]:
-    """Return the powers of `Block.compare`, and the mean score of all."""
+    """Return the powers of `RowBlock.compare`, and the mean score of all."""
     if not local:
         for _ in crowds:
             pass
@@ -319,7 +260,7 @@ def _statistics(tallies: NDArray[np.float64]) -> adaptive.Statistics:
     Parameters
     ----------
     tallies : (chunks, 5) float64
-        What `Block.read` returns.
+        What `RowBlock.read` returns.
     """
     count, ratios, translucency, luma, squares = tallies.T  # (chunks,) each
     total = count.sum()

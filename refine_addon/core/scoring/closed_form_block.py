@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from .. import radix
-from ..frustum import Frustums
+from ..seeing.frustum import Frustums
 from ..splats import base_color, drawable, opacity
 from ..work import for_chunks, part, silent
 from . import adaptive
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ..splats import Splats
     from ..views import ViewSet
     from ..work import Progress
-    from .closed_form import ClosedForm
+    from .closed_form_settings import ClosedForm
 
 LUMA = (0.299, 0.587, 0.114)
 """Factors of red, green and blue in the luma (Rec. 601)."""
@@ -150,7 +150,7 @@ class Source(Protocol):
         """Return some of them; of an empty slice too the types are those of all."""
 
 
-class Block:
+class RowBlock:
     """What the formula needs of n splats, filled step by step, chunk by chunk.
 
     The splats are read once, in the first step; it keeps 69 bytes of each.

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from .projection import Gaussians
+    from ..seeing.projection import Gaussians
 
 FLOOR_WEIGHTS = (0.0, *(float(weight) for weight in 10.0 ** np.arange(-5.0, 0.5, 0.5)))
 """Weights that are tried. At weight 1, a splat of average prior that lies in no view gets a floor

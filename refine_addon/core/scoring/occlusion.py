@@ -11,8 +11,8 @@ rises with the share removed (`coverage`).
 
 Splats hide each other, so they are removed in rounds: a part of the splats goes, the rest is scored
 again, until a tenth is left. The views are measured once; what the rest is worth later is told by
-lines of sight (`thinning`). The result is one order of removal, so a larger budget also removes all
-that a smaller one does. Scoring for one budget ends with the round that removes the last of its
+scoring rays (`removal_rounds`). The result is one order of removal, so a larger budget also removes
+all that a smaller one does. Scoring for one budget ends with the round that removes the last of its
 splats.
 """
 
@@ -27,21 +27,23 @@ import numpy as np
 from .. import processes
 from ..errors import RefineError
 from ..scores import Scores, shares_gone
+from ..seeing import projection
+from ..seeing.measuring import SECONDS, Measured, Measuring, Sampling
+from ..seeing.ray_sample import RaySample
 from ..splats import refuse_undrawable
 from ..work import Progress, part, report, silent
-from . import closed_form, coverage, projection
-from .measuring import SECONDS, Measured, Measuring, Sampling
-from .sight_lines import SightLines
-from .thinning import Thinning
+from . import closed_form, coverage
+from .closed_form_settings import ClosedForm
+from .removal_rounds import RemovalRounds
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
+    from ..seeing.projection import Gaussians
     from ..splats import Splats
     from ..views import ViewSet
-    from .projection import Gaussians
 
 LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
@@ -52,10 +54,13 @@ EXPONENT = 0.25
 FIRST_END = 0.75
 """Where measuring ends and rounds begin, as a share of all the time, to show progress."""
 
+ROUNDS_BEGIN = 0.3
+"""Share of the time after `FIRST_END` that getting scoring rays ready takes, to show progress."""
+
 ROUND_COST = 0.3
 """Share of the time that is still ahead that a round takes, to show progress."""
 
-PRIOR = closed_form.ClosedForm("distance", frustum=False, local=False)
+PRIOR = ClosedForm("distance", frustum=False, local=False)
 """Model of the floor. It has no frustum test, since splats that no view shows also need a floor."""
 
 
@@ -128,13 +133,15 @@ def score(
     -----
     Memory: about 300 bytes a splat, plus a third of that for each thread beyond the first; and 100
     bytes for each point of a view, per thread. A view has at most about 4 million points
-    (`froxels.MAX_POINTS`); only a view that shows more than 3 million splats has more.
-    What lines of sight meet takes 16 bytes each, see `thinning.Thinning`.
+    (`points.MAX_POINTS`); only a view that shows more than 3 million splats has more.
+    Each hit of the scoring rays takes 16 bytes, see `removal_rounds.RemovalRounds`.
     """
-    run = Run(splats, views, settings, progress=part(progress, 0.0, 0.1), threads=threads)
+    scoring = MemoryScoring(
+        splats, views, settings, progress=part(progress, 0.0, 0.1), threads=threads
+    )
     end = FIRST_END if settings.rounds > 1 else 1.0
-    run.measure(range(run.measuring.count), part(progress, 0.1, end))
-    return run.rank(part(progress, end, 1.0), settled)
+    scoring.measure(range(scoring.measuring.count), part(progress, 0.1, end))
+    return scoring.rank(part(progress, end, 1.0), settled)
 
 
 def score_once(
@@ -142,7 +149,7 @@ def score_once(
     views: ViewSet,
     settings: Occlusion = Occlusion(),
     *,
-    judges: bool = False,
+    few_views: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Scores, Measured]:
@@ -152,8 +159,8 @@ def score_once(
     ----------
     splats, views, settings, progress, threads
         See `score`; `settings.rounds` is ignored.
-    judges : bool
-        See `SightLines`.
+    few_views : bool
+        Whether rays of few views are enough, see `RaySample`.
 
     Returns
     -------
@@ -164,12 +171,12 @@ def score_once(
     RefineError, Cancelled
         See `score`.
     """
-    run = Run(
-        splats, views, replace(settings, rounds=1), judges=judges,
+    scoring = MemoryScoring(
+        splats, views, replace(settings, rounds=1), few_views=few_views,
         progress=part(progress, 0.0, 0.1), threads=threads,
     )  # fmt: skip
-    measured = run.measure(range(run.measuring.count), part(progress, 0.1, 1.0))
-    return run.rank(silent), measured.for_all(run.gaussians.index, len(splats))
+    measured = scoring.measure(range(scoring.measuring.count), part(progress, 0.1, 1.0))
+    return scoring.rank(silent), measured.for_all(scoring.gaussians.index, len(splats))
 
 
 def measure(
@@ -236,15 +243,14 @@ def measure_part(  # noqa: PLR0913 - as `measure`, and which part
         splats, views, progress=part(progress, 0.0, 0.1), threads=threads
     )
     measuring = Measuring(scene, views, settings, threads)
-    which = measuring.part(turn, parts)
-    found = measuring.measure(gaussians, which, part(progress, 0.1, 1.0))
-    return Measured.sum(found.values()).for_all(gaussians.index, len(splats)), measuring.share(
-        which
-    )
+    groups = measuring.groups_of_part(turn, parts)
+    sums = measuring.measure(gaussians, groups, part(progress, 0.1, 1.0))
+    measured = Measured.sum(sums.values()).for_all(gaussians.index, len(splats))
+    return measured, measuring.weight_share(groups)
 
 
-class Rounds:
-    """One scoring: the views measure all splats, then rounds of removing and ordering anew.
+class OcclusionScoring:
+    """One scoring: the views measure all splats, then they are removed and ordered in rounds.
 
     Parameters
     ----------
@@ -254,17 +260,17 @@ class Rounds:
         See `Occlusion`.
     prior : (N,) float32
     undrawable : (N,) bool
-    sights : SightLines, optional
+    validation_rays : RaySample, optional
 
     Attributes
     ----------
     gaussians : Gaussians
         The splats that can contribute to a picture, before any is removed.
     measuring : Measuring
-    sights : SightLines or None
-        Note what the lines of sight of the views meet that measure all splats.
-    ranking : SightLines or None
-        The same with those lines that order splats; None in a single round, and once it ranks.
+    validation_rays : RaySample or None
+        Those of the views that have measured all splats.
+    scoring_rays : RaySample or None
+        The same of the rays that order splats; None in a single round, and once it ranks.
     prior : (N,) float32
         Orders the splats that are not among the Gaussians, and is the floor of all others.
     undrawable : (N,) bool
@@ -278,54 +284,55 @@ class Rounds:
         rounds: int,
         prior: NDArray[np.float32],
         undrawable: NDArray[np.bool_],
-        sights: SightLines | None = None,
+        validation_rays: RaySample | None = None,
     ) -> None:
         self.gaussians, self.measuring, self.rounds = gaussians, measuring, rounds
-        self.prior, self.undrawable, self.sights = prior, undrawable, sights
-        self.ranking: SightLines | None = None
+        self.prior, self.undrawable = prior, undrawable
+        self.validation_rays = validation_rays
+        self.scoring_rays: RaySample | None = None
         self._sample = coverage.sample(gaussians)  # (m,)
-        self._blocks: dict[int, Mapping[int, Measured]] = {}  # what holds the sums of each
-        self._errors: dict[int, NDArray[np.float64]] = {}  # of the sample, by blocks
-        self._weights: dict[tuple[int, ...], list[float]] = {}  # of the floor, by blocks
+        self._sums: dict[int, Mapping[int, Measured]] = {}  # group -> what holds its sums
+        self._errors: dict[int, NDArray[np.float64]] = {}  # of the sample, by groups
+        self._weights: dict[tuple[int, ...], list[float]] = {}  # of the floor, by groups
 
-    def measure(self, which: Sequence[int], progress: Progress = silent) -> Measured:
-        """Measure all splats in some more blocks of views; return the sums over all so far, (M,).
+    def measure(self, groups: Sequence[int], progress: Progress = silent) -> Measured:
+        """Measure all splats in some more groups of views; return the sums over all so far, (M,).
 
         Raises
         ------
         Cancelled
             If `progress` answers ``False``.
         """
-        found, errors = self.measuring.blocks(
-            self.gaussians, self._sample, progress, which=which,
-            sights=[lines for lines in (self.sights, self.ranking) if lines is not None],
-        )  # fmt: skip
-        self._blocks |= dict.fromkeys(found, found)
+        samples = [rays for rays in (self.validation_rays, self.scoring_rays) if rays is not None]
+        sums, errors = self.measuring.measure_groups(
+            self.gaussians, groups, self._sample, progress, samples
+        )
+        self._sums |= dict.fromkeys(sums, sums)
         self._errors |= errors
         return self.measured()
 
-    def measured(self, which: Sequence[int] | None = None) -> Measured:
-        """Return the sums over some of the blocks that were measured, by default all, (M,)."""
-        chosen = sorted(self._blocks if which is None else which)
-        return Measured.sum(self._blocks[k][k] for k in chosen)
+    def measured(self, groups: Sequence[int] | None = None) -> Measured:
+        """Return the sums over some of the groups that were measured, by default all, (M,)."""
+        chosen = sorted(self._sums if groups is None else groups)
+        return Measured.sum(self._sums[k][k] for k in chosen)
 
-    def once(self, which: Sequence[int], progress: Progress = silent) -> NDArray[np.float32]:
-        """Return the values of all N splats, in one round, by some of the blocks measured.
+    def once(self, groups: Sequence[int], progress: Progress = silent) -> NDArray[np.float32]:
+        """Return the values of all N splats, in one round, by some of the groups measured.
 
         Raises
         ------
         Cancelled
             If `progress` answers ``False``.
         """
-        removal, measured = self._removal(), self.measured(which)
-        weights = self._floor_weights(measured, which, progress)
+        removal, measured = self._removal(), self.measured(groups)
+        weights = self._floor_weights(measured, groups, progress)
         every = np.arange(len(self.gaussians))
         order = self._order(every, measured, weights, removal, len(every))
         removal.add(self.gaussians.index[order])
         return removal.values
 
     def rank(self, progress: Progress, settled: int | None = None) -> Scores:
-        """Return the scores, by the blocks measured; can be called once.
+        """Return the scores, by the groups measured; can be called once.
 
         Parameters
         ----------
@@ -348,19 +355,18 @@ class Rounds:
             raise RefineError(msg)
         seen = np.zeros(len(self.prior), np.int32)
         seen[self.gaussians.index] = measured.seen
-        blocks = self._blocks
-        weights = self._floor_weights(measured, list(blocks), part(progress, 0.0, 0.0))
-        used = sum(len(self.measuring.members[k]) for k in blocks)
-        left, done, thinning = np.arange(len(self.gaussians)), 0.3, None
-        if self.ranking is not None:
-            ahead = part(progress, 0.0, done)
-            thinning = Thinning(self.ranking, measured, ahead, self.measuring.threads)
-            self.ranking = None  # its lines are let go as splats go
+        weights = self._floor_weights(measured, list(self._sums), part(progress, 0.0, 0.0))
+        left, done, rounds = np.arange(len(self.gaussians)), ROUNDS_BEGIN, None
+        if self.scoring_rays is not None:
+            rounds = RemovalRounds(
+                self.scoring_rays, measured, part(progress, 0.0, done), self.measuring.threads
+            )
+            self.scoring_rays = None  # its hits are let go as splats go
         for stay in _survivors(len(self.prior), self.rounds, settled):
             end = 1.0 if not stay else done + (1.0 - done) * ROUND_COST
-            ahead, done = part(progress, done, end), end
-            now = measured if thinning is None else thinning.measured(left, ahead)
-            report(ahead, 1.0, "scoring")
+            round_progress, done = part(progress, done, end), end
+            now = measured if rounds is None else rounds.remove_and_measure(left, round_progress)
+            report(round_progress, 1.0, "scoring")
             go = max(len(left) - stay, 0)
             order = self._order(left, now, weights, removal, go)
             removal.add(self.gaussians.index[left[order[:go]]])
@@ -369,11 +375,11 @@ class Rounds:
         return Scores(
             values=removal.values,
             seen=seen,
-            views_used=used,
+            views_used=sum(len(self.measuring.groups[k]) for k in self._sums),
             undrawable=int(np.count_nonzero(self.undrawable)),
             facts={"floor": weights},
             method="occlusion",
-            sights=self.sights,
+            ray_sample=self.validation_rays,
             settled=settled,
         )
 
@@ -416,49 +422,49 @@ class Rounds:
         return coverage.order(combined(measured), floors, prior, weights, stops)
 
     def _floor_weights(
-        self, measured: Measured, which: Sequence[int], progress: Progress
+        self, measured: Measured, groups: Sequence[int], progress: Progress
     ) -> list[float]:
-        """Choose the weights of the floor by leaving out each of some blocks of views.
+        """Choose the weights of the floor by leaving out each of some groups of views.
 
         Parameters
         ----------
         measured : Measured
-            Sums over these blocks, (M,).
-        which : sequence of int
+            Sums over these groups, (M,).
+        groups : sequence of int
         progress : callable
         """
-        blocks, sample = tuple(sorted(which)), self._sample
+        chosen, sample = tuple(sorted(groups)), self._sample
         worth = self.prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)
 
         def folds() -> Iterator[tuple[NDArray[np.float64], ...]]:
-            for number in blocks if len(blocks) > 1 else ():
+            for k in chosen if len(chosen) > 1 else ():
                 report(progress, 0.0, "scoring")
-                block, errors = self._blocks[number][number], self._errors[number]
+                left_out, errors = self._sums[k][k], self._errors[k]
                 others = Measured(
                     # Rounding can leave a negative difference.
-                    np.maximum(measured.contribution[sample] - block.contribution[sample], 0.0),
-                    np.maximum(measured.error[sample] - block.error[sample], 0.0),
-                    measured.seen[sample] - block.seen[sample],
+                    np.maximum(measured.contribution[sample] - left_out.contribution[sample], 0.0),
+                    np.maximum(measured.error[sample] - left_out.error[sample], 0.0),
+                    measured.seen[sample] - left_out.seen[sample],
                 )
                 floors = coverage.floor(worth, others.seen, 1.0 + EXPONENT)
                 yield combined(others), floors, errors
 
-        if blocks not in self._weights:
-            self._weights[blocks] = coverage.floor_weights(folds())
-        return self._weights[blocks]
+        if chosen not in self._weights:
+            self._weights[chosen] = coverage.floor_weights(folds())
+        return self._weights[chosen]
 
 
-class Run(Rounds):
+class MemoryScoring(OcclusionScoring):
     """A scoring of splats in memory.
 
     Parameters
     ----------
     splats, views, settings, progress, threads
         See `score`.
-    members : list of list of int, optional
+    groups : list of list of int, optional
         See `Measuring`.
-    judges : bool
-        See `SightLines`.
+    few_views : bool
+        See `RaySample`.
 
     Raises
     ------
@@ -466,7 +472,7 @@ class Run(Rounds):
         See `score`.
     """
 
-    sights: SightLines
+    validation_rays: RaySample
 
     def __init__(  # noqa: PLR0913 - all but three are optional
         self,
@@ -474,8 +480,8 @@ class Run(Rounds):
         views: ViewSet,
         settings: Occlusion,
         *,
-        members: list[list[int]] | None = None,
-        judges: bool = False,
+        groups: list[list[int]] | None = None,
+        few_views: bool = False,
         progress: Progress = silent,
         threads: int | None = None,
     ) -> None:
@@ -487,14 +493,14 @@ class Run(Rounds):
             splats, views, progress=part(progress, 0.0, 0.5), threads=threads
         )
         refuse_undrawable(int(np.count_nonzero(good)), len(good))
-        measuring = Measuring(scene, views, settings, threads, members)
+        measuring = Measuring(scene, views, settings, threads, groups)
         prior = closed_form.score(
             splats, views, PRIOR, progress=part(progress, 0.5, 1.0), threads=threads
         ).values
-        sights = SightLines(measuring.views, gaussians, splats, judges=judges)
-        super().__init__(gaussians, measuring, settings.rounds, prior, ~good, sights)
+        rays = RaySample(measuring.views, gaussians, splats, few_views=few_views)
+        super().__init__(gaussians, measuring, settings.rounds, prior, ~good, rays)
         if settings.rounds > 1:
-            self.ranking = SightLines(measuring.views, gaussians, splats, ranking=True)
+            self.scoring_rays = RaySample(measuring.views, gaussians, splats, scoring=True)
 
 
 class _Removal:

@@ -18,7 +18,7 @@ from ..absorbing.absorb import ALONE, STAGE, Counts, mergeable, patience, reduce
 from ..absorbing.merge_field import Field, ViewSums
 from ..absorbing.merge_graph import MergeGraph
 from ..pipeline import PARTS
-from ..scoring.measuring import Measured
+from ..seeing.measuring import Measured
 from ..splats import Splats, joined
 from ..work import Progress, part, silent
 from .seen import MeasuringTiles, StoredLines, place
@@ -364,7 +364,7 @@ def estimated(
     found: Seen, survivors: Survivors, workers: Workers, progress: Progress
 ) -> float | None:
     """Return the estimated PSNR of survivors, dB; None if too little is seen."""
-    sights, last = found.scores.sights, survivors.regions[0].folder
+    sights, last = found.scores.ray_sample, survivors.regions[0].folder
     assert isinstance(sights, StoredLines)  # noqa: S101 - as `Seen` has
     job = replace(found.job, folder=last.inner("after"))
     gaussians, _ = place(job, survivors.regions, workers, part(progress, 0.0, 0.5))
@@ -394,10 +394,10 @@ def _measure(
     """
     gaussians, good = place(job, sources, workers, part(progress, 0.0, 0.2))
     measuring = MeasuringTiles(job, workers)
-    which = measuring.part(turn, PARTS)
+    which = measuring.groups_of_part(turn, PARTS)
     found = measuring.measure(gaussians, which, part(progress, 0.2, 1.0))  # type: ignore[arg-type]
     every = Measured.sum(found.values()).for_all(gaussians.index, len(good))
-    others = 1.0 - measuring.share(which)
+    others = 1.0 - measuring.weight_share(which)
     every.contribution[:] += others * expected.contribution
     every.error[:] += others * expected.error
     return every

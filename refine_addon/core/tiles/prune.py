@@ -15,9 +15,10 @@ import numpy as np
 from ...version import VERSION
 from .. import radix
 from ..errors import RefineError
+from ..estimate.psnr import psnr_kept
+from ..estimate.quality import needed
 from ..formats.ply_header import with_count
 from ..pipeline import FIRST, MEASURES, conclude, remark
-from ..quality import needed
 from ..report import Clock, Files, complete_report, make_report
 from ..scoring.closed_form_block import ROWS
 from ..selection import Budget, least_seen, quality_of, refuse_none_left, select, single
@@ -211,11 +212,11 @@ class _Run:
             survivors, psnr = self._absorb(seen, kept)
             kept = int(self.counts[:, 0].sum())
             clock.lap("absorb_s")
-        if scores.sights is not None:
+        if scores.ray_sample is not None:
             keep = np.concatenate(
                 [self.job.folder.load(unit.index, ["keep"])["keep"] for unit in self.units]
             )
-            psnr = scores.sights.psnr(keep) if not self._absorbed else psnr
+            psnr = psnr_kept(scores.ray_sample, keep) if not self._absorbed else psnr
         facts = make_report(scores, keep, budget, settings, clock)
         size = sum(tile.size for tile in self.tiles)
         why = remark(budget, self.total - kept, self.total, psnr, size)

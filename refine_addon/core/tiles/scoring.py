@@ -11,7 +11,7 @@ from ..pipeline import with_quality
 from ..scene import Scene, principal_axes
 from ..scores import Scores
 from ..scoring import auto, closed_form
-from ..scoring.occlusion import FIRST_END, PRIOR, Rounds
+from ..scoring.occlusion import FIRST_END, PRIOR, OcclusionScoring
 from ..work import Progress, part
 from .seen import MeasuringTiles, SceneJob, StoredLines, place
 from .steps import Job, Shared
@@ -20,8 +20,8 @@ from .workers import Call
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from ..scoring.measuring import Measured
     from ..scoring.occlusion import Occlusion
+    from ..seeing.measuring import Measured
     from ..task import Settings
     from .units import Unit
     from .workers import Workers
@@ -165,18 +165,18 @@ def by_occlusion(
 
     Notes
     -----
-    Memory of this process: about 120 bytes a splat, and what lines of sight meet, see
-    `thinning.Thinning`. A worker needs 20 bytes a splat, and for each
+    Memory of this process: about 120 bytes a splat, and the hits of scoring rays, see
+    `removal_rounds.RemovalRounds`. A worker needs 20 bytes a splat, and for each
     view at work what it shows: about 160 bytes a splat, and its points, see `occlusion.score`.
     """
     by_auto = settings.method == "auto"
-    members = auto.blocks_of(job.views) if by_auto else None
+    members = auto.groups_of(job.views) if by_auto else None
     how = settings.occlusion
     run = _Scoring(job, units, how, workers, members, part(progress, 0.0, 0.2))
     ahead = part(progress, 0.2, 0.98)
     with np.errstate(under="ignore"):
         if by_auto:
-            scores = auto.scored(run, settings.tolerance, settled=settled, progress=ahead)
+            scores = auto.finish(run, settings.tolerance, settled=settled, progress=ahead)
         else:
             scores = run.all(ahead, settled)
     return run.estimated(scores, part(progress, 0.98, 1.0))
@@ -194,7 +194,7 @@ def to_absorb(
     return Seen(run.job, units, run.estimated(scores, part(progress, 0.98, 1.0)), measured)
 
 
-class _Scoring(Rounds):
+class _Scoring(OcclusionScoring):
     """A scoring of units.
 
     Parameters
@@ -209,7 +209,7 @@ class _Scoring(Rounds):
         Of getting ready to measure.
     """
 
-    sights: StoredLines
+    validation_rays: StoredLines
 
     def __init__(
         self,
@@ -232,10 +232,10 @@ class _Scoring(Rounds):
         gaussians, good = place(self.job, units, workers, part(progress, 0.6, 1.0))
         sights = StoredLines(self.job, workers, units, gaussians)
         measuring = MeasuringTiles(self.job, workers, members)
-        # Those in the folder have what `Rounds` asks of Gaussians in memory.
+        # Those in the folder have what `OcclusionScoring` asks of Gaussians in memory.
         super().__init__(gaussians, measuring, settings.rounds, values, ~good, sights)  # type: ignore[arg-type]
         if settings.rounds > 1:
-            self.ranking = StoredLines(self.job, workers, units, gaussians, ranking=True)
+            self.scoring_rays = StoredLines(self.job, workers, units, gaussians, scoring=True)
         self._folder, self._units = job.folder, units
 
     def all(self, progress: Progress, settled: int | None = None) -> Scores:
@@ -246,7 +246,7 @@ class _Scoring(Rounds):
 
     def estimated(self, scores: Scores, progress: Progress) -> Scores:
         """Return scores with the curve of the estimated PSNR, and write those of each unit."""
-        self.sights.load()
+        self.validation_rays.load()
         start = 0
         for unit in self._units:
             rows = slice(start, start + len(unit))

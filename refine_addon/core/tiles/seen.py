@@ -14,12 +14,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from ..estimate.psnr import mean_psnr
 from ..processes import for_each
 from ..scene import code_order, moments, spatial_code, splat_fingerprint
-from ..scoring import projection
-from ..scoring.measuring import SECONDS, Measured, Measuring, of_view
-from ..scoring.projection import Gaussians
-from ..scoring.sight_lines import Lines, SightLines, meet, met, psnr_of
+from ..seeing import projection
+from ..seeing.cast import cast
+from ..seeing.measuring import SECONDS, Measured, Measuring, measure_footprints
+from ..seeing.projection import Gaussians
+from ..seeing.ray_sample import RaySample, cast_view
+from ..seeing.rays import Rays
 from ..splats import drawable, joined
 from ..work import Progress, part, silent
 from .workers import Call
@@ -30,7 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..scene import Scene
-    from ..scoring.measuring import Sampling, Seen
+    from ..seeing.measuring import Sampling, ViewMeasurement
     from ..splats import Splats
     from ..views import View, ViewSet
     from .folder import Folder
@@ -158,7 +161,7 @@ class SceneJob:
         numbers : list of int
             Of its views, in the order of `ViewSet.by_distance`.
         kinds : list of bool
-            Of the lines to note: whether they order splats, see `SightLines`.
+            Of the rays to cast: whether they are scoring rays, see `RaySample`.
         progress, threads
         """
         name = seen_name(block)
@@ -176,13 +179,13 @@ class SceneJob:
             errors.append(total.error[sample] - before)
         self.folder.note(name, (total.contribution, total.error, total.seen, np.array(errors)))
 
-    def measure_view(self, number: int, kinds: list[bool]) -> tuple[Seen, float]:
+    def measure_view(self, number: int, kinds: list[bool]) -> tuple[ViewMeasurement, float]:
         """Return what a view sees of the splats, and its weight; note its lines."""
         view, weight = self.views.by_distance()[number]
         footprints, colors = self._footprints(view)
         for ranking in kinds:
-            self._note_lines(number, footprints, ranking=ranking)
-        return of_view(footprints, colors, view, self.sampling), weight
+            self._note_lines(number, footprints, scoring=ranking)
+        return measure_footprints(footprints, colors, view, self.sampling), weight
 
     def meet(self, number: int, pixels: tuple[NDArray[np.int64], ...] | None = None) -> None:
         """Note what the lines of sight of a view meet.
@@ -203,17 +206,17 @@ class SceneJob:
         footprints: projection.Footprints,
         pixels: tuple[NDArray[np.int64], ...] | None = None,
         *,
-        ranking: bool = False,
+        scoring: bool = False,
     ) -> None:
-        name = lines_name(number, ranking=ranking)
+        name = lines_name(number, scoring=scoring)
         if self.folder.has(name):
             return
         with np.errstate(under="ignore"):
             if pixels is None:
-                lines = met(self.views.by_distance(), number, footprints, ranking=ranking)
+                rays = cast_view(self.views.by_distance(), number, footprints, scoring=scoring)
             else:
-                lines = meet(footprints, *pixels)
-        self.folder.note(name, tuple(vars(lines).values()))
+                rays = cast(footprints, *pixels)
+        self.folder.note(name, tuple(vars(rays).values()))
 
     def pick(self, source: Source, rows: NDArray[np.int64]) -> Splats:
         """Return some splats of a source."""
@@ -244,9 +247,9 @@ class SceneJob:
         )  # fmt: skip
 
 
-def lines_name(number: int, *, ranking: bool = False) -> str:
+def lines_name(number: int, *, scoring: bool = False) -> str:
     """Return under which name the lines of sight of a view are noted."""
-    return f"{'ranking' if ranking else 'lines'}-{number:06d}"
+    return f"{'scoring' if scoring else 'validation'}-rays-{number:06d}"
 
 
 def seen_name(block: int) -> str:
@@ -334,7 +337,7 @@ class _Looking:
     numbers: list[int]
     kinds: list[bool]
 
-    def __call__(self, place: int) -> tuple[Seen, float]:
+    def __call__(self, place: int) -> tuple[ViewMeasurement, float]:
         """Return what a view sees, and its weight."""
         return self.job.measure_view(self.numbers[place], self.kinds)
 
@@ -347,43 +350,42 @@ class MeasuringTiles(Measuring):
     job : SceneJob
     workers : callable
         See `workers.Workers`.
-    members : list of list of int, optional
+    groups : list of list of int, optional
         See `Measuring`.
     """
 
     def __init__(
-        self, job: SceneJob, workers: Workers, members: list[list[int]] | None = None
+        self, job: SceneJob, workers: Workers, groups: list[list[int]] | None = None
     ) -> None:
-        super().__init__(job.scene, job.views, job.sampling, None, members)
+        super().__init__(job.scene, job.views, job.sampling, None, groups)
         self._job, self._workers = job, workers
 
-    def blocks(  # type: ignore[override]
+    def measure_groups(  # type: ignore[override]
         self,
         gaussians: Placed,  # noqa: ARG002 - as those in memory, and the folder holds them
+        groups: Sequence[int],
         sample: NDArray[np.int64],
         progress: Progress,
-        which: Sequence[int] | None = None,
-        sights: Sequence[SightLines] = (),
+        ray_samples: Sequence[RaySample] = (),
     ) -> tuple[Stored, dict[int, NDArray[np.float64]]]:
-        """Return the sums over each block of views, and the errors of a sample in each view."""
+        """Return the sums over each group of views, and the errors of a sample in each view."""
         folder = self._job.folder
-        chosen = range(self.count) if which is None else which
         folder.note("sample", sample)
-        kinds = [lines.ranking for lines in sights]
+        kinds = [rays.scoring for rays in ray_samples]
         calls = [
-            Call("look", (block, self.members[block], kinds), 1 / len(chosen), chunked=True)
-            for block in chosen
+            Call("look", (group, self.groups[group], kinds), 1 / len(groups), chunked=True)
+            for group in groups
         ]
         for _ in self._workers(self._job, calls, progress, "scoring"):
             pass
-        for lines in sights:
-            assert isinstance(lines, StoredLines)  # noqa: S101 - as those of `_Scoring` are
-            lines.noted.update(itertools.chain(*(self.members[block] for block in chosen)))
-        errors = {block: folder.noted(seen_name(block))[1][3] for block in chosen}
-        return Stored(folder, chosen), errors
+        for rays in ray_samples:
+            assert isinstance(rays, StoredLines)  # noqa: S101 - as those of `_Scoring` are
+            rays.noted.update(itertools.chain(*(self.groups[group] for group in groups)))
+        errors = {group: folder.noted(seen_name(group))[1][3] for group in groups}
+        return Stored(folder, groups), errors
 
 
-class StoredLines(SightLines):
+class StoredLines(RaySample):
     """The lines of sight of all views into one scene, and the splats that they meet.
 
     Parameters
@@ -394,8 +396,8 @@ class StoredLines(SightLines):
     sources : sequence of Source
         All splats.
     gaussians : Placed
-    ranking : bool
-        See `SightLines`.
+    scoring : bool
+        See `RaySample`.
 
     Attributes
     ----------
@@ -410,15 +412,16 @@ class StoredLines(SightLines):
         sources: Sequence[Source],
         gaussians: Placed,
         *,
-        ranking: bool = False,
+        scoring: bool = False,
     ) -> None:
-        self.views, self.ranking = job.views.by_distance(), ranking
+        self.views, self.scoring = job.views.by_distance(), scoring
         self.index = self.rows = gaussians.index
-        self.lines = [None] * len(self.views)
+        self.rays = [None] * len(self.views)
+        self._step = 1
         self.noted: set[int] = set()
         self._job, self._workers, self._sources = job, workers, sources
 
-    def look_from(
+    def cast(
         self,
         numbers: Sequence[int],
         gaussians: Gaussians,  # noqa: ARG002 - as for splats in memory
@@ -437,7 +440,7 @@ class StoredLines(SightLines):
         self.load()
 
     def against_stored(self, other: StoredLines, progress: Progress) -> float | None:
-        """Return the estimated PSNR with other splats instead; see `SightLines.against`.
+        """Return the estimated PSNR with other splats instead; see `estimate.psnr.psnr_against`.
 
         Parameters
         ----------
@@ -445,30 +448,27 @@ class StoredLines(SightLines):
             Into those, by the same views; its lines have not been noted.
         progress : callable
         """
-        judges = self._judges()
-        lines = {number: self.lines[number] for number in judges}
+        rays = {number: self.rays[number] for number in self.validating()}
         other._look(
-            [(k, (own.columns, own.rows)) for k, own in lines.items() if own is not None], progress
+            [(k, (own.columns, own.rows)) for k, own in rays.items() if own is not None], progress
         )
 
-        def compare(number: int, lines: Lines) -> NDArray[np.float64]:
-            view, others = self.views[number][0], other.lines[number]
-            assert others is not None  # noqa: S101 - just noted
-            with np.errstate(under="ignore"):
-                seen = others.colors(other.colors(others, view))
-                return np.array([psnr_of(seen, lines.colors(self.colors(lines, view)), view)])
+        def stored(number: int, _rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
+            again = other.rays[number]
+            assert again is not None  # noqa: S101 - just cast
+            return again, other.colors(number, again)
 
-        return self._mean_of(compare)
+        return mean_psnr(self, stored)
 
     def load(self) -> None:
         """Load the lines that were noted, and what they meet."""
         folder = self._job.folder
         for number in sorted(self.noted):
             columns, rows, line, owner, alpha, dark, owners = folder.noted(
-                lines_name(number, ranking=self.ranking)
+                lines_name(number, scoring=self.scoring)
             )[1]
-            self.lines[number] = Lines(columns, rows, line, owner, alpha, dark, owners)
-        some = [lines.met for lines in self.lines if lines is not None]
+            self.rays[number] = Rays(columns, rows, line, owner, alpha, dark, owners)
+        some = [rays.hit for rays in self.rays if rays is not None]
         rows = np.unique(np.concatenate([np.empty(0, np.int64), *(self.index[m] for m in some)]))
         begins = np.cumsum([0, *map(len, self._sources)])
         edges = itertools.pairwise(np.searchsorted(rows, begins).tolist())

@@ -17,7 +17,7 @@ from ..errors import RefineError
 from ..formats.ply_columns import splats_from_columns
 from ..formats.ply_header import with_count
 from ..formats.ply_write import write_rows
-from ..scoring.closed_form_block import STEPS, Block
+from ..scoring.closed_form_block import STEPS, RowBlock
 from ..selection import lowest
 from ..survivors import columns_with
 from ..whole_file import whole_file
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scoring.closed_form import ClosedForm
+    from ..scoring.closed_form_settings import ClosedForm
     from ..urls import Url
     from ..views import ViewSet
     from .absorbing import Region
@@ -134,7 +134,7 @@ class Job:
         arrays = self.folder.load(unit.index, needed)
         # From a disk a unit is read chunk by chunk; behind a URL each chunk would be a request.
         splats = unit.splats() if step == "read" and unit.remote else unit
-        block = Block(
+        block = RowBlock(
             splats, self.views, self.settings, self.middle, threads=threads, arrays=arrays
         )
         del splats

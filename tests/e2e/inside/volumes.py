@@ -32,7 +32,7 @@ def main(cloud: str, cameras: str, picture: str) -> Generator[float, None, dict[
     """
     extension.enable()
     yield 1.0
-    demands = importlib.import_module(f"{extension.MODULE}.demands")
+    demands = importlib.import_module(f"{extension.MODULE}.objects.demands")
     show = Show(picture)
     hand = Hand()
     yield from hand.press("ESC")  # the splash screen

@@ -21,11 +21,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .. import frustum
 from ..affine import QUARTERS
+from ..seeing import frustum, projection
+from ..seeing.cast import cast, pixels
 from ..work import Progress, for_chunks, part, report, silent
-from . import projection
-from .sight_lines import meet, pixels
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -34,9 +33,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..scene import Scene
+    from ..seeing.projection import Gaussians
     from ..splats import Splats
     from ..views import View, ViewSet
-    from .projection import Gaussians
 
 SAMPLE = 4096
 """About so many splats stand for all, each as much larger as it stands for others."""
@@ -47,8 +46,8 @@ POINTS = 512
 VIEWS = 12
 """So many views at most are turned."""
 
-LINES = 1024
-"""How many lines of sight all of them together have."""
+RAYS = 1024
+"""How many rays all of them together have."""
 
 FINE = 0.015
 """Standard deviation of a splat that is half as fine as one of no size, as a share of the image."""
@@ -137,14 +136,14 @@ class Alignment:
     def from_facts(cls, facts: Mapping[str, Any] | None) -> Alignment:
         """Return what `facts` were made of; of what is none, that nothing is known."""
         try:
-            found = facts or {}
-            turn, known = int(found.get("turn", 0)), bool(found.get("known", False))
-            fineness = tuple(float(value) for value in found.get("fineness", ()))
-            far = tuple(str(name) for name in found.get("far", ()))
+            stored = facts or {}
+            turn, known = int(stored.get("turn", 0)), bool(stored.get("known", False))
+            fineness = tuple(float(value) for value in stored.get("fineness", ()))
+            far = tuple(str(name) for name in stored.get("far", ()))
         except (AttributeError, TypeError, ValueError):
             return cls()
-        told = turn in QUARTERS and len(fineness) in {0, len(QUARTERS)} and (known or fineness)
-        return cls(turn if told else 0, known, fineness, far)
+        whole = turn in QUARTERS and len(fineness) in {0, len(QUARTERS)} and (known or fineness)
+        return cls(turn if whole else 0, known, fineness, far)
 
 
 def alignment(
@@ -173,29 +172,29 @@ def alignment(
     Cancelled
         If `progress` answers ``False``.
     """
-    means = splats.means[_some(splats, POINTS)].astype(np.float64)  # (n, 3)
-    far, there, count = [], 0, 0
+    means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
+    far, in_pictures, count = [], 0, 0
     with np.errstate(under="ignore"):
         for view in views:
             report(progress, 0.0, "checking")
             if view.weight:
                 points = _in_picture(means, view)
-                there, count = there + points.shape[1], count + len(means)
+                in_pictures, count = in_pictures + points.shape[1], count + len(means)
                 far += [view.name] if _is_far(points, view) else []
-        found = Alignment(far=tuple(far))
+        unturned = Alignment(far=tuple(far))
         if views.turn is not None:
-            return replace(found, turn=views.turn, known=True)
+            return replace(unturned, turn=views.turn, known=True)
         one_way = np.linalg.norm(views.rotations[:, 2].mean(axis=0)) >= ONE_WAY
-        if used is None or one_way or there >= WHOLE * count:
-            return found
-        rows = _some(splats, SAMPLE)
+        if used is None or one_way or in_pictures >= WHOLE * count:
+            return unturned
+        rows = _spread_rows(splats, SAMPLE)
         fineness = _fineness(splats, rows, used.spread(VIEWS), progress, threads)
     best = list(QUARTERS)[int(np.argmax(fineness))]
     turn = best if max(fineness) > max(BETTER * fineness[0], LEAST) else 0
-    return replace(found, turn=turn, fineness=fineness)
+    return replace(unturned, turn=turn, fineness=fineness)
 
 
-def _some(splats: Splats, count: int) -> NDArray[np.int64]:
+def _spread_rows(splats: Splats, count: int) -> NDArray[np.int64]:
     """Return the rows of at least `count` splats, if there are as many, evenly spread."""
     return np.arange(0, len(splats), max(len(splats) // count, 1))
 
@@ -240,56 +239,56 @@ def _fineness(
     progress : callable
     threads : int, optional
     """
-    crowd = len(splats) / len(rows)
-    some = splats.take(rows)
-    larger = np.asarray(some.log_scales, np.float64) + 0.5 * np.log(crowd)
-    some = replace(some, log_scales=larger, sh_rest=some.sh_rest[:, :0])
+    stand_for = len(splats) / len(rows)
+    sample = splats.take(rows)
+    larger = np.asarray(sample.log_scales, np.float64) + 0.5 * np.log(stand_for)
+    sample = replace(sample, log_scales=larger, sh_rest=sample.sh_rest[:, :0])
     gaussians, scene, _ = projection.prepare(
-        some, views, progress=part(progress, 0.0, 0.2), threads=threads
+        sample, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
-    looks = [view for view, _ in views.by_distance()]
-    count, rotations = len(looks), list(QUARTERS.values())
+    ordered = [view for view, _ in views.by_distance()]
+    count, rotations = len(ordered), list(QUARTERS.values())
 
-    def work(piece: slice) -> float:
+    def fineness_of_turned(piece: slice) -> float:
         turn, number = divmod(piece.start, count)
-        places = pixels(looks[number], number, LINES / count)
-        view = looks[number].turned(rotations[turn])
-        return _fineness_of(gaussians, scene, view, places, crowd)
+        columns_and_rows = pixels(ordered[number], number, RAYS / count)
+        view = ordered[number].turned(rotations[turn])
+        return _fineness_of(gaussians, scene, view, columns_and_rows, stand_for)
 
-    found = for_chunks(
-        work, len(QUARTERS) * count, 1,
+    fineness = for_chunks(
+        fineness_of_turned, len(QUARTERS) * count, 1,
         progress=part(progress, 0.2, 1.0), what="checking", threads=threads,
     )  # fmt: skip
-    return tuple(np.reshape(found, (len(QUARTERS), count)).mean(axis=1).tolist())
+    return tuple(np.reshape(fineness, (len(QUARTERS), count)).mean(axis=1).tolist())
 
 
 def _fineness_of(
     gaussians: Gaussians,
     scene: Scene,
     view: View,
-    pixels: tuple[NDArray[np.int64], NDArray[np.int64]],
-    crowd: float,
+    columns_and_rows: tuple[NDArray[np.int64], NDArray[np.int64]],
+    stand_for: float,
 ) -> float:
     """Return the fineness of one picture.
 
     Parameters
     ----------
     gaussians : Gaussians
-        Each stands for `crowd` others, and its footprint is as much larger.
+        Each stands for `stand_for` splats, and its footprint is as much larger.
     scene : Scene
     view : View
-    pixels : tuple of (C,) and (R,) int64
-        Columns and rows through which lines of sight go.
-    crowd : float
+    columns_and_rows : tuple of (C,) and (R,) int64
+        Of the pixels that the rays go through.
+    stand_for : float
     """
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
-        lines = meet(footprints, *pixels)
-        if not len(lines.line):
+        rays = cast(footprints, *columns_and_rows)
+        if not len(rays.ray):
             return 0.0
         square = np.zeros(len(gaussians))  # px^2
-        square[footprints.index] = footprints.sigmas[0] * footprints.sigmas[1] / crowd
+        square[footprints.index] = footprints.sigmas[0] * footprints.sigmas[1] / stand_for
         square /= FINE**2 * view.width * view.height
-        _, owner, weight = lines.contributions()
-        total = float((weight / (1.0 + square[lines.met[owner]])).sum())
-    return total / lines.count
+        _, owner, weight = rays.contributions()
+        total = float((weight / (1.0 + square[rays.hit[owner]])).sum())
+    return total / rays.count

@@ -13,30 +13,30 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
+from ..core.errors import RefineError
+from ..core.estimate.quality import Quality
+from ..core.selection import rank
+from ..core.splats import joined
+from ..core.task import DEFAULTS, Task
+from ..core.volumes import FREE, Forced
+from ..mesh import edit as mesh_edit
+from ..mesh import layout as mesh_layout
+from ..mesh import scores as mesh_scores
 from . import demands, splat_object
-from .core.errors import RefineError
-from .core.quality import Quality
-from .core.selection import rank
-from .core.splats import joined
-from .core.task import DEFAULTS, Task
-from .core.volumes import FREE, Forced
 from .demands import Demands
-from .mesh import edit as mesh_edit
-from .mesh import layout as mesh_layout
-from .mesh import scores as mesh_scores
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
-    from .core.absorbing.absorb import Absorbed
-    from .core.scores import Scores
-    from .core.selection import Budget
-    from .core.splats import Splats
-    from .core.task import Result, Settings
-    from .core.views import ViewSet
-    from .mesh.layout import SplatObject
+    from ..core.absorbing.absorb import Absorbed
+    from ..core.scores import Scores
+    from ..core.selection import Budget
+    from ..core.splats import Splats
+    from ..core.task import Result, Settings
+    from ..core.views import ViewSet
+    from ..mesh.layout import SplatObject
     from .splat_object import Plan
 
 Members = list["SplatObject"]
@@ -207,21 +207,28 @@ def store(group: Members, scores: Scores, noted: Noted) -> None:
     """
     _check_counts(group, len(scores.values))
     ranks, scoring = rank(scores.values), uuid.uuid4().hex
-    stay, go = (parts_of(mask, group) for mask in (noted.forced.protected, noted.forced.removed))
-    pairs = zip(group, noted.origins, strict=True)
-    for (member, origin), rows, protected, removed in zip(
-        pairs, _rows(group), stay, go, strict=True
+    stay = parts_of(noted.forced.protected, group)
+    for member, origin, rows, protected in zip(
+        group, noted.origins, _rows(group), stay, strict=True
     ):
-        values, own, together = scores.values[rows], scores, None
-        gone = int(np.count_nonzero(removed))
+        own, together = scores, None
         if len(group) > 1:
-            undrawable = int(np.count_nonzero(values == 0.0)) - gone
-            own = replace(scores, values=values, seen=scores.seen[rows], undrawable=undrawable)
+            own = _scores_of_rows(scores, rows)
             together = mesh_scores.Together(scoring, len(scores.values), ranks[rows])
         mesh_scores.store(
             member, own, noted.settings, origin, noted.cameras,
-            forced=gone, protected=protected, asked=noted.asked, together=together,
+            protected=protected, asked=noted.asked, together=together,
         )  # fmt: skip
+
+
+def _scores_of_rows(scores: Scores, rows: slice) -> Scores:
+    """Return the scores of one object of those that were scored together."""
+    values = scores.values[rows]
+    scored = np.ones(len(values), np.bool_) if scores.scored is None else scores.scored[rows]
+    undrawable = int(np.count_nonzero((values == 0.0) & scored))
+    return replace(
+        scores, values=values, seen=scores.seen[rows], undrawable=undrawable, scored=scored
+    )
 
 
 def stored_task(
@@ -337,17 +344,21 @@ def _check_scored_together(group: Members) -> None:
 
 def _scores(group: Members, parts: list[Scores], masks: dict[str, Any]) -> Scores:
     """Return the scores of all objects as one; their curve, if all that were scored are there."""
-    records = [mesh_scores.record(member.mesh) or {} for member in group]
-    noted, removed = records[0], masks.get("removed")
-    whole = noted["together"]["splats"] == sum(len(part.values) for part in parts)
-    gone = 0 if removed is None else int(np.count_nonzero(removed))
-    whole = whole and gone == sum(record.get("forced", 0) for record in records)
+    noted, removed = mesh_scores.record(group[0].mesh) or {}, masks.get("removed")
+    values = np.concatenate([part.values for part in parts])
+    scored = ~_joined_masks(
+        [None if part.scored is None else ~part.scored for part in parts],
+        [len(part.values) for part in parts],
+    )
+    forced_out = np.zeros_like(scored) if removed is None else removed
+    whole = noted["together"]["splats"] == len(values) and np.array_equal(forced_out, ~scored)
     return replace(
         parts[0],
-        values=np.concatenate([part.values for part in parts]),
+        values=values,
         seen=np.concatenate([part.seen for part in parts]),
         undrawable=sum(part.undrawable for part in parts),
         quality=Quality.from_facts(noted.get("quality")) if whole else None,
+        scored=scored,
     )
 
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import frustum
 from ..rendering import ALPHA_CUT, LOW_PASS, NEAR_RELATIVE
 from ..scene import Scene, scene_of, spatial_order, splat_fingerprint
 from ..splats import SH_C0, drawable, opacity, rotation_matrices
 from ..work import Progress, checkpoint, for_chunks, part, report, silent
+from . import frustum
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -6,16 +6,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .affine import is_uniform, transformed
-from .formats.registry import format_named, read_splats
+from ..affine import is_uniform, transformed
+from ..formats.registry import format_named, read_written
+from .psnr import psnr_against
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from .scores import Scores
-    from .views import ViewSet
+    from ..scores import Scores
+    from ..views import ViewSet
 
 
 def written_facts(
@@ -33,9 +34,9 @@ def written_facts(
     path : Path
         The file; it is read again.
     scores : Scores
-        Of the splats that it was made of; their lines of sight tell the PSNR.
+        Of the splats that it was made of; their validation rays tell the PSNR.
     views : ViewSet
-        Those that the lines belong to.
+        Those of the rays.
     matrix : (4, 4) float64, optional
         From the frame of the file to that of the views; by default they are the same.
     threads : int, optional
@@ -44,21 +45,24 @@ def written_facts(
     -------
     dict
         ``written_psnr``: the estimated PSNR in dB against the pictures of all splats, with what the
-        format rounds and leaves out; None where nothing tells it, or
-        the matrix scales directions differently, which harmonics cannot express.
+        format rounds and leaves out; None where nothing tells it, where the file may not be read
+        (see `read_written`), or the matrix scales directions differently, which harmonics cannot
+        express.
 
     Raises
     ------
     RefineError
-        See `read_splats`.
+        See `read_written`.
     """
     if format_named(path) is None:
         return {}
     matrix = np.eye(4) if matrix is None else matrix
-    if scores.sights is None or not is_uniform(matrix):
+    if scores.ray_sample is None or not is_uniform(matrix):
         return {"written_psnr": None}
-    splats = read_splats(path).splats()
+    splats = read_written(path)
+    if splats is None:
+        return {"written_psnr": None}
     if not np.array_equal(matrix, np.eye(4)):
         splats = transformed(splats, matrix)
-    psnr = scores.sights.against(splats, views, threads=threads)
+    psnr = psnr_against(scores.ray_sample, splats, views, threads=threads)
     return {"written_psnr": None if psnr is None else round(psnr, 2)}

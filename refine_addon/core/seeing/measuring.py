@@ -19,7 +19,8 @@ import numpy as np
 from ..errors import RefineError
 from ..processes import for_each
 from . import froxels, projection
-from .sight_lines import met
+from .points import cell_size, scatter
+from .ray_sample import cast_view
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -30,13 +31,15 @@ if TYPE_CHECKING:
     from ..views import View, ViewSet
     from ..work import Progress
     from .projection import Footprints, Gaussians
-    from .sight_lines import Lines, SightLines
+    from .ray_sample import RaySample
+    from .rays import Rays
 
-BLOCKS = 8
-"""Of views; sums are added block by block, so they do not depend on threads."""
+VIEW_GROUPS = 8
+"""Views are measured in so many groups; sums are added group by group, so they do not depend on
+threads."""
 
 SECONDS = 1.2e-6
-"""About how long one core measures a splat in one view, to tell what is worth a process."""
+"""About how long one core takes to measure a splat in one view, to tell what is worth a process."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class Sampling:
     Attributes
     ----------
     cell : float
-        Least side of a cell, pixels; `froxels.cell_size` chooses a larger one where the splats need
+        Least side of a cell, pixels; `points.cell_size` chooses a larger one where the splats need
         no finer cells.
     density : float
         Points per standard deviation for a splat whose standard deviation is as long as a cell.
@@ -119,15 +122,15 @@ class Measured:
         self.error[:] += other.error
         self.seen[:] += other.seen
 
-    def add_view(self, seen: Seen, weight: float) -> None:
+    def add_view(self, measurement: ViewMeasurement, weight: float) -> None:
         """Add what one view sees, times its weight."""
-        self.seen[seen.rows[seen.inside]] += 1
+        self.seen[measurement.rows[measurement.inside]] += 1
         with np.errstate(under="ignore"):
-            self.contribution[seen.rows] += weight * seen.contribution
-            self.error[seen.rows] += weight * seen.error
+            self.contribution[measurement.rows] += weight * measurement.contribution
+            self.error[measurement.rows] += weight * measurement.error
 
 
-class Seen(NamedTuple):
+class ViewMeasurement(NamedTuple):
     """What one view sees of n Gaussians.
 
     Attributes
@@ -154,15 +157,15 @@ class Measuring:
     views : ViewSet
     sampling : Sampling
     threads : int, optional
-    members : list of list of int, optional
-        By default each block has every eighth view.
+    groups : list of list of int, optional
+        By default each group has every eighth view.
 
     Attributes
     ----------
     views : list of (View, float)
         Views and their weights, see `ViewSet.by_distance`.
-    members : list of list of int
-        The numbers of the views of each block.
+    groups : list of list of int
+        The numbers of the views of each group.
     """
 
     def __init__(
@@ -171,95 +174,95 @@ class Measuring:
         views: ViewSet,
         sampling: Sampling,
         threads: int | None,
-        members: list[list[int]] | None = None,
+        groups: list[list[int]] | None = None,
     ) -> None:
         self.scene, self.sampling, self.threads = scene, sampling, threads
         self.views = views.by_distance()
         total = len(self.views)
-        count = min(BLOCKS, total)
-        self.members = members or [list(range(k, total, count)) for k in range(count)]
+        count = min(VIEW_GROUPS, total)
+        self.groups = groups or [list(range(k, total, count)) for k in range(count)]
 
     @property
     def count(self) -> int:
-        """Number of blocks."""
-        return len(self.members)
+        """Number of groups."""
+        return len(self.groups)
 
-    def part(self, turn: int, parts: int) -> range:
-        """Return the blocks of one of `parts` parts of the views; see `occlusion.measure_part`."""
+    def groups_of_part(self, turn: int, parts: int) -> range:
+        """Return the groups of one of `parts` parts of the views; see `occlusion.measure_part`."""
         parts = min(parts, self.count)
         return range(turn % parts, self.count, parts)
 
-    def share(self, which: Sequence[int]) -> float:
-        """Return the share of the weights of all views that some blocks have."""
+    def weight_share(self, groups: Sequence[int]) -> float:
+        """Return the share of the weights of all views that some groups have."""
         weights = [weight for _, weight in self.views]
-        mine = (weights[number] for k in which for number in self.members[k])
-        return math.fsum(mine) / math.fsum(weights)
+        chosen = (weights[number] for k in groups for number in self.groups[k])
+        return math.fsum(chosen) / math.fsum(weights)
 
     def measure(
-        self, gaussians: Gaussians, which: Sequence[int], progress: Progress
+        self, gaussians: Gaussians, groups: Sequence[int], progress: Progress
     ) -> Mapping[int, Measured]:
-        """Return the sums over some blocks of views; see `blocks`."""
-        none = np.empty(0, np.int64)
-        return self.blocks(gaussians, none, progress, which=which)[0]
+        """Return the sums over some groups of views; see `measure_groups`."""
+        no_sample = np.empty(0, np.int64)
+        return self.measure_groups(gaussians, groups, no_sample, progress)[0]
 
-    def blocks(
+    def measure_groups(
         self,
         gaussians: Gaussians,
+        groups: Sequence[int],
         sample: NDArray[np.int64],
         progress: Progress,
-        which: Sequence[int] | None = None,
-        sights: Sequence[SightLines] = (),
+        ray_samples: Sequence[RaySample] = (),
     ) -> tuple[Mapping[int, Measured], dict[int, NDArray[np.float64]]]:
-        """Return the sums over each block of views, and the errors of a sample in each view.
+        """Return the sums over each group of views, and the errors of a sample in each view.
 
         Parameters
         ----------
         gaussians : Gaussians
+        groups : sequence of int
+            Those to measure.
         sample : (m,) int64
             Rows of the Gaussians.
         progress : callable
-        which : sequence of int, optional
-            The blocks to measure; by default all `count` of them.
-        sights : sequence of SightLines
-            Note what their lines meet.
+        ray_samples : sequence of RaySample
+            Get the rays that they want of these views.
 
         Returns
         -------
         dict of int to Measured, dict of int to (views, m) float64
-            Of each of these blocks.
+            Of each of these groups.
         """
-        chosen = range(self.count) if which is None else which
-        numbers = [number for k in chosen for number in self.members[k]]
-        missing = [
-            (each.ranking, {number for number in numbers if each.lacks(number)}) for each in sights
+        numbers = [number for k in groups for number in self.groups[k]]
+        wanted = [
+            (rays.scoring, {number for number in numbers if rays.wants(number)})
+            for rays in ray_samples
         ]
-        found = for_each(
-            _Looking(gaussians, self.scene, self.views, self.sampling, numbers, missing),
+        measurements = for_each(
+            _MeasureAndCast(gaussians, self.scene, self.views, self.sampling, numbers, wanted),
             len(numbers), SECONDS * len(gaussians) * len(numbers),
             progress=progress, what="scoring", threads=self.threads,
         )  # fmt: skip
         sums: dict[int, Measured] = {}
         errors: dict[int, NDArray[np.float64]] = {}
-        for k in chosen:
+        for k in groups:
             total = sums[k] = Measured.zero(len(gaussians))
-            grown = []
-            for number in self.members[k]:
-                seen, lines = next(found)
+            errors_of_views = []
+            for number in self.groups[k]:
+                measurement, cast = next(measurements)
                 before = total.error[sample]  # (m,)
-                total.add_view(seen, self.views[number][1])
-                grown.append(total.error[sample] - before)
-                for each, noted in zip(sights, lines, strict=True):
-                    if noted is not None:
-                        each.lines[number] = noted
-            errors[k] = np.array(grown)
-        for _ in found:
+                total.add_view(measurement, self.views[number][1])
+                errors_of_views.append(total.error[sample] - before)
+                for rays, rays_of_view in zip(ray_samples, cast, strict=True):
+                    if rays_of_view is not None:
+                        rays.rays[number] = rays_of_view
+            errors[k] = np.array(errors_of_views)
+        for _ in measurements:
             pass  # lets it end
         return sums, errors
 
 
 @dataclass(frozen=True, eq=False)
-class _Looking:
-    """Measures some views; any process can.
+class _MeasureAndCast:
+    """Measures some views and casts their rays; any process can.
 
     Attributes
     ----------
@@ -270,9 +273,9 @@ class _Looking:
     sampling : Sampling
     numbers : list of int
         Of those that measure.
-    missing : list of (bool, set of int)
-        Of several kinds of lines of sight: whether they order splats, and the numbers of the views
-        of which they are wanted.
+    wanted : list of (bool, set of int)
+        Of several samples of rays: whether they are scoring rays, and the numbers of the views
+        whose rays are wanted.
     """
 
     gaussians: Gaussians
@@ -280,37 +283,39 @@ class _Looking:
     views: list[tuple[View, float]]
     sampling: Sampling
     numbers: list[int]
-    missing: list[tuple[bool, set[int]]]
+    wanted: list[tuple[bool, set[int]]]
 
-    def __call__(self, place: int) -> tuple[Seen, list[Lines | None]]:
-        """Return what a view sees, and what its lines of sight meet."""
+    def __call__(self, place: int) -> tuple[ViewMeasurement, list[Rays | None]]:
+        """Return what a view sees of the splats, and its rays."""
         number = self.numbers[place]
-        footprints, seen = measure_view(
+        footprints, measurement = measure_view(
             self.gaussians, self.scene, self.views[number][0], self.sampling
         )
         with np.errstate(under="ignore"):
-            return seen, [
-                met(self.views, number, footprints, ranking=ranking) if number in wanted else None
-                for ranking, wanted in self.missing
+            return measurement, [
+                cast_view(self.views, number, footprints, scoring=scoring)
+                if number in numbers
+                else None
+                for scoring, numbers in self.wanted
             ]
 
 
 def measure_view(
     gaussians: Gaussians, scene: Scene, view: View, sampling: Sampling
-) -> tuple[Footprints, Seen]:
+) -> tuple[Footprints, ViewMeasurement]:
     """Return the footprints in a view, and what it sees of them."""
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)
     colors = gaussians.colors[footprints.index]  # (n, 3)
-    return footprints, of_view(footprints, colors, view, sampling)
+    return footprints, measure_footprints(footprints, colors, view, sampling)
 
 
-def of_view(
+def measure_footprints(
     footprints: Footprints,
     colors: NDArray[np.float32],
     view: View,
     sampling: Sampling,
-) -> Seen:
+) -> ViewMeasurement:
     """Return what a view sees of n footprints.
 
     Parameters
@@ -322,19 +327,19 @@ def of_view(
     """
     rows, inside = footprints.index, footprints.inside
     if not len(rows):
-        return Seen(rows, inside, np.empty(0), np.empty(0))
+        return ViewMeasurement(rows, inside, np.empty(0), np.empty(0))
     with np.errstate(under="ignore"):
-        side = froxels.cell_size(footprints, view, sampling.cell, sampling.density)
-        points = froxels.scatter(footprints, view, side, sampling.density)
+        side = cell_size(footprints, view, sampling.cell, sampling.density)
+        points = scatter(footprints, view, side, sampling.density)
         mass, mass_squared = froxels.masses(footprints)  # (n,) each
         traits = froxels.traits(footprints, mass, colors, points.area)  # (n, 6)
         visible, errors = np.empty((2, len(points.owners)))  # (m,) each
         for cells, place in points.pieces():
-            shares, mine = points.shares[place], traits.take(points.owners[place], axis=0)
-            seen, squared_contrast = froxels.look(shares, mine, points.columns[cells])
-            seen *= shares
-            visible[place] = seen
-            seen *= seen
-            errors[place] = seen * squared_contrast
+            shares, of_points = points.shares[place], traits.take(points.owners[place], axis=0)
+            weight, squared_contrast = froxels.composite(shares, of_points, points.counts[cells])
+            weight *= shares
+            visible[place] = weight
+            weight *= weight
+            errors[place] = weight * squared_contrast
         visible, errors = froxels.mean_visible(points, visible, errors)
-        return Seen(rows, inside, mass * visible, mass_squared * errors)
+        return ViewMeasurement(rows, inside, mass * visible, mass_squared * errors)

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import bpy
 
+from ..core.levels.files import GOAL
+from ..mesh.layout import SplatObject, check
 from . import splat_object
-from .core.levels.files import GOAL
-from .mesh.layout import SplatObject, check
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from .core.levels.lod import Level
+    from ..core.levels.lod import Level
 
 FACTS = "refine_lod"
 """Custom property of the object of a level: what is known of it, as in the manifest of files."""

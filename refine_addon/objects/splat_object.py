@@ -14,27 +14,27 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from .cameras.objects import world_matrix
-from .core import pipeline
-from .core.affine import is_uniform, transformed
-from .core.errors import RefineError
-from .core.file_to_file import picture_facts
-from .core.formats.ply import columns_from_splats
-from .core.formats.registry import as_written, format_named, refuse_unknown_size
-from .core.report import Clock, Files, complete_report, held
-from .core.survivors import survivor_columns
-from .core.task import DEFAULTS, Result, Settings, Task
-from .core.volumes import FREE, Forced
-from .core.whole_file import expanded, refuse_existing
-from .core.work import Progress, part, silent
-from .core.written import written_facts
+from ..cameras.objects import world_matrix
+from ..core import pipeline
+from ..core.affine import is_uniform, transformed
+from ..core.errors import RefineError
+from ..core.estimate.written import written_facts
+from ..core.file_to_file import picture_facts
+from ..core.formats.ply import columns_from_splats
+from ..core.formats.registry import as_written, format_named, refuse_unknown_size
+from ..core.report import Clock, Files, complete_report, held
+from ..core.survivors import survivor_columns
+from ..core.task import DEFAULTS, Result, Settings, Task
+from ..core.volumes import FREE, Forced
+from ..core.whole_file import expanded, refuse_existing
+from ..core.work import Progress, part, silent
+from ..mesh import attributes as mesh_attributes
+from ..mesh import edit as mesh_edit
+from ..mesh import floaters as mesh_floaters
+from ..mesh import layout as mesh_layout
+from ..mesh.layout import SplatObject, check
+from ..mesh.scores import RECORD, store, stored_scores
 from .demands import NONE
-from .mesh import attributes as mesh_attributes
-from .mesh import edit as mesh_edit
-from .mesh import floaters as mesh_floaters
-from .mesh import layout as mesh_layout
-from .mesh.layout import SplatObject, check
-from .mesh.scores import RECORD, store, stored_scores
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -42,15 +42,15 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from .core.absorbing.absorb import Absorbed
-    from .core.formats.ply import SplatFile
-    from .core.formats.registry import Packed
-    from .core.levels.lod import Level
-    from .core.picture_files import PictureFiles
-    from .core.scores import Scores
-    from .core.selection import Budget
-    from .core.splats import Splats
-    from .core.views import ViewSet
+    from ..core.absorbing.absorb import Absorbed
+    from ..core.formats.ply import SplatFile
+    from ..core.formats.registry import Packed
+    from ..core.levels.lod import Level
+    from ..core.picture_files import PictureFiles
+    from ..core.scores import Scores
+    from ..core.selection import Budget
+    from ..core.splats import Splats
+    from ..core.views import ViewSet
     from .demands import Demands
 
 
@@ -469,7 +469,7 @@ def prune_object(  # noqa: PLR0913 - the command's options
     result.report["notes"] += made.notes(result.keep)
     if save and not dry_run:
         with mesh_edit.all_or_nothing(checked.obj):
-            store(checked, result.scores, settings, forced=result.report["splats"]["forced"])
+            store(checked, result.scores, settings)
             _reduce(checked, result.keep, columns)
             _save(target)
     clock.lap("write_s")

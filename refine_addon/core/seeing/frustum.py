@@ -17,12 +17,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from .work import Progress, for_chunks, silent
+from ..work import Progress, for_chunks, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .views import View, ViewSet
+    from ..views import View, ViewSet
 
 _STACK = 16
 """Rows of one matrix product: so few that BLAS starts no threads, which would slow down ours."""

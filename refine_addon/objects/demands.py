@@ -11,25 +11,25 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from .cameras.objects import world_matrix
-from .core.affine import moved
-from .core.errors import RefineError
-from .core.solid import Solid
-from .core.volumes import Box, Forced, Placed, Sphere, Zone, forced
-from .mesh import attributes as mesh_attributes
-from .mesh import edit as mesh_edit
-from .mesh import floaters as mesh_floaters
-from .mesh import scores as mesh_scores
-from .mesh.layout import splat_count
-from .mesh.notes import parsed
+from ..cameras.objects import world_matrix
+from ..core.affine import moved
+from ..core.errors import RefineError
+from ..core.solid import Solid
+from ..core.volumes import Box, Forced, Placed, Sphere, Zone, forced
+from ..mesh import attributes as mesh_attributes
+from ..mesh import edit as mesh_edit
+from ..mesh import floaters as mesh_floaters
+from ..mesh import scores as mesh_scores
+from ..mesh.layout import splat_count
+from ..mesh.notes import parsed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-    from .core.volumes import Role, Volume
-    from .mesh.layout import SplatObject
+    from ..core.volumes import Role, Volume
+    from ..mesh.layout import SplatObject
 
 FACTS = "refine_forced"
 """Custom property of the mesh: what was last found to stay and to go, or why not, as JSON."""

@@ -1,0 +1,199 @@
+"""What each splat is worth while others go, told by scoring rays.
+
+Splats hide each other, so what one is worth rises as those around it go. Rays that were cast once
+(`seeing.ray_sample`) tell it at any time without measuring the views again: the hits of a ray are
+known, front to back, and so is what it would show without any one of them. Few rays hit a small
+splat, so what they tell is weighed against what the views measured of all splats
+(`seeing.measuring`)::
+
+    error_i = (n_i  error on the rays now  +  KNOWN  error measured, grown) / (n_i + KNOWN)
+
+n_i is how many rays hit the splat while all were there. A measured sum grows as the rays tell, see
+`_grown`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..seeing.measuring import Measured
+from ..work import Progress, for_chunks, part
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..seeing.ray_sample import RaySample
+    from ..seeing.rays import Rays
+
+    Sums = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+KNOWN = 10.0
+"""What was measured counts as much as so many rays."""
+
+_LOADING = 0.3
+"""Share of the time that getting colours takes, to show progress."""
+
+
+@dataclass(frozen=True, eq=False)
+class _ViewRays:
+    """The scoring rays of one view.
+
+    Attributes
+    ----------
+    rays : Rays
+    colors : (3, u) float32
+        Of the splats that they hit.
+    area : float
+        Of the image for each ray, px^2, times the view's weight.
+    """
+
+    rays: Rays
+    colors: NDArray[np.float32]
+    area: float
+
+    def keeping(self, keep: NDArray[np.bool_]) -> _ViewRays:
+        """Return them with their hits on some of all M Gaussians alone."""
+        return replace(self, rays=self.rays.keeping(keep.take(self.rays.hit)))
+
+    def removal_errors(self) -> Sums:
+        """Return error and contribution of the splats that are hit, (u,) each; see `measuring`."""
+        error, contribution = self.rays.removal_errors(self.colors)
+        return np.asarray(self.area * error), np.asarray(self.area * contribution)
+
+
+class RemovalRounds:
+    """M Gaussians, of which ever more are removed.
+
+    Parameters
+    ----------
+    scoring_rays : RaySample
+        Cast while all were there.
+    measured : Measured
+        What the views saw of them then.
+    progress : callable
+    threads : int, optional
+
+    Raises
+    ------
+    Cancelled
+        If `progress` answers ``False``.
+
+    Notes
+    -----
+    Memory: 16 bytes for every hit, of which there are at most about
+    `ray_sample.MAX_SCORING_HITS`.
+    """
+
+    def __init__(
+        self,
+        scoring_rays: RaySample,
+        measured: Measured,
+        progress: Progress,
+        threads: int | None,
+    ) -> None:
+        self._measured, self._threads = measured, threads
+        scoring_rays.load()
+        numbers = [k for k, rays in enumerate(scoring_rays.rays) if rays is not None]
+
+        def with_colors(piece: slice) -> _ViewRays:
+            number: int = numbers[piece.start]
+            rays, (view, weight) = scoring_rays.rays[number], scoring_rays.views[number]
+            assert rays is not None  # noqa: S101 - as `numbers` says
+            with np.errstate(under="ignore"):
+                colors = scoring_rays.colors(number, rays).astype(np.float32)
+            return _ViewRays(rays, colors, weight * view.width * view.height / rays.count)
+
+        self._views: list[_ViewRays] = for_chunks(
+            with_colors, len(numbers), 1,
+            progress=part(progress, 0.0, _LOADING), what="scoring", threads=threads,
+        )  # fmt: skip
+        self._rays_hitting = np.zeros(len(measured.seen), np.int64)  # (M,), n_i
+        for view in self._views:
+            hit = view.rays.hit
+            self._rays_hitting[hit] += np.bincount(view.rays.owner, minlength=len(hit))
+        every = np.arange(len(self._rays_hitting))
+        self._first = self._sums(every, part(progress, _LOADING, 1.0))
+
+    def remove_and_measure(self, left: NDArray[np.int64], progress: Progress) -> Measured:
+        """Remove all Gaussians but some; return what each of these is worth now, (n,).
+
+        Parameters
+        ----------
+        left : (n,) int64
+            Rows of those that stay, ascending; none that was removed before.
+        progress : callable
+
+        Raises
+        ------
+        Cancelled
+            If `progress` answers ``False``.
+        """
+        nothing_gone = len(left) == len(self._rays_hitting)
+        now = self._first if nothing_gone else self._sums(left, progress)
+        measured = self._measured.error[left], self._measured.contribution[left]
+        count = self._rays_hitting[left]  # (n,)
+        error, contribution = (
+            _grown(sums, before[left], after, KNOWN / np.maximum(count, 1))
+            for sums, before, after in zip(measured, self._first, now, strict=True)
+        )
+        error = (count * now[0] + KNOWN * error) / (count + KNOWN)
+        return Measured(contribution, error, self._measured.seen[left])
+
+    def _sums(self, left: NDArray[np.int64], progress: Progress) -> Sums:
+        """Return error and contribution of Gaussians that are left, (n,) each, by the rays."""
+        keep = np.zeros(len(self._rays_hitting), np.bool_)
+        keep[left] = True
+        nothing_gone = len(left) == len(keep)
+
+        def removal_errors(piece: slice) -> Sums:
+            view: _ViewRays = self._views[piece.start]
+            if not nothing_gone:
+                view = self._views[piece.start] = view.keeping(keep)
+            with np.errstate(under="ignore"):
+                return view.removal_errors()
+
+        of_views = for_chunks(
+            removal_errors, len(self._views), 1,
+            progress=progress, what="scoring", threads=self._threads,
+        )  # fmt: skip
+        error, contribution = np.zeros(len(keep)), np.zeros(len(keep))
+        for view, (errors, contributions) in zip(self._views, of_views, strict=True):
+            error[view.rays.hit] += errors
+            contribution[view.rays.hit] += contributions
+        return error[left], contribution[left]
+
+
+def _grown(
+    measured: NDArray[np.float64],
+    before: NDArray[np.float64],
+    now: NDArray[np.float64],
+    known: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return measured sums times what they have grown by since, (n,).
+
+    The growth of a splat is what the rays tell of it, and the mean growth of the scene as if that
+    were so many rays more::
+
+        growth = (now + scene growth  prior) / (before + prior),    prior = known  measured
+
+    Parameters
+    ----------
+    measured : (n,) float64
+        Before any splat had gone.
+    before, now : (n,) float64
+        What the rays told then, and what they tell now.
+    known : (n,) float64
+        How many times the measured sum the growth of the scene counts: many for a splat that few
+        rays hit.
+    """
+    total = float(before.sum())
+    scene_growth = float(now.sum()) / total if total > 0.0 else 1.0
+    prior = known * measured
+    both = before + prior
+    growth = np.divide(
+        now + scene_growth * prior, both, out=np.ones_like(measured), where=both > 0.0
+    )
+    return np.asarray(measured * growth)

@@ -1,0 +1,1 @@
+"""What the views see of splats: footprints, points in cells, rays and what they hit."""

@@ -1,0 +1,239 @@
+"""Where rays go, and which footprints they hit."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..rendering import ALPHA_CUT, ALPHA_MAX
+from ..work import checkpoint
+from .rays import Rays
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from ..views import View
+    from .projection import Footprints
+
+MIN_RAYS_OF_VIEW = 16
+"""A view has at least this many rays, if it has as many pixels."""
+
+_PAIRS = 1 << 17  # pairs of footprint and pixel at a time, which limits temporary memory
+_MAX_TABLE = 1 << 14  # pixels; up to here a table says how many rays lie before each
+
+_STEPS = (0.7548776662466927, 0.5698402909980532)
+"""1 / p and 1 / p^2 of the plastic number p: their multiples modulo 1 spread evenly over the unit
+square (the R2 sequence, Roberts 2018)."""
+
+
+def pixels(view: View, number: int, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the columns and rows of a view in which about `count` rays lie, spread evenly.
+
+    Parameters
+    ----------
+    view : View
+    number : int
+        Each number gives other pixels.
+    count : float
+
+    Returns
+    -------
+    columns, rows : (C,), (R,) int64
+        Ascending; see `Rays`.
+    """
+    count = max(count, MIN_RAYS_OF_VIEW)
+    columns = max(round(math.sqrt(count * view.width / view.height)), 1)
+    columns = min(columns, view.width, max(int(count), 1))
+    rows = min(max(round(count / columns), 1), view.height)
+    return (
+        spread(view.width, columns, (number * _STEPS[0]) % 1.0),
+        spread(view.height, rows, (number * _STEPS[1]) % 1.0),
+    )
+
+
+def spread(size: int, count: int, start: float) -> NDArray[np.int64]:
+    """Return `count` of `size` pixels, evenly spread and ascending; `start` shifts them, 0 to 1."""
+    places = (np.arange(count) + start) * (size / count)
+    return np.asarray(np.floor(places), np.int64)
+
+
+def depth_complexity(footprints: Footprints, view: View) -> float:
+    """Return about how many footprints a ray of a view hits on average, at most all of them."""
+    size = float(view.width * view.height)
+    area = squared_reach(footprints.alphas)  # (n,), px^2
+    area *= np.float32(math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
+    return float(np.minimum(area, np.float32(size)).sum(dtype=np.float64)) / size
+
+
+def cast(footprints: Footprints, columns: NDArray[np.int64], rows: NDArray[np.int64]) -> Rays:
+    """Return the rays through some pixels with all that they hit.
+
+    A ray hits a footprint where its alpha there is at least `ALPHA_CUT`.
+
+    Parameters
+    ----------
+    footprints : Footprints
+        In the view of the pixels, front to back.
+    columns, rows : (C,), (R,) int64
+        See `Rays`; ascending.
+    """
+    reach = squared_reach(footprints.alphas)  # (n,)
+    # Of each footprint: the first column and row in its bounding box, and how many lie in it.
+    (left, wide), (top, tall) = (
+        boxes(footprints, reach, axis, places) for axis, places in enumerate((columns, rows))
+    )
+    boxed = np.flatnonzero(wide * tall > 0)  # (r,)
+    hits = [_hits(np.empty(0), np.empty(0), np.empty(0))]
+    for start, end in slices((wide * tall)[boxed], _PAIRS):
+        checkpoint()
+        owner, column, row = boxed_pixels(boxed[start:end], (left, wide), (top, tall))
+        squared = mahalanobis(footprints, owner, columns.take(column), rows.take(row))
+        inside = np.flatnonzero(squared < reach.take(owner))
+        owner = owner[inside]
+        alpha = footprints.alphas.take(owner) * np.exp(squared[inside] / -2.0)
+        hits.append(_hits(owner, row[inside] * len(columns) + column[inside], alpha))
+    footprint, ray, alphas = (np.concatenate(arrays) for arrays in zip(*hits, strict=True))
+    order = np.argsort(ray, kind="stable")  # footprints are front to back, and so stay hits
+    hit, place = _members(footprints.index, footprint.take(order))
+    alphas = np.minimum(alphas.take(order), np.float32(ALPHA_MAX))
+    ray = ray.take(order).astype(np.int32)
+    return Rays(columns, rows, ray, place, alphas, np.log1p(-alphas), hit)
+
+
+def _hits(
+    owner: NDArray[Any], ray: NDArray[Any], alpha: NDArray[Any]
+) -> tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.float32]]:
+    """Return hits in the smallest types that hold them.
+
+    A view has fewer than 2^16 rays: NumPy sorts numbers of 16 bits by radix, in linear time.
+    """
+    return owner.astype(np.int32), ray.astype(np.uint16), alpha.astype(np.float32)
+
+
+def slices(sizes: NDArray[np.int64], limit: int) -> list[tuple[int, int]]:
+    """Return slices of consecutive groups, (r,) sizes, with about `limit` members each."""
+    ends = np.cumsum(sizes, dtype=np.int64)
+    if not len(ends):
+        return []
+    cuts = np.searchsorted(ends, np.arange(0, ends[-1], limit)).tolist()
+    return [*pairwise([*cuts, len(sizes)])]
+
+
+def boxed_pixels(
+    chosen: NDArray[np.int64],
+    across: tuple[NDArray[np.int64], NDArray[np.int64]],
+    down: tuple[NDArray[np.int64], NDArray[np.int64]],
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
+    """Return all p pairs of some footprints and the pixels in their bounding boxes.
+
+    Parameters
+    ----------
+    chosen : (b,) int64
+        Which footprints.
+    across, down : tuple of (n,) and (n,) int64
+        The boxes of all n, see `boxes`.
+
+    Returns
+    -------
+    owner : (p,) int64
+        The footprint.
+    column, row : (p,) int32
+        Places of the pixel among the columns and rows.
+    """
+    (left, wide), (top, tall) = ([each[chosen] for each in box] for box in (across, down))
+    count = wide * tall
+    place = np.repeat(np.arange(len(chosen)), count)
+    number = np.arange(len(place), dtype=np.int32)
+    number -= np.repeat((np.cumsum(count) - count).astype(np.int32), count)
+    row, column = np.divmod(number, wide.astype(np.int32).take(place))
+    column += left.astype(np.int32).take(place)
+    row += top.astype(np.int32).take(place)
+    return chosen.take(place), column, row
+
+
+def _members(
+    index: NDArray[np.int64], footprint: NDArray[np.int32]
+) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Return the u Gaussians that are hit, ascending, and for each hit its place among them.
+
+    Parameters
+    ----------
+    index : (n,) int64
+        The Gaussian of each footprint, each once.
+    footprint : (h,) int32
+        Of each hit.
+    """
+    used = np.zeros(len(index), np.bool_)
+    used[footprint] = True
+    members = np.flatnonzero(used)
+    members = members[np.argsort(index[members])]
+    place = np.empty(len(index), np.int32)
+    place[members] = np.arange(len(members))
+    return index[members], place.take(footprint)
+
+
+def boxes(
+    footprints: Footprints, reach: NDArray[np.float32], axis: int, places: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first of some columns or rows in each footprint's bounding box, and how many.
+
+    Parameters
+    ----------
+    footprints : Footprints
+    reach : (n,) float32
+        Squared Mahalanobis distance to which a footprint is followed.
+    axis : int
+        0 for columns, 1 for rows.
+    places : (C,) int64
+        Numbers of the columns or rows, ascending; their centres are half a pixel on.
+    """
+    center = footprints.centers[axis] - np.float32(0.5)
+    half = np.sqrt(reach * (footprints.major[axis] ** 2 + footprints.minor[axis] ** 2))
+    first, end = (_before(places, np.ceil(edge)) for edge in (center - half, center + half))
+    return first, end - first
+
+
+def _before(places: NDArray[np.int64], edges: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return how many of some ascending pixels lie before each edge, (n,)."""
+    size = int(places[-1]) + 1
+    if size > _MAX_TABLE:
+        return np.asarray(np.searchsorted(places.astype(np.float64), edges.astype(np.float64)))
+    table = np.searchsorted(places, np.arange(size + 1))  # four times as fast as searching each
+    return np.asarray(table.take(edges.clip(0.0, size).astype(np.int64)))
+
+
+def mahalanobis(
+    footprints: Footprints,
+    owner: NDArray[np.int64],
+    column: NDArray[np.integer[Any]],
+    row: NDArray[np.integer[Any]],
+) -> NDArray[np.float32]:
+    """Return the squared Mahalanobis distance of pixels to footprints, (p,).
+
+    Parameters
+    ----------
+    footprints : Footprints
+    owner : (p,) int64
+        Row of the footprint.
+    column, row : (p,) integer
+        Of the pixel, whose centre is half a pixel on.
+    """
+    across = column.astype(np.float32) + np.float32(0.5) - footprints.centers[0].take(owner)
+    down = row.astype(np.float32) + np.float32(0.5) - footprints.centers[1].take(owner)
+    squared = np.zeros(len(owner), np.float32)
+    for axes, sigma in zip((footprints.major, footprints.minor), footprints.sigmas, strict=True):
+        along = across * axes[0].take(owner) + down * axes[1].take(owner)
+        along /= np.square(sigma.take(owner))
+        squared += along * along
+    return squared
+
+
+def squared_reach(alphas: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the squared Mahalanobis distance at which alpha falls to `ALPHA_CUT`, (n,)."""
+    ratio = alphas * np.float32(1.0 / ALPHA_CUT)
+    return np.asarray(np.float32(2.0) * np.log(np.maximum(ratio, np.float32(1.0))))

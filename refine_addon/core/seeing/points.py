@@ -1,0 +1,447 @@
+"""Points over the footprints of one view, sorted by depth within the cells of the image.
+
+Each footprint is replaced by a lattice of points; each point has a share of the splat's mass, which
+is the integral of its alpha. The image is divided into square cells. Within a cell the points are
+sorted by depth: `froxels` tells what hides them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ..work import checkpoint
+from .lattices import COUNTS, FLAT, WIDE_EXTENT, lattice_table, lattices
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from ..views import View
+    from .projection import Footprints
+
+FEW_CELLS = 10_000
+"""An image may have this many cells however few footprints it has."""
+
+FOOTPRINTS = 4.0
+"""An image of more than `FEW_CELLS` cells has at least this many footprints for each of them. So
+the cells follow the splats, not the pixels: finer ones show nothing that the splats have."""
+
+MAX_CELLS = 65535
+"""Most cells of an image: NumPy sorts numbers of 16 bits by radix, in linear time."""
+
+MAX_POINTS = 1 << 22
+"""Most points of a view, as estimated: cells grow until it is met. A point takes about 100 bytes.
+"""
+
+LEAST_POINTS = 1.25
+"""A view has this many points a footprint where `MAX_POINTS` would be fewer: a footprint has at
+least one point, however large the cells are."""
+
+_GROWTH = 2.0**0.25  # factor by which the side of a cell grows in a step
+_SLACK = 1.01  # on the side of a cell: a column of cells may lie partly outside the image
+_OUTSIDE = MAX_CELLS  # the cell number of points outside the image
+_MARGIN = 1e-2  # cells; far more than what rounding moves a point by
+_BLOCK = 1 << 15  # points processed at a time, which limits temporary memory
+_VAST = 8  # a lattice whose points lie an eighth of the image apart could miss the image
+_FAR = 15.0  # standard deviations; farther out a Gaussian is 0 in float32
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """The m points inside the image, cell by cell, and front to back in each cell.
+
+    Of several points of one splat in one cell the first has the shares of all, so that a splat does
+    not hide itself; the others have none.
+
+    Attributes
+    ----------
+    owners : (m,) int32
+        Row of the `Footprints`.
+    shares : (m,) float32
+        Of the splat's mass.
+    counts : (C,) int64
+        How many points lie in each of the C cells that are not empty: the columns of points.
+    inside, squares : (n,) float64
+        Of each footprint: the sum of its shares, and of their squares.
+    area : float
+        Of a cell, px^2.
+    """
+
+    owners: NDArray[np.int32]
+    shares: NDArray[np.float32]
+    counts: NDArray[np.int64]
+    inside: NDArray[np.float64]
+    squares: NDArray[np.float64]
+    area: float
+
+    def pieces(self) -> Iterator[tuple[slice, slice]]:
+        """Yield about `_BLOCK` points at a time, in whole cells: slices of the cells and points."""
+        for cells, place in _runs(self.counts):
+            checkpoint()
+            yield cells, place
+
+
+def _runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
+    """Yield runs of consecutive groups with about `_BLOCK` members: slices of both.
+
+    Parameters
+    ----------
+    sizes : (G,) int64
+        How many members each group has.
+
+    Yields
+    ------
+    groups, members : slice
+    """
+    ends = np.cumsum(sizes)
+    cuts = np.searchsorted(ends, np.arange(_BLOCK, int(sizes.sum()), _BLOCK)) + 1
+    start = member = 0
+    for cut in np.unique([*cuts, len(sizes)]).tolist():
+        if cut > start:
+            yield slice(start, cut), slice(member, int(ends[cut - 1]))
+            start, member = cut, int(ends[cut - 1])
+
+
+def cell_size(footprints: Footprints, view: View, cell: float, density: float) -> float:
+    """Return the side of a cell, pixels: `cell`, or larger, which saves points.
+
+    It is larger where the image would have more cells than the footprints need (`FOOTPRINTS`), or
+    more than `MAX_CELLS`, and where the footprints would have more than `MAX_POINTS` points.
+    """
+    needed = max(FEW_CELLS, len(footprints.index) / FOOTPRINTS)
+    side = max(cell, math.sqrt(view.width * view.height / min(needed, MAX_CELLS)) * _SLACK)
+    while math.ceil(view.width / side) * math.ceil(view.height / side) > MAX_CELLS:
+        side *= _GROWTH  # happens for images that are only a few pixels wide or high
+    # As cells grow, the points needed fall to one a footprint, which is below this limit.
+    limit = max(MAX_POINTS, LEAST_POINTS * len(footprints.index))
+    while _points_needed(footprints, side, density) > limit:
+        side *= _GROWTH
+    return side
+
+
+def _points_needed(footprints: Footprints, side: float, density: float) -> float:
+    """Return about how many points the footprints have with cells of this side."""
+    along = (footprints.sigmas * np.float32(density / side)).clip(1.0, COUNTS[-1])
+    return float(np.dot(along[0], along[1]))
+
+
+def scatter(footprints: Footprints, view: View, side: float, density: float) -> Points:
+    """Return points over all footprints, sorted into cells.
+
+    Parameters
+    ----------
+    footprints : Footprints
+        Front to back.
+    view : View
+    side : float
+        Of a cell, pixels.
+    density : float
+        Points per standard deviation that is as long as a cell.
+    """
+    kinds = _kinds(footprints, view, density / side)  # (n,)
+    frame = _in_cells(footprints, view, side)
+    vast = kinds == len(lattices()) - 1  # (n,), the few footprints much larger than the image
+    frame.axes[:, vast] = 0.0  # in the image; `_flat_points` replaces their points
+    rows, patches, whole = _patches(frame, kinds)  # (q,) each
+    sizes = lattice_table().sizes.take(patches)  # (q,)
+    owners = np.repeat(rows.astype(np.int32), sizes)  # (p,)
+    cells, shares, sums = _lay_out(frame, rows, patches, whole)  # (p,), (p,), (2, q)
+    replaced = np.flatnonzero(vast.take(rows))
+    if len(replaced):
+        at = np.cumsum(sizes)[replaced][:, None] - np.arange(FLAT**2, 0, -1)
+        cells[at], shares[at] = _flat_points(footprints, rows[replaced], view, side)
+        sums[:, replaced] = shares[at].sum(axis=1), (shares[at] ** 2).sum(axis=1)
+    inside, squares = (  # (n,) each
+        np.asarray(np.bincount(rows, sum_, len(kinds)), np.float64) for sum_ in sums
+    )
+    return _sort_into_cells(cells, owners, shares, inside, squares, side * side)
+
+
+def _kinds(footprints: Footprints, view: View, scale: float) -> NDArray[np.uint8]:
+    """Return which of `lattices` each footprint gets, (n,); `scale`: points per pixel of sigma."""
+    place_of = np.searchsorted(COUNTS, np.arange(COUNTS[-1] + 1)).astype(np.uint8)
+    wanted = np.ceil((footprints.sigmas * np.float32(scale)).clip(1.0, COUNTS[-1]))  # (2, n)
+    index = place_of[wanted.astype(np.int64)]  # (2, n)
+    # The points of a larger lattice are so far apart that all of them could miss the image.
+    spacing = footprints.sigmas[0] * (2.0 * WIDE_EXTENT / COUNTS[-1])
+    vast = spacing > max(view.width, view.height) / _VAST
+    kinds = index[0] * np.uint8(len(COUNTS)) + index[1]
+    return np.where(vast, np.uint8(len(COUNTS) ** 2), kinds)
+
+
+class _CellFrame(NamedTuple):
+    """Footprints in units of a cell.
+
+    Attributes
+    ----------
+    axes : (6, n) float32
+        Half axes, major then minor, and centre: each across and down.
+    size : tuple of float
+        Of the image, across and down.
+    """
+
+    axes: NDArray[np.float32]
+    size: tuple[float, float]
+
+
+def _in_cells(footprints: Footprints, view: View, side: float) -> _CellFrame:
+    """Return footprints in units of a cell."""
+    axes = np.concatenate([footprints.major, footprints.minor, footprints.centers])
+    axes *= np.float32(1.0 / side)
+    return _CellFrame(axes, (view.width / side, view.height / side))
+
+
+def _patches(
+    frame: _CellFrame, kinds: NDArray[np.uint8]
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Return the patches that may reach into the image, footprint by footprint.
+
+    Parameters
+    ----------
+    frame : _CellFrame
+    kinds : (n,) uint8
+        Which lattice each footprint gets.
+
+    Returns
+    -------
+    rows, patches : (q,) int64
+        Of the footprints, and of the table.
+    whole : (q,) bool
+        Which lie in the image with all of their points.
+    """
+    table = lattice_table()
+    count = table.patches.take(kinds)  # (n,)
+    rows = np.repeat(np.arange(len(kinds)), count)  # (q,)
+    before = np.cumsum(count) - count - table.first.take(kinds)  # (n,)
+    patches = np.arange(len(rows)) - before.take(rows)  # (q,)
+    middle, half = table.middle.take(patches, axis=1), table.half.take(patches, axis=1)  # (2, q)
+    touching = np.ones(len(rows), np.bool_)
+    whole = np.ones(len(rows), np.bool_)
+    for axis, size in enumerate(frame.size):
+        checkpoint()
+        major, minor = frame.axes[axis].take(rows), frame.axes[2 + axis].take(rows)  # (q,) each
+        where = major * middle[0] + minor * middle[1] + frame.axes[4 + axis].take(rows)
+        reach = np.abs(major) * half[0] + np.abs(minor) * half[1] + np.float32(_MARGIN)
+        low, high = where - reach, where + reach
+        touching &= (high >= 0.0) & (low < size)
+        whole &= (low >= 0.0) & (high < size)
+    kept = np.flatnonzero(touching)
+    return rows.take(kept), patches.take(kept), whole.take(kept)
+
+
+def _lay_out(
+    frame: _CellFrame,
+    rows: NDArray[np.int64],
+    patches: NDArray[np.int64],
+    whole: NDArray[np.bool_],
+) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]:
+    """Return the points of q patches, one after the other.
+
+    Parameters
+    ----------
+    frame : _CellFrame
+    rows, patches, whole : (q,) array
+        See `_patches`.
+
+    Returns
+    -------
+    cells : (p,) uint16
+        `_OUTSIDE` for points beside the image.
+    shares : (p,) float32
+        Of the mass.
+    sums : (2, q) float32
+        Of the shares of each patch's points inside the image, and of their squares.
+    """
+    table = lattice_table()
+    sizes = table.sizes.take(patches)  # (q,)
+    first = np.cumsum(sizes) - sizes  # (q,), number of each patch's first point
+    cells = np.empty(int(sizes.sum()), np.uint16)
+    shares, sums = np.empty(len(cells), np.float32), table.sums.take(patches, axis=1)
+    # Patches alike are laid out together, which needs no look-up for each point.
+    inner = np.flatnonzero(whole)
+    inner = inner.take(np.argsort(patches.take(inner).astype(np.uint16), kind="stable"))  # (s,)
+    axes, begin = frame.axes.take(rows.take(inner), axis=1), first.take(inner)
+    for patch, piece in _equal_runs(patches.take(inner)):
+        members = slice(int(table.start[patch]), int(table.start[patch] + table.sizes[patch]))
+        at = begin[piece] + np.arange(members.stop - members.start)[:, None]  # (points, patches)
+        place = _positions(axes[:, piece], table.points[:, members, None])
+        cells[at] = _cell_numbers(place, frame.size)
+        shares[at] = table.shares[members, None]
+    edge = np.flatnonzero(~whole)
+    for piece, _ in _runs(sizes.take(edge)):
+        checkpoint()
+        cut = edge[piece]
+        at, cell, share, sums[:, cut] = _lay_out_at_edge(frame, rows[cut], patches[cut], first[cut])
+        cells[at], shares[at] = cell, share
+    return cells, shares, sums
+
+
+def _equal_runs(patches: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
+    """Yield runs of equal numbers that have about `_BLOCK` points at most: number and slice.
+
+    Parameters
+    ----------
+    patches : (s,) int64
+        Ascending.
+    """
+    sizes = lattice_table().sizes
+    stops = np.cumsum(np.bincount(patches, minlength=len(sizes))).tolist()
+    for patch, (start, stop) in enumerate(pairwise([0, *stops])):
+        step = max(_BLOCK // int(sizes[patch]), 1)
+        for begin in range(start, stop, step):
+            checkpoint()
+            yield patch, slice(begin, min(begin + step, stop))
+
+
+def _lay_out_at_edge(
+    frame: _CellFrame,
+    rows: NDArray[np.int64],
+    patches: NDArray[np.int64],
+    first: NDArray[np.int64],
+) -> tuple[NDArray[np.int64], NDArray[Any], NDArray[np.float32], NDArray[np.float32]]:
+    """Return the points of q patches that lie across the edge of the image, one after the other.
+
+    Parameters
+    ----------
+    frame : _CellFrame
+    rows, patches : (q,) int64
+        See `_patches`.
+    first : (q,) int64
+        The number of each patch's first point.
+
+    Returns
+    -------
+    at : (p,) int64
+        Numbers of the points.
+    cells, shares : (p,) array
+        `_OUTSIDE` and 0 for points beside the image.
+    sums : (2, q) float32
+        Of the shares of each patch, and of their squares.
+    """
+    table = lattice_table()
+    sizes = table.sizes.take(patches)  # (q,)
+    begin = np.cumsum(sizes) - sizes
+    step = np.arange(int(sizes.sum())) - np.repeat(begin, sizes)  # (p,), as all that follows
+    which = step + np.repeat(table.start.take(patches), sizes)
+    axes = np.repeat(frame.axes.take(rows, axis=1), sizes, axis=1)
+    place = _positions(axes, table.points.take(which, axis=1))
+    there = np.ones(len(which), np.bool_)
+    for where, size in zip(place, frame.size, strict=True):
+        there &= (where >= 0.0) & (where < np.float32(size))
+    cells = np.where(there, _cell_numbers(place, frame.size), np.uint16(_OUTSIDE))
+    shares = np.where(there, table.shares.take(which), np.float32(0.0))
+    sums = np.add.reduceat([shares, shares * shares], begin, axis=1)
+    return step + np.repeat(first, sizes), cells, shares, sums
+
+
+def _positions(
+    axes: NDArray[np.float32], points: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return where points of lattices lie, across and down, in cells.
+
+    Parameters
+    ----------
+    axes : (6, ...) float32
+        See `_CellFrame`.
+    points : (2, ...) float32
+        Of the lattice, along the major and the minor axis.
+    """
+    across = axes[0] * points[0]
+    across += axes[2] * points[1]
+    across += axes[4]
+    down = axes[1] * points[0]
+    down += axes[3] * points[1]
+    down += axes[5]
+    return across, down
+
+
+def _cell_numbers(
+    place: tuple[NDArray[np.float32], NDArray[np.float32]], size: tuple[float, float]
+) -> NDArray[np.uint16]:
+    """Return the number of each point's cell; it means nothing beside the image.
+
+    Parameters
+    ----------
+    place : tuple of float32 arrays
+        Across and down, in cells.
+    size : tuple of float
+        Of the image, in cells.
+    """
+    number = place[1].astype(np.int32)
+    number *= math.ceil(size[0])
+    number += place[0].astype(np.int32)
+    return number.astype(np.uint16)
+
+
+def _flat_points(
+    footprints: Footprints, row: NDArray[np.int64], view: View, side: float
+) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
+    """Return cells, (FLAT^2,), and shares, (r, FLAT^2), for r footprints wider than the image.
+
+    The share of a point is the density of the splat's mass there times the area around the point.
+    """
+    points = lattices()[-1].points
+    u = np.float32(view.width / 2) * (points[0] + 1)
+    v = np.float32(view.height / 2) * (points[1] + 1)
+    squared = np.zeros((len(row), len(u)), np.float32)  # squared Mahalanobis distance
+    dx = u - footprints.centers[0, row][:, None]
+    dy = v - footprints.centers[1, row][:, None]
+    for half, sigma in zip((footprints.major, footprints.minor), footprints.sigmas, strict=True):
+        unit = half[:, row] / sigma[row] ** 2
+        along = (dx * unit[0][:, None] + dy * unit[1][:, None]).clip(-_FAR, _FAR)
+        squared += along * along
+    mass = np.float32(2.0 * math.pi) * footprints.sigmas[0, row] * footprints.sigmas[1, row]
+    share = np.float32(view.width * view.height / FLAT**2) / mass
+    cells = _cell_numbers((u / np.float32(side), v / np.float32(side)), (view.width / side, 0.0))
+    return cells, np.exp(squared / -2.0) * share[:, None]
+
+
+def _sort_into_cells(
+    cells: NDArray[np.uint16],
+    owners: NDArray[np.int32],
+    shares: NDArray[np.float32],
+    inside: NDArray[np.float64],
+    squares: NDArray[np.float64],
+    area: float,
+) -> Points:
+    """Sort p points into cells, and merge those of one splat in one cell.
+
+    Parameters
+    ----------
+    cells : (p,) uint16
+        Points of the cell `_OUTSIDE` are dropped.
+    owners : (p,) int32
+        Ascending, that is, front to back.
+    shares : (p,) float32
+    inside, squares : (n,) float64
+        See `Points`; `squares` before merging, and changed in place.
+    area : float
+    """
+    filled = np.bincount(cells, minlength=_OUTSIDE)[:_OUTSIDE]
+    counts = filled[filled > 0]  # (C,)
+    # A stable sort keeps the points of a cell front to back; those `_OUTSIDE` come last.
+    order = np.argsort(cells, kind="stable")[: counts.sum()]
+    checkpoint()
+    owners, shares = owners.take(order), shares.take(order)
+    if len(order):
+        new = np.empty(len(owners), np.bool_)  # whether a point is the first of its splat there
+        np.not_equal(owners[1:], owners[:-1], out=new[1:])
+        new[np.cumsum(counts) - counts] = True  # the first point of each cell
+        again = np.flatnonzero(~new)  # (a,)
+        starts = np.flatnonzero(new.take(again - 1))  # where another splat's points begin
+        if len(starts):
+            first = again.take(starts) - 1
+            more, own = shares.take(again), shares.take(first)
+            total = own + np.add.reduceat(more, starts)
+            apart = own * own + np.add.reduceat(more * more, starts)
+            squares += np.bincount(owners.take(first), total * total - apart, len(squares))
+            shares[again] = 0.0
+            shares[first] = total
+    return Points(owners, shares, counts, inside, squares, area)

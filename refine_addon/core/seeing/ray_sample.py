@@ -1,0 +1,219 @@
+"""A sample of the pixels of all views: the rays through them, and the splats that they hit.
+
+Of a few hundred pixels of each view, spread evenly, it is noted which splats their rays hit. What
+these pixels show follows from that, with all splats or with any choice of them, without projecting
+splats again. Two samples are taken, of different pixels: what is chosen by the *scoring rays* would
+look better on them than it is, so the *validation rays* tell how good the pictures are.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .. import spherical_harmonics
+from ..work import Progress, for_chunks, part, silent
+from . import projection
+from .cast import cast, depth_complexity, pixels
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from ..scene import Scene
+    from ..splats import Splats
+    from ..views import View, ViewSet
+    from .projection import Footprints, Gaussians
+    from .rays import Rays
+
+VALIDATION_RAYS = 1 << 14
+"""How many validation rays all views together have."""
+
+MAX_VALIDATION_HITS = 1 << 24
+"""About how many hits these may have together; dense scenes get fewer rays."""
+
+SCORING_RAYS = 1 << 16
+"""How many scoring rays all views together have."""
+
+MAX_SCORING_HITS = 3 << 24
+"""About how many hits these may have together. Each takes 16 bytes."""
+
+MAX_HITS_OF_VIEW = 1 << 21
+"""About how many hits the rays of one view may have: casting takes 60 bytes for each, and views are
+cast side by side. Only few views of dense scenes reach it."""
+
+MAX_RAYS_OF_VIEW = 60_000
+"""A view has at most so many rays: their numbers fit into 16 bits, see `cast`."""
+
+VALIDATION_VIEWS = 24
+"""At most about so many views validate what takes longer than deleting splats does."""
+
+
+class RaySample:
+    """Rays of all views into one scene.
+
+    Parameters
+    ----------
+    views : sequence of (View, float)
+        Views and their weights, in an order given by the scene; see `ViewSet.by_distance`.
+    gaussians : Gaussians
+        What the rays may hit.
+    splats : Splats
+        What the Gaussians were made of, for their colours.
+    few_views : bool
+        Whether rays of only about `VALIDATION_VIEWS` of the views are wanted: enough to validate
+        other splats by, not for a curve.
+    scoring : bool
+        Whether these are scoring rays; else they are validation rays.
+
+    Attributes
+    ----------
+    index : (M,) int64
+        Rows of the splats that the Gaussians are, among all.
+    rows : (M,) int64
+        The same among `splats`, which need only hold those that are hit.
+    rays : list of Rays or None
+        Of each view; None where they have not been cast.
+    """
+
+    def __init__(
+        self,
+        views: Sequence[tuple[View, float]],
+        gaussians: Gaussians,
+        splats: Splats,
+        *,
+        few_views: bool = False,
+        scoring: bool = False,
+    ) -> None:
+        self.views, self.splats, self.scoring = views, splats, scoring
+        self._step = max(math.ceil(len(views) / VALIDATION_VIEWS), 1) if few_views else 1
+        self.index = self.rows = gaussians.index
+        self.rays: list[Rays | None] = [None] * len(views)
+
+    def colors(self, number: int, rays: Rays) -> NDArray[np.float64]:
+        """Return the colours in which view `number` sees what its rays hit, (3, u)."""
+        return colors_from(self.splats, self.rows[rays.hit], self.views[number][0])
+
+    def load(self) -> None:
+        """Make ready what the rays hit, where that does not lie in memory."""
+
+    def wants(self, number: int) -> bool:
+        """Return whether the rays of a view are wanted and have not been cast yet."""
+        return self.rays[number] is None and number % self._step == 0
+
+    def cast(
+        self,
+        numbers: Sequence[int],
+        gaussians: Gaussians,
+        scene: Scene,
+        progress: Progress,
+        threads: int | None,
+    ) -> None:
+        """Project all Gaussians into some views, and cast the rays of these views."""
+
+        def cast_one(piece: slice) -> None:
+            number = numbers[piece.start]
+            if self.wants(number):
+                with np.errstate(under="ignore"):
+                    footprints = projection.project(gaussians, scene, self.views[number][0])
+                    self.rays[number] = cast_view(
+                        self.views, number, footprints, scoring=self.scoring
+                    )
+
+        for_chunks(
+            cast_one, len(numbers), 1, progress=progress, what="casting rays", threads=threads
+        )
+
+    def seeing(self) -> list[int]:
+        """Return the numbers of the views whose rays hit a splat."""
+        return [k for k, rays in enumerate(self.rays) if rays is not None and len(rays.ray)]
+
+    def validating(self) -> list[int]:
+        """Return the numbers of the views that validate where not all can."""
+        seeing = self.seeing()
+        return seeing[:: max(math.ceil(len(seeing) / VALIDATION_VIEWS), 1)]
+
+    def hitting(self, numbers: Sequence[int]) -> int:
+        """Return how many rays of some views hit a splat."""
+        return sum(rays.hitting for rays in (self.rays[number] for number in numbers) if rays)
+
+
+def validation_rays(
+    splats: Splats, views: ViewSet, *, progress: Progress = silent, threads: int | None = None
+) -> RaySample:
+    """Return the validation rays of all views, for scores that did not project splats.
+
+    Parameters
+    ----------
+    splats : Splats
+        In the frame and unit of the views.
+    views : ViewSet
+    progress : callable, optional
+    threads : int, optional
+
+    Raises
+    ------
+    Cancelled
+        If `progress` answers ``False``.
+    """
+    gaussians, scene, _ = projection.prepare(
+        splats, views, progress=part(progress, 0.0, 0.2), threads=threads
+    )
+    sample = RaySample(views.by_distance(), gaussians, splats)
+    numbers = range(len(sample.views))
+    sample.cast(numbers, gaussians, scene, part(progress, 0.2, 1.0), threads)
+    return sample
+
+
+def cast_view(
+    views: Sequence[tuple[View, float]],
+    number: int,
+    footprints: Footprints,
+    *,
+    scoring: bool = False,
+) -> Rays:
+    """Return the rays of one of some views.
+
+    Parameters
+    ----------
+    views : sequence of (View, float)
+        All views of the sample, which share its rays evenly.
+    number : int
+        Which of them.
+    footprints : Footprints
+        In that view.
+    scoring : bool
+        Whether these are scoring rays, which go through other pixels than the validation rays.
+    """
+    view = views[number][0]
+    rays, hits = SCORING_RAYS, MAX_SCORING_HITS
+    if not scoring:
+        rays, hits = VALIDATION_RAYS, MAX_VALIDATION_HITS
+    hits_of_view = min(hits / len(views), MAX_HITS_OF_VIEW)
+    count = min(rays / len(views), MAX_RAYS_OF_VIEW)
+    count = min(count, hits_of_view / max(depth_complexity(footprints, view), 1.0))
+    return cast(footprints, *pixels(view, number + len(views) * scoring, count))
+
+
+def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float64]:
+    """Return the colours in which a view sees some splats, (3, n), at least 0.
+
+    By all harmonics: by their constant alone, as the rest of scoring takes colours, the estimated
+    PSNR was 1.2 dB too high on an outdoor scene.
+
+    Parameters
+    ----------
+    splats : Splats
+        In the frame of the view.
+    rows : (n,) int64
+        Which of them.
+    view : View
+    """
+    direction = splats.means[rows].astype(np.float64) - view.center
+    length = np.linalg.norm(direction, axis=1)
+    direction /= np.maximum(length, np.finfo(np.float64).tiny)[:, None]
+    colors = spherical_harmonics.colors(direction, splats.sh_dc[rows], splats.sh_rest[rows])
+    return np.ascontiguousarray(colors.T.clip(0.0, projection.BRIGHTEST))

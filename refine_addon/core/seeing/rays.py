@@ -1,0 +1,243 @@
+"""Rays through some pixels of one view, and the splats that they hit.
+
+A ray hits a splat where the splat's footprint holds the centre of the ray's pixel. The hits of a
+ray are composited front to back, as a renderer composites a pixel::
+
+    C = sum over hits of  T alpha c,    T = product over the hits in front of  1 - alpha
+
+So the colours of these pixels are known with all splats and with any choice of them, exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..work import checkpoint
+from .ray_sums import behind, in_front, paired
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+LOG_OPAQUE = -9.3
+"""Logarithm of the transmittance below which nothing is seen, 1e-4."""
+
+LEAST_LEFT = 1e-8
+"""The colour behind a hit is divided by the transmittance behind it, and at least by this."""
+
+_PIECE = 1 << 15  # hits processed at a time: what stays in the second-level cache
+
+
+@dataclass(frozen=True, eq=False)
+class Rays:
+    """The P rays of one view, and the h hits that they have on u splats.
+
+    Attributes
+    ----------
+    columns, rows : (C,), (R,) int64
+        The rays go through the pixels where these columns and rows cross, row by row: P = C R.
+    ray : (h,) int32
+        On which ray each hit lies, ascending; the hits of a ray are front to back.
+    owner : (h,) int32
+        Which splat it hits, as a place in `hit`.
+    alpha, log_passed : (h,) float32
+        Alpha of the splat there, and the logarithm of 1 - alpha.
+    hit : (u,) int64
+        The Gaussians that any ray hits, ascending.
+    """
+
+    columns: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    ray: NDArray[np.int32]
+    owner: NDArray[np.int32]
+    alpha: NDArray[np.float32]
+    log_passed: NDArray[np.float32]
+    hit: NDArray[np.int64]
+
+    @property
+    def count(self) -> int:
+        """How many rays there are."""
+        return len(self.columns) * len(self.rows)
+
+    @property
+    def hitting(self) -> int:
+        """How many of the rays hit a splat."""
+        return len(self._first_hits())
+
+    def keeping(self, keep: NDArray[np.bool_]) -> Rays:
+        """Return the rays with their hits on some of the splats alone.
+
+        Parameters
+        ----------
+        keep : (u,) bool
+            Which of `hit` stay.
+        """
+        kept = np.flatnonzero(keep.take(self.owner))
+        return replace(
+            self,
+            ray=self.ray.take(kept),
+            owner=self.owner.take(kept),
+            alpha=self.alpha.take(kept),
+            log_passed=self.log_passed.take(kept),
+        )
+
+    def contributions(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
+        """Return what the rays see: the r hits that are not hidden.
+
+        Returns
+        -------
+        ray, owner : (r,) int32
+            As the attributes.
+        weight : (r,) float32
+            Transmittance times alpha: the share of the pixel that the splat makes up.
+        """
+        log_front = in_front(self.log_passed.astype(np.float64), self._counts())
+        seen = np.flatnonzero(log_front > LOG_OPAQUE)
+        weight = self.alpha.take(seen) * np.exp(log_front.take(seen).astype(np.float32))
+        return self.ray.take(seen), self.owner.take(seen), weight
+
+    def colors(self, colors: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the colour of each ray over black, (3, P), 0..1.
+
+        Parameters
+        ----------
+        colors : (3, u) float64
+            Of the splats that are hit.
+        """
+        ray, owner, weight = self.contributions()
+        channels = [
+            np.bincount(ray, weight * channel.take(owner), self.count) for channel in colors
+        ]
+        return np.stack(channels).clip(0.0, 1.0)
+
+    def removal_errors(
+        self, colors: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return how much all rays together would change without each splat, (u,) each.
+
+        Parameters
+        ----------
+        colors : (3, u) float32
+            Of the splats that are hit.
+
+        Returns
+        -------
+        error : (u,) float64
+            The squared change of the colours of the rays without this splat, over all channels:
+            ``(T alpha)^2 |c - B|^2``, with T the transmittance in front of it and B the colour
+            behind it.
+        contribution : (u,) float64
+            The sum of ``T alpha``, in pixels.
+        """
+        ends = np.append(self._first_hits(), len(self.ray))
+        cuts = np.unique(np.searchsorted(ends, [*range(0, len(self.ray), _PIECE), len(self.ray)]))
+        error, weight = np.empty((2, len(self.ray)), np.float32)
+        owner = self.owner.astype(np.intp)
+        for first, last in pairwise(cuts.tolist()):  # whole rays at a time
+            checkpoint()
+            piece = slice(int(ends[first]), int(ends[last]))
+            error[piece], weight[piece] = _removal_errors(
+                self.alpha[piece], self.log_passed[piece], colors.take(owner[piece], axis=1),
+                np.diff(ends[first : last + 1]),
+            )  # fmt: skip
+        sums = (np.bincount(owner, each, len(self.hit)) for each in (error, weight))
+        errors, contributions = (np.asarray(each, np.float64) for each in sums)
+        return errors, contributions
+
+    def colors_by_nearest_kept(
+        self, colors: NDArray[np.float64], keep: NDArray[np.bool_]
+    ) -> NDArray[np.float64]:
+        """Return the colour of each ray, (3, P), 0..1, if kept splats stand in for removed ones.
+
+        A removed splat is as opaque as it was, in the colour of the nearest kept hit of the ray, or
+        black where there is none.
+
+        Parameters
+        ----------
+        colors : (3, u) float64
+            Of the splats that are hit.
+        keep : (u,) bool
+            Which of them are kept.
+        """
+        nobody = colors.shape[1]
+        owner = self._nearest_kept(keep, nobody)
+        black = np.zeros((3, 1))
+        return replace(self, owner=owner).colors(np.append(colors, black, axis=1))
+
+    def _nearest_kept(self, keep: NDArray[np.bool_], nobody: int) -> NDArray[np.int32]:
+        """Return for each hit the owner of the nearest kept hit of the same ray, (h,).
+
+        Nearest in the number of hits between; of two, the one in front. A kept hit is its own.
+
+        Parameters
+        ----------
+        keep : (u,) bool
+        nobody : int
+            Stands where no hit of the ray is kept.
+        """
+        kept, here = keep.take(self.owner), np.arange(len(self.owner))
+        none = len(here)  # farther than any hit
+        counts = self._counts()
+        first = np.repeat(self._first_hits(), counts)  # (h,), the first hit of the same ray
+        end = first + np.repeat(counts, counts)  # (h,), behind the last one
+        before = np.maximum.accumulate(np.where(kept, here, -1))
+        after = np.minimum.accumulate(np.where(kept, here, none)[::-1])[::-1]
+        steps_front = np.where(before >= first, here - before, none)
+        steps_back = np.where(after < end, after - here, none)
+        nearest = np.where(steps_front < steps_back, before, after)
+        alone = np.minimum(steps_front, steps_back) == none
+        owner = self.owner.take(np.where(alone, here, nearest))
+        owner[alone] = nobody
+        return owner
+
+    def _first_hits(self) -> NDArray[np.int64]:
+        """Return the place of the first hit of each ray that has any."""
+        new = np.ones(len(self.ray), np.bool_)
+        np.not_equal(self.ray[1:], self.ray[:-1], out=new[1:])
+        return np.flatnonzero(new)
+
+    def _counts(self) -> NDArray[np.int64]:
+        """Return how many hits each ray has that has any."""
+        return np.diff(np.append(self._first_hits(), len(self.ray)))
+
+
+def _removal_errors(
+    alpha: NDArray[np.float32],
+    log_passed: NDArray[np.float32],
+    colors: NDArray[np.float32],
+    counts: NDArray[np.int64],
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return for each hit of some rays how much its ray would change without it.
+
+    Parameters
+    ----------
+    alpha, log_passed : (h,) float32
+        See `Rays`.
+    colors : (3, h) float32
+    counts : (n,) int64
+        How many hits each ray has, at least one.
+
+    Returns
+    -------
+    error, contribution : (h,) float32
+        See `Rays.removal_errors`; 0 where the hit is hidden.
+    """
+    log_front = in_front(log_passed.astype(np.float64), counts)
+    transmittance = np.exp(log_front.astype(np.float32))
+    transmittance[log_front < LOG_OPAQUE] = 0.0
+    weight = transmittance * alpha
+    left = np.maximum(transmittance - weight, np.float32(LEAST_LEFT))  # transmittance behind it
+    red_green = behind(paired(weight * colors[0], weight * colors[1]), counts)
+    blue = behind((weight * colors[2]).astype(np.float64), counts)
+    error = np.zeros(len(alpha), np.float32)
+    for own, light in zip(colors, (red_green.real, red_green.imag, blue), strict=True):
+        change = light.astype(np.float32)
+        change /= left  # the colour behind
+        change -= own
+        change *= weight
+        change *= change
+        error += change
+    return error, weight

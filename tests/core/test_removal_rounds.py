@@ -1,0 +1,246 @@
+"""What scoring rays say splats are worth while others go, against rays drawn anew."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from refine_addon.core import ViewSet
+from refine_addon.core.errors import Cancelled
+from refine_addon.core.scoring import occlusion
+from refine_addon.core.scoring.removal_rounds import KNOWN, RemovalRounds
+from refine_addon.core.seeing import cast, projection, ray_sample
+from refine_addon.core.seeing import rays as rays_module
+from refine_addon.core.seeing.measuring import Measured
+from refine_addon.core.seeing.ray_sample import RaySample
+from refine_addon.core.seeing.rays import Rays
+from refine_addon.core.work import silent
+from tests.core.test_occlusion import cloud, ring
+
+RANDOM = np.random.default_rng(5)
+
+
+def some_rays(count: int = 40, splats: int = 30) -> tuple[Rays, np.ndarray]:
+    """Return rays that hit up to 20 of some splats each, the last of them nothing."""
+    ray, owner = [], []
+    for number in range(count - 1):
+        hits = RANDOM.permutation(splats)[: RANDOM.integers(0, 21)]
+        ray += [number] * len(hits)
+        owner += hits.tolist()
+    alpha = RANDOM.uniform(0.01, 0.9, len(ray)).astype(np.float32)
+    rays = Rays(
+        np.arange(count), np.zeros(1, np.int64), np.array(ray, np.int32),
+        np.array(owner, np.int32), alpha, np.log1p(-alpha), np.arange(splats),
+    )  # fmt: skip
+    return rays, RANDOM.uniform(0.0, 1.0, (3, splats)).astype(np.float32)
+
+
+def drawn(rays: Rays, colors: np.ndarray, without: int = -1) -> np.ndarray:
+    """Return the colour of each ray, one after the other, (P, 3)."""
+    picture, left = np.zeros((rays.count, 3)), np.ones(rays.count)
+    for ray, owner, alpha in zip(rays.ray, rays.owner, rays.alpha, strict=True):
+        if owner != without:
+            picture[ray] += left[ray] * alpha * colors[:, owner]
+            left[ray] *= 1.0 - float(alpha)
+    return picture
+
+
+@pytest.mark.parametrize("piece", [1, 7, 1 << 15])
+def test_a_removal_error_is_the_squared_change_of_the_rays_without_a_splat(monkeypatch, piece):
+    monkeypatch.setattr(rays_module, "_PIECE", piece)
+    rays, colors = some_rays()
+    whole = drawn(rays, colors)
+    expected = [((drawn(rays, colors, k) - whole) ** 2).sum() for k in range(30)]
+    white = np.ones((3, 30), np.float32)
+    parts = [
+        (drawn(rays, white) - drawn(rays, white * (np.arange(30) != k)))[:, 0].sum()
+        for k in range(30)
+    ]
+
+    error, contribution = rays.removal_errors(colors)
+
+    # What lies behind less than 1e-4 of the light is left out.
+    np.testing.assert_allclose(error, expected, rtol=1e-2, atol=1e-6)
+    np.testing.assert_allclose(contribution, parts, rtol=1e-4, atol=1e-3)
+
+
+def test_rays_that_hit_nothing_lose_nothing():
+    rays, colors = some_rays()
+
+    for each in rays.keeping(np.zeros(30, np.bool_)).removal_errors(colors):
+        np.testing.assert_array_equal(each, np.zeros(30))
+
+
+@pytest.fixture
+def scene():
+    """Return ranking rays into a cloud from two views, one of weight 3, and what they measure."""
+    one, two = ring(2)
+    views = ViewSet((one, replace(two, weight=3.0)))
+    splats = cloud()
+    gaussians, frame, _ = projection.prepare(splats, views)
+    sample = RaySample(views.by_distance(), gaussians, splats, scoring=True)
+    sample.cast(range(2), gaussians, frame, silent, None)
+    count = len(gaussians)
+    random = np.random.default_rng(2)
+    sums = (random.uniform(0.5, 2.0, count) for _ in range(2))
+    return sample, Measured(*sums, np.arange(count, dtype=np.int32))
+
+
+def told(sample: RaySample, keep: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return error, contribution and number of rays of all Gaussians, with some of them there."""
+    error, contribution, hits = np.zeros((3, len(keep)))
+    for number, (rays, (view, weight)) in enumerate(zip(sample.rays, sample.views, strict=True)):
+        area = weight * view.width * view.height / rays.count
+        colors = sample.colors(number, rays).astype(np.float32)
+        hits[rays.hit] += np.bincount(rays.owner, minlength=len(rays.hit))
+        for total, some in zip(
+            (error, contribution), rays.keeping(keep[rays.hit]).removal_errors(colors), strict=True
+        ):
+            total[rays.hit] += area * some
+    return error, contribution, hits
+
+
+def test_while_all_are_there_rays_are_weighed_against_what_was_measured(scene):
+    sample, measured = scene
+    every = np.arange(len(measured.seen))
+    error, _, hits = told(sample, np.ones(len(every), np.bool_))
+
+    found = RemovalRounds(sample, measured, silent, 1).remove_and_measure(every, silent)
+
+    expected = (hits * error + KNOWN * measured.error) / (hits + KNOWN)
+    np.testing.assert_allclose(found.error, expected, rtol=1e-9)
+    np.testing.assert_allclose(found.contribution, measured.contribution, rtol=1e-12)
+    np.testing.assert_array_equal(found.seen, measured.seen)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_what_is_left_grows_as_rays_tell_and_unhit_splats_as_all_do(scene, threads):
+    """Removed at once or one half after the other: the same."""
+    sample, measured = scene
+    count = len(measured.seen)
+    keep = np.arange(count) % 3 > 0
+    left = np.flatnonzero(keep)
+    before, now = told(sample, np.ones(count, np.bool_)), told(sample, keep)
+    hits = before[2][left]
+    expected = []
+    for sums, first, after in zip(
+        (measured.error, measured.contribution), before, now, strict=False
+    ):
+        own, then, later = sums[left], first[left], after[left]
+        prior = KNOWN / np.maximum(hits, 1) * own
+        expected.append(own * (later + prior * later.sum() / then.sum()) / (then + prior))
+    expected[0] = (hits * now[0][left] + KNOWN * expected[0]) / (hits + KNOWN)
+    at_once, halves = (RemovalRounds(sample, measured, silent, threads) for _ in range(2))
+
+    found = at_once.remove_and_measure(left, silent)
+    halves.remove_and_measure(np.flatnonzero(keep | (np.arange(count) < count // 2)), silent)
+    again = halves.remove_and_measure(left, silent)
+
+    assert now[0][left].sum() > 1.05 * before[0][left].sum()
+    for name, values in zip(("error", "contribution"), expected, strict=True):
+        np.testing.assert_allclose(getattr(found, name), values, rtol=1e-9)
+        np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
+    np.testing.assert_array_equal(found.seen, measured.seen[left])
+
+
+def test_what_no_line_hits_grows_as_all_others(scene):
+    sample, measured = scene
+    last = int(sample.rays[0].hit[-1])
+    sample.rays = [rays.keeping(rays.hit != last) for rays in sample.rays]
+    left = np.flatnonzero(
+        (np.arange(len(measured.seen)) % 3 > 0) | (np.arange(len(measured.seen)) == last)
+    )
+    keep = np.zeros(len(measured.seen), np.bool_)
+    keep[left] = True
+    before, now = (told(sample, some)[0][left].sum() for some in (np.ones_like(keep), keep))
+
+    found = RemovalRounds(sample, measured, silent, 1).remove_and_measure(left, silent)
+
+    place = int(np.searchsorted(left, last))
+    assert found.error[place] == pytest.approx(measured.error[last] * now / before)
+
+
+def test_it_can_be_cancelled(scene):
+    sample, measured = scene
+    rounds = RemovalRounds(sample, measured, silent, 1)
+
+    with pytest.raises(Cancelled):
+        RemovalRounds(sample, measured, lambda *_: False, 1)
+    with pytest.raises(Cancelled):
+        rounds.remove_and_measure(np.arange(5), lambda *_: False)
+
+
+def test_scoring_rays_are_others_than_validation_rays():
+    """Else an order would look better than it is, on the noise that it was made of."""
+    view = replace(ring()[0], width=2000, height=1500, fx=900.0, fy=900.0, cx=1000.0, cy=750.0)
+    views = [(view, 0.5), (view, 0.5)]
+    splats = cloud()
+    gaussians, frame, _ = projection.prepare(splats, ViewSet((view,)))
+    footprints = projection.project(gaussians, frame, view)
+
+    judging, ordering = (
+        [ray_sample.cast_view(views, number, footprints, scoring=scoring) for number in (0, 1)]
+        for scoring in (False, True)
+    )
+
+    places = [
+        {(column, row) for rays in some for column in rays.columns for row in rays.rows}
+        for some in (judging, ordering)
+    ]
+    assert len(places[1]) == pytest.approx(4 * len(places[0]), rel=0.02)
+    assert len(places[0] & places[1]) < 0.02 * len(places[0])
+
+
+def test_no_view_has_more_rays_than_numbers_of_16_bits_tell_apart():
+    view = replace(ring()[0], width=2000, height=1500, fx=900.0, fy=900.0, cx=1000.0, cy=750.0)
+    gaussians, frame, _ = projection.prepare(cloud(), ViewSet((view,)))
+    footprints = projection.project(gaussians, frame, view)
+
+    rays = ray_sample.cast_view([(view, 1.0)], 0, footprints, scoring=True)
+
+    assert 59_000 < rays.count < 1 << 16
+
+
+def test_one_round_needs_no_rays_that_order():
+    run = occlusion.MemoryScoring(cloud(), ring(), occlusion.Occlusion(rounds=1))
+
+    assert run.scoring_rays is None
+
+
+@pytest.mark.parametrize(("width", "height"), [(200_000, 1), (1, 200_000), (300, 200)])
+def test_rays_are_no_more_than_asked_for_in_images_of_any_shape(width, height):
+    view = replace(ring()[0], width=width, height=height)
+
+    columns, rows = cast.pixels(view, 0, 60_000)
+
+    assert 30_000 < len(columns) * len(rows) <= 60_200
+
+
+def test_a_view_has_no_more_hits_than_memory_is_for(monkeypatch):
+    """Of 65,536 rays a limit of hits leaves fewer, where each hits much; among eight views not."""
+    view = replace(ring()[0], width=2000, height=1500, fx=900.0, fy=900.0, cx=1000.0, cy=750.0)
+    gaussians, frame, _ = projection.prepare(cloud(), ViewSet((view,)))
+    footprints = projection.project(gaussians, frame, view)
+    crowd = cast.depth_complexity(footprints, view)
+    monkeypatch.setattr(ray_sample, "MAX_HITS_OF_VIEW", 10_000 * crowd)
+
+    one, of_eight = (
+        ray_sample.cast_view([(view, 1.0)] * count, 0, footprints, scoring=True).count
+        for count in (1, 8)
+    )
+
+    assert one == pytest.approx(10_000, rel=0.02)
+    assert of_eight == pytest.approx(65_536 / 8, rel=0.02)
+
+
+def test_rays_are_let_go_as_splats_go():
+    """16 bytes for each hit, not twice that."""
+    run = occlusion.MemoryScoring(cloud(), ring(), occlusion.Occlusion(rounds=2))
+    run.measure(range(run.measuring.count))
+    assert run.scoring_rays is not None
+
+    run.rank(silent)
+
+    assert run.scoring_rays is None
