@@ -710,7 +710,7 @@ def run(*arguments: str, environment: dict[str, str] | None = None, **options):
         [sys.executable, "-W", "error", "-m", "refine_addon", *arguments],
         env={**os.environ, **paths},
         capture_output=options.pop("capture_output", True),
-        timeout=60,
+        timeout=600,
         check=False,
         **options,
     )
@@ -776,7 +776,7 @@ def test_progress_is_drawn_on_a_terminal_and_wiped_away():
 def read_all(descriptor: int) -> bytes:
     """Return what a terminal was sent, until its other end is closed."""
     drawn = b""
-    end = time.monotonic() + 10
+    end = time.monotonic() + 60
     while time.monotonic() < end:
         try:
             more = os.read(descriptor, 4096)

@@ -74,6 +74,7 @@ def read(folder, paths):
 # Occlusion, auto and what they estimate.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [OCCLUSION, AUTO], ids=["occlusion", "auto"])
 @pytest.mark.parametrize(
     "budget", [Budget(ratio=0.7), Budget(psnr=36.0), Budget(min_seen=60)], ids=str
@@ -108,36 +109,50 @@ def test_views_of_nothing_are_refused_as_of_one_file(tmp_path, tiles, views):
     assert not list((tmp_path / "out").glob("*"))
 
 
-@pytest.mark.parametrize("stop", [0.1, 0.3, 0.55, 0.7])
+@pytest.mark.slow
 @pytest.mark.parametrize("absorb", [False, True], ids=["deleted", "absorbed"])
 def test_a_job_that_was_interrupted_goes_on_where_it_was(
-    tmp_path, tiles, views, monkeypatch, stop, absorb
+    tmp_path, tiles, views, monkeypatch, absorb
 ):
-    """What a block of views has measured is not measured again, and the bytes are the same."""
-    budget, done = Budget(ratio=0.5), []
-    prune_tiles(tiles, tmp_path / "once", views, budget, OCCLUSION, absorb=absorb)
+    """What a block of views has measured is not measured again, and the bytes are the same.
+
+    Interrupted once, and four times in one job, when a tenth, three tenths, ... are done.
+    """
+    budget, settings, done = Budget(ratio=0.5), replace(OCCLUSION, views=8), []
     measure = seen.measure_footprints
     monkeypatch.setattr(
         seen, "measure_footprints", lambda *some: done.append(some) or measure(*some)
     )
 
-    def interrupt(fraction, _what):
-        if fraction > stop:
-            raise KeyboardInterrupt
+    def measured(folder, *stops):
+        """Return how many views are measured until a job is done that is stopped some times."""
+        done.clear()
 
-    prune_tiles(tiles, tmp_path / "count", views, budget, OCCLUSION, absorb=absorb)
-    needed = len(done)
-    done.clear()
-    with pytest.raises(KeyboardInterrupt):
-        prune_tiles(
-            tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=absorb, progress=interrupt
+        def interrupt(fraction, _what):
+            if stops and fraction > stops[0]:
+                raise KeyboardInterrupt
+
+        def run():
+            prune_tiles(
+                tiles, tmp_path / folder, views, budget, settings, absorb=absorb, progress=interrupt
+            )
+
+        while stops:
+            with pytest.raises(KeyboardInterrupt):
+                run()
+            stops = stops[1:]
+        run()
+        return len(done)
+
+    needed = measured("once")
+    for folder, stops in (("late", (0.7,)), ("often", (0.1, 0.3, 0.55, 0.7))):
+        taken = measured(folder, *stops)
+
+        assert needed <= taken <= needed + 2 * len(stops)  # the views of the blocks under way
+        assert read(tmp_path / folder, tiles).tobytes() == read(tmp_path / "once", tiles).tobytes()
+        assert sorted(path.name for path in (tmp_path / folder).iterdir()) == sorted(
+            path.name for path in tiles
         )
-    prune_tiles(tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=absorb)
-
-    once, again = (read(tmp_path / folder, tiles).tobytes() for folder in ("once", "out"))
-    assert once == again
-    assert needed <= len(done) <= needed + 2  # the views of the block under way
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in tiles}
 
 
 # Absorbing.
@@ -187,6 +202,7 @@ def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views,
     assert psnr_against(sample, made, others) > one - 0.3
 
 
+@pytest.mark.slow
 def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, rows, views):
     """Kept, merged and deleted add up to all; survivors that did not change are their old bytes.
 
@@ -203,6 +219,7 @@ def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, rows, views)
     assert np.isfinite([made[name] for name in made.dtype.names]).all()
 
 
+@pytest.mark.slow
 def test_what_is_deleted_alone_needs_no_merging(tmp_path, tiles, views):
     """Up to a tenth is deleted as in memory: the same rows, and nothing changes."""
     told = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.1), OCCLUSION, absorb=True)
@@ -217,6 +234,7 @@ def test_what_is_deleted_alone_needs_no_merging(tmp_path, tiles, views):
     assert read(tmp_path / "out", tiles).tobytes() == expected.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_tiles_of_other_degrees_absorb_one_another(tmp_path, rows, views):
     """Each keeps its own properties, and no number is lost that it has room for."""
@@ -279,6 +297,7 @@ def test_regions_of_one_stage_cross_those_of_the_next():
 # What a view loads.
 
 
+@pytest.mark.slow
 def test_a_view_loads_no_chunk_behind_it(tmp_path, tiles, views, monkeypatch):
     """Of 100 chunks all are loaded by some view, and a fifth of the times none was needed."""
     monkeypatch.setattr(seen, "CHUNK", 50)
