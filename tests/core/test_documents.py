@@ -43,6 +43,27 @@ def test_every_python_file_and_folder_that_is_named_exists(text):
     assert missing == []
 
 
+def test_every_name_that_is_given_with_its_file_is_defined_there(text):
+    """``core/views.py::View``: a class, function, method, constant or test of that name."""
+    given = re.findall(r"`([\w./-]+\.py)::(\w+)(_\.\.\.)?`", text)
+
+    missing = [
+        f"{path}::{name}"
+        for path, name, cut in given
+        if not any(
+            re.search(
+                rf"^\s*(?:def|class) {name}{'' if cut else chr(92) + 'b'}|^(?:\w+, )*{name}\b.* = ",
+                (ROOT / file[1:]).read_text(encoding="utf-8"),
+                re.MULTILINE,
+            )
+            for file in FILES
+            if file.endswith("/" + path)
+        )
+    ]
+
+    assert missing == []
+
+
 def _names(name: str, file: str) -> bool:
     return file.endswith("/" + name) or (not name.endswith(".py") and file.startswith("/" + name))
 
