@@ -2,12 +2,13 @@
 
 PY := .venv/bin/python
 # What decides what .venv holds; `touch`ed markers say that it holds it.
+DEMO := .venv/.demo
 DEV := .venv/.dev
 BENCH := .venv/.bench
 
 .PHONY: demo test test-core test-numpy test-e2e check build bench bench-trade fuzz mutants clean
 
-demo: $(DEV)          ## the main job: the committed room, its cameras, half of it pruned, into out/
+demo: $(DEMO)         ## the main job: the committed room, its cameras, half of it pruned, into out/
 	$(PY) docs/demo.py
 
 test: $(BENCH)        ## core, add-on and benchmark tests, all of them
@@ -25,8 +26,9 @@ test-e2e: $(BENCH) build ## the installed zip in real Blenders; skips, with the 
 	# fails gets one more try, and failing twice fails the build.
 	$(PY) -m pytest tests/e2e/test_window.py || $(PY) -m pytest tests/e2e/test_window.py --last-failed
 
-check: $(DEV)         ## lint, format, types
+check: $(DEV)         ## lint, format, types, and whether each mutant's line is still there
 	.venv/bin/ruff check && .venv/bin/ruff format --check && .venv/bin/mypy
+	$(PY) tests/mutants.py --stale
 
 build: $(DEV)         ## the extension's zip, validated, into build/
 	$(PY) .ci/build_extension.py
@@ -53,10 +55,15 @@ clean:                ## all that was made
 .venv/bin/python:
 	sh .ci/make_venv .venv
 
+$(DEMO): pyproject.toml | .venv/bin/python
+	$(PY) -m pip install --quiet --editable '.[demo]'
+	$(PY) .ci/check_libraries.py
+	touch $@
+
 $(DEV): pyproject.toml | .venv/bin/python
 	$(PY) -m pip install --quiet --editable '.[dev]'
 	$(PY) .ci/check_libraries.py
-	touch $@
+	touch $(DEMO) $@
 
 $(BENCH): $(DEV)
 	$(PY) -m pip install --quiet --editable '.[dev,bench]'

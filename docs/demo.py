@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 CAMERA = "018"
-PERCENTAGE = int(sys.argv[1]) if len(sys.argv) > 1 else 125
+PERCENTAGE = int(sys.argv[1]) if len(sys.argv) > 1 else 75
 """Size of the pictures; those of the README are 200 % of what the cameras saw."""
 
 # Before bpy is imported, so that nobody's own Blender settings are read or written.

@@ -176,7 +176,7 @@ def _published() -> list[Method]:
         _scoring(
             f"refine-{depth}",
             LITERATURE,
-            f"REFINE's closed form, {text} (`--published --depth {depth}`)",
+            f"REFINE's closed form, {text} (`ClosedForm.published({depth!r})`)",
             Settings("closed-form", views=0, closed_form=ClosedForm.published(depth)),
         )
         for depth, text in readings.items()

@@ -13,8 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .signals import Listener, exit_code, reason
-from .terminal import complain
+from .signals import Listener, exit_code, reason  # and nothing that loads NumPy, see `Listener`
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,7 +39,7 @@ def main(arguments: Sequence[str], *, scene: bool = False, last: bool = False) -
     """
     with Listener(last=last) as listener:
         try:
-            # Loads NumPy, which takes longer than many a run; a signal waits until it is there.
+            # Loads all of core, and with it NumPy: a signal waits until that is there.
             from . import flow  # noqa: PLC0415
 
             listener.interrupt()
@@ -48,6 +47,8 @@ def main(arguments: Sequence[str], *, scene: bool = False, last: bool = False) -
             listener.wait()
         except KeyboardInterrupt as stop:
             listener.wait()
+            from .terminal import complain  # noqa: PLC0415 - by now it is there
+
             complain(f"{reason(stop)}; nothing was left half-written")
             return exit_code(stop)
     return code

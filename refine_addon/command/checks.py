@@ -40,7 +40,7 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     if given.command in ("info", "convert"):
         return
     try:
-        _check_settings(parser, given)
+        _check_settings(given)
     except RefineError as error:
         parser.error(str(error))
     zones.check(parser, given)
@@ -63,8 +63,8 @@ def _refuse_urls(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
         parser.error(str(error))
 
 
-def _check_settings(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
-    """Refuse values that cannot be, and settings of a method that is not used.
+def _check_settings(given: argparse.Namespace) -> None:
+    """Refuse values that cannot be, and a budget that means nothing to the method.
 
     Raises
     ------
@@ -80,8 +80,6 @@ def _check_settings(parser: argparse.ArgumentParser, given: argparse.Namespace) 
     settings = options.settings(given)
     if given.command == "prune":
         options.budget(given).refuse_meaningless(settings.method, frustum=settings.frustum)
-    if settings.method != "closed-form" and (given.published or given.depth != "z"):
-        parser.error("--published and --depth are settings of --method closed-form")
 
 
 def open_blend() -> str:

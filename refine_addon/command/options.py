@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from ..core import METHODS, REASONS, Budget, Cleaning, ClosedForm, Levels, RefineError, Settings
+from ..core import METHODS, REASONS, Budget, Cleaning, Levels, RefineError, Settings
 from ..core.errors import printable
 from ..core.formats.registry import SUFFIXES
 from ..core.levels.files import GOAL
@@ -353,20 +353,6 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
         help="with --method auto: by how much the PSNR may be lower than by all views, in dB "
         f"(default {Settings.tolerance})",
     )
-    parser.add_argument(
-        "--depth",
-        choices=["z", "distance"],
-        default="z",
-        help="what the closed form takes as distance: along the view's axis (z), or to the view "
-        "itself (default z); only with --method closed-form",
-    )
-    parser.add_argument(
-        "--published",
-        action="store_true",
-        help="the formula as published, without frustum test and with constants in scene units: "
-        "the paper's with --depth z, its authors' code with --depth distance; only with --method "
-        "closed-form",
-    )
     _add_views(parser)
 
 
@@ -451,6 +437,9 @@ def _folder(text: str) -> Path | Url:
 
 def _path(text: str) -> Path:
     """Return the path of what is written, the home folder spelt out."""
+    if text == "-":
+        msg = "nothing is written to standard output: give the name of a file (./- is one, too)"
+        raise argparse.ArgumentTypeError(msg)
     try:
         return expanded(_given(text))
     except RefineError as error:
@@ -459,8 +448,7 @@ def _path(text: str) -> Path:
 
 def settings(options: argparse.Namespace) -> Settings:
     """Return how to score, or raise `RefineError` where a value cannot be."""
-    make = ClosedForm.published if options.published else ClosedForm
-    return Settings(options.method, options.views, make(options.depth), tolerance=options.tolerance)
+    return Settings(options.method, options.views, tolerance=options.tolerance)
 
 
 def cleaning(options: argparse.Namespace) -> Cleaning:

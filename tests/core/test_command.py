@@ -18,7 +18,6 @@ import pytest
 from refine_addon import command
 from refine_addon.core import (
     Budget,
-    ClosedForm,
     Settings,
     prune,
     prune_file,
@@ -97,21 +96,6 @@ def contents(folder: Path) -> dict[Path, bytes]:
         (["--views", "0"], Budget(ratio=0.5), Settings(views=0)),
         (["--method", "closed-form"], Budget(ratio=0.5), Settings("closed-form")),
         (["--method", "occlusion"], Budget(ratio=0.5), Settings("occlusion")),
-        (
-            [*CLOSED, "--depth", "distance"],
-            Budget(ratio=0.5),
-            Settings("closed-form", closed_form=ClosedForm("distance")),
-        ),
-        (
-            [*CLOSED, "--published"],
-            Budget(ratio=0.5),
-            Settings("closed-form", closed_form=ClosedForm.published("z")),
-        ),
-        (
-            [*CLOSED, "--published", "--depth", "distance"],
-            Budget(ratio=0.5),
-            Settings("closed-form", closed_form=ClosedForm.published("distance")),
-        ),
     ],
 )
 def test_every_budget_and_setting_keeps_the_rows_that_the_interface_keeps(
@@ -280,19 +264,19 @@ def test_one_bad_file_does_not_stop_the_others(folder, capsys):
 
 @pytest.mark.slow
 def test_a_batch_of_files_leaves_none_of_them_open_or_mapped(folder):
-    """300 files: as many are open and mapped at the end as at the start."""
+    """60 files: as many are open and mapped at the end as at the start."""
     if not Path("/proc/self/fd").is_dir():
         pytest.skip("counts open files as Linux shows them")
-    for index in range(300):
+    for index in range(60):
         (folder / f"{index}.ply").write_bytes(plain_ply(20, seed=index))
-    inputs = [f"{index}.ply" for index in range(300)]
+    inputs = [f"{index}.ply" for index in range(60)]
     command.main(["info", "--quiet", *inputs])
     before = open_files()
 
     assert command.main(["prune", *inputs, *PRUNE[2:], "--output-dir", "out", "--quiet"]) == 0
 
     after = open_files()
-    assert len(list((folder / "out").iterdir())) == 300
+    assert len(list((folder / "out").iterdir())) == 60
     assert after[0] <= before[0]
     assert after[1] <= before[1] + 20
 
@@ -511,10 +495,8 @@ USAGE = {
     "no pictures": [*PRUNE, "-o", "out.ply", "--psnr", "0"],
     "seen by too many": [*PRUNE, "-o", "out.ply", "--min-seen", "101"],
     "a score of any method": [*PRUNE, "-o", "out.ply", "--threshold", "1"],
-    "a count of all views": [*PRUNE, "-o", "out.ply", *CLOSED, "--published", "--min-seen", "5"],
     "views below 0": [*PRUNE, "-o", "out.ply", "--views", "-1"],
     "unknown method": [*PRUNE, "-o", "out.ply", "--method", "guess"],
-    "unknown depth": [*PRUNE, "-o", "out.ply", "--depth", "y"],
     "object without Blender": ["prune", "--object", "Splats", "-o", "out.ply", *PRUNE[2:]],
     "save without object": [*PRUNE, "-o", "out.ply", "--save"],
     "object and input": [*PRUNE, "--object", "Splats", "-o", "out.ply"],
@@ -788,11 +770,24 @@ def test_an_output_never_replaces_what_is_no_splat_file(folder, capsys):
     assert (folder / "cameras.json").read_bytes() == before
 
 
-@pytest.mark.parametrize("method", [[], ["--method", "occlusion"]])
-def test_settings_of_the_closed_form_are_refused_elsewhere(folder, capsys, method):  # noqa: ARG001
-    """They would change nothing; auto is the default."""
-    assert command.main([*PRUNE, "-o", "out.ply", *method, "--published"]) == 2
-    assert "settings of --method closed-form" in capsys.readouterr().err
+@pytest.mark.parametrize("option", ["-o", "--report", "--pictures", "--output-dir"])
+def test_nothing_is_written_to_standard_output(folder, capsys, option):
+    """A lone - stands for it elsewhere: a file of that name would be found by nobody."""
+    before = sorted(folder.iterdir())
+
+    assert command.main([*PRUNE, option, "-"]) == 2
+
+    assert "nothing is written to standard output" in capsys.readouterr().err
+    assert sorted(folder.iterdir()) == before
+
+
+@pytest.mark.parametrize("name", ["out.ply.gz", "out.PLY.BZ2", "out.splat.zip"])
+def test_an_output_that_is_named_as_compressed_is_refused(folder, capsys, name):
+    """It would hold a plain PLY; in one sentence, before anything is read."""
+    assert command.main([*PRUNE, "-o", name]) == 2
+
+    assert "is not written, expected one of .ply" in capsys.readouterr().err
+    assert not (folder / name).exists()
 
 
 def test_info_of_a_signalling_not_a_number_does_not_warn(folder, capsys):  # noqa: ARG001

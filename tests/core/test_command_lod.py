@@ -181,6 +181,18 @@ def test_files_that_the_new_manifest_does_not_name_go(files, capsys):  # noqa: F
     assert (files / "outside.lod3.ply").exists()
 
 
+@pytest.mark.parametrize("told", ["[" * 100_000, "}", '{"file": 1}', "[{}]"])
+def test_a_manifest_that_cannot_be_read_names_no_files(files, told):  # noqa: F811
+    """It is replaced; brackets within brackets are more than the parser of JSON follows."""
+    out = files / "out"
+    out.mkdir()
+    (out / "lod.json").write_text('{"lod": 1, "levels": ' + told)
+
+    assert call(files, "lod", "-o", str(out), "--overwrite", *QUICK) == 0
+
+    assert json.loads((out / "lod.json").read_text())["lod"] == 1
+
+
 def test_a_level_can_be_the_source_of_a_new_run(files):  # noqa: F811
     """It is in the folder, and the manifest before names it: it stays."""
     out = files / "out"

@@ -112,6 +112,40 @@ def test_ctrl_c_at_any_import_is_code_130_and_one_line():
         assert (process.returncode, *said) == (130, b"", CANCELLED), moment
 
 
+AMID_NUMPY = """
+import os, runpy, signal, sys
+
+def stop(event, arguments):
+    if event == "import" and arguments[0] == "datetime" and "numpy" in sys.modules:
+        os.kill(os.getpid(), signal.SIGINT)
+
+sys.addaudithook(stop)
+runpy.run_module("refine_addon", run_name="__main__", alter_sys=True)
+"""
+
+
+@pytest.mark.usefixtures("folder")
+def test_ctrl_c_amid_the_import_of_numpy_is_code_130_and_one_line():
+    """NumPy's compiled part imports datetime, and turns what is raised there into an ImportError.
+
+    That would end in a traceback that says not to import NumPy from its source directory.
+    """
+    with start("-c", AMID_NUMPY, *LONG) as process:
+        said = process.communicate(timeout=30)
+
+    assert (process.returncode, *said) == (130, b"", CANCELLED)
+
+
+def test_nothing_loads_numpy_before_signals_are_listened_to():
+    """Whoever imports the command has no NumPy yet: `main` loads it within its `Listener`."""
+    check = "import sys, refine_addon.command; sys.exit('numpy' in sys.modules)"
+
+    with start("-c", check) as process:
+        process.communicate(timeout=30)
+
+    assert process.returncode == 0
+
+
 def test_the_installed_script_is_what_python_runs():
     """`refine` of pyproject.toml is the function that ``python -m refine_addon`` calls."""
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]

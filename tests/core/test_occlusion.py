@@ -744,14 +744,14 @@ def test_what_cannot_be_drawn_scores_zero_and_all_else_more():
 def test_no_scene_makes_numpy_complain(focal, spread):
     """Cameras inside splats, splats of all sizes, any focal length; warnings are errors."""
     rng = np.random.default_rng(5)
-    splats = cloud(400, 4)
+    splats = cloud(200, 4)
     splats.means[:] *= spread
-    splats.log_scales[:] = rng.uniform(-60.0, 60.0, size=(400, 3))
-    splats.log_scales[::3] = rng.normal(0.0, 2.0, size=(134, 3))
+    splats.log_scales[:] = rng.uniform(-60.0, 60.0, size=(200, 3))
+    splats.log_scales[::3] = rng.normal(0.0, 2.0, size=(67, 3))
     splats.means[5] = ring()[0].center
     splats.means[6], splats.log_scales[6], splats.opacity_logits[6] = 0.0, -3.0, 1.0  # seen by all
     splats.sh_dc[::7] *= 1e6
-    views = ViewSet(tuple(replace(view, fx=focal, fy=focal * 1.1) for view in ring()))
+    views = ViewSet(tuple(replace(view, fx=focal, fy=focal * 1.1) for view in ring()[:2]))
 
     with np.errstate(all="raise"):
         found = occlusion.score(splats, views, Occlusion(rounds=2), threads=1)

@@ -42,8 +42,8 @@ SUFFIXES = (".ply", *(form.suffix for form in FORMATS))
 
 _LONGEST_FIRST = sorted(SUFFIXES, key=len, reverse=True)
 
-NOT_WRITTEN = (".ksplat", ".gltf", ".lcc")
-"""Endings of other splat formats: a PLY of such a name would mislead."""
+NOT_WRITTEN = (".ksplat", ".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
+"""Endings of other splat formats and of compressed files: a PLY of such a name would mislead."""
 
 _HEAD = 1 << 16
 """Bytes by which a format is known; the header of a compressed PLY has fewer."""

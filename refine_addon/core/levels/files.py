@@ -195,7 +195,7 @@ def _unlisted(folder: Path) -> list[Path]:
     try:
         told = json.loads(path.read_bytes())
         names = [str(entry["file"]) for entry in told["levels"]]
-    except (OSError, ValueError, LookupError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):  # none that we wrote
         names = []
     path.unlink(missing_ok=True)
     return [folder / name for name in names if _LEVEL.fullmatch(name)]
