@@ -96,6 +96,25 @@ def test_every_link_leads_somewhere(document):
             assert heading in [re.sub(r"[^\w -]", "", line).replace(" ", "-") for line in headings]
 
 
+PROSE = [path for path in DOCUMENTS if path.name not in {"trade.md", "CHANGELOG.md"}]
+"""Documents but the generated one, and the one in which an entry is a line."""
+
+
+@pytest.mark.parametrize("document", PROSE, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_lines_end_where_sentences_do(document):
+    """So a change of a sentence is a change of its line. Tables and fenced blocks are as they are.
+
+    A bold heading, a date or a list's number may stand before a sentence.
+    """
+    text = document.read_text(encoding="utf-8")
+    text = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    lines = [line for line in text.splitlines() if not line.startswith(("|", "#", "    ", "!["))]
+    begun = re.compile(r"^\s*(?:- |\d+\. )?(?:\*\*[^*]+\*\*|\d{4}-\d\d-\d\d\.)?")
+    plain = [re.sub(r"`[^`]*`", "x", begun.sub("", line)) for line in lines]
+
+    assert [line for line in plain if re.search(r'(?<!Eq)[.!?][)"*]* +["(*[]*[A-Z]', line)] == []
+
+
 def decisions():
     """Return the subjects of docs/decisions.md, and its entries: their headings and texts."""
     text = (ROOT / "docs/decisions.md").read_text(encoding="utf-8")
