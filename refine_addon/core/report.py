@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
     from numpy.typing import NDArray
 
     from .formats.ply import SplatFile
     from .formats.registry import Packed
     from .scores import Scores
     from .selection import Budget
-    from .task import Settings
 
 
 class Clock:
@@ -141,7 +141,11 @@ def held(
 
 
 def make_report(
-    scores: Scores, keep: NDArray[np.bool_], budget: Budget, settings: Settings, clock: Clock
+    scores: Scores,
+    keep: NDArray[np.bool_],
+    budget: Budget,
+    settings: DataclassInstance,
+    clock: Clock,
 ) -> dict[str, Any]:
     """Return the report of a prune, as plain JSON values.
 

@@ -33,11 +33,11 @@ from refine_addon.core import (
     select,
 )
 from refine_addon.core.pipeline import decide
-from refine_addon.core.scene import principal_axes
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
 from refine_addon.core.scoring.closed_form_block import LUMA
 from refine_addon.core.seeing import froxels, lattices, points, projection, ray_sums
 from refine_addon.core.seeing.measuring import Measured
+from refine_addon.core.seeing.scene import principal_axes
 from refine_addon.core.selection import rank
 from refine_addon.core.task import Task
 from tests.strategies import plain_header, ply_of, splat_names

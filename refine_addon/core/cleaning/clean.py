@@ -20,8 +20,8 @@ from ..errors import RefineError
 from ..seeing import projection
 from ..seeing.measuring import VIEW_GROUPS
 from ..seeing.ray_sample import RaySample
-from ..splats import refuse_undrawable
-from ..volumes import among_all, refuse_all
+from ..splats import among_all, refuse_undrawable
+from ..volumes import refuse_all
 from ..work import Progress, for_chunks, part, silent
 from . import sight
 from .clusters import cluster_sizes
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
     from ..seeing.projection import Footprints, Gaussians
+    from ..seeing.scene import Scene
     from ..splats import Splats
     from ..views import ViewSet
 

@@ -27,10 +27,10 @@ from ..seeing.ray_sums import in_front
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..scene import Scene
     from ..seeing.projection import Footprints, Gaussians
     from ..seeing.ray_sample import RaySample
     from ..seeing.rays import Rays
+    from ..seeing.scene import Scene
     from ..views import View
 
 RAYS = 2500

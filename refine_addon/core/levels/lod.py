@@ -17,8 +17,8 @@ from ..errors import RefineError
 from ..estimate.quality import PSNR_CAP
 from ..pipeline import decide, score
 from ..selection import Budget
+from ..splats import among_all
 from ..task import DEFAULTS, Origin, Task
-from ..volumes import among_all
 from ..work import Progress, part, silent
 from .distance import Lookout
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from ..affine import is_uniform, transformed
 from ..cleaning.clean import clean
-from ..estimate.written import written_facts
 from ..formats.registry import read_written, refuse_unknown_size
 from ..pipeline import decide
 from ..task import DEFAULTS, Settings, Task
+from .written import written_facts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
+    from ..seeing.scene import Scene
     from ..splats import Splats
     from ..task import Settings
     from ..views import ViewSet

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..pipeline import with_quality
-from ..scene import Scene, principal_axes
 from ..scoring import auto
 from ..scoring.occlusion import FIRST_END, PRIOR, OcclusionScoring
+from ..seeing.scene import Scene, principal_axes
 from ..work import Progress, part
 from .closed_form import by_closed_form
 from .gaussians import SceneContext, SumMoments, store_gaussians
