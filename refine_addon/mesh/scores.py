@@ -29,8 +29,8 @@ SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
 """Point attributes: the score, its place from 0 (goes first) to 1, in how many views it lies."""
 
 SCORED = "refine_scored"
-"""Boolean point attribute: which splats have a score; not those that were forced out, and not those
-that were joined or added since, for which Blender writes False."""
+"""Boolean point attribute: which splats have a score. Neither those that were forced out have one,
+nor those that were joined or added since, for which Blender writes False."""
 
 RECORD = "refine_scores"
 """Custom property of the mesh: how its scores came to be, as JSON."""
@@ -117,7 +117,7 @@ def store(  # noqa: PLR0913 - all that a note holds
             "together": together and {"id": together.id, "splats": together.splats},
         }
     )
-    # What can fail comes first: scores and note are to belong together.
+    # The heat map may fail for want of memory, and comes first: scores and note belong together.
     heat_map.write(mesh, ranks)
     mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
     mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
@@ -146,17 +146,17 @@ def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
 
 
 def unrefined(record: dict[str, Any]) -> bool:
-    """Tell whether the scores of a note are a sketch of those that were asked for."""
+    """Tell whether the scores of a note are a first version of those that were asked for."""
     return bool(record.get("asked"))
 
 
-def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None) -> Scores:
+def stored_scores(checked: SplatObject, forced_out: NDArray[np.bool_] | None = None) -> Scores:
     """Return the scores that an object's mesh holds.
 
     Parameters
     ----------
     checked : SplatObject
-    removed : (N,) bool, optional
+    forced_out : (N,) bool, optional
         Splats that have to go, and need no score.
 
     Raises
@@ -166,23 +166,20 @@ def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None
     """
     mesh, label = checked.mesh, f"object '{checked.obj.name}'"
     noted = record(mesh)
-    kinds = {SCORE: "FLOAT", SEEN: "INT", SCORED: "BOOLEAN"}
-    for name, kind in kinds.items():
-        attribute = mesh.attributes.get(name)
-        if noted is None or not attribute or attribute.data_type != kind:
-            msg = f"{label}: has no scores; score it first"
-            raise RefineError(msg)
+    if noted is None or not _has_scores(mesh):
+        msg = f"{label}: has no scores; score it first"
+        raise RefineError(msg)
     values = mesh_attributes.read_attribute(mesh, SCORE)
     scored = mesh_attributes.read_attribute(mesh, SCORED)
-    unscored = ~scored if removed is None else ~scored & ~removed
-    if len(values) > noted["splats"] or unscored.any():
+    forced_out = np.zeros_like(scored) if forced_out is None else forced_out
+    unscored = int(np.count_nonzero(~scored & ~forced_out))
+    if len(values) > noted["splats"] or unscored:
         msg = (
-            f"{label}: scored with {noted['splats']} splats, has {len(values)} now, "
-            f"{np.count_nonzero(unscored)} of them without a score; score it again"
+            f"{label}: scored with {noted['splats']} splats, has {len(values)} now, {unscored} of "
+            "them without a score; score it again"
         )
         raise RefineError(msg)
     # The curve is that of all splats that were scored: of one object, with the same forced out.
-    forced_out = np.zeros_like(scored) if removed is None else removed
     whole = len(values) == noted["splats"] and not noted.get("together")
     whole = whole and np.array_equal(forced_out, ~scored)
     return Scores(
@@ -198,3 +195,10 @@ def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None
         quality=Quality.from_facts(noted.get("quality")) if whole else None,
         scored=None if scored.all() else scored,
     )
+
+
+def _has_scores(mesh: bpy.types.Mesh) -> bool:
+    """Tell whether a mesh has the attributes that `stored_scores` reads."""
+    kinds = {SCORE: "FLOAT", SEEN: "INT", SCORED: "BOOLEAN"}
+    attributes = ((mesh.attributes.get(name), kind) for name, kind in kinds.items())
+    return all(attribute and attribute.data_type == kind for attribute, kind in attributes)
