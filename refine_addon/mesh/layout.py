@@ -139,9 +139,10 @@ class Layout:
 
 @dataclass(frozen=True)
 class SplatObject:
-    """An object that holds splats, as `check` found it; what works on splats is handed one.
+    """An object that holds splats, and in which attributes: what `check` returns.
 
-    It is made once, where an operation begins, and holds until splats or attributes come or go.
+    An operation makes it once, where it begins. It is out of date as soon as splats or attributes
+    come or go.
 
     Attributes
     ----------
@@ -255,7 +256,7 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
         layout = Layout(columns, header, native.is_native(mesh))
         described = layout.row_dtype.itemsize > 0
     except (AttributeError, KeyError, TypeError, ValueError):
-        # Somebody else may have written there: what does not describe a file is no layout.
+        # Another program may have written there: what does not describe a file is no layout.
         return None
     return layout if described else None
 

@@ -55,7 +55,7 @@ def chosen(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> list[bpy.typ
 
 
 def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
-    """Return the objects of `chosen`, found to hold splats.
+    """Return the objects of `chosen`, all of which hold splats.
 
     Raises
     ------

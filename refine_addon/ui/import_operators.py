@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ..core.work import Progress
 
 _ROWS = 1 << 16
-"""Rows that are read between two looks at whether to go on."""
+"""Rows that are read before the next look at whether the import was cancelled."""
 
 FILE_NAMES = ";".join(f"*{suffix}" for suffix in SUFFIXES)
 """What a file browser shows."""
@@ -89,9 +89,9 @@ class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper
         """Read the files; one that cannot be read does not stop the others."""
         read = _Read([], [])
         for index, path in enumerate(paths):
-            ahead = part(progress, index / len(paths), (index + 1) / len(paths))
+            progress_of_file = part(progress, index / len(paths), (index + 1) / len(paths))
             try:
-                read.files.append(_read(path, ahead))
+                read.files.append(_read(path, progress_of_file))
             except FAILURES as error:
                 read.errors.append(error)
         return read

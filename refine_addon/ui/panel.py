@@ -130,13 +130,13 @@ class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
         settings = context.scene.refine
         layout.operator("refine.find_floaters", icon="VIEWZOOM")
         obj = context.object
-        found = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        counts = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
         column = layout.column(align=True)
         for name, text, _ in FLOATERS:
-            shown = text if found is None else f"{text}: {found[name]:,}"
+            shown = text if counts is None else f"{text}: {counts[name]:,}"
             column.prop_enum(settings, "reasons", name, text=shown)
-        if found is not None:
-            total = sum(found[name] for name in settings.reasons)
+        if counts is not None:
+            total = sum(counts[name] for name in settings.reasons)
             layout.label(
                 text=f"Go: {total:,} of {mesh_layout.splat_count(obj.data):,}", icon="TRASH"
             )

@@ -168,9 +168,9 @@ def _protectable(
     if mesh_layout.looks_like_splats(obj):
         yield from (group.name for group in obj.vertex_groups)
         for attribute in obj.data.attributes:
-            own = attribute.name.startswith((".", "refine_", "f_rest_"))
-            own = own or attribute.name in {*REQUIRED, "radius"}
-            if attribute.data_type in MARKING and attribute.domain == "POINT" and not own:
+            ours = attribute.name.startswith((".", "refine_", "f_rest_"))
+            ours = ours or attribute.name in {*REQUIRED, "radius"}
+            if attribute.data_type in MARKING and attribute.domain == "POINT" and not ours:
                 yield attribute.name
 
 
