@@ -12,7 +12,7 @@ from ..core.errors import RefineError
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
 from .layout import splat_count
-from .notes import parsed
+from .records import parsed
 
 if TYPE_CHECKING:
     from collections.abc import Collection

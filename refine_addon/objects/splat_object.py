@@ -246,7 +246,7 @@ def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
 def _reduce(
     checked: SplatObject, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
 ) -> None:
-    """Delete what does not stay, store what the others became, and drop the note of the scores."""
+    """Delete what does not stay, store what the others became, and drop the scores' record."""
     mesh_edit.delete_vertices(checked.obj, ~keep)
     columns = {name: values[keep] for name, values in columns.items()}
     mesh_attributes.write_columns(checked, columns)

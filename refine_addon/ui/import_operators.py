@@ -213,10 +213,10 @@ def _capture_folder(obj: bpy.types.Object | None) -> Path | None:
     Trained scenes have their splats some folders below their cameras, in
     ``point_cloud/iteration_30000``.
     """
-    noted = obj.get(FOLDER) if obj is not None else None
-    if not isinstance(noted, str) or not noted or not os.path.isdir(noted):  # noqa: PTH112
+    stored = obj.get(FOLDER) if obj is not None else None
+    if not isinstance(stored, str) or not stored or not os.path.isdir(stored):  # noqa: PTH112
         return None
-    folder = Path(noted)
+    folder = Path(stored)
     for place in (folder, *folder.parents[:_ABOVE]):
         if any((place / name).exists() for name in _CAMERAS):
             return place

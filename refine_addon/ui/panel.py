@@ -16,7 +16,8 @@ from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
 from ..objects import demands, splat_group
 from ..viewport import draw as viewport_draw
-from . import camera_list, kept, plans, preview, price, running, staleness, wrapped
+from . import camera_list, plans, preview, price, running, staleness, wrapped
+from .panel_cache import cached
 from .properties import FLOATERS
 from .view_operators import MODES
 from .volumes import ROLES
@@ -70,7 +71,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         if several:
             wrapped.label(layout, context, "Scored and pruned as one scene", icon="INFO")
             return
-        size = kept.answer("bytes", context, lambda: mesh_layout.export_bytes(obj))
+        size = cached("bytes", context, lambda: mesh_layout.export_bytes(obj))
         if size is not None:
             layout.label(text=size_in_words(size))
         layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
@@ -93,7 +94,7 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
         if settings.source == "FRAMES":
             _draw_frames(layout, settings, context.scene)
         elif settings.source != "ACTIVE":
-            count = kept.answer("cameras", context, lambda: len(_cameras(context)))
+            count = cached("cameras", context, lambda: len(_cameras(context)))
             layout.label(text=counted(count, "camera"), icon="CAMERA_DATA")
 
 
@@ -329,7 +330,7 @@ def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> Non
 
 
 def _record(obj: bpy.types.Object | None) -> dict[str, Any] | None:
-    """Return the note of the scores of an object, None without."""
+    """Return the record of an object's scoring, None without."""
     return mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
 
 
@@ -347,7 +348,7 @@ def _changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
     objects = splat_group.chosen(context.view_layer, obj)
     question = ("changes", tuple(each.data.get(mesh_scores.RECORD) for each in objects))
     marked = dict.fromkeys(objects)  # what is protected of them is marked
-    return kept.answer(question, context, lambda: staleness.changes_of(context, marked))
+    return cached(question, context, lambda: staleness.changes_of(context, marked))
 
 
 def _draw_price(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

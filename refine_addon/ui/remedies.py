@@ -84,7 +84,7 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_add_ring(AtOnce, OnSplats, bpy.types.Operator):
-    """Add cameras around the splats that see all of them; they decide with those there are"""
+    """Add cameras around the splats that see all of them; they decide together with the others"""
 
     bl_idname = "refine.add_ring"
     bl_label = "Add a Ring of Cameras"
@@ -130,7 +130,7 @@ class REFINE_OT_leave_out(AtOnce, OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_keep_unseen(AtOnce, OnSplats, bpy.types.Operator):
-    """Mark the splats that lie in no view to stay, with those that are marked"""
+    """Mark the splats that lie in no view to stay, beside those that are marked already"""
 
     bl_idname = "refine.keep_unseen"
     bl_label = "Keep What Is Unseen"

@@ -53,7 +53,7 @@ def changes(
     context : bpy.types.Context
         Evaluated: matrices are read as they stand.
     obj : bpy.types.Object
-        Without scores, or scored by a script that noted no origin, it has no changes.
+        Without scores, or scored by a script that recorded no origin, it has no changes.
     protected : (N,) bool, optional
         Which of its splats stay in any case; by default those that are marked so for the views.
     """
@@ -149,7 +149,7 @@ def _deciding(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _cameras(context: bpy.types.Context) -> dict[str, Any]:
-    """Return a note of the cameras that decide; of a shot, which frames of which camera."""
+    """Return numbers that tell the cameras that decide from others; of a shot, its frames."""
     scene, settings = context.scene, context.scene.refine
     if settings.source == "FRAMES":
         frames = settings.to_frames(scene)
