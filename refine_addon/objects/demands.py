@@ -16,7 +16,7 @@ from ..core import volumes as core_volumes
 from ..core.affine import moved
 from ..core.errors import RefineError
 from ..core.solid import Solid
-from ..core.volumes import Box, Forced, Placed, Sphere, Zone
+from ..core.volumes import Box, Forced, MovedVolume, Sphere, Zone
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
@@ -164,7 +164,7 @@ def _empty_volume(
     if obj.empty_display_type == "SPHERE":
         shape = Sphere((0.0, 0.0, 0.0), size)
     key = _digest(repr((obj.empty_display_type, size)).encode(), matrix.tobytes())
-    return _CachedVolume(label, key, partial(Placed, shape, matrix))
+    return _CachedVolume(label, key, partial(MovedVolume, shape, matrix))
 
 
 def _mesh_volume(

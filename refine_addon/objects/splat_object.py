@@ -18,22 +18,19 @@ from ..cameras.objects import world_matrix
 from ..core import pipeline
 from ..core.affine import is_uniform, transformed
 from ..core.errors import RefineError
-from ..core.estimate.written import written_facts
-from ..core.file_to_file import picture_facts
 from ..core.formats.ply import columns_from_splats
-from ..core.formats.registry import as_written, format_named, refuse_unknown_size
-from ..core.report import Clock, Files, complete_report, held
+from ..core.formats.registry import as_written
 from ..core.survivors import survivor_columns
 from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.volumes import FREE, Forced
 from ..core.whole_file import expanded, refuse_existing
-from ..core.work import Progress, part, silent
+from ..core.work import Progress, silent
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
 from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject, check
-from ..mesh.scores import RECORD, store, stored_scores
+from ..mesh.scores import RECORD, stored_scores
 from .demands import NONE
 
 if TYPE_CHECKING:
@@ -46,7 +43,6 @@ if TYPE_CHECKING:
     from ..core.formats.ply import SplatFile
     from ..core.formats.registry import Packed
     from ..core.levels.lod import Level
-    from ..core.picture_files import PictureFiles
     from ..core.scores import Scores
     from ..core.selection import Budget
     from ..core.splats import Splats
@@ -214,7 +210,7 @@ def apply_objects(parts: Sequence[tuple[SplatObject, Result | Level]]) -> list[O
         for checked, _ in parts:
             stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
         for (checked, result), changed in zip(parts, columns, strict=True):
-            _reduce(checked, result.keep, changed)
+            reduce_object(checked, result.keep, changed)
     return outcomes
 
 
@@ -239,11 +235,11 @@ def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
         raise RefineError(msg)
     outcome = _outcome(checked, keep)
     with mesh_edit.all_or_nothing(checked.obj):
-        _reduce(checked, keep, {})
+        reduce_object(checked, keep, {})
     return outcome
 
 
-def _reduce(
+def reduce_object(
     checked: SplatObject, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
 ) -> None:
     """Delete what does not stay, store what the others became, and drop the scores' record."""
@@ -380,126 +376,6 @@ def score_object(
     return mesh_attributes.file_from_object(checked), scores, forced, modifier_notes(checked.obj)
 
 
-def prune_object(  # noqa: PLR0913 - the command's options
-    name: str,
-    views: ViewSet,
-    budget: Budget,
-    settings: Settings,
-    demands: Demands = NONE,
-    *,
-    absorb: bool = False,
-    output: Path | None = None,
-    pictures: PictureFiles | None = None,
-    save: bool = False,
-    dry_run: bool = False,
-    overwrite: bool = False,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Prune an object of the open scene, export what stays, save the .blend.
-
-    Parameters
-    ----------
-    name : str
-        Of the object.
-    views, budget, settings, absorb, progress
-        See `refine_addon.core.pipeline.prune`.
-    demands : Demands
-        What must stay and what must go.
-    output : Path, optional
-        The file to make, in the format that its suffix names.
-    pictures : PictureFiles, optional
-        Where pictures before and after go; none are drawn without it.
-    save : bool
-        Whether to delete the splats from the object and save the .blend.
-    dry_run : bool
-        Whether to decide only.
-    overwrite : bool
-        Whether `output` may be replaced.
-
-    Returns
-    -------
-    dict
-        The report, as of `refine_addon.core.file_to_file.prune_file`.
-
-    Raises
-    ------
-    RefineError
-        See `gather`, `Demands.forced`, `apply_object`, `export_object` and
-        `refine_addon.core.pipeline.prune`; also if there is no such object, or the .blend cannot be
-        saved. What was exported by then stays; the object is as it was.
-    """
-    clock = Clock()
-    checked = check(find(name))
-    target = None if output is None or dry_run else expanded(output)
-    if target is not None:
-        refuse_existing(target, overwrite=overwrite)
-    if pictures is not None:
-        pictures.refuse_existing(views)
-    if save and not dry_run:
-        _check_savable(checked.obj)
-    row_bytes, fixed_bytes = _file_size(checked, budget, output)
-    seen = settings.estimates or budget.psnr is not None or pictures is not None
-    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
-    splats = gather(checked, whole=absorb or (None if seen else False))
-    found = demands.forced(checked)
-    task = Task(
-        budget=budget,
-        settings=settings,
-        splats=splats,
-        views=views,
-        protected=found.protected,
-        removed=found.removed,
-        absorb=absorb,
-        row_bytes=row_bytes,
-        fixed_bytes=fixed_bytes,
-        reusable=save and not dry_run,  # they are stored
-    )
-    clock.lap("read_s")
-    result = pipeline.decide(task, clock=clock, progress=part(progress, 0.0, 0.8))
-    sizes = _outcome(checked, result.keep)
-    columns = absorbed_columns(checked, result.absorbed) if result.absorbed and not dry_run else {}
-    if target is None:
-        made = as_written(mesh_attributes.file_from_object(checked), output)
-    else:
-        made = export_object(
-            checked, target, keep=result.keep, columns=columns, overwrite=overwrite
-        )
-    result.report["splats"] |= held(made, result.keep, written=target is not None)
-    result.report["notes"] += made.notes(result.keep)
-    if save and not dry_run:
-        with mesh_edit.all_or_nothing(checked.obj):
-            store(checked, result.scores, settings)
-            _reduce(checked, result.keep, columns)
-            _save(target)
-    clock.lap("write_s")
-    if target is not None:
-        used = views.spread(settings.views)
-        result.report.update(written_facts(target, result.scores, used, matrix=matrix))
-    drawn = picture_facts(
-        pictures, splats, result, target, views,
-        clock=clock, matrix=matrix, progress=part(progress, 0.85, 1.0),
-    )  # fmt: skip
-    result.report.update(drawn)
-    result.report["volumes"] = list(found.facts)
-    result.report["notes"] += modifier_notes(checked.obj)
-    source, output_name = f"{bpy.data.filepath}#{name}", None if target is None else str(target)
-    after = sizes.bytes_after if target is None else target.stat().st_size
-    files = Files(source, output_name, sizes.bytes_before, after)
-    complete_report(result.report, clock, files)
-    return result.report
-
-
-def _file_size(checked: SplatObject, budget: Budget, output: Path | None) -> tuple[float, int]:
-    """Return the bytes that a splat takes in the output, and those of all else in it."""
-    form = None if output is None else format_named(output)
-    if form is None:
-        return mesh_attributes.file_size(checked)
-    if budget.max_mb is not None:
-        refuse_unknown_size(form)
-    sizes = form.sizes_without_more(len(checked), mesh_layout.sh_degree(checked.mesh))
-    return (sizes.row, sizes.fixed) if sizes else (0.0, 0)
-
-
 def _outcome(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
     kept = int(np.count_nonzero(keep))
     return Outcome.of(len(keep), kept, *mesh_attributes.file_size(checked))
@@ -529,20 +405,3 @@ def find(name: str) -> bpy.types.Object:
         msg = f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {listed})"
         raise RefineError(msg)
     return obj
-
-
-def _check_savable(obj: bpy.types.Object) -> None:
-    mesh_edit.check_deletable(obj)
-    if not bpy.data.filepath:
-        msg = "the scene is not saved in a .blend file yet: --save has nowhere to save to"
-        raise RefineError(msg)
-
-
-def _save(exported: Path | None) -> None:
-    try:
-        bpy.ops.wm.save_mainfile()
-    except RuntimeError as error:
-        msg = f"{bpy.data.filepath}: cannot be saved ({str(error).strip()}); nothing was removed"
-        if exported is not None:
-            msg += f", {exported} was written"
-        raise RefineError(msg) from error

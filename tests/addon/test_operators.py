@@ -29,7 +29,11 @@ def test_import_score_apply_export_writes_the_file_that_core_writes(addon, room_
     bpy.ops.refine.export_ply(filepath=str(tmp_path / "panel.ply"))
     core = addon.core
     views = core.read_cameras(ROOM / "cameras.json")
-    core.prune_file(ROOM / "point_cloud.ply", tmp_path / "core.ply", views, core.Budget(ratio=0.5))
+    core.prune_file(
+        ROOM / "point_cloud.ply",
+        tmp_path / "core.ply",
+        core.PruneRequest(views, core.Budget(ratio=0.5)),
+    )
 
     assert len(room_cameras.objects) == len(views) == 72
     assert _bytes(tmp_path / "panel.ply") == _bytes(tmp_path / "core.ply")
@@ -548,8 +552,10 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
     core = addon.core
     views = core.read_cameras(ROOM / "cameras.json")
     with pytest.raises(core.RefineError, match=r"^~nouser/x\.ply: cannot be found"):
-        addon.objects.splat_object.prune_object(
-            "room", views, core.Budget(ratio=0.5), core.Settings(), output=Path("~nouser/x.ply")
+        addon.objects.prune_object.prune_object(
+            "room",
+            addon.core.PruneRequest(views, core.Budget(ratio=0.5), core.Settings()),
+            output=Path("~nouser/x.ply"),
         )
 
 
