@@ -231,22 +231,15 @@ def _strip(
     for start, end in slices(pairs[boxed], _PAIRS):
         checkpoint()
         owner, column, row = boxed_pixels(boxed[start:end], across, down)
-        pixel = row * len(columns) + column
-        see_through = np.flatnonzero((log_left > LOG_OPAQUE).take(pixel))
-        owner, pixel = owner[see_through], pixel[see_through]
-        squared = mahalanobis(
-            footprints,
-            owner,
-            columns.take(column[see_through]),
-            rows.take(row[see_through]),
-        )
+        see_through = np.flatnonzero((log_left > LOG_OPAQUE).take(row * len(columns) + column))
+        owner, column, row = owner[see_through], column[see_through], row[see_through]
+        squared = mahalanobis(footprints, owner, columns.take(column), rows.take(row))
         inside = np.flatnonzero(squared < reach.take(owner))
-        owner, pixel = owner[inside], pixel[inside]
+        owner, pixel = owner[inside], row[inside] * len(columns) + column[inside]
         alpha = footprints.alphas.take(owner) * np.exp(squared[inside] / np.float32(-2.0))
         order = np.argsort(pixel.astype(np.min_scalar_type(pixels)), kind="stable")
         owner, pixel = owner[order], pixel[order]
-        alpha = np.minimum(alpha[order], np.float32(ALPHA_MAX))
-        weight = _weights(pixel, alpha, log_left)
+        weight = _weights(pixel, np.minimum(alpha[order], np.float32(ALPHA_MAX)), log_left)
         for channel in range(3):
             image[channel] += np.bincount(pixel, weight * colors[channel].take(owner), pixels)
     return image
