@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -9,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 from .errors import RefineError
 from .pictures import AMPLIFIED, CAMERAS, compare
 from .png import png
-from .whole_file import refuse_existing, whole_file
+from .whole_file import new_folder, refuse_existing, whole_file
 from .work import Progress, silent
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from .pictures import Comparison
@@ -25,7 +27,8 @@ KINDS = ("before", "after", "difference")
 _IMAGE = re.compile(r"\.(png|jpe?g|webp|tiff?|exr|bmp)$", re.IGNORECASE)
 """The suffix of a photo, after which imported cameras are named."""
 
-_LONGEST = 80  # characters of a camera's name; systems take names of 255 bytes
+_LONGEST = 80
+"""Bytes of a camera's name that its files have: its end. Systems take names of 255 bytes."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,7 @@ class PictureFiles:
     Attributes
     ----------
     folder : Path
-        It is there.
+        Made if it is not there.
     name : str
         Of the splats: the first part of the files' names.
     overwrite : bool
@@ -46,17 +49,20 @@ class PictureFiles:
     name: str
     overwrite: bool = False
 
-    def refuse_existing(self, views: ViewSet) -> None:
-        """Refuse what could not be written, before the work.
+    @contextlib.contextmanager
+    def opened(self, views: ViewSet) -> Iterator[None]:
+        """Make the folder, and refuse what could not be written, before the work.
 
         Raises
         ------
         RefineError
-            See `refine_addon.core.whole_file.refuse_existing`.
+            See `refine_addon.core.whole_file.new_folder` and `refuse_existing`.
         """
-        for paths in self._paths(chosen(views)):
-            for path in paths.values():
-                refuse_existing(path, overwrite=self.overwrite)
+        with new_folder(self.folder):
+            for paths in self._paths(chosen(views)):
+                for path in paths.values():
+                    refuse_existing(path, overwrite=self.overwrite)
+            yield
 
     def write(
         self,
@@ -152,7 +158,8 @@ def _labels(names: list[str]) -> list[str]:
     """
     labels: list[str] = []
     for name in names:
-        label = new = _plain(_IMAGE.sub("", name))[-_LONGEST:] or "view"
+        end = _plain(_IMAGE.sub("", name)).encode()[-_LONGEST:]
+        label = new = end.decode(errors="ignore") or "view"
         number = 2
         while new in labels:
             new, number = f"{label}_{number}", number + 1

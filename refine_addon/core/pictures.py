@@ -13,14 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .estimate.psnr import psnr_of
-from .rendering import ALPHA_MAX, NEAR_RELATIVE
+from .rendering import NEAR_RELATIVE
 from .seeing import frustum, projection
-from .seeing.cast import boxed_pixels, boxes, mahalanobis, slices, squared_reach
+from .seeing.cast import hits
 from .seeing.ray_sample import colors_from
 from .seeing.ray_sums import in_front
 from .seeing.rays import LOG_OPAQUE
 from .views import ViewSet
-from .work import Progress, checkpoint, for_chunks, part, silent
+from .work import Progress, for_chunks, part, silent
 
 if TYPE_CHECKING:
     from typing import Any
@@ -222,26 +222,17 @@ def _strip(
     """
     pixels = len(columns) * len(rows)
     log_left, image = np.zeros(pixels), np.zeros((3, pixels))  # logarithm of the transmittance
-    reach = squared_reach(footprints.alphas)
-    across, down = (
-        boxes(footprints, reach, axis, places) for axis, places in enumerate((columns, rows))
-    )
-    pairs = across[1] * down[1]
-    boxed = np.flatnonzero(pairs > 0)
-    for start, end in slices(pairs[boxed], _PAIRS):
-        checkpoint()
-        owner, column, row = boxed_pixels(boxed[start:end], across, down)
-        see_through = np.flatnonzero((log_left > LOG_OPAQUE).take(row * len(columns) + column))
-        owner, column, row = owner[see_through], column[see_through], row[see_through]
-        squared = mahalanobis(footprints, owner, columns.take(column), rows.take(row))
-        inside = np.flatnonzero(squared < reach.take(owner))
-        owner, pixel = owner[inside], row[inside] * len(columns) + column[inside]
-        alpha = footprints.alphas.take(owner) * np.exp(squared[inside] / np.float32(-2.0))
+
+    def see_through(pixel: NDArray[np.int32]) -> NDArray[np.bool_]:
+        return np.asarray((log_left > LOG_OPAQUE).take(pixel))
+
+    for owner, pixel, alpha in hits(footprints, columns, rows, _PAIRS, see_through):
         order = np.argsort(pixel.astype(np.min_scalar_type(pixels)), kind="stable")
-        owner, pixel = owner[order], pixel[order]
-        weight = _weights(pixel, np.minimum(alpha[order], np.float32(ALPHA_MAX)), log_left)
+        sorted_owner, sorted_pixel = owner[order], pixel[order]
+        weight = _weights(sorted_pixel, alpha[order], log_left)
         for channel in range(3):
-            image[channel] += np.bincount(pixel, weight * colors[channel].take(owner), pixels)
+            light = weight * colors[channel].take(sorted_owner)
+            image[channel] += np.bincount(sorted_pixel, light, pixels)
     return image
 
 

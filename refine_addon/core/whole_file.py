@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import itertools
 import os
 import platform
 import re
@@ -92,6 +93,27 @@ def make_folder(path: Path) -> bool:
         msg = f"{path}: cannot be made ({reason_of(error)})"
         raise RefineError(msg) from error
     return there
+
+
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[None]:
+    """Make a folder and those above it; remove those that were not there and are empty at the end.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be made; nothing is left then.
+    """
+    made: list[Path] = []
+    try:
+        with contextlib.suppress(OSError, ValueError):  # which `make_folder` explains
+            made += itertools.takewhile(lambda folder: not mode_of(folder), (path, *path.parents))
+        make_folder(path)
+        yield
+    finally:
+        for folder in made:
+            with contextlib.suppress(OSError):  # it holds something
+                folder.rmdir()
 
 
 def refuse_mapped(path: Path, source: Path) -> None:

@@ -191,6 +191,18 @@ def test_absurd_splats_are_measured_without_a_warning(value):
     assert np.isfinite(found.fineness).all()
 
 
+def test_a_signalling_nan_is_no_place_and_makes_no_warning():
+    """Converting one to float64 is an invalid operation to the processor; warnings are errors."""
+    means = cloud().means.astype(np.float32)
+    means.view(np.uint32)[::7, 0] = 0x7FA00000
+
+    found = alignment(replace(cloud(), means=means), ring(20))
+
+    assert found == alignment(
+        replace(cloud(), means=np.where(np.isnan(means), np.nan, means)), ring(20)
+    )
+
+
 def test_measuring_can_be_cancelled():
     """At the first report."""
     with pytest.raises(Cancelled):

@@ -172,7 +172,7 @@ def alignment(
     Cancelled
         If `progress` answers ``False``.
     """
-    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one
+    with np.errstate(invalid="ignore"):  # signalling NaN
         means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
     far, in_pictures, count = [], 0, 0
     with np.errstate(under="ignore"):
