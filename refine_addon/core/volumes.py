@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
-from .affine import moved
+from .affine import is_flat, moved, scales_of
 from .errors import RefineError
 
 if TYPE_CHECKING:
@@ -123,9 +123,9 @@ class MovedVolume:
         RefineError
             If it is flat.
         """
-        scales = np.linalg.svd(self.matrix[:3, :3], compute_uv=False)
-        if not scales[2] > 1e-9 * scales[0]:
-            msg = f"is flat (scales {scales.round(9).tolist()}), expected a volume"
+        if is_flat(self.matrix):
+            scales = scales_of(self.matrix).round(9).tolist()
+            msg = f"is flat (scales {scales}), expected a volume"
             raise RefineError(msg)
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
