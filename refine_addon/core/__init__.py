@@ -16,7 +16,8 @@ from .levels.files import LevelsRequest, lod_file
 from .levels.lod import Level, Levels, lod
 from .operation.files import prune_file
 from .operation.prune import PruneRequest
-from .pipeline import prune, score
+from .pipeline import prune
+from .score_splats import score
 from .scores import Scores
 from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion

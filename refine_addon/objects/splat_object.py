@@ -15,7 +15,7 @@ import bpy
 import numpy as np
 
 from ..cameras.objects import world_matrix
-from ..core import pipeline
+from ..core import score
 from ..core.affine import is_uniform, transformed
 from ..core.errors import RefineError
 from ..core.formats.ply import columns_from_splats
@@ -347,7 +347,7 @@ def score_object(
     name : str
         Of the object.
     views, settings, progress
-        See `refine_addon.core.pipeline.score`.
+        See `refine_addon.core.score`.
     demands : Demands
         What must stay and what must go; the latter scores 0.
 
@@ -365,12 +365,12 @@ def score_object(
     Raises
     ------
     RefineError
-        See `gather`, `Demands.forced` and `refine_addon.core.pipeline.score`; also if there is no
+        See `gather`, `Demands.forced` and `refine_addon.core.score`; also if there is no
         such object.
     """
     checked = check(find(name))
     found = demands.forced(checked)
-    scores = pipeline.score(
+    scores = score(
         gather(checked), views, settings,
         protected=found.protected, removed=found.removed, progress=progress,
     )  # fmt: skip

@@ -18,7 +18,7 @@ from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
 from ..cameras.sets import Choice
-from ..core import pipeline
+from ..core import pipeline, score_splats
 from ..core.estimate.quality import in_words
 from ..core.formats.registry import FORMATS, Packed, without_suffix
 from ..core.levels.lod import Level, Levels, lod
@@ -193,7 +193,7 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
         """Score, and count how many splats lie in each view."""
         ahead = part(progress, 0.0, 0.97)
-        scores = pipeline.score(
+        scores = score_splats.score(
             job.splats, job.views, job.settings,
             protected=job.forced.protected, removed=job.forced.removed,
             quality=job.quality, progress=ahead,
@@ -238,7 +238,7 @@ def _rough(job: _Scoring) -> Settings:
 
 
 def _sketched(job: _Scoring, progress: Progress) -> Scores:
-    return pipeline.score(
+    return score_splats.score(
         job.splats, job.views, _rough(job), removed=job.forced.removed, progress=progress
     )
 

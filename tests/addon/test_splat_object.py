@@ -206,7 +206,7 @@ def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, room,
     core = addon.core
     splats = addon.objects.splat_object.gather(addon.mesh.layout.check(room))
     worker = addon.ui.worker.Worker(
-        lambda progress: core.pipeline.score(splats, room_views, progress=progress)
+        lambda progress: core.score(splats, room_views, progress=progress)
     )
     scores = worker.result()
     cancelled = addon.ui.worker.Worker.__new__(addon.ui.worker.Worker)

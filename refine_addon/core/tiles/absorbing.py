@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..absorb_splats import PARTS
 from ..absorbing import merge_field
 from ..absorbing.absorb import ALONE, STAGE, Counts, mergeable, patience, reduced, stages
 from ..absorbing.merge_field import Field, ViewSums
 from ..absorbing.merge_graph import MergeGraph
-from ..pipeline import PARTS
 from ..seeing.measuring import Measured
 from ..splats import Splats, joined
 from ..work import Progress, part, silent

@@ -14,12 +14,12 @@ import numpy as np
 
 from ...version import VERSION
 from .. import radix
+from ..absorb_splats import FIRST
 from ..errors import RefineError
 from ..estimate.psnr import psnr_kept
 from ..estimate.quality import needed
 from ..formats.ply_header import with_count
-from ..pipeline import FIRST, MEASURES, conclude, remark
-from ..report import Clock, Files, complete_report, make_report
+from ..report import MEASURES, Clock, Files, complete_report, conclude, make_report, remark
 from ..scoring.closed_form_block import ROWS
 from ..selection import Budget, least_seen, quality_of, refuse_none_left, select, single
 from ..task import DEFAULTS, Settings

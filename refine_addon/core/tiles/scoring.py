@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..pipeline import with_quality
 from ..scene import Scene, principal_axes
+from ..score_splats import with_quality
 from ..scores import Scores
 from ..scoring import auto, closed_form
 from ..scoring.occlusion import FIRST_END, PRIOR, OcclusionScoring
@@ -104,7 +104,7 @@ def by_closed_form(
     """
     steps = _Steps(job, units, workers, progress)
     total = sum(map(len, units))
-    with np.errstate(under="ignore"):  # as in `pipeline.score`
+    with np.errstate(under="ignore"):  # as in `score_splats.score`
         found = closed_form.steps(
             steps.each, total, job.views, job.settings, remember=job.folder.once
         )
