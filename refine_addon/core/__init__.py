@@ -14,8 +14,10 @@ from .formats.ply import SplatFile, read_ply
 from .formats.registry import as_written, read_splats
 from .levels.files import LevelsRequest, lod_file
 from .levels.lod import Level, Levels, lod
-from .operation.files import prune_file
-from .operation.prune import PruneRequest
+from .operation.clean import CleanRequest, clean_file
+from .operation.convert import convert_file
+from .operation.prune import PruneRequest, prune_file
+from .operation.score import ScoreRequest, score_file
 from .pipeline import prune
 from .score_splats import score
 from .scores import Scores
@@ -36,6 +38,7 @@ __all__ = [
     "Box",
     "Budget",
     "Cancelled",
+    "CleanRequest",
     "Cleaned",
     "Cleaning",
     "ClosedForm",
@@ -47,6 +50,7 @@ __all__ = [
     "PruneRequest",
     "RefineError",
     "Result",
+    "ScoreRequest",
     "Scores",
     "Settings",
     "Solid",
@@ -58,6 +62,8 @@ __all__ = [
     "Zone",
     "as_written",
     "clean",
+    "clean_file",
+    "convert_file",
     "forced",
     "lod",
     "lod_file",
@@ -69,6 +75,7 @@ __all__ = [
     "read_ply",
     "read_splats",
     "score",
+    "score_file",
     "select",
     "survivor_columns",
 ]

@@ -84,7 +84,7 @@ def test_an_apply_that_fails_leaves_the_mesh_as_it_was(few, fail_at, stage):
 
 def pruned(addon, room_views, tmp_path, **options):
     """Prune the object as the command does, to a file and in the .blend."""
-    return addon.objects.prune_object.prune_object(
+    return addon.objects.operation.prune_object(
         "room",
         addon.core.PruneRequest(
             room_views, addon.core.Budget(ratio=0.6), addon.core.Settings(views=4), **options
