@@ -30,7 +30,7 @@ from .survivors import survivor_columns
 from .task import METHODS, Result, Settings
 from .tiles.prune import prune_tiles
 from .views import View, ViewSet
-from .volumes import Box, Placed, Sphere, Zone, forced
+from .volumes import Box, MovedVolume, Sphere, Zone, forced
 
 __all__ = [
     "METHODS",
@@ -45,8 +45,8 @@ __all__ = [
     "Level",
     "Levels",
     "LevelsRequest",
+    "MovedVolume",
     "Occlusion",
-    "Placed",
     "PruneRequest",
     "RefineError",
     "Result",

@@ -1,4 +1,4 @@
-"""What the panel and the command do to an object: score, plan, apply, export.
+"""What the panel and the command do to an object: score, apply, export.
 
 An operation begins with `mesh.layout.check`, which finds out that an object holds splats, and hands
 what it found to all functions here. Each either does all it says, or raises `RefineError` and
@@ -46,8 +46,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What a budget would do to an object.
+class Outcome:
+    """What a budget does to an object, or would.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Plan:
     bytes_after: int
 
     @classmethod
-    def of(cls, count: int, kept: int, row_bytes: int, fixed_bytes: int) -> Plan:
+    def of(cls, count: int, kept: int, row_bytes: int, fixed_bytes: int) -> Outcome:
         """Return what keeping so many of `count` splats does to a file.
 
         Parameters
@@ -87,8 +87,8 @@ def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
     ----------
     checked : SplatObject
     whole : bool or None
-        Whether to bring view-dependent colour along, for absorbing; the scale must be uniform then.
-        None brings it if it is, for an estimate of the pictures' quality.
+        Whether to read view-dependent colour, for absorbing; the object's scale must be uniform
+        then. None reads it if the scale is uniform, for an estimate of the pictures' quality.
 
     Raises
     ------
@@ -105,8 +105,8 @@ def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
 
 def modifier_notes(obj: bpy.types.Object) -> list[str]:
     """Return a sentence if modifiers show the object otherwise than it is scored and exported."""
-    ours = ("REFINE", "KIRI")  # they draw splats, and move none
-    names = [m.name for m in obj.modifiers if m.show_viewport and not m.name.startswith(ours)]
+    drawing = ("REFINE", "KIRI")  # these draw splats and move none
+    names = [m.name for m in obj.modifiers if m.show_viewport and not m.name.startswith(drawing)]
     if not names:
         return []
     note = (
@@ -119,7 +119,7 @@ def modifier_notes(obj: bpy.types.Object) -> list[str]:
 def stored_task(
     checked: SplatObject,
     budget: Budget,
-    found: Forced = FREE,
+    forced: Forced = FREE,
     *,
     settings: Settings = DEFAULTS,
     views: ViewSet | None = None,
@@ -130,7 +130,7 @@ def stored_task(
     ----------
     checked : SplatObject
     budget : Budget
-    found : Forced
+    forced : Forced
         What must stay and what must go; see `Demands.forced`.
     settings : Settings, optional
         For absorbing.
@@ -154,17 +154,17 @@ def stored_task(
         settings=settings,
         splats=None if views is None else gather(checked, whole=True),
         views=views,
-        scores=stored_scores(checked, found.removed),
-        protected=found.protected,
-        removed=found.removed,
+        scores=stored_scores(checked, forced.removed),
+        protected=forced.protected,
+        removed=forced.removed,
         absorb=views is not None,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
     )
 
 
-def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
-    """Delete the splats that do not stay, and set what the others became: all of it or nothing.
+def apply_object(checked: SplatObject, result: Result | Level) -> Outcome:
+    """Delete the splats that do not stay, and store what the others became: all of it or nothing.
 
     Everything else of the object and its mesh stays: attributes, vertex groups, custom properties,
     materials, modifiers. The scores stay to be looked at, but the next apply asks for new ones.
@@ -177,21 +177,20 @@ def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
 
     Returns
     -------
-    Plan
-        What was done.
+    Outcome
 
     Raises
     ------
     RefineError
         See `mesh_edit.check_deletable`; also if there are no longer as many splats.
     """
-    (done,) = apply_objects([(checked, result)])
-    return done
+    (outcome,) = apply_objects([(checked, result)])
+    return outcome
 
 
-def apply_objects(parts: Sequence[tuple[SplatObject, Result | Level]]) -> list[Plan]:
+def apply_objects(parts: Sequence[tuple[SplatObject, Result | Level]]) -> list[Outcome]:
     """Do what `apply_object` does to several objects: to all of them or to none."""
-    done, columns = [], []
+    outcomes, columns = [], []
     for checked, result in parts:
         mesh_edit.check_deletable(checked.obj)
         if len(result.keep) != len(checked):
@@ -200,20 +199,20 @@ def apply_objects(parts: Sequence[tuple[SplatObject, Result | Level]]) -> list[P
                 f"{len(result.keep)} when it was decided which stay; apply again"
             )
             raise RefineError(msg)
-        done.append(_plan(checked, result.keep))
+        outcomes.append(_outcome(checked, result.keep))
         columns.append(absorbed_columns(checked, result.absorbed) if result.absorbed else {})
     with ExitStack() as stack:
         for checked, _ in parts:
             stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
         for (checked, result), changed in zip(parts, columns, strict=True):
             reduce_object(checked, result.keep, changed)
-    return done
+    return outcomes
 
 
-def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:
+def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
     """Delete the splats that do not stay, all of them or none; nothing else changes.
 
-    Scores tell what is missed of all splats together, so they are to be computed again.
+    Scores hold for all splats together, so they are to be computed again.
 
     Parameters
     ----------
@@ -229,16 +228,16 @@ def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:
     if not keep.any():
         msg = f"object '{checked.obj.name}': no splat would be left; nothing was deleted"
         raise RefineError(msg)
-    done = _plan(checked, keep)
+    outcome = _outcome(checked, keep)
     with mesh_edit.all_or_nothing(checked.obj):
         reduce_object(checked, keep, {})
-    return done
+    return outcome
 
 
 def reduce_object(
     checked: SplatObject, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
 ) -> None:
-    """Delete what does not stay, set what the others became, and ask for new scores from here."""
+    """Delete what does not stay, store what the others became, and drop the note of the scores."""
     mesh_edit.delete_vertices(checked.obj, ~keep)
     columns = {name: values[keep] for name, values in columns.items()}
     mesh_attributes.write_columns(checked, columns)
@@ -327,9 +326,9 @@ def write_export(
     return made
 
 
-def _plan(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:
+def _outcome(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
     kept = int(np.count_nonzero(keep))
-    return Plan.of(len(keep), kept, *mesh_attributes.file_size(checked))
+    return Outcome.of(len(keep), kept, *mesh_attributes.file_size(checked))
 
 
 def _world_columns(checked: SplatObject) -> dict[str, NDArray[Any]]:

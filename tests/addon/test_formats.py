@@ -53,7 +53,7 @@ def test_the_file_name_follows_the_format_that_is_chosen(addon):
     """
 
     class Browser:
-        check = addon.ui.operators.REFINE_OT_export_ply.check
+        check = addon.ui.export_operators.REFINE_OT_export_ply.check
 
     browser = Browser()
     browser.filepath, browser.suffix, browser.settled = "a.compressed.ply", ".spz", ".ply"

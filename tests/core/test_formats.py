@@ -37,7 +37,7 @@ FORMATS = [form for form in registry.FORMATS if form.suffix != ".sog" or find_sp
 """All but plain PLY; SOG where Pillow is installed."""
 
 SUFFIX = [form.suffix for form in FORMATS]
-FIXED = [form.suffix for form in FORMATS if form.sizes(1, 0)]
+FIXED = [form.suffix for form in FORMATS if form.sizes]
 COUNT = 600
 """Splats of the test scene: two whole chunks of a compressed PLY and a part of one."""
 

@@ -607,21 +607,29 @@ def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, vi
         np.testing.assert_allclose(sums.error, 2.0 + 0.75 * expected.error)
 
 
-@pytest.mark.parametrize("method", ["occlusion", "auto"])
-@pytest.mark.parametrize("ratio", [0.05, 0.3, 0.55, 0.7, 0.93])
-@pytest.mark.parametrize("zoned", ["", "a seventh stays", "half stays"])
-def test_scoring_for_one_budget_decides_what_scores_for_all_would(
-    small, views, method, ratio, zoned
-):
-    """Scoring ends with the round that removes the last of its splats: the same report, too."""
+@pytest.fixture(
+    scope="module",
+    params=itertools.product(["occlusion", "auto"], ["", "a seventh stays", "half stays"]),
+    ids=" ".join,
+)
+def scored_for_all(request, small, views):
+    """Return a task without scores, one with the scores for every budget, and what has to stay."""
+    method, zoned = request.param
     splats = read_ply(small).splats()
     every = np.arange(len(splats))
     held = every % 2 == 0 if zoned.startswith("half") else every % 7 == 0
     demands = {"protected": held, "removed": every % 11 == 0} if zoned else {}
-    task = Task(Budget(ratio=ratio), Settings(method, views=24), splats, views, **demands)
-    some = decide(task)
+    task = Task(Budget(ratio=0.5), Settings(method, views=12), splats, views, **demands)
+    return task, replace(task, scores=decide(replace(task, reusable=True)).scores), zoned
 
-    whole = decide(replace(task, reusable=True))
+
+@pytest.mark.parametrize("ratio", [0.05, 0.55, 0.93])
+def test_scoring_for_one_budget_decides_what_scores_for_all_would(scored_for_all, ratio):
+    """Scoring ends with the round that removes the last of its splats: the same report, too."""
+    task, scored, zoned = scored_for_all
+    some = decide(replace(task, budget=Budget(ratio=ratio)))
+
+    whole = decide(replace(scored, budget=Budget(ratio=ratio)))
 
     assert whole.scores.settled is None
     np.testing.assert_array_equal(some.keep, whole.keep)

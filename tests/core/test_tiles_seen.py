@@ -26,8 +26,11 @@ from refine_addon.core.scoring import closed_form
 from refine_addon.core.seeing import projection
 from refine_addon.core.seeing.ray_sample import validation_rays
 from refine_addon.core.splats import joined
-from refine_addon.core.tiles import absorbing, seen, units
-from refine_addon.core.tiles.seen import SceneJob
+from refine_addon.core.tiles import absorbing, gaussians, measuring, units
+from refine_addon.core.tiles.folder import Folder
+from refine_addon.core.tiles.gaussians import SceneContext
+from refine_addon.core.tiles.rays import StoredRays
+from refine_addon.core.tiles.workers import InProcess, Runner
 from refine_addon.core.views import ViewSet
 from tests.strategies import plain_header, splat_names
 from tests.tiles import COUNT, ROOM, cut, room_rows, write
@@ -41,7 +44,7 @@ def small(monkeypatch):
     """Make units, chunks and regions so small that 5000 splats have several of each."""
     monkeypatch.setattr(closed_form, "ROWS", 1000)
     monkeypatch.setattr(units, "ROWS", 1000)
-    monkeypatch.setattr(seen, "CHUNK", 700)
+    monkeypatch.setattr(gaussians, "CHUNK", 700)
     monkeypatch.setattr(absorbing, "REGION", 1500)
 
 
@@ -74,6 +77,7 @@ def read(folder, paths):
 # Occlusion, auto and what they estimate.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [OCCLUSION, AUTO], ids=["occlusion", "auto"])
 @pytest.mark.parametrize(
     "budget", [Budget(ratio=0.7), Budget(psnr=36.0), Budget(min_seen=60)], ids=str
@@ -108,36 +112,50 @@ def test_views_of_nothing_are_refused_as_of_one_file(tmp_path, tiles, views):
     assert not list((tmp_path / "out").glob("*"))
 
 
-@pytest.mark.parametrize("stop", [0.1, 0.3, 0.55, 0.7])
+@pytest.mark.slow
 @pytest.mark.parametrize("absorb", [False, True], ids=["deleted", "absorbed"])
 def test_a_job_that_was_interrupted_goes_on_where_it_was(
-    tmp_path, tiles, views, monkeypatch, stop, absorb
+    tmp_path, tiles, views, monkeypatch, absorb
 ):
-    """What a block of views has measured is not measured again, and the bytes are the same."""
-    budget, done = Budget(ratio=0.5), []
-    prune_tiles(tiles, tmp_path / "once", views, budget, OCCLUSION, absorb=absorb)
-    measure = seen.measure_footprints
+    """What a block of views has measured is not measured again, and the bytes are the same.
+
+    Interrupted once, and four times in one job, when a tenth, three tenths, ... are done.
+    """
+    budget, settings, done = Budget(ratio=0.5), replace(OCCLUSION, views=8), []
+    measure = measuring.measure_footprints
     monkeypatch.setattr(
-        seen, "measure_footprints", lambda *some: done.append(some) or measure(*some)
+        measuring, "measure_footprints", lambda *some: done.append(some) or measure(*some)
     )
 
-    def interrupt(fraction, _what):
-        if fraction > stop:
-            raise KeyboardInterrupt
+    def measured(folder, *stops):
+        """Return how many views are measured until a job is done that is stopped some times."""
+        done.clear()
 
-    prune_tiles(tiles, tmp_path / "count", views, budget, OCCLUSION, absorb=absorb)
-    needed = len(done)
-    done.clear()
-    with pytest.raises(KeyboardInterrupt):
-        prune_tiles(
-            tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=absorb, progress=interrupt
+        def interrupt(fraction, _what):
+            if stops and fraction > stops[0]:
+                raise KeyboardInterrupt
+
+        def run():
+            prune_tiles(
+                tiles, tmp_path / folder, views, budget, settings, absorb=absorb, progress=interrupt
+            )
+
+        while stops:
+            with pytest.raises(KeyboardInterrupt):
+                run()
+            stops = stops[1:]
+        run()
+        return len(done)
+
+    needed = measured("once")
+    for folder, stops in (("late", (0.7,)), ("often", (0.1, 0.3, 0.55, 0.7))):
+        taken = measured(folder, *stops)
+
+        assert needed <= taken <= needed + 2 * len(stops)  # the views of the blocks under way
+        assert read(tmp_path / folder, tiles).tobytes() == read(tmp_path / "once", tiles).tobytes()
+        assert sorted(path.name for path in (tmp_path / folder).iterdir()) == sorted(
+            path.name for path in tiles
         )
-    prune_tiles(tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=absorb)
-
-    once, again = (read(tmp_path / folder, tiles).tobytes() for folder in ("once", "out"))
-    assert once == again
-    assert needed <= len(done) <= needed + 2  # the views of the block under way
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in tiles}
 
 
 # Absorbing.
@@ -155,14 +173,13 @@ def test_absorbing_tiles_is_as_good_as_absorbing_one_file(tmp_path, views, monke
     splats = file.splats()
     whole = prune(splats, views, Budget(ratio=ratio), settings, absorb=True)
 
-    sample = validation_rays(splats, views.spread(64))
+    rays = validation_rays(splats, views.spread(64))
     made = joined([read_ply(tmp_path / "out" / path.name).splats() for path in tiles])
-    one = psnr_against(sample, whole.absorbed.splats, views.spread(64))
-    assert psnr_against(sample, made, views.spread(64)) > one - 0.3
+    one = psnr_against(rays, whole.absorbed.splats, views.spread(64))
+    psnr = psnr_against(rays, made, views.spread(64))
+    assert psnr > one - 0.3
     assert len(made) == told["splats"]["kept"] == whole.report["splats"]["kept"]
-    assert told["estimated_psnr"] == pytest.approx(
-        psnr_against(sample, made, views.spread(64)), abs=0.1
-    )
+    assert told["estimated_psnr"] == pytest.approx(psnr, abs=0.1)
 
 
 @pytest.mark.slow
@@ -174,7 +191,7 @@ def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views,
     monkeypatch.setattr(absorbing, "REGION", 10_000)
     few, others = ViewSet(views.views[:3]), ViewSet(views.views[10::4])
     splats = read_ply(ROOM / "point_cloud.ply").splats()
-    sample = validation_rays(splats, others)
+    rays = validation_rays(splats, others)
     whole = prune(splats, few, Budget(ratio=0.5), OCCLUSION, absorb=True)
 
     prune_tiles(
@@ -183,10 +200,11 @@ def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views,
 
     made = read_ply(tmp_path / "point_cloud.ply").splats()
     assert np.count_nonzero(whole.scores.seen) < 0.3 * len(splats)
-    one = psnr_against(sample, whole.absorbed.splats, others)
-    assert psnr_against(sample, made, others) > one - 0.3
+    one = psnr_against(rays, whole.absorbed.splats, others)
+    assert psnr_against(rays, made, others) > one - 0.3
 
 
+@pytest.mark.slow
 def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, rows, views):
     """Kept, merged and deleted add up to all; survivors that did not change are their old bytes.
 
@@ -203,6 +221,45 @@ def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, rows, views)
     assert np.isfinite([made[name] for name in made.dtype.names]).all()
 
 
+@pytest.mark.parametrize("ratio", [0.5, 0.8])
+def test_absorbing_a_single_region_is_absorbing_one_file(
+    tmp_path, tiles, views, monkeypatch, ratio
+):
+    """Where one region holds all that are left, every row is the same to the byte.
+
+    At 80 % there are three stages, before two of which the views measure again.
+    """
+    monkeypatch.setattr(absorbing, "REGION", COUNT)
+    budget = Budget(ratio=ratio)
+    told = prune_tiles(tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=True)
+    request = PruneRequest(views, budget, OCCLUSION, absorb=True)
+    whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", request)
+
+    assert told["absorbed"] == whole.report["absorbed"]
+    assert told["absorbed"]["changed"] > 100
+    expected = read_ply(tmp_path / "pruned.ply").rows
+    assert read(tmp_path / "out", tiles).tobytes() == expected.tobytes()
+    assert told["estimated_psnr"] == pytest.approx(whole.report["estimated_psnr"], abs=0.011)
+
+
+def test_a_stage_leaves_enough_to_choose_from():
+    """Merges count half a splat each, so no stage may ask for more than half of the splats."""
+    assert absorbing.STAGE >= 0.5
+
+
+def test_stored_rays_know_which_are_wanted(tmp_path, views):
+    """All views' at first; none of those that lie in the folder."""
+    context = SceneContext(Folder(tmp_path), views, None, None)
+    stored = gaussians.StoredGaussians(context.folder.inner(""), np.arange(3))
+
+    rays = StoredRays(context, Runner(InProcess()), [], stored)
+    rays.noted.add(1)
+
+    assert [rays.wants(number) for number in range(3)] == [True, False, True]
+    assert rays.seeing() == []
+
+
+@pytest.mark.slow
 def test_what_is_deleted_alone_needs_no_merging(tmp_path, tiles, views):
     """Up to a tenth is deleted as in memory: the same rows, and nothing changes."""
     told = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.1), OCCLUSION, absorb=True)
@@ -217,6 +274,7 @@ def test_what_is_deleted_alone_needs_no_merging(tmp_path, tiles, views):
     assert read(tmp_path / "out", tiles).tobytes() == expected.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_tiles_of_other_degrees_absorb_one_another(tmp_path, rows, views):
     """Each keeps its own properties, and no number is lost that it has room for."""
@@ -257,7 +315,7 @@ def test_regions_divide_all_splats(count, most, stage, seed):
     means = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
     means[::17] = np.nan
 
-    found = absorbing.regions(means, most, stage)
+    found = absorbing.divided(means, most, stage)
 
     assert sorted(np.concatenate(found).tolist()) == list(range(count))
     sizes = [len(rows) for rows in found]
@@ -270,7 +328,7 @@ def test_regions_of_one_stage_cross_those_of_the_next():
     """Of 1000 splats in a cube, halves along an axis and askew: each pair has some in common."""
     means = np.random.default_rng(1).uniform(size=(1000, 3)).astype(np.float32)
 
-    first, second = (absorbing.regions(means, 500, stage) for stage in (0, 1))
+    first, second = (absorbing.divided(means, 500, stage) for stage in (0, 1))
 
     common = [len(np.intersect1d(one, other)) for one in first for other in second]
     assert min(common) > 50
@@ -279,14 +337,15 @@ def test_regions_of_one_stage_cross_those_of_the_next():
 # What a view loads.
 
 
+@pytest.mark.slow
 def test_a_view_loads_no_chunk_behind_it(tmp_path, tiles, views, monkeypatch):
     """Of 100 chunks all are loaded by some view, and a fifth of the times none was needed."""
-    monkeypatch.setattr(seen, "CHUNK", 50)
-    loaded, load = [], SceneJob._chunk
+    monkeypatch.setattr(gaussians, "CHUNK", 50)
+    loaded, load = [], SceneContext.chunk
     monkeypatch.setattr(
-        SceneJob,
-        "_chunk",
-        lambda job, number: loaded.append(number) or load(job, number),
+        SceneContext,
+        "chunk",
+        lambda context, number: loaded.append(number) or load(context, number),
     )
     once = Settings(method="occlusion", views=12, occlusion=replace(OCCLUSION.occlusion, rounds=1))
 
