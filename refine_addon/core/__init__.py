@@ -14,9 +14,12 @@ from .formats.ply import SplatFile, read_ply
 from .formats.registry import as_written, read_splats
 from .levels.files import LevelsRequest, lod_file
 from .levels.lod import Level, Levels, lod
-from .operation.files import prune_file
-from .operation.prune import PruneRequest
-from .pipeline import prune, score
+from .operation.clean import CleanRequest, clean_file
+from .operation.convert import convert_file
+from .operation.prune import PruneRequest, prune_file
+from .operation.score import ScoreRequest, score_file
+from .pipeline import prune
+from .score_splats import score
 from .scores import Scores
 from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
@@ -36,6 +39,7 @@ __all__ = [
     "Box",
     "Budget",
     "Cancelled",
+    "CleanRequest",
     "Cleaned",
     "Cleaning",
     "ClosedForm",
@@ -47,6 +51,7 @@ __all__ = [
     "PruneRequest",
     "RefineError",
     "Result",
+    "ScoreRequest",
     "Scores",
     "Settings",
     "Solid",
@@ -58,6 +63,8 @@ __all__ = [
     "Zone",
     "as_written",
     "clean",
+    "clean_file",
+    "convert_file",
     "forced",
     "lod",
     "lod_file",
@@ -69,6 +76,7 @@ __all__ = [
     "read_ply",
     "read_splats",
     "score",
+    "score_file",
     "select",
     "survivor_columns",
 ]

@@ -71,7 +71,7 @@ def store(  # noqa: PLR0913 - all that a record holds
     ----------
     checked : SplatObject
     scores, settings
-        What `core.pipeline.score` gave, and was given.
+        What `core.score` gave, and was given.
     origin : dict, optional
         See `staleness.origin`.
     cameras : list of (str, int), optional

@@ -552,7 +552,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
     core = addon.core
     views = core.read_cameras(ROOM / "cameras.json")
     with pytest.raises(core.RefineError, match=r"^~nouser/x\.ply: cannot be found"):
-        addon.objects.prune_object.prune_object(
+        addon.objects.operation.prune_object(
             "room",
             addon.core.PruneRequest(views, core.Budget(ratio=0.5), core.Settings()),
             output=Path("~nouser/x.ply"),
@@ -562,7 +562,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
 @pytest.mark.parametrize(
     ("module", "function", "operator", "arguments"),
     [
-        ("core.pipeline", "score", "score", {}),
+        ("core.score_splats", "score", "score", {}),
         ("core.pipeline", "decide", "apply", {}),
         ("ui.import_operators", "read_splats", "import_ply", {"filepath": "in.ply"}),
         ("ui.import_operators", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),

@@ -337,9 +337,10 @@ def test_the_report_of_scores_is_plain_too(folder):
     assert command.main([*SCORE, "-o", "out.ply", "--report", "report.json"]) == 0
 
     (entry,) = json.loads((folder / "report.json").read_text())["results"]
-    assert entry["files"] == {"input": "in.ply", "output": "out.ply"}
+    sizes = [(folder / name).stat().st_size for name in ("in.ply", "out.ply")]
+    assert [*entry["files"].values()] == ["in.ply", "out.ply", *sizes]
     counts = {"before": COUNT, "undrawable": 0, "unseen": unseen, "forced": 0}
-    assert entry["splats"] == counts
+    assert entry["splats"] == counts | {"written": COUNT, "left_out": 0}
     assert all(map(math.isfinite, numbers(entry)))
 
 

@@ -24,7 +24,7 @@ from refine_addon.core import (
     Splats,
     View,
     ViewSet,
-    pipeline,
+    absorb_splats,
     prune,
     prune_file,
     read_cameras,
@@ -587,7 +587,7 @@ def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, vi
         ones = np.ones(len(splats))
         return Measured(ones, 2.0 * ones, np.zeros(len(splats), np.int32)), 0.25
 
-    def listening(splats, used, measure, count, original=pipeline.absorbing.absorb, **changes):
+    def listening(splats, used, measure, count, original=absorb_splats.absorbing.absorb, **changes):
         def tell(now, expected, progress):
             sums = measure(now, expected, progress)
             if expected is not None:
@@ -596,8 +596,8 @@ def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, vi
 
         return original(splats, used, tell, count, **changes)
 
-    monkeypatch.setattr(pipeline.occlusion, "measure_part", quarter)
-    monkeypatch.setattr(pipeline.absorbing, "absorb", listening)
+    monkeypatch.setattr(absorb_splats.occlusion, "measure_part", quarter)
+    monkeypatch.setattr(absorb_splats.absorbing, "absorb", listening)
     prune(read_ply(small).splats(), views, Budget(ratio=0.7), absorb=True)
 
     assert asked == [(turn, 2) for turn in range(len(asked))]

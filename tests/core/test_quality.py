@@ -432,7 +432,7 @@ def test_published_scores_reach_it_too():
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [25.0, 40.0])
 def test_absorbing_reaches_a_psnr_with_fewer(goal):
-    """By its own estimate, to `pipeline.CLOSE` or as near as three tries come."""
+    """By its own estimate, to `absorb_splats.CLOSE` or as near as three tries come."""
     splats, views = cloud(1500), ring()
     plain = prune(splats, views, Budget(psnr=goal), Settings("occlusion"))
     merged = prune(splats, views, Budget(psnr=goal), absorb=True)

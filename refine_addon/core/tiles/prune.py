@@ -17,8 +17,7 @@ from ..errors import RefineError
 from ..estimate.psnr import psnr_kept
 from ..estimate.quality import needed
 from ..formats.ply_header import with_count
-from ..pipeline import MEASURES, conclude, remark
-from ..report import Clock, Files, complete_report, make_report
+from ..report import MEASURES, Clock, Files, complete_report, conclude, make_report, remark
 from ..scoring.closed_form_block import ROWS
 from ..selection import Budget, refuse_none_left
 from ..task import DEFAULTS, Settings
