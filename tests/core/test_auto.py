@@ -82,6 +82,7 @@ def test_where_all_may_be_lost_five_of_eight_groups_measure(scene):
     assert scores.facts["auto"]["views"] == 10
 
 
+@pytest.mark.slow
 def test_the_report_says_what_was_expected_and_chosen(scene):
     """How many of the views measured, what that may lose, and what the validation views told."""
     settings = Settings(occlusion=COARSE, tolerance=30.0)
@@ -126,6 +127,7 @@ def test_a_view_given_many_times_is_in_one_group_each_time():
     assert sorted(number for group in groups for number in group) == list(range(16))
 
 
+@pytest.mark.slow
 def test_few_views_all_measure(scene):
     """Of 15 too few would be left to validate: the scores are those of occlusion to the bit."""
     splats, views = scene
@@ -222,6 +224,7 @@ def test_progress_never_goes_back(scene):
         assert 0.0 <= told[0] <= told[-1] <= 1.0
 
 
+@pytest.mark.slow
 def test_scores_depend_on_no_order_of_views(scene):
     """Backwards: the same views measure first, and the same validate."""
     splats, views = scene

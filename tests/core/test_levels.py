@@ -252,6 +252,7 @@ def test_the_geometric_error_is_the_width_of_what_changed():
     assert reach.pixel == pytest.approx(400.0, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_no_level_has_a_smaller_geometric_error_than_one_before(monkeypatch):
     """A viewer that goes by 3D Tiles' rule would never choose the one before."""
     errors = iter((3.0, 1.0, 4.0))
@@ -410,6 +411,7 @@ def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, monkeypat
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
+@pytest.mark.slow
 def test_no_manifest_lists_levels_of_two_runs(tmp_path, monkeypatch):
     """Where replacing fails at the second level, the first is replaced and the manifest is gone."""
     source = file_of(colourful(), tmp_path / "a.ply")

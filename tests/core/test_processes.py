@@ -23,6 +23,8 @@ from refine_addon.core.processes import for_each
 from refine_addon.core.selection import Budget
 from refine_addon.core.task import Settings
 
+pytestmark = pytest.mark.slow
+
 ROOM = Path(__file__).parents[1] / "data/room_small"
 LONG = 600.0  # seconds; a tenth of it is more than any machine needs to notice
 MUCH = 1e3  # seconds of work: worth processes
