@@ -358,7 +358,7 @@ def test_esc_before_anything_is_shown_leaves_the_old_scores(start, addon, few, m
             time.sleep(0.01)
         raise addon.core.Cancelled
 
-    monkeypatch.setattr(module, "_sketched", slow)
+    monkeypatch.setattr(module, "_sketch", slow)
     operator, context, said = start()
     assert tell.wait(60.0)
     operator.modal(context, event("ESC"))
@@ -420,7 +420,7 @@ def test_what_ends_the_session_ends_the_thread(start, gate, addon, how):  # noqa
 def test_work_that_listens_to_nobody_is_left_behind(start, addon, few, monkeypatch):
     """It still waits when the operator is over; what it comes to later is dropped."""
     free, expected = threading.Event(), scored_by(few, "auto")
-    monkeypatch.setattr(addon.ui.operators, "_sketched", lambda _job, _progress: free.wait(600.0))
+    monkeypatch.setattr(addon.ui.operators, "_sketch", lambda _job, _progress: free.wait(600.0))
     operator, context, _ = start()
     operator.modal(context, event("ESC"))
     answer = until_over(operator, context)
@@ -437,7 +437,7 @@ def test_work_that_listens_to_nobody_is_left_behind(start, addon, few, monkeypat
 @pytest.mark.parametrize("suffix", [".ply", ".sog"])
 def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, few, tmp_path, suffix):
     """The same bytes, images of a SOG by Blender's library on the main thread included."""
-    export, read = addon.ui.operators.REFINE_OT_export_ply, addon.ui.import_operators
+    export, read = addon.ui.export_operators.REFINE_OT_export_ply, addon.ui.import_operators
     at_once, later = (tmp_path / f"{name}{suffix}" for name in ("now", "later"))
     bpy.ops.refine.export_ply(filepath=str(at_once))
     options = {"overwrite": False, "apply_transform": False}
@@ -466,7 +466,7 @@ def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, 
 
     held = SimpleNamespace(suffix=".splat", degree=form.degree, write=write, loss="", sizes=None)
     monkeypatch.setattr(registry, "format_named", lambda _path: held)
-    export = addon.ui.operators.REFINE_OT_export_ply
+    export = addon.ui.export_operators.REFINE_OT_export_ply
     options = {"overwrite": False, "apply_transform": False}
     operator, context, _ = start(export, filepath=str(tmp_path / "out.splat"), **options)
     assert begun.wait(60.0)

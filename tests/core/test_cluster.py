@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -14,8 +18,7 @@ from refine_addon.command import main
 from refine_addon.core import Budget, RefineError, Settings, prune_tiles, read_cameras, read_ply
 from refine_addon.core.formats.ply_header import with_count
 from refine_addon.core.tiles import absorbing, cluster, units
-from refine_addon.core.tiles.folder import Folder
-from refine_addon.core.tiles.steps import Job
+from refine_addon.core.tiles.folder import Folder, Interrupted
 
 ROOM = Path(__file__).parents[2] / "tests/data/room_small"
 CLOSED = Settings(method="closed-form", views=8)
@@ -136,19 +139,18 @@ def test_workers_read_and_write_behind_urls(tmp_path, tiles, workers, monkeypatc
 @needs_dask
 def test_workers_that_do_not_see_the_files_are_named(tmp_path, tiles, workers, monkeypatch):
     """The folder of the job, a tile, or refine itself is another one there."""
-    views = read_cameras(ROOM / "cameras.json")
-    job = Job(Folder(tmp_path / "elsewhere"), views, CLOSED.closed_form, views.middle())
+    folder = Folder(tmp_path / "elsewhere")
     with pytest.raises(RefineError, match=r"worker tcp://.*elsewhere is not there; workers need"):
-        workers.check(job, [])
+        workers.check(folder, [])
     tile = units.tile_at(tiles[0])
     tiles[0].unlink()
-    with job.folder.opened():
-        job.folder.note("begun", None)
+    with folder.opened():
+        folder.note("begun", None)
         with pytest.raises(RefineError, match=r"worker tcp://.*a\.ply is not there, or another"):
-            workers.check(job, [tile])
+            workers.check(folder, [tile])
     monkeypatch.setattr(cluster, "VERSION", "0.0.0")
     with pytest.raises(RefineError, match=r"worker tcp://.*it has refine .*, this is 0\.0\.0"):
-        workers.check(job, [])
+        workers.check(folder, [])
 
 
 @needs_dask
@@ -161,6 +163,75 @@ def test_a_scheduler_that_is_not_there_is_named(monkeypatch):
         cluster.cluster(scheduler="tcp://127.0.0.1:1"),
     ):
         pass
+
+
+class FakeCluster:
+    """Stands for a cluster that takes a moment to start, while Ctrl-C is pressed."""
+
+    made: ClassVar[list[FakeCluster]] = []
+
+    def __init__(self, **_options):
+        self.made.append(self)
+        self.started = self.closed = False
+        time.sleep(0.1)  # until whoever started this waits
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0.1)
+        self.started = True
+
+    def close(self):
+        """Dask asserts that what it closes has started."""
+        assert self.started
+        self.closed = True
+
+
+def test_ctrl_c_while_workers_start_waits_for_them_and_closes_them(monkeypatch):
+    """Dask cannot close workers that are half started: it printed an AssertionError at the end."""
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(distributed, "LocalCluster", FakeCluster)
+
+    with pytest.raises(KeyboardInterrupt), cluster.cluster(2):
+        pass
+
+    assert [one.closed for one in FakeCluster.made] == [True]
+
+
+def test_a_worker_that_ends_while_it_starts_is_told_in_a_sentence(monkeypatch):
+    """The job has not begun, or goes on where it was: the same command does either."""
+    distributed = pytest.importorskip("distributed")
+
+    def failing(**_options):
+        msg = "Nanny failed to start."
+        raise RuntimeError(msg)
+
+    monkeypatch.setattr(distributed, "LocalCluster", failing)
+
+    words = r"workers ended while they were started \(Nanny failed to start\.\)"
+    with pytest.raises(Interrupted, match=words), cluster.cluster(2):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("answers", "raised"),
+    [
+        ([{"a": OSError("lost"), "b": ""}], None),
+        ([{"a": OSError("lost")}, {"c": ""}], None),
+        ([{"a": OSError("lost")}] * 3, Interrupted),
+        ([{"a": "it is blind", "b": OSError("lost")}], RefineError),
+    ],
+    ids=["one", "all", "again and again", "another"],
+)
+def test_workers_lost_while_they_are_asked_do_not_end_a_job(tmp_path, answers, raised):
+    """Others answer for them, or those that are started in their place."""
+    left = [*answers]
+    client = SimpleNamespace(
+        run=lambda *_given, **_options: left.pop(0), wait_for_workers=lambda *_given, **_options: 0
+    )
+    check = cluster.Cluster(client).check
+
+    with contextlib.nullcontext() if raised is None else pytest.raises(raised):
+        check(Folder(tmp_path), [])
+
+    assert not left
 
 
 def test_without_dask_the_extra_is_named(tmp_path, tiles, capsys, monkeypatch):

@@ -9,7 +9,7 @@ import pytest
 
 from refine_addon.command import main
 from refine_addon.core import Budget, Settings, prune, read_cameras, read_ply
-from refine_addon.core.tiles import prune as together
+from refine_addon.core.tiles import storage
 from tests.strategies import plain_header, plain_ply, splat_names
 
 CLOSED = ["--method", "closed-form"]
@@ -119,7 +119,7 @@ def test_after_ctrl_c_it_says_how_to_go_on(folder, capsys, monkeypatch):
         def stop(*_paths, **_options):
             raise KeyboardInterrupt
 
-        patched.setattr(together, "publish", stop)
+        patched.setattr(storage, "publish", stop)
         assert call(*CLOSED, "--output-dir", "out") == 130
     assert "the same command goes on where this one was" in capsys.readouterr().out
 

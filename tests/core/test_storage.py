@@ -15,7 +15,7 @@ import pytest
 
 from refine_addon.command import main
 from refine_addon.core import Budget, RefineError, Settings, prune_tiles, read_cameras, read_splats
-from refine_addon.core.tiles import steps, storage, units
+from refine_addon.core.tiles import storage, units, writing
 from refine_addon.core.urls import Url
 from tests.strategies import plain_header, plain_ply, splat_names
 
@@ -184,7 +184,7 @@ def test_a_storage_that_fails_leaves_what_is_done(folder, memory, views, monkeyp
     assert len(memory.find("/out")) == 1
 
     with monkeypatch.context() as patched:
-        patched.setattr(steps, "rows_of", None)
+        patched.setattr(writing, "rows_of", None)
         prune_tiles(URLS, "memory://out", views, HALF, CLOSED)
     assert [Path(path).name[-6:] for path in sent] == ["000000", "000001", "000001"]
     assert memory.find("/out") == ["/out/a.ply", "/out/b.ply"]
@@ -199,7 +199,7 @@ def test_a_storage_that_cannot_be_written_to_is_known_at_once(memory, views, mon
         raise PermissionError(msg)
 
     monkeypatch.setattr(type(memory), "pipe_file", refused)
-    monkeypatch.setattr(steps.Job, "score", None)
+    monkeypatch.setattr(units.Unit, "take", None)
 
     with pytest.raises(RefineError, match=r"^memory://out: cannot be written to \(read-only\)$"):
         prune_tiles(URLS, "memory://out", views, HALF, CLOSED)

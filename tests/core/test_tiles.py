@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import os
+import shutil
+import sys
 from dataclasses import fields
 from pathlib import Path
 
@@ -10,6 +15,7 @@ import pytest
 
 from refine_addon.core import (
     Budget,
+    PruneRequest,
     RefineError,
     Settings,
     prune_file,
@@ -20,9 +26,9 @@ from refine_addon.core import (
 )
 from refine_addon.core.scoring import closed_form
 from refine_addon.core.selection import select
-from refine_addon.core.tiles import prune as together
-from refine_addon.core.tiles import steps, units
-from refine_addon.core.tiles.folder import Folder
+from refine_addon.core.tiles import folder as folder_module
+from refine_addon.core.tiles import storage, units, writing
+from refine_addon.core.tiles.folder import Folder, Interrupted
 from tests.strategies import plain_ply, ply_of
 from tests.tiles import COUNT, ROOM, cut, joined, room_rows, write
 
@@ -73,7 +79,9 @@ def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budg
     if budget.max_mb:
         assert 0 <= 400_000 - report["files"]["output_bytes"] < 2 * 248
         budget = Budget(keep=report["splats"]["kept"])
-    whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", views, budget, CLOSED)
+    whole = prune_file(
+        tmp_path / "whole.ply", tmp_path / "pruned.ply", PruneRequest(views, budget, CLOSED)
+    )
     assert joined(tmp_path / "out" / path.name for path in tiles) == joined(
         [tmp_path / "pruned.ply"]
     )
@@ -258,22 +266,61 @@ def test_a_tile_that_changes_meanwhile_stops_all(tmp_path, tiles, views):
     assert not list((tmp_path / "out").glob("*"))
 
 
-def test_a_tile_that_cannot_be_written_leaves_none(tmp_path, tiles, views, monkeypatch):
-    """As on a full disk at the third tile."""
-    write_tile = steps.Job.write
+@pytest.mark.parametrize("count", [0, 3], ids=["none", "three"])
+def test_tiles_without_a_splat_are_refused(tmp_path, views, count):
+    """There is nothing to rank, whatever the budget."""
+    empty = cut(tmp_path, room_rows()[:0], (0,) * (count + 1))
 
-    def full(self, tile, *more, **options):
-        if tile.path.endswith(tiles[2].name):
-            msg = "no space left on the disk"
-            raise RefineError(msg)
-        return write_tile(self, tile, *more, **options)
+    with pytest.raises(RefineError, match=f"none of {count} tiles has a splat"):
+        prune_tiles(empty, tmp_path / "out", views, Budget(max_mb=1.0), CLOSED)
 
-    monkeypatch.setattr(steps.Job, "write", full)
 
-    with pytest.raises(RefineError, match="no space left"):
-        prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+@pytest.mark.parametrize("link", [Path.symlink_to, Path.hardlink_to], ids=["symbolic", "hard"])
+def test_a_link_to_a_tile_is_that_tile_again(tmp_path, tiles, views, link):
+    """Both names are told: the splats would count twice."""
+    again = tmp_path / "again.ply"
+    link(again, tiles[0])
 
-    assert not list((tmp_path / "out").glob("*"))
+    with pytest.raises(RefineError, match=r"again\.ply: is given twice, also as .*b\.ply"):
+        prune_tiles([*tiles, again], tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+
+
+def test_a_failed_job_leaves_no_folder_that_it_made(tmp_path, tiles, views):
+    """Neither the outputs' nor the one above it; one that was there stays."""
+    (tmp_path / "there").mkdir()
+    for folder in ("there", "new/deep"):
+        with pytest.raises(RefineError, match="would remove all"):
+            prune_tiles(tiles, tmp_path / folder, views, Budget(threshold=1e30), CLOSED)
+
+    assert not list((tmp_path / "there").iterdir())
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.usefixtures("rows")
+def test_the_work_for_a_tile_does_not_grow_with_their_number(tmp_path, views):
+    """Eight times the tiles take at most nine times the calls; comparing each with each takes 64.
+
+    Calls are counted, of Python's functions and of others, while tiles of two splats are pruned.
+    """
+    rows, calls = room_rows(), []
+    budget, settings = Budget(ratio=0.5), Settings(method="closed-form", views=1)
+    for count in (25, 200):
+        (tmp_path / str(count)).mkdir()
+        paths = [tmp_path / str(count) / f"{number}.ply" for number in range(count)]
+        for number, path in enumerate(paths):
+            write(path, rows[1400 + 2 * number : 1402 + 2 * number])
+        calls.append(0)
+
+        def count_calls(_frame, event, _argument):
+            calls[-1] += event in ("call", "c_call")
+
+        sys.setprofile(count_calls)
+        try:
+            prune_tiles(paths, tmp_path / f"out-{count}", views, budget, settings, threads=1)
+        finally:
+            sys.setprofile(None)
+
+    assert calls[1] < 9 * calls[0]
 
 
 def test_a_slice_of_a_unit_is_that_of_its_tiles(tmp_path):
@@ -323,7 +370,7 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views,
     budget = Budget(ratio=0.5)
     prune_tiles(tiles, tmp_path / "once", views, budget, CLOSED)
     done = []
-    take, write_rows = units.Unit.take, steps.write_rows
+    take, write_rows = units.Unit.take, writing.write_rows
 
     def taken(unit, piece):
         if not piece.stop:  # whoever reads a unit looks at its types first
@@ -332,7 +379,7 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views,
 
     monkeypatch.setattr(units.Unit, "take", taken)
     monkeypatch.setattr(
-        steps, "write_rows", lambda *rows: done.append(len(rows[1])) or write_rows(*rows)
+        writing, "write_rows", lambda *rows: done.append(len(rows[1])) or write_rows(*rows)
     )
 
     def interrupt(fraction, _what):
@@ -353,24 +400,220 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views,
     assert sum(index for index in done if index >= 5) <= COUNT + (1900 if stop > 0.82 else 0)
 
 
-def test_a_job_that_was_stopped_while_it_renamed_goes_on(tmp_path, tiles, views, monkeypatch):
-    """One of four files is in its place already; replacing it, the second run ends."""
-    publish, budget = together.publish, Budget(ratio=0.5)
+def renaming_stops(monkeypatch, name, error):
+    """Make renaming to a name fail."""
+    publish = storage.publish
 
     def stop(made, path, **options):
-        if path.name == tiles[1].name:
-            raise KeyboardInterrupt
+        if path.name == name:
+            raise error
         publish(made, path, **options)
 
+    monkeypatch.setattr(storage, "publish", stop)
+
+
+@pytest.mark.parametrize(
+    ("error", "raised"),
+    [(KeyboardInterrupt(), KeyboardInterrupt), (RefineError("the disk failed"), Interrupted)],
+)
+def test_a_job_that_was_stopped_while_it_renamed_goes_on(
+    tmp_path, tiles, views, monkeypatch, error, raised
+):
+    """One of four files is in its place already; the same call renames the others."""
+    budget, out = Budget(ratio=0.5), tmp_path / "out"
     with monkeypatch.context() as patched:
-        patched.setattr(together, "publish", stop)
+        renaming_stops(patched, tiles[1].name, error)
+        with pytest.raises(raised):
+            prune_tiles(tiles, out, views, budget, CLOSED)
+    assert [path.name for path in out.glob("*.ply")] == [tiles[0].name]
+
+    monkeypatch.setattr(writing, "rows_of", None)  # nothing is written again
+    report = prune_tiles(tiles, out, views, budget, CLOSED)
+
+    assert {path.name for path in out.iterdir()} == {path.name for path in tiles}
+    assert sum(len(read_ply(out / path.name)) for path in tiles) == COUNT // 2
+    for tile in report["tiles"]:
+        assert tile["output_bytes"] == Path(tile["output"]).stat().st_size
+
+
+def test_ctrl_c_after_the_last_tile_was_renamed_comes_too_late(tmp_path, tiles, views, monkeypatch):
+    """The folder of the job goes all the same: nothing is left that would go on."""
+    rmtree, calls = shutil.rmtree, []
+
+    def stop_at_first(path, **options):
+        calls.append(path)
+        if len(calls) == 1:
+            rmtree(path / "done", **options)
+            raise KeyboardInterrupt
+        rmtree(path, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", stop_at_first)
+
+    report = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+
+    assert report["splats"]["written"] == COUNT // 2
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in tiles}
+
+
+def test_a_file_in_the_place_of_a_renamed_tile_is_not_replaced(tmp_path, tiles, views, monkeypatch):
+    """Between two runs another program wrote it: it is refused, and with `overwrite` replaced."""
+    budget, out = Budget(ratio=0.5), tmp_path / "out"
+    with monkeypatch.context() as patched:
+        renaming_stops(patched, tiles[1].name, KeyboardInterrupt())
         with pytest.raises(KeyboardInterrupt):
-            prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+            prune_tiles(tiles, out, views, budget, CLOSED)
+    (out / tiles[0].name).write_bytes(b"mine")
 
     with pytest.raises(RefineError, match="exists already"):
-        prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
-    prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED, overwrite=True)
-    assert sum(len(read_ply(tmp_path / "out" / path.name)) for path in tiles) == COUNT // 2
+        prune_tiles(tiles, out, views, budget, CLOSED)
+    assert (out / tiles[0].name).read_bytes() == b"mine"
+    prune_tiles(tiles, out, views, budget, CLOSED, overwrite=True)
+
+    assert sum(len(read_ply(out / path.name)) for path in tiles) == COUNT // 2
+
+
+@pytest.mark.parametrize(
+    ("overwrite", "words"), [(False, "exists already"), (True, "is a folder, expected a file")]
+)
+def test_what_appears_in_the_place_of_a_tile_meanwhile_stops_before_the_first(
+    tmp_path, tiles, views, monkeypatch, overwrite, words
+):
+    """A file, or a folder that nothing can replace: no tile is renamed, and none is lost."""
+    budget, out = Budget(ratio=0.5), tmp_path / "out"
+    there = out / tiles[3].name
+
+    def progress(fraction, _what):
+        if fraction > 0.9 and not there.exists():
+            (Path.mkdir if overwrite else Path.touch)(there)
+
+    options = {"overwrite": overwrite}
+    with pytest.raises(Interrupted, match=f"{words}.*; the same command goes on"):
+        prune_tiles(tiles, out, views, budget, CLOSED, progress=progress, **options)
+    assert [*out.glob("*.ply")] == [there]
+    (Path.rmdir if overwrite else Path.unlink)(there)
+    monkeypatch.setattr(writing, "rows_of", None)  # nothing is written again
+    prune_tiles(tiles, out, views, budget, CLOSED, **options)
+
+    assert {path.name for path in out.iterdir()} == {path.name for path in tiles}
+
+
+@pytest.mark.parametrize("calls", [1, 30, 60, 77], ids=["begin", "scores", "selected", "tiles"])
+def test_on_a_full_disk_what_is_done_stays(tmp_path, tiles, views, monkeypatch, calls):
+    """Wherever it fills up, the file is named, and the same call goes on once there is room."""
+    budget, done = Budget(ratio=0.5), []
+    prune_tiles(tiles, tmp_path / "once", views, budget, CLOSED)
+    open_file = Folder.writing
+
+    @contextlib.contextmanager
+    def filling(folder, path):
+        done.append(path)
+        with open_file(folder, path) as stream:
+            yield stream
+            if len(done) >= calls:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Folder, "writing", filling)
+        with pytest.raises(Interrupted) as stopped:
+            prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+    words = f"{done[-1]}: no space left on the disk; the same command goes on where this one was"
+    assert str(stopped.value) == words
+    assert len(done) == calls
+    assert not done[-1].exists()
+
+    prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+    assert joined(tmp_path / "out" / path.name for path in tiles) == joined(
+        tmp_path / "once" / path.name for path in tiles
+    )
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="only Linux has a disk that is full")
+def test_an_array_on_a_full_disk_says_so():
+    """NumPy would say how many of its numbers were written, not why, and name no file."""
+    with (
+        Path("/dev/full").open("wb", buffering=0) as full,
+        pytest.raises(OSError, match=os.strerror(errno.ENOSPC)),
+    ):
+        folder_module._write(full, np.zeros(100_000))
+
+
+def interrupted_at(fraction):
+    """Return a progress callback that stops there."""
+
+    def progress(done, _what):
+        if done > fraction:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+@pytest.mark.parametrize("name", ["means.npy", "plain.npy", "values.npy"])
+def test_an_array_that_a_power_cut_truncated_is_made_again(tmp_path, tiles, views, name):
+    """It is named, what was not damaged stays, and the next run ends with the same bytes."""
+    budget, out = Budget(ratio=0.5), tmp_path / "out"
+    prune_tiles(tiles, tmp_path / "once", views, budget, CLOSED)
+    stop = {"means.npy": 0.4, "plain.npy": 0.77, "values.npy": 0.82}[name]
+    with pytest.raises(KeyboardInterrupt):
+        prune_tiles(tiles, out, views, budget, CLOSED, progress=interrupted_at(stop))
+    damaged = next(path for path in sorted(out.rglob(name)) if path.stat().st_size > 300)
+    os.truncate(damaged, 300)
+
+    with pytest.raises(Interrupted, match=f"{name}: is damaged; the same command goes on"):
+        prune_tiles(tiles, out, views, budget, CLOSED)
+    prune_tiles(tiles, out, views, budget, CLOSED)
+
+    assert joined(out / path.name for path in tiles) == joined(
+        tmp_path / "once" / path.name for path in tiles
+    )
+
+
+def test_a_note_that_a_power_cut_truncated_counts_as_none(tmp_path):
+    """Of one array or of several, whatever is left of it; what was whole is read as before."""
+    folder = Folder(tmp_path / "job")
+    with folder.opened():
+        for name, result in (("one", np.arange(3)), ("two", (np.eye(2), 0.1)), ("none", None)):
+            folder.note(name, result)
+            path = next((folder.path / "done").glob(f"{name}*"))
+            whole = path.read_bytes()
+            for size in (0, 100, len(whole) - 1):
+                path.write_bytes(whole[:size])
+                assert folder.noted(name) == (False, None)
+
+
+def test_a_tile_with_the_longest_name_is_pruned(tmp_path, tiles, views):
+    """255 bytes: what is noted of a tile does not have its name."""
+    long = tmp_path / f"{'x' * 251}.ply"
+    tiles[0].rename(long)
+
+    prune_tiles([long, *tiles[1:]], tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+
+    assert (tmp_path / "out" / long.name).exists()
+
+
+def test_where_an_open_file_cannot_be_removed_the_folder_goes_all_the_same(tmp_path, monkeypatch):
+    """As on Windows: the lock is closed before the folder goes."""
+    rmtree, opened = shutil.rmtree, []
+    open_file = Path.open
+
+    def noting(path, *mode, **options):
+        stream = open_file(path, *mode, **options)
+        opened.append(stream)
+        return stream
+
+    def remove(path, **options):
+        if all(stream.closed for stream in opened):
+            rmtree(path, **options)
+        else:
+            for inner in ("done", "arrays", "tiles"):
+                rmtree(path / inner)
+
+    monkeypatch.setattr(Path, "open", noting)
+    monkeypatch.setattr(shutil, "rmtree", remove)
+    folder = Folder(tmp_path / "job")
+    with folder.opened():
+        folder.remove()
+
+    assert not folder.path.exists()
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from numpy.lib.recfunctions import drop_fields
 
 from refine_addon.core import (
     Budget,
+    PruneRequest,
     RefineError,
     Settings,
     prune,
@@ -25,8 +26,11 @@ from refine_addon.core.scoring import closed_form
 from refine_addon.core.seeing import projection
 from refine_addon.core.seeing.ray_sample import validation_rays
 from refine_addon.core.splats import joined
-from refine_addon.core.tiles import absorbing, seen, units
-from refine_addon.core.tiles.seen import SceneJob
+from refine_addon.core.tiles import absorbing, gaussians, measuring, units
+from refine_addon.core.tiles.folder import Folder
+from refine_addon.core.tiles.gaussians import SceneContext
+from refine_addon.core.tiles.rays import StoredRays
+from refine_addon.core.tiles.workers import InProcess, Runner
 from refine_addon.core.views import ViewSet
 from tests.strategies import plain_header, splat_names
 from tests.tiles import COUNT, ROOM, cut, room_rows, write
@@ -40,7 +44,7 @@ def small(monkeypatch):
     """Make units, chunks and regions so small that 5000 splats have several of each."""
     monkeypatch.setattr(closed_form, "ROWS", 1000)
     monkeypatch.setattr(units, "ROWS", 1000)
-    monkeypatch.setattr(seen, "CHUNK", 700)
+    monkeypatch.setattr(gaussians, "CHUNK", 700)
     monkeypatch.setattr(absorbing, "REGION", 1500)
 
 
@@ -81,7 +85,9 @@ def read(folder, paths):
 def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budget, settings):
     """To the byte, and the estimates are the same but for how rounding adds up."""
     told = prune_tiles(tiles, tmp_path / "out", views, budget, settings)
-    whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", views, budget, settings)
+    whole = prune_file(
+        tmp_path / "whole.ply", tmp_path / "pruned.ply", PruneRequest(views, budget, settings)
+    )
 
     expected = read_ply(tmp_path / "pruned.ply").rows
     assert read(tmp_path / "out", tiles).tobytes() == expected.tobytes()
@@ -98,7 +104,7 @@ def test_views_of_nothing_are_refused_as_of_one_file(tmp_path, tiles, views):
     """Near planes behind all splats: the message is that of one file, and nothing is left."""
     away = ViewSet(tuple(replace(view, near=1e6) for view in views))
     with pytest.raises(RefineError) as alone:
-        prune_file(tmp_path / "whole.ply", None, away, Budget(ratio=0.5), OCCLUSION)
+        prune_file(tmp_path / "whole.ply", None, PruneRequest(away, Budget(ratio=0.5), OCCLUSION))
 
     with pytest.raises(RefineError) as together:
         prune_tiles(tiles, tmp_path / "out", away, Budget(ratio=0.5), OCCLUSION)
@@ -117,9 +123,9 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(
     Interrupted once, and four times in one job, when a tenth, three tenths, ... are done.
     """
     budget, settings, done = Budget(ratio=0.5), replace(OCCLUSION, views=8), []
-    measure = seen.measure_footprints
+    measure = measuring.measure_footprints
     monkeypatch.setattr(
-        seen, "measure_footprints", lambda *some: done.append(some) or measure(*some)
+        measuring, "measure_footprints", lambda *some: done.append(some) or measure(*some)
     )
 
     def measured(folder, *stops):
@@ -168,14 +174,13 @@ def test_absorbing_tiles_is_as_good_as_absorbing_one_file(tmp_path, views, monke
     splats = file.splats()
     whole = prune(splats, views, Budget(ratio=ratio), settings, absorb=True)
 
-    sample = validation_rays(splats, views.spread(64))
+    rays = validation_rays(splats, views.spread(64))
     made = joined([read_ply(tmp_path / "out" / path.name).splats() for path in tiles])
-    one = psnr_against(sample, whole.absorbed.splats, views.spread(64))
-    assert psnr_against(sample, made, views.spread(64)) > one - 0.3
+    one = psnr_against(rays, whole.absorbed.splats, views.spread(64))
+    psnr = psnr_against(rays, made, views.spread(64))
+    assert psnr > one - 0.3
     assert len(made) == told["splats"]["kept"] == whole.report["splats"]["kept"]
-    assert told["estimated_psnr"] == pytest.approx(
-        psnr_against(sample, made, views.spread(64)), abs=0.1
-    )
+    assert told["estimated_psnr"] == pytest.approx(psnr, abs=0.1)
 
 
 @pytest.mark.slow
@@ -187,7 +192,7 @@ def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views,
     monkeypatch.setattr(absorbing, "REGION", 10_000)
     few, others = ViewSet(views.views[:3]), ViewSet(views.views[10::4])
     splats = read_ply(ROOM / "point_cloud.ply").splats()
-    sample = validation_rays(splats, others)
+    rays = validation_rays(splats, others)
     whole = prune(splats, few, Budget(ratio=0.5), OCCLUSION, absorb=True)
 
     prune_tiles(
@@ -196,8 +201,8 @@ def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views,
 
     made = read_ply(tmp_path / "point_cloud.ply").splats()
     assert np.count_nonzero(whole.scores.seen) < 0.3 * len(splats)
-    one = psnr_against(sample, whole.absorbed.splats, others)
-    assert psnr_against(sample, made, others) > one - 0.3
+    one = psnr_against(rays, whole.absorbed.splats, others)
+    assert psnr_against(rays, made, others) > one - 0.3
 
 
 @pytest.mark.slow
@@ -217,14 +222,53 @@ def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, rows, views)
     assert np.isfinite([made[name] for name in made.dtype.names]).all()
 
 
+@pytest.mark.parametrize("ratio", [0.5, 0.8])
+def test_absorbing_a_single_region_is_absorbing_one_file(
+    tmp_path, tiles, views, monkeypatch, ratio
+):
+    """Where one region holds all that are left, every row is the same to the byte.
+
+    At 80 % there are three stages, before two of which the views measure again.
+    """
+    monkeypatch.setattr(absorbing, "REGION", COUNT)
+    budget = Budget(ratio=ratio)
+    told = prune_tiles(tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=True)
+    request = PruneRequest(views, budget, OCCLUSION, absorb=True)
+    whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", request)
+
+    assert told["absorbed"] == whole.report["absorbed"]
+    assert told["absorbed"]["changed"] > 100
+    expected = read_ply(tmp_path / "pruned.ply").rows
+    assert read(tmp_path / "out", tiles).tobytes() == expected.tobytes()
+    assert told["estimated_psnr"] == pytest.approx(whole.report["estimated_psnr"], abs=0.011)
+
+
+def test_a_stage_leaves_enough_to_choose_from():
+    """Merges count half a splat each, so no stage may ask for more than half of the splats."""
+    assert absorbing.STAGE >= 0.5
+
+
+def test_stored_rays_know_which_are_wanted(tmp_path, views):
+    """All views' at first; none of those that lie in the folder."""
+    context = SceneContext(Folder(tmp_path), views, None, None)
+    stored = gaussians.StoredGaussians(context.folder.inner(""), np.arange(3))
+
+    rays = StoredRays(context, Runner(InProcess()), [], stored)
+    rays.noted.add(1)
+
+    assert [rays.wants(number) for number in range(3)] == [True, False, True]
+    assert rays.seeing() == []
+
+
 @pytest.mark.slow
 def test_what_is_deleted_alone_needs_no_merging(tmp_path, tiles, views):
     """Up to a tenth is deleted as in memory: the same rows, and nothing changes."""
     told = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.1), OCCLUSION, absorb=True)
     whole = prune_file(
-        tmp_path / "whole.ply", tmp_path / "pruned.ply", views, Budget(ratio=0.1), OCCLUSION,
-        absorb=True,
-    )  # fmt: skip
+        tmp_path / "whole.ply",
+        tmp_path / "pruned.ply",
+        PruneRequest(views, Budget(ratio=0.1), OCCLUSION, absorb=True),
+    )
 
     assert told["absorbed"] == whole.report["absorbed"]
     expected = read_ply(tmp_path / "pruned.ply").rows
@@ -272,7 +316,7 @@ def test_regions_divide_all_splats(count, most, stage, seed):
     means = np.random.default_rng(seed).normal(size=(count, 3)).astype(np.float32)
     means[::17] = np.nan
 
-    found = absorbing.regions(means, most, stage)
+    found = absorbing.divided(means, most, stage)
 
     assert sorted(np.concatenate(found).tolist()) == list(range(count))
     sizes = [len(rows) for rows in found]
@@ -285,7 +329,7 @@ def test_regions_of_one_stage_cross_those_of_the_next():
     """Of 1000 splats in a cube, halves along an axis and askew: each pair has some in common."""
     means = np.random.default_rng(1).uniform(size=(1000, 3)).astype(np.float32)
 
-    first, second = (absorbing.regions(means, 500, stage) for stage in (0, 1))
+    first, second = (absorbing.divided(means, 500, stage) for stage in (0, 1))
 
     common = [len(np.intersect1d(one, other)) for one in first for other in second]
     assert min(common) > 50
@@ -297,12 +341,12 @@ def test_regions_of_one_stage_cross_those_of_the_next():
 @pytest.mark.slow
 def test_a_view_loads_no_chunk_behind_it(tmp_path, tiles, views, monkeypatch):
     """Of 100 chunks all are loaded by some view, and a fifth of the times none was needed."""
-    monkeypatch.setattr(seen, "CHUNK", 50)
-    loaded, load = [], SceneJob._chunk
+    monkeypatch.setattr(gaussians, "CHUNK", 50)
+    loaded, load = [], SceneContext.chunk
     monkeypatch.setattr(
-        SceneJob,
-        "_chunk",
-        lambda job, number: loaded.append(number) or load(job, number),
+        SceneContext,
+        "chunk",
+        lambda context, number: loaded.append(number) or load(context, number),
     )
     once = Settings(method="occlusion", views=12, occlusion=replace(OCCLUSION.occlusion, rounds=1))
 

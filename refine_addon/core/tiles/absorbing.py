@@ -1,235 +1,58 @@
 """Absorbing splats that no memory holds at once: region by region, stage by stage.
 
-A stage divides all splats that are left into boxes of about equally many (`regions`), and absorbs
-each by itself: what the views see of its splats, hidden by all others, is measured before. How many
-of a region stay is decided by one ranking of all. The next stage divides along other planes, so
-neighbours that a plane kept apart meet in the next stage. A splat is in one region in each stage.
+Up to `REGION` splats are absorbed at once, as in memory. More are divided, in each stage, into
+boxes of about equally many (`divided`), and each box is absorbed by itself: what the views see of
+its splats, hidden by all others, is measured before. How many of a region stay is decided by one
+ranking of all. The next stage divides along other planes, so neighbours that a plane separates can
+merge in the next stage. A splat is in one region in each stage.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+import math
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..absorbing import merge_field
-from ..absorbing.absorb import ALONE, STAGE, Counts, mergeable, patience, reduced, stages
-from ..absorbing.merge_field import Field, ViewSums
-from ..absorbing.merge_graph import MergeGraph
-from ..pipeline import PARTS
+from ..absorbing.absorb import STAGE, Counts, patience, stages
+from ..pipeline import FIRST, PARTS
 from ..seeing.measuring import Measured
-from ..splats import Splats, joined
-from ..work import Progress, part, silent
-from .seen import MeasuringTiles, StoredLines, place
-from .workers import Call
+from ..selection import Budget, select
+from .gaussians import store_gaussians
+from .measuring import TileMeasuring
+from .rays import StoredRays
+from .regions import (
+    SURVIVORS,
+    AbsorbAtOnce,
+    AbsorbRegion,
+    GatherRegion,
+    PriceRegion,
+    Region,
+    SaveMeans,
+    SettleUnit,
+    StageContext,
+)
+from .workers import Runner
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from typing import Any
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
-    from ..views import ViewSet
+    from ..task import Settings
     from .folder import Folder
-    from .scoring import Seen
-    from .seen import SceneJob, Source
-    from .workers import Workers
+    from .gaussians import SceneContext
+    from .scoring import MeasuredTiles
+    from .units import Source, Unit
 
 REGION = 1 << 20
 """Splats of a region at most; absorbing takes about 900 bytes of each."""
 
-_FIELD = tuple(item.name for item in fields(Field))
-_PRICED = ("allowed", "allowed_error", "first", "second", "cost")
-_OVER = (*_FIELD, *_PRICED, "gathered", "whence", "stood", "may", "mass", "looks")
 _SAMPLE = 1 << 14  # splats that decide along which axis a box is divided
 _ASKEW = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]], np.float32) / np.float32(3.0)
-
-
-@dataclass(frozen=True)
-class Region:
-    """The splats that are left in a region after a stage.
-
-    Attributes
-    ----------
-    index : int
-        Which one of all.
-    count : int
-    folder : Folder
-        Of the stage.
-    """
-
-    index: int
-    count: int
-    folder: Folder
-
-    def __len__(self) -> int:
-        """Return the number of splats."""
-        return self.count
-
-    def splats(self) -> Splats:
-        """Return its splats, in float64."""
-        return unpacked(self.table())
-
-    def table(self) -> NDArray[np.float64]:
-        """Return its splats as one table, (n, 14 + 3 K), without reading it yet."""
-        return self.folder.map(self.index, "splats")
-
-
-@dataclass(frozen=True)
-class AbsorbJob:
-    """The steps of a stage; see `steps.Job`.
-
-    Attributes
-    ----------
-    folder : Folder
-        Of the stage.
-    views : ViewSet
-    scene : Scene
-    sources : sequence of Source
-        What the stage before left.
-    starts : (sources + 1,) int64
-        How many splats lie before each source, and all.
-    factor : float
-        On the cost of merging, see `absorb.patience`.
-    """
-
-    folder: Folder
-    views: ViewSet
-    scene: Scene
-    sources: Sequence[Source]
-    starts: NDArray[np.int64]
-    factor: float
-
-    def means(self, source: Source) -> None:
-        """Write where the splats of a source are."""
-        self.folder.save(source.index, {"means": np.asarray(source.splats().means, np.float32)})
-
-    def gather(
-        self, index: int, *, progress: Progress = silent, threads: int | None = 1
-    ) -> NDArray[np.float64]:
-        """Get a region ready to merge, but for the allowance, and write it.
-
-        Parameters
-        ----------
-        index : int
-            Which one. The folder has the rows of its splats among those of all sources, and what
-            the views see of them.
-        progress, threads
-
-        Returns
-        -------
-        (2, 2) float64
-            See `merge_field.Unallowed.seen_and_whole`.
-        """
-        name = f"{index:06d}.gather"
-        return np.asarray(self.folder.once(name, lambda: self._ready(index, progress, threads)))
-
-    def _ready(self, index: int, progress: Progress, threads: int | None) -> NDArray[np.float64]:
-        rows, sums = self.folder.load(index, ("rows", "sums")).values()
-        table, origin, members = self._gathered(rows)
-        splats = unpacked(table)
-        may = mergeable(splats, self.scene, np.zeros(len(rows), np.bool_))
-        found = merge_field.unallowed(
-            splats, may, self.views, self.scene, ViewSums(*sums),
-            progress=progress, threads=threads,
-        )  # fmt: skip
-        arrays = {"gathered": table, "whence": origin, "stood": members, "may": may}
-        arrays |= {"mass": found.mass, "looks": found.seen}
-        self.folder.save(index, arrays | vars(found.field))
-        return found.seen_and_whole()
-
-    def price(
-        self,
-        index: int,
-        whole: NDArray[np.float64],
-        *,
-        progress: Progress = silent,
-        threads: int | None = 1,
-    ) -> None:
-        """Find what merging and deleting the splats of a region costs, and write it.
-
-        Parameters
-        ----------
-        index : int
-            Which one.
-        whole : (2, 2) float64
-            `seen_and_whole` of all regions together.
-        progress, threads
-        """
-        name = f"{index:06d}.price"
-        if self.folder.has(name):
-            return
-        own = self.folder.load(index, (*_FIELD, "mass", "looks"))
-        field = Field(*(own[item] for item in _FIELD))
-        bare = merge_field.Unallowed(field, own["mass"], own["looks"])
-        graph = MergeGraph(bare.with_allowance(whole), self.scene, self.factor, threads=threads)
-        graph.connect(progress)
-        best, merges = graph.best()
-        rows, may = self.folder.load(index, ("rows", "may")).values()
-        costs, weights = np.full(len(rows), -1.0), np.ones(len(rows), np.float32)
-        # What cannot be drawn goes first; of two splats that merge, one goes.
-        costs[may], weights[may] = best, np.where(merges, np.float32(0.5), np.float32(1.0))
-        arrays: dict[str, NDArray[Any]] = {"first": graph.first, "second": graph.second}
-        arrays |= {"cost": graph.cost, "allowed": graph.field.contribution}
-        arrays |= {"allowed_error": graph.field.error}
-        self.folder.save(index, arrays | {"costs": costs, "weights": weights})
-        self.folder.note(name, None)
-
-    def absorb(
-        self, index: int, count: int, *, progress: Progress = silent, threads: int | None = 1
-    ) -> int:
-        """Absorb a region down to `count` splats, and write it; return how many survived."""
-        name = f"{index:06d}.absorb"
-        left = self.folder.once(name, lambda: self._absorbed(index, count, progress, threads))
-        self.folder.drop(index, _OVER)
-        return int(left)
-
-    def _absorbed(
-        self, index: int, count: int, progress: Progress, threads: int | None
-    ) -> NDArray[np.int64]:
-        own = self.folder.load(index, ("gathered", "whence", "stood", "may", "sums"))
-
-        def graph() -> MergeGraph:
-            made = self.folder.load(index, (*_FIELD, *_PRICED)).values()
-            *field, contribution, error, first, second, cost = made
-            return MergeGraph.connected_by(
-                replace(Field(*field), contribution=contribution, error=error),
-                self.scene, self.factor, (first, second, cost), threads=threads,
-            )  # fmt: skip
-
-        with np.errstate(under="ignore"):
-            left, keep, taken, expected = reduced(
-                unpacked(own["gathered"]), ViewSums(*own["sums"]), own["may"], graph, count,
-                protected=np.zeros(len(own["whence"]), np.bool_), progress=progress,
-            )  # fmt: skip
-        stands = taken >= 0
-        total = np.bincount(taken[stands], own["stood"][stands], len(left)).astype(np.int64)
-        made = {"splats": packed(left), "origin": own["whence"][keep], "members": total}
-        made["expected"] = np.array([expected.contribution, expected.error])
-        self.folder.save(index, made)
-        return np.array(len(left))
-
-    def _gathered(
-        self, rows: NDArray[np.int64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
-        """Return the table of some rows, ascending, and of each its first row and its members."""
-        parts, origins, members = [], [], []
-        edges = np.searchsorted(rows, self.starts)
-        for number, source in enumerate(self.sources):
-            mine = rows[edges[number] : edges[number + 1]] - self.starts[number]
-            if not len(mine):
-                continue
-            parts.append(source.splats().take(mine))
-            if isinstance(source, Region):
-                found = source.folder.load(source.index, ("origin", "members"))
-                origins.append(found["origin"][mine])
-                members.append(found["members"][mine])
-            else:
-                origins.append(mine + self.starts[number])
-                members.append(np.ones(len(mine), np.int64))
-        return packed(joined(parts)), np.concatenate(origins), np.concatenate(members)
+"""Rotation of the planes in every other stage."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -239,6 +62,7 @@ class Survivors(Counts):
     Attributes
     ----------
     regions : sequence of Region
+        Where they are; none if nothing changed.
     origin : (K,) int64
         Rows of the survivors among the N, region by region, in no order.
     changed : (K,) bool
@@ -254,26 +78,36 @@ class Survivors(Counts):
     deleted: int
 
 
-def absorb(
-    found: Seen,
-    rest: NDArray[np.bool_],
-    goal: int,
-    *,
-    workers: Workers,
-    progress: Progress = silent,
-) -> Survivors:
+@dataclass(frozen=True, eq=False)
+class _Left:
+    """The n splats that are left before a stage.
+
+    Attributes
+    ----------
+    sources : sequence of Source
+        Where they are.
+    rows : (n,) int64
+        Which rows of all sources together, ascending.
+    measured : Measured
+        What the views see of them, or are expected to see.
+    """
+
+    sources: Sequence[Source]
+    rows: NDArray[np.int64]
+    measured: Measured
+
+
+def absorb(tiles: MeasuredTiles, goal: int, settings: Settings, runner: Runner) -> Survivors:
     """Reduce splats to `goal` by the merges and deletions that cost the pictures least.
 
     Parameters
     ----------
-    found : Seen
-        What the views see of all N splats.
-    rest : (N,) bool
-        Which of them are left.
+    tiles : MeasuredTiles
+        All N splats, and what the views see of them.
     goal : int
         How many survive.
-    workers, progress : callable
-        See `prune.prune_tiles`.
+    settings : Settings
+    runner : Runner
 
     Raises
     ------
@@ -284,126 +118,179 @@ def absorb(
     -----
     Memory of this process: about 150 bytes a splat; of a worker: see `REGION`.
     """
-    count, total = int(np.count_nonzero(rest)), len(rest)
-    factor = patience(1.0 - goal / max(count, 1))
-    # Several regions need another stage, with other borders, where a single one does not.
-    left_after = stages(count, goal, ALONE if count <= REGION else STAGE)
-    sources: Sequence[Source] = found.sources
-    regions_left: list[Region] = []
-    rows = np.flatnonzero(rest)  # (n,), among those of all sources
-    origin, members = rows, np.ones(count, np.int64)
-    now = found.measured.take(rows)
-    for stage, left in enumerate(left_after):
-        ahead = part(progress, stage / len(left_after), (stage + 1) / len(left_after))
-        own = found.job.folder.inner(f"stage-{stage}")
-        starts = np.cumsum([0, *map(len, sources)])
-        if stage:
-            seen = replace(found.job, folder=own.inner("seen"))
-            now = _measure(seen, sources, now, stage - 1, workers, part(ahead, 0.0, 0.5))
-        job = AbsorbJob(own, found.job.views, found.job.scene, sources, starts, factor)
-        for _ in workers(job, [Call("means", (s,), 1 / len(sources)) for s in sources], silent, ""):
-            pass
-        means = np.concatenate([own.map(source.index, "means")[:] for source in sources])[rows]
-        pieces = regions(means, REGION, stage)
-        for index, piece in enumerate(pieces):
-            sums = np.array([now.contribution[piece], now.error[piece]])
-            own.save(index, {"rows": rows[piece], "sums": sums})
-        stay = _staying(job, [len(piece) for piece in pieces], left, workers, part(ahead, 0.5, 0.8))
-        calls = [
-            Call("absorb", (index, count), count / left, chunked=True)
-            for index, count in enumerate(stay)
-        ]
-        sizes = workers(job, calls, part(ahead, 0.8, 1.0), "absorbing")
-        sources = regions_left = [Region(index, size, own) for index, size in enumerate(sizes)]
-        origin, members = (
-            np.concatenate([own.load(source.index, [name])[name] for source in sources])
-            for name in ("origin", "members")
-        )
-        sums = np.concatenate([own.load(s.index, ["expected"])["expected"] for s in sources], 1)
-        now = Measured(sums[0], sums[1], np.zeros(len(origin), np.int32))
-        rows = np.arange(len(origin))
-    merged = int(members.sum()) - len(origin)
-    return Survivors(regions_left, origin, members > 1, merged, total - len(origin) - merged)
+    total = len(tiles.measured.seen)
+    first = min(math.floor(FIRST * total), total - goal)
+    rows = np.flatnonzero(select(tiles.scores, Budget(keep=total - first)))
+    if goal >= len(rows):
+        return Survivors([], rows, np.zeros(len(rows), np.bool_), 0, first)
+    left = _Left(tiles.units, rows, tiles.measured.take(rows))
+    if len(rows) <= REGION:
+        return _at_once(tiles.context, left, AbsorbAtOnce(goal, total, settings), runner)
+    factor = patience(1.0 - goal / len(rows))
+    counts = stages(len(rows), goal, STAGE)
+    for number, count in enumerate(counts):
+        ahead = runner.part(number / len(counts), (number + 1) / len(counts))
+        regions, left = _stage(tiles.context, number, left, count, factor, ahead)
+    origin, members = (_of_all(regions, name) for name in ("origin", "members"))
+    merged = int(members.sum()) - goal
+    return Survivors(regions, origin, members > 1, merged, total - goal - merged)
 
 
-def _staying(
-    job: AbsorbJob, sizes: Sequence[int], left: int, workers: Workers, progress: Progress
-) -> list[int]:
-    """Return how many splats of each region stay, of `left` that do of all.
+def _at_once(scene: SceneContext, left: _Left, step: AbsorbAtOnce, runner: Runner) -> Survivors:
+    """Absorb all splats in one step, as `pipeline.absorb_removed` does in memory."""
+    folder = scene.folder.inner("at-once")
+    context = StageContext(folder, scene.views, scene.scene, left.sources)
+    _save_region(folder, 0, left, np.arange(len(left.rows)))
+    ((count, merged),) = runner.run(context, [step], "absorbing")
+    arrays = folder.load(0, ("origin", "changed"))
+    return Survivors(
+        [Region(0, count, folder)],
+        arrays["origin"],
+        arrays["changed"],
+        merged,
+        step.total - count - merged,
+    )
 
-    As many go as a region has among the cheapest merges and deletions of all.
+
+def _stage(
+    scene: SceneContext,
+    number: int,
+    left: _Left,
+    count: int,
+    factor: float,
+    runner: Runner,
+) -> tuple[list[Region], _Left]:
+    """Reduce the splats that are left to `count`, region by region.
 
     Parameters
     ----------
-    job : AbsorbJob
+    scene : SceneContext
+        In which all splats were measured.
+    number : int
+        Of the stage; before all but the first, the splats are measured anew.
+    left : _Left
+    count : int
+    factor : float
+        See `StageContext`.
+    runner : Runner
+    """
+    folder = scene.folder.inner(f"stage-{number}")
+    if number:
+        context = replace(scene, folder=folder.inner("seen"))
+        left = _measured_again(context, left, number - 1, runner.part(0.0, 0.5))
+    stage = StageContext(folder, scene.views, scene.scene, left.sources, factor)
+    Runner(runner.workers).run_all(stage, [SaveMeans(source) for source in left.sources], "")
+    means = np.concatenate([folder.map(source.index, "means") for source in left.sources])
+    boxes = divided(means[left.rows], REGION, number)
+    for index, places in enumerate(boxes):
+        _save_region(folder, index, left, places)
+    sizes = [*map(len, boxes)]
+    stay = _staying(stage, sizes, count, runner.part(0.5, 0.8))
+    steps = [AbsorbRegion(index, survivors) for index, survivors in enumerate(stay)]
+    survivors = runner.part(0.8, 1.0).run(stage, steps, "absorbing", sizes)
+    regions = [Region(index, size, folder) for index, size in enumerate(survivors)]
+    expected = _of_all(regions, "expected", axis=1)
+    rows = np.arange(expected.shape[1])
+    measured = Measured(expected[0], expected[1], np.zeros(len(rows), np.int32))
+    return regions, _Left(regions, rows, measured)
+
+
+def _save_region(folder: Folder, index: int, left: _Left, places: NDArray[np.int64]) -> None:
+    """Save which of the splats that are left are in a region; see `StageContext`."""
+    sums = np.array([left.measured.contribution[places], left.measured.error[places]])
+    folder.save(index, {"rows": left.rows[places], "sums": sums})
+
+
+def _of_all(regions: Sequence[Region], name: str, axis: int = 0) -> NDArray[Any]:
+    """Return an array of all regions as one."""
+    arrays = [region.folder.load(region.index, [name])[name] for region in regions]
+    return np.concatenate(arrays, axis)
+
+
+def _measured_again(scene: SceneContext, left: _Left, turn: int, runner: Runner) -> _Left:
+    """Measure all splats in a part of the views, and add what the others are expected to see.
+
+    Parameters
+    ----------
+    scene : SceneContext
+        With a folder of its own.
+    left : _Left
+        All rows of its sources.
+    turn : int
+        See `occlusion.measure_part`.
+    runner : Runner
+    """
+    gaussians, good = store_gaussians(scene, left.sources, runner.part(0.0, 0.2))
+    measuring = TileMeasuring(scene, runner)
+    groups = measuring.groups_of_part(turn, PARTS)
+    ahead = runner.part(0.2, 1.0).progress
+    sums = measuring.measure(gaussians, groups, ahead)  # type: ignore[arg-type]
+    measured = Measured.sum(sums.values()).for_all(gaussians.index, len(good))
+    others = 1.0 - measuring.weight_share(groups)
+    measured.contribution[:] += others * left.measured.contribution
+    measured.error[:] += others * left.measured.error
+    return replace(left, measured=measured)
+
+
+def _staying(stage: StageContext, sizes: Sequence[int], left: int, runner: Runner) -> list[int]:
+    """Return how many splats of each region stay, of `left` that do of all.
+
+    As many go as a region has among the cheapest merges and deletions of all. A merge counts half,
+    since of two splats that merge one goes; so all of them together may count half of the splats,
+    and `STAGE` has to be .5 or more, or there would not be enough to go.
+
+    Parameters
+    ----------
+    stage : StageContext
     sizes : sequence of int
         Splats of each region.
     left : int
-    workers, progress : callable
+    runner : Runner
     """
-    total = sum(sizes)
-    calls = [Call("gather", (k,), n / total, chunked=True) for k, n in enumerate(sizes)]
-    whole = np.sum([*workers(job, calls, part(progress, 0.0, 0.4), "absorbing")], axis=0)
-    calls = [Call("price", (k, whole), n / total, chunked=True) for k, n in enumerate(sizes)]
-    for _ in workers(job, calls, part(progress, 0.4, 1.0), "absorbing"):
-        pass
-    own = [job.folder.load(k, ("costs", "weights")) for k in range(len(sizes))]
-    costs = np.concatenate([arrays["costs"] for arrays in own])
-    weights = np.concatenate([arrays["weights"] for arrays in own])
+    total, numbers = sum(sizes), range(len(sizes))
+    gather = [GatherRegion(index) for index in numbers]
+    whole = np.sum([*runner.part(0.0, 0.4).run(stage, gather, "absorbing", sizes)], axis=0)
+    price = [PriceRegion(index, whole) for index in numbers]
+    runner.part(0.4, 1.0).run_all(stage, price, "absorbing", sizes)
+    priced = [stage.folder.load(index, ("costs", "weights")) for index in numbers]
+    costs = np.concatenate([arrays["costs"] for arrays in priced])
+    weights = np.concatenate([arrays["weights"] for arrays in priced])
     order = np.argsort(costs, kind="stable")
     last = int(np.searchsorted(np.cumsum(weights[order], dtype=np.float64), total - left))
     weights[order[last + 1 :]] = 0.0
     ends = np.cumsum(sizes)
-    gone = np.cumsum([piece.sum(dtype=np.float64) for piece in np.split(weights, ends[:-1])])
+    of_regions = np.split(weights, ends[:-1])
+    gone = np.cumsum([weights.sum(dtype=np.float64) for weights in of_regions])
     # Rounded so that the sum is exact: each gets what is added up to its end.
     gone = np.rint(gone * ((total - left) / gone[-1])).astype(np.int64)
     return [size - int(go) for size, go in zip(sizes, np.diff(gone, prepend=0), strict=True)]
 
 
-def estimated(
-    found: Seen, survivors: Survivors, workers: Workers, progress: Progress
-) -> float | None:
-    """Return the estimated PSNR of survivors, dB; None if too little is seen."""
-    sights, last = found.scores.ray_sample, survivors.regions[0].folder
-    assert isinstance(sights, StoredLines)  # noqa: S101 - as `Seen` has
-    job = replace(found.job, folder=last.inner("after"))
-    gaussians, _ = place(job, survivors.regions, workers, part(progress, 0.0, 0.5))
-    after = StoredLines(job, workers, survivors.regions, gaussians)
-    return sights.against_stored(after, part(progress, 0.5, 1.0))
+def settle(
+    survivors: Survivors, units: Sequence[Unit], folder: Folder, runner: Runner
+) -> Iterator[NDArray[np.int64]]:
+    """Note of each unit which splats survive, and as what; yield what `save_kept` returns."""
+    order = np.argsort(survivors.origin)
+    arrays = survivors.origin[order], order, survivors.changed[order]
+    for name, array in zip(SURVIVORS, arrays, strict=True):
+        folder.note(name, array)
+    begins = np.cumsum([0, *map(len, units)]).tolist()
+    steps = [
+        SettleUnit(unit, begin, survivors.regions)
+        for unit, begin in zip(units, begins, strict=False)
+    ]
+    return runner.run(folder, steps, "selecting")
 
 
-def _measure(
-    job: SceneJob,
-    sources: Sequence[Source],
-    expected: Measured,
-    turn: int,
-    workers: Workers,
-    progress: Progress,
-) -> Measured:
-    """Measure all splats in a part of the views, and add what the others are expected to see.
-
-    Parameters
-    ----------
-    job : SceneJob
-    sources : sequence of Source
-    expected : Measured
-        Of all splats, as far as the measuring before tells.
-    turn : int
-        See `occlusion.measure_part`.
-    workers, progress : callable
-    """
-    gaussians, good = place(job, sources, workers, part(progress, 0.0, 0.2))
-    measuring = MeasuringTiles(job, workers)
-    which = measuring.groups_of_part(turn, PARTS)
-    found = measuring.measure(gaussians, which, part(progress, 0.2, 1.0))  # type: ignore[arg-type]
-    every = Measured.sum(found.values()).for_all(gaussians.index, len(good))
-    others = 1.0 - measuring.weight_share(which)
-    every.contribution[:] += others * expected.contribution
-    every.error[:] += others * expected.error
-    return every
+def estimated(tiles: MeasuredTiles, survivors: Survivors, runner: Runner) -> float | None:
+    """Return the estimated PSNR of survivors that changed, dB; None if too little is seen."""
+    context = replace(tiles.context, folder=survivors.regions[0].folder.inner("after"))
+    gaussians, _ = store_gaussians(context, survivors.regions, runner.part(0.0, 0.5))
+    after = StoredRays(context, runner, survivors.regions, gaussians)
+    return tiles.rays.psnr_against(after, runner.part(0.5, 1.0))
 
 
-def regions(means: NDArray[np.float32], most: int, stage: int) -> list[NDArray[np.int64]]:
+def divided(means: NDArray[np.float32], most: int, stage: int) -> list[NDArray[np.int64]]:
     """Divide splats into boxes of about equally many, by planes at right angles to where they vary.
 
     Parameters
@@ -422,36 +309,20 @@ def regions(means: NDArray[np.float32], most: int, stage: int) -> list[NDArray[n
     """
     place = np.where(np.isfinite(means).all(axis=1, keepdims=True), means, np.float32(0.0))
     place = place @ (_ASKEW if stage % 2 else np.eye(3, dtype=np.float32))
-    return _divided(place, np.arange(len(means)), -(-len(means) // most))
+    return _halved(place, np.arange(len(means)), -(-len(means) // most))
 
 
-def _divided(
+def _halved(
     place: NDArray[np.float32], rows: NDArray[np.int64], count: int
 ) -> list[NDArray[np.int64]]:
     """Divide some rows of places into `count` boxes."""
     if count <= 1:
         return [rows]
-    some = place[rows[:: max(len(rows) // _SAMPLE, 1)]]
-    low, high = np.quantile(some, (0.05, 0.95), axis=0)
+    sample = place[rows[:: max(len(rows) // _SAMPLE, 1)]]
+    low, high = np.quantile(sample, (0.05, 0.95), axis=0)
     along = place[rows, int(np.argmax(high - low))]
     less = count // 2
-    order = np.argpartition(along, len(rows) * less // count)
     cut = len(rows) * less // count
+    order = np.argpartition(along, cut)
     one, other = np.sort(rows[order[:cut]]), np.sort(rows[order[cut:]])
-    return _divided(place, one, less) + _divided(place, other, count - less)
-
-
-def packed(splats: Splats) -> NDArray[np.float64]:
-    """Return splats as one table, (n, 14 + 3 K)."""
-    count = len(splats)
-    columns = [splats.means, splats.log_scales, splats.quaternions]
-    columns += [splats.opacity_logits[:, None], splats.sh_dc, splats.sh_rest.reshape(count, -1)]
-    with np.errstate(invalid="ignore"):  # signalling NaN
-        return np.concatenate([np.asarray(values, np.float64) for values in columns], axis=1)
-
-
-def unpacked(table: NDArray[np.float64]) -> Splats:
-    """Return the splats of a table."""
-    means, scales, quaternions, logits, constant, rest = np.split(table, [3, 6, 10, 11, 14], axis=1)
-    harmonics = rest.reshape(len(table), rest.shape[1] // 3, 3)
-    return Splats(means, scales, quaternions, logits[:, 0], constant, harmonics)
+    return _halved(place, one, less) + _halved(place, other, count - less)

@@ -11,23 +11,27 @@ import asyncio
 import contextlib
 import functools
 import pickle
+import signal
 import threading
 import uuid
 from collections import deque
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 from ...version import VERSION
 from ..errors import RefineError
-from ..work import Progress, report
-from .steps import unseen_files
-from .workers import Interrupted
+from ..work import Progress, report, silent
+from .folder import Interrupted
+from .units import header_of
+from .workers import shares_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
-    from .steps import Job
+    from .folder import Folder
     from .units import Tile
-    from .workers import Call
+    from .workers import Context, Result, Step
 
 _AHEAD = 3
 """Groups of steps a thread of a worker that are handed out ahead: so many wait here at most."""
@@ -49,7 +53,10 @@ _MEMORY = {
 for each chunk, which takes longer than the work."""
 
 _CONNECT = 10
-"""Seconds to find a scheduler."""
+"""Seconds to find a scheduler, and a worker."""
+
+_TRIES = 3
+"""How often workers are asked whether they see the files of a job, if all of them get lost."""
 
 
 @contextlib.contextmanager
@@ -82,18 +89,50 @@ def cluster(workers: int | None = None, scheduler: str | None = None) -> Iterato
     with contextlib.ExitStack() as held:
         if scheduler is None:
             held.enter_context(dask.config.set(_MEMORY))
-            scheduler = held.enter_context(
-                distributed.LocalCluster(
+
+            def start() -> Any:  # noqa: ANN401 - Dask has no types
+                return distributed.LocalCluster(
                     n_workers=workers, threads_per_worker=1, processes=True,
                     dashboard_address=None, memory_limit=None, silence_logs=50,
-                )
-            )  # fmt: skip
+                )  # fmt: skip
+
+            try:
+                scheduler = held.enter_context(_uninterrupted(start))
+            except Exception as error:
+                msg = f"workers ended while they were started ({error}); try again"
+                raise Interrupted(msg) from error
         try:
             client = held.enter_context(distributed.Client(scheduler, timeout=_CONNECT))
         except (OSError, ValueError) as error:
             msg = f"{scheduler}: no Dask scheduler answers there ({error})"
             raise RefineError(msg) from error
         yield Cluster(client)
+
+
+def _uninterrupted(make: Callable[[], Any]) -> Any:  # noqa: ANN401 - as made
+    """Return what `make` returns, which is called on a thread, where no Ctrl-C arrives.
+
+    A cluster that is interrupted while it starts cannot close what it has started. So it starts,
+    is closed, and only then is the interrupt raised.
+    """
+    with ThreadPoolExecutor(1, initializer=_block_ctrl_c) as pool:
+        future = pool.submit(make)
+        try:
+            return future.result()
+        except KeyboardInterrupt:
+            with contextlib.suppress(Exception):
+                future.result().close()
+            raise
+
+
+def _block_ctrl_c() -> None:
+    """Keep Ctrl-C from this thread, and so from all processes that it starts.
+
+    A terminal sends it to all processes; workers would print where they were.
+    """
+    if hasattr(signal, "pthread_sigmask"):  # not on Windows
+        resource_tracker.ensure_running()  # starting it, Python unblocks these signals
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 
 class Cluster:
@@ -107,22 +146,17 @@ class Cluster:
     def __init__(self, client: Any) -> None:  # noqa: ANN401 - Dask has no types
         self._client = client
 
-    def check(self, job: Job, tiles: list[Tile]) -> None:
+    def check(self, folder: Folder, tiles: Sequence[Tile]) -> None:
         """Ask every worker whether it sees the files of a job.
 
         Raises
         ------
         RefineError
             If there is no worker, or one does not see a file or has another version; by its name.
+        Interrupted
+            If all workers were lost.
         """
-        try:
-            answers = self._client.run(_answer, VERSION, job, tiles, on_error="return")
-        except Exception as error:
-            msg = f"the workers do not answer: {error}"
-            raise RefineError(msg) from error
-        if not answers:
-            msg = "the scheduler has no workers"
-            raise RefineError(msg)
+        answers = self._answers(folder, tiles)
         for worker, answer in answers.items():
             wrong = answer
             if isinstance(answer, BaseException):
@@ -131,10 +165,37 @@ class Cluster:
                 msg = f"worker {worker}: {wrong}; workers need the same files under the same paths"
                 raise RefineError(msg)
 
-    def __call__(
-        self, job: object, calls: Sequence[Call], progress: Progress, what: str
-    ) -> Iterator[Any]:
-        """Yield what each call returns, in their order.
+    def _answers(self, folder: Folder, tiles: Sequence[Tile]) -> dict[str, Any]:
+        """Return what each worker answers to `_answer`, but for those that were lost meanwhile."""
+        for _ in range(_TRIES):
+            try:
+                self._client.wait_for_workers(1, timeout=_CONNECT)
+                answers = self._client.run(_answer, VERSION, folder, tiles, on_error="return")
+            except TimeoutError as error:
+                msg = "the scheduler has no workers"
+                raise RefineError(msg) from error
+            except Exception as error:
+                msg = f"the workers do not answer: {error}"
+                raise Interrupted(msg) from error
+            there = {
+                worker: answer
+                for worker, answer in answers.items()
+                if not isinstance(answer, OSError)
+            }
+            if there:
+                return there
+        msg = "the workers were lost again and again"
+        raise Interrupted(msg)
+
+    def run(
+        self,
+        context: Context,
+        steps: Sequence[Step[Context, Result]],
+        progress: Progress,
+        what: str,
+        sizes: Sequence[int] = (),
+    ) -> Iterator[Result]:
+        """Do steps; see `Workers.run`.
 
         Raises
         ------
@@ -144,20 +205,21 @@ class Cluster:
         from distributed import CancelledError, KilledWorker  # noqa: PLC0415 - as above
         from distributed.comm import CommClosedError  # noqa: PLC0415
 
-        packed = pickle.dumps(job)  # once: the arrays of all views take Dask some milliseconds
+        packed = pickle.dumps(context)  # once: the arrays of all views take Dask some milliseconds
         threads = max(sum(self._client.nthreads().values()), 1)
-        size = max(1, min(_TOGETHER, len(calls) // (_TURNS * threads)))
-        groups = [calls[start : start + size] for start in range(0, len(calls), size)]
+        size = max(1, min(_TOGETHER, len(steps) // (_TURNS * threads)))
+        groups = [steps[start : start + size] for start in range(0, len(steps), size)]
+        shares = iter(shares_of(steps, sizes))
         waiting: deque[Any] = deque()
         left, done = deque(groups), 0.0
         try:
-            for group in groups:
+            for _ in groups:
                 while left and len(waiting) < _AHEAD * threads:
                     waiting.append(self._submit(packed, left.popleft()))
                 results = self._result(waiting[0], progress, done, what)
                 waiting.popleft()
-                for call, result in zip(group, results, strict=True):
-                    done += call.share
+                for result in results:
+                    done += next(shares)
                     yield result
         except (KilledWorker, CancelledError, CommClosedError) as error:
             msg = f"workers were lost ({error})"
@@ -165,9 +227,9 @@ class Cluster:
         finally:
             self._client.cancel([*waiting])
 
-    def _submit(self, packed: bytes, group: Sequence[Call]) -> Any:  # noqa: ANN401 - Dask's future
-        key = f"{group[0].step}-{uuid.uuid4().hex}"
-        return self._client.submit(_do, packed, [*group], key=key)
+    def _submit(self, packed: bytes, group: Sequence[Any]) -> Any:  # noqa: ANN401 - Dask's future
+        key = f"{type(group[0]).__name__}-{uuid.uuid4().hex}"
+        return self._client.submit(_run, packed, [*group], key=key)
 
     def _result(self, future: Any, progress: Progress, done: float, what: str) -> Any:  # noqa: ANN401
         """Return the result of a future, and ask meanwhile whether to go on."""
@@ -179,10 +241,10 @@ class Cluster:
         return future.result()
 
 
-def _do(packed: bytes, group: Sequence[Call]) -> list[Any]:
-    """Do steps of a job one after the other, in a worker."""
-    job = _unpacked(packed)
-    return [call.do(job, threads=1) for call in group]
+def _run(packed: bytes, group: Sequence[Any]) -> list[Any]:
+    """Do steps one after the other, in a worker."""
+    context = _unpacked(packed)
+    return [step.run(context, silent, 1) for step in group]
 
 
 @functools.lru_cache(maxsize=2)
@@ -190,9 +252,21 @@ def _unpacked(packed: bytes) -> object:
     return pickle.loads(packed)  # noqa: S301 - Dask itself sends pickles
 
 
-async def _answer(version: str, job: Job, tiles: list[Tile]) -> str:
+async def _answer(version: str, folder: Folder, tiles: Sequence[Tile]) -> str:
     """Say what is wrong with this worker; "" if nothing is."""
     if version != VERSION:
         return f"it has refine {VERSION}, this is {version}"
     # Not on the worker's own thread: requests for many tiles would make it look dead.
-    return await asyncio.to_thread(unseen_files, job, tiles)
+    return await asyncio.to_thread(_missing, folder, tiles)
+
+
+def _missing(folder: Folder, tiles: Sequence[Tile]) -> str:
+    """Return what this process cannot see of a job's files, in a sentence; "" if all is there."""
+    if not folder.noted("begun")[0]:
+        return f"{folder.path} is not there"
+    for tile in tiles:
+        with contextlib.suppress(RefineError, OSError):
+            header_of(tile)
+            continue
+        return f"{tile.path} is not there, or another file"
+    return ""

@@ -1,20 +1,22 @@
-"""The folder of a job: arrays between the steps, and what has been done.
+"""The folder of a job: arrays between the steps, and notes of what has been done.
 
-Every file is written whole or not at all (`whole_file`), and holds the same bytes whoever writes
+Every file is written whole or not at all, and holds the same bytes whoever writes
 it. So a step may be done twice, or again after whoever did it was killed.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import secrets
 import shutil
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import RefineError
-from ..whole_file import whole_file
 
 try:
     import fcntl
@@ -24,13 +26,21 @@ except ImportError:  # Windows
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping
     from pathlib import Path
+    from typing import BinaryIO
 
     from numpy.typing import NDArray
+
+_DAMAGE = (ValueError, EOFError)
+"""What NumPy raises for a file that is not a whole array."""
+
+
+class Interrupted(RefineError):  # noqa: N818 - the input is not at fault
+    """Raised where workers, a disk or a storage failed: what is done stays for the next run."""
 
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder on a disk that everybody who works on the job sees.
+    """A folder on a disk that every process that works on the job sees.
 
     Attributes
     ----------
@@ -45,78 +55,133 @@ class Folder:
         """Where finished tiles wait until all of them are finished."""
         return self.path / "tiles"
 
-    def save(self, unit: int, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Keep arrays of a unit by their names."""
-        if arrays:
-            self._array(unit, "").parent.mkdir(exist_ok=True)
+    def save(self, index: int, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Store arrays by name, of the unit, chunk or region of that number.
+
+        Raises
+        ------
+        Interrupted
+            If the disk is full or fails.
+        """
         for name, array in arrays.items():
-            with self._written(self._array(unit, name)) as stream:
-                np.save(stream, array, allow_pickle=False)
+            with self.writing(self._array(index, name)) as stream:
+                _write(stream, array)
 
-    def load(self, unit: int, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-        """Return arrays of a unit by their names."""
-        return {name: self._read(self._array(unit, name)) for name in names}
+    def load(self, index: int, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+        """Return arrays that were saved, by name.
 
-    def drop(self, unit: int, names: Iterable[str]) -> None:
-        """Forget arrays of a unit."""
+        Raises
+        ------
+        FileNotFoundError
+        Interrupted
+            If a file is damaged; see `once`.
+        """
+        return {name: self._loaded(index, name) for name in names}
+
+    def map(self, index: int, name: str) -> NDArray[Any]:
+        """Return an array that was saved, without reading it yet; see `load` for errors."""
+        return self._loaded(index, name, mode="r")
+
+    def drop(self, index: int, names: Iterable[str]) -> None:
+        """Remove arrays that were saved, where they are there."""
         for name in names:
-            self._array(unit, name).unlink(missing_ok=True)
-
-    def map(self, unit: int, name: str) -> NDArray[Any]:
-        """Return an array of a unit without reading it yet."""
-        return np.asarray(np.load(self._array(unit, name), mmap_mode="r", allow_pickle=False))
-
-    def mapped(self, name: str) -> NDArray[Any]:
-        """Return an array that was noted without reading it yet."""
-        return np.asarray(np.load(self.path / "done" / name, mmap_mode="r", allow_pickle=False))
+            self._array(index, name).unlink(missing_ok=True)
 
     def once(self, name: str, make: Callable[[], Any]) -> Any:  # noqa: ANN401 - as made, or `noted`
-        """Return what came of something, as it was noted; if it is not done, make and note it."""
-        done, found = self.noted(name)
-        if done:
-            return found
-        try:
-            found = make()
-        except FileNotFoundError:
-            # Another worker, taken for dead, ended this just now and cleared away what it needs.
-            done, found = self.noted(name)
-            if not done:
-                raise
-            return found
-        self.note(name, found)
-        return found
+        """Return the noted result of that name; if there is none, make and note it.
 
-    def has(self, name: str) -> bool:
-        """Return whether something is done."""
-        return any((self.path / "done" / f"{name}{end}").exists() for end in ("", ".tuple"))
+        A name of what arrays of one number were saved by begins with that number, six digits long:
+        if one of them is damaged, the next run makes them again.
+
+        Raises
+        ------
+        Interrupted
+            If an array that it needs is gone; the next run makes all arrays again.
+        """
+        done, result = self.noted(name)
+        if done:
+            return result
+        try:
+            result = make()
+        except FileNotFoundError as error:
+            # Another worker, taken for dead, ended this just now and removed what it needs.
+            done, result = self.noted(name)
+            if done:
+                return result
+            self._forget("")
+            msg = f"{error.filename}: is gone"
+            raise Interrupted(msg) from error
+        self.note(name, result)
+        return result
 
     def inner(self, name: str) -> Folder:
         """Return a folder in this one, and make it if it is not there."""
         folder = Folder(self.path / name)
-        for path in (folder.path, folder.path / "done", folder.path / "arrays"):
+        for path in (folder.path / "done", folder.path / "arrays"):
             path.mkdir(parents=True, exist_ok=True)
         return folder
 
     def note(self, name: str, result: Any) -> None:  # noqa: ANN401 - an array, a tuple of some, None
-        """Note what came of something: from then on it is done."""
+        """Note a result: from then on it is done.
+
+        Raises
+        ------
+        Interrupted
+            If the disk is full or fails.
+        """
         alone = isinstance(result, np.ndarray)
         arrays = [result] if alone else [np.asarray(each) for each in result or ()]
-        with self._written(self.path / "done" / f"{name}{'' if alone else '.tuple'}") as stream:
-            for array in arrays:
-                np.save(stream, array, allow_pickle=False)
+        path = self.path / "done" / f"{name}{'' if alone else '.tuple'}"
+        with self.writing(path) as stream:
+            for array in arrays if alone else [np.array(len(arrays)), *arrays]:
+                _write(stream, array)
 
     def noted(self, name: str) -> tuple[bool, Any]:
-        """Return whether something is done, and what came of it; numbers as arrays of no axis."""
-        with contextlib.suppress(FileNotFoundError):
-            return True, self._read(self.path / "done" / name)
+        """Return whether a result was noted, and which; numbers as arrays without axes.
+
+        A note that a power cut has truncated counts as none.
+        """
+        with contextlib.suppress(FileNotFoundError, *_DAMAGE):
+            return True, _read(self.path / "done" / name)
+        with (
+            contextlib.suppress(FileNotFoundError, *_DAMAGE),
+            (self.path / "done" / f"{name}.tuple").open("rb") as stream,
+        ):
+            count = int(np.load(stream, allow_pickle=False))
+            arrays = tuple(np.load(stream, allow_pickle=False) for _ in range(count))
+            return True, arrays or None
+        return False, None
+
+    def mapped(self, name: str) -> NDArray[Any]:
+        """Return an array that was noted, without reading it yet; see `load` for errors."""
+        return self._read_or_forget(self.path / "done" / name, name, "r")
+
+    @contextlib.contextmanager
+    def writing(self, path: Path) -> Iterator[BinaryIO]:
+        """Open a file of the job to write it whole; the folder that it lies in is made if need be.
+
+        `whole_file` would look through that folder each time for what killed runs have left; here
+        that goes with the folder.
+
+        Raises
+        ------
+        Interrupted
+            If it cannot be written, as on a full disk. What else the block raises passes.
+        """
+        temporary = path.with_name(f"{secrets.token_hex(8)}.tmp")
         try:
-            with (self.path / "done" / f"{name}.tuple").open("rb") as stream:
-                arrays = []
-                while stream.peek(1):
-                    arrays.append(np.load(stream, allow_pickle=False))
-        except FileNotFoundError:
-            return False, None
-        return True, tuple(arrays) or None
+            path.parent.mkdir(exist_ok=True)
+            with temporary.open("xb") as stream:
+                yield stream
+            temporary.replace(path)
+        except OSError as error:
+            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+            reason = f"cannot be written ({error.strerror})"
+            msg = f"{path}: {'no space left on the disk' if full else reason}"
+            raise Interrupted(msg) from error
+        finally:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[None]:
@@ -125,7 +190,7 @@ class Folder:
         Raises
         ------
         RefineError
-            If it cannot be made, or somebody else works on the job.
+            If it cannot be made, or another process works on the job.
         """
         try:
             self.tiles.mkdir(parents=True, exist_ok=True)
@@ -134,27 +199,58 @@ class Folder:
         except OSError as error:
             msg = f"{self.path}: cannot be made ({error.strerror or error})"
             raise RefineError(msg) from error
-        with stream:
-            if fcntl is not None:
-                try:
-                    fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                except BlockingIOError as error:
-                    msg = f"{self.path}: another run is at work on the same job"
-                    raise RefineError(msg) from error
-                except OSError:
-                    pass  # this file system has no locks
-            yield
+        try:
+            with stream:
+                if fcntl is not None:
+                    try:
+                        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    except BlockingIOError as error:
+                        msg = f"{self.path}: another run is at work on the same job"
+                        raise RefineError(msg) from error
+                    except OSError:
+                        pass  # this file system has no locks
+                yield
+        finally:
+            if not (self.path / "done").exists():
+                self.remove()  # Windows does not remove the lock while it is open
 
     def remove(self) -> None:
-        """Remove the folder and all that is in it."""
-        shutil.rmtree(self.path, ignore_errors=True)
+        """Remove the folder and all that is in it; Ctrl-C meanwhile comes too late."""
+        try:
+            shutil.rmtree(self.path, ignore_errors=True)
+        except KeyboardInterrupt:
+            shutil.rmtree(self.path, ignore_errors=True)
 
-    def _array(self, unit: int, name: str) -> Path:
-        return self.path / "arrays" / f"{unit:06d}" / f"{name}.npy"
+    def _loaded(self, index: int, name: str, mode: str | None = None) -> NDArray[Any]:
+        return self._read_or_forget(self._array(index, name), f"{index:06d}.", mode)
 
-    def _written(self, path: Path) -> contextlib.AbstractContextManager[Any]:
-        return whole_file(path, overwrite=True)
+    def _read_or_forget(self, path: Path, start: str, mode: str | None) -> NDArray[Any]:
+        """Read an array; if it is damaged, forget what would keep it from being made again."""
+        try:
+            return _read(path, mode)
+        except _DAMAGE as error:
+            self._forget(start)
+            msg = f"{path}: is damaged"
+            raise Interrupted(msg) from error
 
-    def _read(self, path: Path) -> NDArray[Any]:
-        with path.open("rb") as stream:
-            return np.asarray(np.load(stream, allow_pickle=False))
+    def _forget(self, start: str) -> None:
+        """Remove the notes whose names start so: what they stand for is then done again."""
+        for path in (self.path / "done").glob(f"{start}*"):
+            path.unlink(missing_ok=True)
+
+    def _array(self, index: int, name: str) -> Path:
+        return self.path / "arrays" / f"{index:06d}" / f"{name}.npy"
+
+
+def _write(stream: BinaryIO, array: NDArray[Any]) -> None:
+    """Write an array by calls of ``write``, whose errors name a full disk.
+
+    To a file NumPy writes by C's ``fwrite``, and then says "90000 requested and 25072 written".
+    """
+    only_write: Any = SimpleNamespace(write=stream.write)
+    np.save(only_write, array, allow_pickle=False)
+
+
+def _read(path: Path, mode: Any = None) -> NDArray[Any]:  # noqa: ANN401 - as `numpy.load`
+    """Return an array, mapped if `mode` is "r"."""
+    return np.asarray(np.load(path, mmap_mode=mode, allow_pickle=False))

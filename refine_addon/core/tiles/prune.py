@@ -4,49 +4,50 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import math
+import itertools
 import tempfile
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...version import VERSION
-from .. import radix
-from ..errors import RefineError
+from ..errors import Cancelled, RefineError
 from ..estimate.psnr import psnr_kept
 from ..estimate.quality import needed
 from ..formats.ply_header import with_count
-from ..pipeline import FIRST, MEASURES, conclude, remark
+from ..pipeline import MEASURES, conclude, remark
 from ..report import Clock, Files, complete_report, make_report
 from ..scoring.closed_form_block import ROWS
-from ..selection import Budget, least_seen, quality_of, refuse_none_left, select, single
+from ..selection import Budget, refuse_none_left
 from ..task import DEFAULTS, Settings
 from ..urls import Url
-from ..work import Progress, part, silent
+from ..work import Progress, silent
 from . import absorbing
-from .folder import Folder
-from .scoring import by_closed_form, by_occlusion, to_absorb
-from .steps import SURVIVORS, Job, Rule
-from .storage import discard, identity, located, make_folder, publish, refuse_existing
-from .units import header_of, tile_at, units_of
-from .workers import Call, Here, Interrupted
+from .closed_form import ClosedFormContext, by_closed_form
+from .folder import Folder, Interrupted
+from .scoring import by_occlusion, measured_once
+from .selecting import ChooseByScore, removals, rule_of
+from .storage import located, make_folder
+from .units import header_of, pieces_of, tiles_at, units_of
+from .workers import InProcess, Runner
+from .writing import Outputs, WriteTile
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
     from ..scores import Scores
     from ..views import ViewSet
     from .absorbing import Survivors
-    from .scoring import Seen
+    from .scoring import MeasuredTiles
     from .units import Tile
     from .workers import Workers
 
 SCORED = 0.82
-"""Part of the progress that scoring is; the rest is writing."""
+"""Part of the progress that scoring is, or scoring and absorbing; the rest is writing."""
 
 
 def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
@@ -67,8 +68,8 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     The same splats stay as if all files were one, in the order in which they are given: of equal
     scores, those of the first file go first. All files are written, or none. What stands between
     the steps lies in a folder beside the outputs until the job is done: 50 bytes a splat for the
-    closed form, 400 for occlusion. If the process is killed, the same call later goes on from
-    there.
+    closed form, 400 for occlusion. If the process is interrupted or killed, the same call later
+    goes on from there.
 
     Parameters
     ----------
@@ -81,11 +82,11 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     views, budget, settings, progress, threads
         See `pipeline.prune`.
     absorb : bool
-        See `pipeline.prune`. A region of up to a million splats is absorbed at a time
-        (`absorbing`), so survivors are not exactly those of one file.
+        See `pipeline.prune`. Up to `absorbing.REGION` splats survivors are those of one file; more
+        are absorbed region by region.
     overwrite : bool
         Whether files may be replaced.
-    workers : callable, optional
+    workers : Workers, optional
         Who does the steps; by default this process. See `cluster`.
 
     Returns
@@ -96,258 +97,225 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     Raises
     ------
     RefineError, Cancelled
-        See `pipeline.prune` and `units.tile_at`; also if the method or budget is none that works
-        over tiles, or two files have one name. Then nothing is written.
+        See `pipeline.prune` and `units.tiles_at`; also if the method or budget is none that works
+        over tiles, or two files have one name. Then nothing is written, and nothing kept.
+    Interrupted
+        If a disk is full, a storage or all workers fail, or a file appears in the place of an
+        output. What is done is kept for the same call.
     """
     clock = Clock()
     _refuse_what_needs_all(budget, settings, absorb=absorb)
-    tiles = [tile_at(path) for path in sources]
-    _refuse_twice(tiles)
-    output = None if folder is None else located(folder)
-    targets = [] if output is None else _targets(tiles, output, overwrite=overwrite)
+    tiles = tiles_at(sources)
     used = views.spread(settings.views)
     with contextlib.ExitStack() as held:
-        if output is None:
-            place = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="refine-")))
+        outputs = None
+        if folder is None:
+            job = Folder(Path(held.enter_context(tempfile.TemporaryDirectory(prefix="refine-"))))
         else:
-            digest = _digest(tiles, used, budget, settings, absorb=absorb)
+            output = located(folder)
+            held.callback(_remove_empty, make_folder(output))
             near = Path.cwd() if isinstance(output, Url) else output.absolute()
-            place = near / f".refine-{digest}"
-        urls: list[Url] = []
-        if isinstance(output, Url):
-            urls = [output / f"{place.name}-{number:06d}" for number in range(len(tiles))]
-        job = Job(Folder(place), used, settings.closed_form, used.middle())
-        held.enter_context(job.folder.opened())
-        try:
-            run = _Run(job, tiles, workers or Here(threads), progress)
-            facts = run.prune(budget, settings, views, clock, absorb=absorb)
-            sizes = run.write(urls) if targets else run.sizes()
-            made: Sequence[Path | Url] = urls or [
-                job.folder.tiles / target.name for target in targets
-            ]
-            for waiting, target in zip(made, targets, strict=True):
-                publish(waiting, target, overwrite=overwrite)
-        except Interrupted as error:
-            if output is None:
-                raise
-            msg = f"{error}; the same command goes on where this one was"
-            raise Interrupted(msg) from error
-        except Exception:
-            job.folder.remove()
-            for url in urls:
-                discard(url)
-            raise
-        job.folder.remove()
+            digest = _digest(tiles, used, budget, settings, absorb=absorb)
+            job = Folder(near / f".refine-{digest}")
+            outputs = Outputs.of(job, tiles, output, overwrite=overwrite)
+        pruning = _Pruning(job, tiles, used, Runner(workers or InProcess(threads), progress))
+        with _kept_if_interrupted(job, outputs):
+            facts = pruning.decide(budget, settings, views, clock, absorb=absorb)
+            sizes = pruning.write(outputs) if outputs else pruning.sizes()
+            if outputs:
+                outputs.publish()
     clock.lap("write_s")
-    facts["splats"]["written"] = facts["splats"]["kept"] if targets else None
-    before = sum(tile.size for tile in tiles)
-    complete_report(facts, clock, Files(f"{len(tiles)} tiles", _shown(output), before, sum(sizes)))
-    names: list[Path | Url | None] = [*targets] or [None] * len(tiles)
-    facts["tiles"] = [
-        {
-            "input": tile.path,
-            "output": _shown(name),
-            "before": tile.splats,
-            "kept": kept,
-            "unseen": unseen,
-            "input_bytes": tile.size,
-            "output_bytes": size,
-        }
-        for tile, name, size, (kept, unseen) in zip(
-            tiles, names, sizes, run.counts.tolist(), strict=True
-        )
-    ]
+    facts["splats"]["written"] = facts["splats"]["kept"] if outputs else None
+    before, after = sum(tile.size for tile in tiles), sum(sizes)
+    target = None if folder is None else str(output)
+    complete_report(facts, clock, Files(f"{len(tiles)} tiles", target, before, after))
+    facts["tiles"] = pruning.facts(outputs, sizes)
     return facts
 
 
-class _Run:
-    """A job under way.
+@contextlib.contextmanager
+def _kept_if_interrupted(job: Folder, outputs: Outputs | None) -> Iterator[None]:
+    """Open the folder of a job; remove it when the block ends, unless the job can go on."""
+    with job.opened():
+        try:
+            yield
+        except Interrupted as error:
+            if outputs is None:
+                raise
+            msg = f"{error}; the same command goes on where this one was"
+            raise Interrupted(msg) from error
+        except (RefineError, Cancelled):
+            job.remove()
+            if outputs:
+                outputs.discard()
+            raise
+        job.remove()
 
-    Parameters
-    ----------
-    job : Job
-    tiles : list of Tile
-    workers : callable
-    progress : callable
+
+@dataclass
+class _Pruning:
+    """A job under way.
 
     Attributes
     ----------
-    counts : (tiles, 2) int64
-        Of each tile, how many splats stay, and how many lie in no view.
+    folder : Folder
+    tiles : list of Tile
+    views : ViewSet
+        Those that are used.
+    runner : Runner
     """
 
-    def __init__(self, job: Job, tiles: list[Tile], workers: Workers, progress: Progress) -> None:
-        self.job, self.tiles, self.units = job, tiles, units_of(tiles)
-        self.total = sum(tile.splats for tile in tiles)
-        self.counts = np.zeros((len(tiles), 2), np.int64)
-        self._workers, self._progress = workers, progress
-        self._absorbed = False
-        job.folder.note("begun", None)
-        workers.check(job, tiles)
+    folder: Folder
+    tiles: list[Tile]
+    views: ViewSet
+    runner: Runner
 
-    def prune(
+    def __post_init__(self) -> None:
+        """Cut the tiles into units."""
+        self.units = units_of(self.tiles)
+        self.pieces = pieces_of(self.tiles, self.units)
+        self.total = sum(map(len, self.units))
+        # Of each tile, how many splats stay, and how many lie in no view.
+        self.counts = np.zeros((len(self.tiles), 2), np.int64)
+        self.survivors: Survivors | None = None
+
+    def decide(
         self, budget: Budget, settings: Settings, views: ViewSet, clock: Clock, *, absorb: bool
     ) -> dict[str, Any]:
         """Score the tiles and decide what stays; return the report as far as it is known."""
-        ahead = part(self._progress, 0.0, SCORED * (0.3 if absorb else 1.0))
-        seen: Seen | None = None
-        if absorb:
-            seen = to_absorb(self.job, self.units, settings, self._workers, ahead)
-            scores = seen.scores
-        elif settings.method == "closed-form":
-            scores = by_closed_form(self.job, self.units, self._workers, ahead)[0]
-        else:
-            amount, by_bytes = _amount(budget, self.tiles)
-            settled = None if amount is None or by_bytes else needed(amount, self.total)
-            scores = by_occlusion(self.job, self.units, settings, settled, self._workers, ahead)
+        self._check_workers()
+        scores, measured = self._score(budget, settings, absorb=absorb)
         notes = (*scores.notes, views.note) if views.note else scores.notes
         scores = replace(scores, notes=notes, views_given=len(views))
         clock.lap("score_s")
-        self._count(self._map("choose", self._rule(budget, scores)))
-        kept, unseen = self.counts.sum(axis=0).tolist()
-        refuse_none_left(budget, self.total, kept)
+        self._select(budget, scores)
         clock.lap("select_s")
-        keep, psnr, survivors = np.empty(0, np.bool_), None, None
-        if seen is not None:
-            survivors, psnr = self._absorb(seen, kept)
-            kept = int(self.counts[:, 0].sum())
+        keep, psnr = np.empty(0, np.bool_), None
+        if measured is not None:
+            psnr = self._absorb(measured, settings)
             clock.lap("absorb_s")
         if scores.ray_sample is not None:
             keep = np.concatenate(
-                [self.job.folder.load(unit.index, ["keep"])["keep"] for unit in self.units]
+                [self.folder.load(unit.index, ["keep"])["keep"] for unit in self.units]
             )
-            psnr = psnr_kept(scores.ray_sample, keep) if not self._absorbed else psnr
+            psnr = psnr if self._changed else psnr_kept(scores.ray_sample, keep)
         facts = make_report(scores, keep, budget, settings, clock)
-        size = sum(tile.size for tile in self.tiles)
-        why = remark(budget, self.total - kept, self.total, psnr, size)
-        conclude(facts, scores, keep, psnr, survivors, why)
-        if survivors is not None and settings.method == "closed-form":
+        kept, unseen = self.counts.sum(axis=0).tolist()
+        size, removed = sum(tile.size for tile in self.tiles), self.total - kept
+        why = remark(budget, removed, self.total, psnr, size)
+        conclude(facts, scores, keep, psnr, self.survivors, why)
+        if self.survivors is not None and settings.method == "closed-form":
             facts["notes"].append(MEASURES)
-        facts["splats"] |= {
-            "before": self.total,
-            "kept": kept,
-            "removed": self.total - kept,
-            "unseen": unseen,
-            "left_out": 0,
-            "protected": 0,
-            "forced": 0,
-        }
+        facts["splats"] |= {"before": self.total, "kept": kept, "removed": removed}
+        facts["splats"] |= {"unseen": unseen, "left_out": 0, "protected": 0, "forced": 0}
         return facts
 
-    def _absorb(self, seen: Seen, goal: int) -> tuple[Survivors, float | None]:
-        """Absorb to `goal` survivors; the units then say which stay, and as what.
+    def _check_workers(self) -> None:
+        """Raise `RefineError` if a worker does not see all files, `Interrupted` if much is done."""
+        goes_on, _ = self.folder.noted("begun")
+        self.folder.note("begun", None)
+        try:
+            self.runner.workers.check(self.folder, self.tiles)
+        except RefineError as error:
+            if goes_on:
+                raise Interrupted(str(error)) from error
+            raise
+
+    def _score(
+        self, budget: Budget, settings: Settings, *, absorb: bool
+    ) -> tuple[Scores, MeasuredTiles | None]:
+        """Score all splats; to absorb, also return what the views see of them."""
+        closed_form = ClosedFormContext(
+            self.folder, self.views, settings.closed_form, self.views.middle()
+        )
+        runner = self.runner.part(0.0, SCORED * (0.3 if absorb else 1.0))
+        if absorb:
+            measured = measured_once(closed_form, self.units, settings, runner)
+            return measured.scores, measured
+        if settings.method == "closed-form":
+            return by_closed_form(closed_form, self.units, runner)[0], None
+        removed = removals(budget, self.tiles)
+        settled = None
+        if removed is not None and not removed.by_bytes:
+            settled = needed(removed.amount, self.total)
+        return by_occlusion(closed_form, self.units, settings, settled, runner), None
+
+    def _select(self, budget: Budget, scores: Scores) -> None:
+        """Decide by scores which splats stay, and count them."""
+        runner = self.runner.part(SCORED, SCORED)
+        rule = rule_of(budget, scores, self.tiles, self.units, self.folder, runner)
+        steps = [ChooseByScore(unit, rule) for unit in self.units]
+        self._count(runner.run(self.folder, steps, "selecting"))
+        refuse_none_left(budget, self.total, int(self.counts[:, 0].sum()))
+
+    def _absorb(self, measured: MeasuredTiles, settings: Settings) -> float | None:
+        """Absorb to as many survivors as were selected; the units then say which stay, and as what.
 
         Returns
         -------
-        survivors : Survivors
-        psnr : float or None
-            The estimate for them, dB, if some of them changed.
+        float or None
+            The estimated PSNR of the survivors, dB, if some of them changed.
         """
-        first = min(math.floor(FIRST * self.total), self.total - goal)
-        rest = select(seen.scores, Budget(keep=self.total - first))
-        ahead = part(self._progress, 0.3 * SCORED, 0.95 * SCORED)
-        found = absorbing.absorb(seen, rest, goal, workers=self._workers, progress=ahead)
-        order = np.argsort(found.origin)
-        arrays = found.origin[order], order, found.changed[order]
-        for name, array in zip(SURVIVORS, arrays, strict=True):
-            self.job.folder.note(name, array)
-        begins = np.cumsum([0, *map(len, self.units)])
-        self._count(self._map("settle", begins, found.regions))
-        self._absorbed = bool(found.regions)
-        if not self._absorbed:
-            return found, None
-        ahead = part(self._progress, 0.95 * SCORED, SCORED)
-        return found, absorbing.estimated(seen, found, self._workers, ahead)
+        kept, runner = int(self.counts[:, 0].sum()), self.runner.part(0.3 * SCORED, 0.95 * SCORED)
+        survivors = self.survivors = absorbing.absorb(measured, kept, settings, runner)
+        runner = self.runner.part(0.95 * SCORED, SCORED)
+        self._count(absorbing.settle(survivors, self.units, self.folder, runner.part(0.0, 0.0)))
+        return absorbing.estimated(measured, survivors, runner) if self._changed else None
 
-    def _count(self, kept: Iterator[NDArray[np.int64]]) -> None:
-        """Note what each unit says of its parts, see `Job.choose`."""
-        places = {tile: place for place, tile in enumerate(self.tiles)}
+    @property
+    def _changed(self) -> bool:
+        """Whether survivors may have absorbed others."""
+        return self.survivors is not None and bool(self.survivors.regions)
+
+    def _count(self, counts: Iterable[NDArray[np.int64]]) -> None:
+        """Add up what each unit tells of its parts; see `selecting.save_kept`."""
+        numbers = {tile: number for number, tile in enumerate(self.tiles)}
+        parts = itertools.chain.from_iterable(unit.parts for unit in self.units)
+        rows = [numbers[each.tile] for each in parts]
         self.counts[:] = 0
-        for unit, each in zip(self.units, kept, strict=True):
-            for (tile, _, _), pair in zip(unit.parts, each, strict=True):
-                self.counts[places[tile]] += pair
+        np.add.at(self.counts, rows, np.concatenate([*counts]))
 
-    def write(self, urls: Sequence[Url]) -> list[int]:
-        """Write each tile into the folder of the job, and to its URL if there are some.
-
-        Returns
-        -------
-        list of int
-            Their bytes.
-        """
-        places: Sequence[Url | None] = urls or [None] * len(self.tiles)
-        calls = [
-            Call(
-                "write",
-                (
-                    tile,
-                    [u for u in self.units if any(tile == part.tile for part in u.parts)],
-                    kept,
-                ),
-                tile.splats / self.total,
-                options={"absorbed": self._absorbed, "url": url},
+    def write(self, outputs: Outputs) -> list[int]:
+        """Write each tile where it waits, unless it is in its place; return the bytes of all."""
+        sizes = outputs.in_place()
+        steps = [
+            WriteTile(number, tile, self.pieces[number], kept, self._changed, url)
+            for number, (tile, (kept, _), url) in enumerate(
+                zip(self.tiles, self.counts.tolist(), outputs.urls, strict=True)
             )
-            for tile, (kept, _), url in zip(self.tiles, self.counts.tolist(), places, strict=True)
+            if number not in sizes
         ]
-        return [*self._workers(self.job, calls, part(self._progress, SCORED, 1.0), "writing")]
+        work, runner = [step.tile.size for step in steps], self.runner.part(SCORED, 1.0)
+        written = runner.run(self.folder, steps, "writing", work)
+        sizes |= {step.number: size for step, size in zip(steps, written, strict=True)}
+        return [sizes[number] for number in range(len(self.tiles))]
 
     def sizes(self) -> list[int]:
         """Return the bytes that `write` would write of each tile."""
-        found = []
+        sizes = []
         for tile, (kept, _) in zip(self.tiles, self.counts.tolist(), strict=True):
             header = header_of(tile)
             shorter = len(header) - len(with_count(header, kept))
-            found.append(tile.fixed_bytes - shorter + kept * tile.row_bytes)
-        return found
+            sizes.append(tile.fixed_bytes - shorter + kept * tile.row_bytes)
+        return sizes
 
-    def _map(self, step: str, *arguments: Any, **options: Any) -> Iterator[Any]:  # noqa: ANN401 - of each its own
-        """Do a step of `Job` with each unit."""
-        calls = [
-            Call(step, (unit, *arguments), len(unit) / self.total, options=options)
-            for unit in self.units
+    def facts(self, outputs: Outputs | None, sizes: Sequence[int]) -> list[dict[str, Any]]:
+        """Return what the report says of each tile."""
+        targets = [str(target) for target in outputs.targets] if outputs else [None] * len(sizes)
+        return [
+            {
+                "input": tile.path,
+                "output": target,
+                "before": tile.splats,
+                "kept": kept,
+                "unseen": unseen,
+                "input_bytes": tile.size,
+                "output_bytes": size,
+            }
+            for tile, target, size, (kept, unseen) in zip(
+                self.tiles, targets, sizes, self.counts.tolist(), strict=True
+            )
         ]
-        ahead = part(self._progress, SCORED, SCORED)
-        return self._workers(self.job, calls, ahead, "selecting")
-
-    def _rule(self, budget: Budget, scores: Scores) -> Rule:
-        """Return which splats a budget removes by scores."""
-        if budget.threshold is not None:
-            return Rule(threshold=float(single(budget.threshold)))
-        if budget.min_seen is not None:
-            return Rule(least_seen=least_seen(budget.min_seen, scores.views_used))
-        if budget.psnr is not None:
-            share = quality_of(scores).share(budget.psnr)
-            amount, by_bytes = math.floor(share * self.total), False
-        else:
-            found, by_bytes = _amount(budget, self.tiles)
-            amount = found or 0
-        if not amount:
-            return Rule(left=(0,) * len(self.units))
-
-        def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:
-            return radix.added(self._map("rank", prefixes, shift, by_bytes=by_bytes))
-
-        edge, below = radix.find(count, 32, [amount - 1])[0]
-        tied = [*self._map("tied", edge, by_bytes=by_bytes)]
-        before = np.cumsum([0, *tied[:-1]])
-        return Rule(edge=edge, left=tuple((amount - below - before).tolist()), by_bytes=by_bytes)
-
-
-def _amount(budget: Budget, tiles: Sequence[Tile]) -> tuple[int | None, bool]:
-    """Return how many splats a budget removes, if it tells; or how many bytes, and True.
-
-    Raises
-    ------
-    RefineError
-        See `Budget.removals`.
-    """
-    lengths = {tile.row_bytes for tile in tiles if tile.splats}
-    total, fixed = sum(tile.splats for tile in tiles), sum(tile.fixed_bytes for tile in tiles)
-    removals = budget.removals(total, min(lengths), fixed)
-    if budget.max_mb is None or len(lengths) == 1:
-        return removals, False
-    excess = sum(tile.splats * tile.row_bytes for tile in tiles) - budget.room(fixed)
-    return max(excess, 0), True
 
 
 def _refuse_what_needs_all(budget: Budget, settings: Settings, *, absorb: bool) -> None:
@@ -362,51 +330,23 @@ def _refuse_what_needs_all(budget: Budget, settings: Settings, *, absorb: bool) 
     budget.refuse_meaningless(settings.method, frustum=settings.frustum)
 
 
-def _refuse_twice(tiles: Sequence[Tile]) -> None:
-    """Raise `RefineError` if a file is given twice: its splats would count twice."""
-    given: set[str] = set()
-    for tile in tiles:
-        if tile.path in given:
-            msg = f"{tile.path}: is given twice"
-            raise RefineError(msg)
-        given.add(tile.path)
-
-
-def _targets(tiles: Sequence[Tile], folder: Path | Url, *, overwrite: bool) -> Sequence[Path | Url]:
-    """Return where each tile goes, and make the folder.
-
-    Raises
-    ------
-    RefineError
-        If two tiles have one name, or a file could not be made, or may not be replaced.
-    """
-    make_folder(folder)
-    targets = [folder / tile.name for tile in tiles]
-    read = {identity(tile.place) for tile in tiles}
-    for place, target in enumerate(targets):
-        if target in targets[:place]:
-            msg = f"{tiles[place].path}: another tile is called {target.name} too"
-            raise RefineError(msg)
-        if identity(target) in read:
-            msg = f"{target}: is read until all tiles are written; write to another folder"
-            raise RefineError(msg)
-        refuse_existing(target, overwrite=overwrite)
-    return targets
+def _remove_empty(folders: Sequence[Path]) -> None:
+    """Remove folders that are empty, the innermost first."""
+    with contextlib.suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
 
 
 def _digest(
     tiles: Sequence[Tile], views: ViewSet, budget: Budget, settings: Settings, *, absorb: bool
 ) -> str:
     """Return a name for a job: that of the same job again, and of no other."""
-    told = hashlib.blake2b(digest_size=8)
+    digest = hashlib.blake2b(digest_size=8)
     for fact in (VERSION, ROWS, [*tiles], budget, settings, absorb):
-        told.update(repr(fact).encode("utf-8", "surrogateescape"))
+        digest.update(repr(fact).encode("utf-8", "surrogateescape"))
     for view in views:
         for field in fields(view):
             value = getattr(view, field.name)
-            told.update(value.tobytes() if isinstance(value, np.ndarray) else repr(value).encode())
-    return told.hexdigest()
-
-
-def _shown(path: Path | Url | None) -> str | None:
-    return None if path is None else str(path)
+            is_array = isinstance(value, np.ndarray)
+            digest.update(value.tobytes() if is_array else repr(value).encode())
+    return digest.hexdigest()

@@ -1,148 +1,63 @@
-"""Scoring splats that no memory holds at once."""
+"""Scoring splats that no memory holds at once by occlusion and auto."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..pipeline import with_quality
 from ..scene import Scene, principal_axes
-from ..scores import Scores
-from ..scoring import auto, closed_form
+from ..scoring import auto
 from ..scoring.occlusion import FIRST_END, PRIOR, OcclusionScoring
 from ..work import Progress, part
-from .seen import MeasuringTiles, SceneJob, StoredLines, place
-from .steps import Job, Shared
-from .workers import Call
+from .closed_form import by_closed_form
+from .gaussians import SceneContext, SumMoments, store_gaussians
+from .measuring import TileMeasuring
+from .rays import StoredRays
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Sequence
 
+    from ..scores import Scores
     from ..scoring.occlusion import Occlusion
     from ..seeing.measuring import Measured
     from ..task import Settings
+    from .closed_form import ClosedFormContext
     from .units import Unit
-    from .workers import Workers
-
-SHARES: Mapping[str, tuple[float, float]] = {
-    "read": (0.0, 0.24),
-    "count": (0.24, 0.24),
-    "sum_views": (0.24, 0.92),
-    "add": (0.92, 0.95),
-    "compare": (0.95, 1.0),
-}
-"""Step -> the part of the progress of the closed form that is its own."""
-
-_NAMES = {"read": "reading", "count": "reading"}  # of steps; the others are "scoring"
-
-_SMALL = 1 << 16
-"""Bytes of an argument that travels with each step; larger ones lie in the folder."""
-
-
-@dataclass
-class _Steps:
-    """Does the steps of the closed form with each unit.
-
-    Attributes
-    ----------
-    job : Job
-    units : sequence of Unit
-    workers, progress : callable
-    """
-
-    job: Job
-    units: Sequence[Unit]
-    workers: Workers
-    progress: Progress
-    shared: int = 0
-
-    def each(self, step: str, *arguments: Any) -> Iterator[Any]:  # noqa: ANN401 - of each step its own
-        """Do a step with each unit."""
-        given, total = tuple(map(self._small, arguments)), sum(map(len, self.units))
-        calls = [
-            Call("score", (unit, step, given), len(unit) / total, chunked=True)
-            for unit in self.units
-        ]
-        ahead = part(self.progress, *SHARES[step])
-        return self.workers(self.job, calls, ahead, _NAMES.get(step, "scoring"))
-
-    def _small(self, argument: Any) -> Any:  # noqa: ANN401 - as given
-        """Return an argument, or where it lies if it is large."""
-        if not isinstance(argument, np.ndarray) or argument.nbytes <= _SMALL:
-            return argument
-        self.shared += 1
-        name = f"shared-{self.shared}"
-        self.job.folder.note(name, argument)
-        return Shared(name)
-
-
-def by_closed_form(
-    job: Job, units: Sequence[Unit], workers: Workers, progress: Progress
-) -> tuple[Scores, float]:
-    """Score units by the closed form; the folder has ``values`` and ``seen`` of each afterwards.
-
-    Parameters
-    ----------
-    job : Job
-    units : sequence of Unit
-    workers, progress : callable
-        See `prune.prune_tiles`.
-
-    Returns
-    -------
-    scores : Scores
-        Without the values and numbers of views of any splat.
-    size : float
-        Of the scene.
-
-    Raises
-    ------
-    RefineError, Cancelled
-        See `closed_form.score`.
-    """
-    steps = _Steps(job, units, workers, progress)
-    total = sum(map(len, units))
-    with np.errstate(under="ignore"):  # as in `pipeline.score`
-        found = closed_form.steps(
-            steps.each, total, job.views, job.settings, remember=job.folder.once
-        )
-    nothing = np.empty(0)
-    scores = Scores(
-        nothing.astype(np.float32), nothing.astype(np.int32), len(job.views), found.undrawable,
-        found.facts, method="closed-form", frustum=job.settings.frustum,
-    )  # fmt: skip
-    return scores, found.size
+    from .workers import Runner
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class MeasuredTiles:
     """What views see of N splats, hidden by one another.
 
     Attributes
     ----------
-    job : SceneJob
-    sources : sequence of Unit
+    context : SceneContext
+    units : sequence of Unit
         The splats.
     scores : Scores
     measured : Measured
         Of all N.
+    rays : StoredRays
+        The validation rays.
     """
 
-    job: SceneJob
-    sources: Sequence[Unit]
+    context: SceneContext
+    units: Sequence[Unit]
     scores: Scores
     measured: Measured
+    rays: StoredRays
 
 
 def by_occlusion(
-    job: Job,
+    closed_form: ClosedFormContext,
     units: Sequence[Unit],
     settings: Settings,
     settled: int | None,
-    workers: Workers,
-    progress: Progress,
+    runner: Runner,
 ) -> Scores:
     """Score units by occlusion or auto: the same as in memory.
 
@@ -150,13 +65,13 @@ def by_occlusion(
 
     Parameters
     ----------
-    job : Job
+    closed_form : ClosedFormContext
+        For the prior; its folder is that of the job.
     units : sequence of Unit
     settings : Settings
     settled : int or None
         See `occlusion.score`.
-    workers, progress : callable
-        See `prune.prune_tiles`.
+    runner : Runner
 
     Raises
     ------
@@ -166,102 +81,117 @@ def by_occlusion(
     Notes
     -----
     Memory of this process: about 120 bytes a splat, and the hits of scoring rays, see
-    `removal_rounds.RemovalRounds`. A worker needs 20 bytes a splat, and for each
-    view at work what it shows: about 160 bytes a splat, and its points, see `occlusion.score`.
+    `removal_rounds.RemovalRounds`. A worker needs 20 bytes a splat, and for each view at work about
+    160 bytes for each splat that it shows, and its points, see `occlusion.score`.
     """
     by_auto = settings.method == "auto"
-    members = auto.groups_of(job.views) if by_auto else None
-    how = settings.occlusion
-    run = _Scoring(job, units, how, workers, members, part(progress, 0.0, 0.2))
-    ahead = part(progress, 0.2, 0.98)
+    groups = auto.groups_of(closed_form.views) if by_auto else None
+    scoring = TileScoring(closed_form, units, settings.occlusion, groups, runner.part(0.0, 0.2))
+    ahead = runner.part(0.2, 0.98).progress
     with np.errstate(under="ignore"):
         if by_auto:
-            scores = auto.finish(run, settings.tolerance, settled=settled, progress=ahead)
+            scores = auto.finish(scoring, settings.tolerance, settled=settled, progress=ahead)
         else:
-            scores = run.all(ahead, settled)
-    return run.estimated(scores, part(progress, 0.98, 1.0))
+            scores = scoring.finish(ahead, settled)
+    return scoring.save(scores, runner.part(0.98, 1.0).progress)
 
 
-def to_absorb(
-    job: Job, units: Sequence[Unit], settings: Settings, workers: Workers, progress: Progress
-) -> Seen:
-    """Score units by occlusion in one round; see `by_occlusion`."""
+def measured_once(
+    closed_form: ClosedFormContext,
+    units: Sequence[Unit],
+    settings: Settings,
+    runner: Runner,
+) -> MeasuredTiles:
+    """Score units by occlusion in one round; parameters as `by_occlusion`."""
     how = replace(settings.occlusion, rounds=1)
-    run = _Scoring(job, units, how, workers, None, part(progress, 0.0, 0.2))
+    scoring = TileScoring(closed_form, units, how, None, runner.part(0.0, 0.2))
     with np.errstate(under="ignore"):
-        scores = run.all(part(progress, 0.2, 0.98))
-        measured = run.measured().for_all(run.gaussians.index, len(run.prior))
-    return Seen(run.job, units, run.estimated(scores, part(progress, 0.98, 1.0)), measured)
+        scores = scoring.finish(runner.part(0.2, 0.98).progress)
+        measured = scoring.measured().for_all(scoring.gaussians.index, len(scoring.prior))
+    scores = scoring.save(scores, runner.part(0.98, 1.0).progress)
+    return MeasuredTiles(scoring.context, units, scores, measured, scoring.validation_rays)
 
 
-class _Scoring(OcclusionScoring):
+class TileScoring(OcclusionScoring):
     """A scoring of units.
 
     Parameters
     ----------
-    job : Job
+    closed_form : ClosedFormContext
+        For the prior; its folder is that of the job.
     units : sequence of Unit
     settings : Occlusion
-    workers : callable
-    members : list of list of int, optional
+    groups : list of list of int, optional
         See `measuring.Measuring`.
-    progress : callable
-        Of getting ready to measure.
+    runner : Runner
+        For getting ready to measure.
+
+    Attributes
+    ----------
+    context : SceneContext
+        What the views measure in.
     """
 
-    validation_rays: StoredLines
+    validation_rays: StoredRays
 
     def __init__(
         self,
-        job: Job,
+        closed_form: ClosedFormContext,
         units: Sequence[Unit],
         settings: Occlusion,
-        workers: Workers,
-        members: list[list[int]] | None,
-        progress: Progress,
+        groups: list[list[int]] | None,
+        runner: Runner,
     ) -> None:
-        prior = replace(job, folder=job.folder.inner("prior"), settings=PRIOR)
-        _, size = by_closed_form(prior, units, workers, part(progress, 0.0, 0.5))
+        self._job, self._units = closed_form.folder, units
+        prior = replace(closed_form, folder=self._job.inner("prior"), settings=PRIOR)
+        _, size = by_closed_form(prior, units, runner.part(0.0, 0.5))
         values = np.concatenate(
             [prior.folder.load(unit.index, ["values"])["values"] for unit in units]
         )
-        unturned = Scene(job.middle[0], size, np.eye(3))
-        self.job = SceneJob(job.folder.inner("seen"), job.views, settings, unturned)
-        scene = _scene(self.job, units, workers, part(progress, 0.5, 0.6))
-        self.job = replace(self.job, scene=scene)
-        gaussians, good = place(self.job, units, workers, part(progress, 0.6, 1.0))
-        sights = StoredLines(self.job, workers, units, gaussians)
-        measuring = MeasuringTiles(self.job, workers, members)
-        # Those in the folder have what `OcclusionScoring` asks of Gaussians in memory.
-        super().__init__(gaussians, measuring, settings.rounds, values, ~good, sights)  # type: ignore[arg-type]
+        unturned = SceneContext(
+            self._job.inner("seen"),
+            prior.views,
+            settings,
+            Scene(prior.middle[0], size, np.eye(3)),
+        )
+        scene = _turned(unturned, units, runner.part(0.5, 0.6))
+        self.context = context = replace(unturned, scene=scene)
+        gaussians, good = store_gaussians(context, units, runner.part(0.6, 1.0))
+        # They have what `OcclusionScoring` asks of Gaussians in memory.
+        super().__init__(
+            gaussians,  # type: ignore[arg-type]
+            TileMeasuring(context, runner, groups),
+            settings.rounds,
+            values,
+            ~good,
+            StoredRays(context, runner, units, gaussians),
+        )
         if settings.rounds > 1:
-            self.scoring_rays = StoredLines(self.job, workers, units, gaussians, scoring=True)
-        self._folder, self._units = job.folder, units
+            self.scoring_rays = StoredRays(context, runner, units, gaussians, scoring=True)
 
-    def all(self, progress: Progress, settled: int | None = None) -> Scores:
-        """Measure all blocks of views, and return the scores; see `occlusion.score`."""
+    def finish(self, progress: Progress, settled: int | None = None) -> Scores:
+        """Measure all groups of views, and return the scores; see `occlusion.score`."""
         end = FIRST_END if self.rounds > 1 else 1.0
         self.measure(range(self.measuring.count), part(progress, 0.0, end))
         return self.rank(part(progress, end, 1.0), settled)
 
-    def estimated(self, scores: Scores, progress: Progress) -> Scores:
-        """Return scores with the curve of the estimated PSNR, and write those of each unit."""
+    def save(self, scores: Scores, progress: Progress) -> Scores:
+        """Save the scores of each unit; return them with the curve of the estimated PSNR."""
         self.validation_rays.load()
         start = 0
         for unit in self._units:
             rows = slice(start, start + len(unit))
             arrays = {"values": scores.values[rows], "seen": scores.seen[rows]}
-            self._folder.save(unit.index, arrays)
+            self._job.save(unit.index, arrays)
             start = rows.stop
         with np.errstate(under="ignore"):
             return with_quality(scores, progress=progress)
 
 
-def _scene(seen: SceneJob, units: Sequence[Unit], workers: Workers, progress: Progress) -> Scene:
+def _turned(context: SceneContext, units: Sequence[Unit], runner: Runner) -> Scene:
     """Return `scene.scene_of` of all units, given its origin and size."""
-    calls = [Call("moments", (unit,), 1 / len(units)) for unit in units]
-    total = np.zeros((4, 3))
-    for found in workers(seen, calls, progress, "reading"):
-        for moments in found:  # one after the other, as in memory
+    steps, total = [SumMoments(unit) for unit in units], np.zeros((4, 3))
+    for pieces in runner.run(context, steps, "reading"):
+        for moments in pieces:  # one after the other, as in memory
             total += moments
-    return replace(seen.scene, axes=principal_axes(total[:3], total[3]))
+    return replace(context.scene, axes=principal_axes(total[:3], total[3]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,10 +14,10 @@ from .. import whole_file
 from ..errors import RefineError
 from ..urls import Url, is_url
 from ..whole_file import expanded
-from .workers import Interrupted
+from .folder import Interrupted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Hashable, Iterator
 
     from numpy.typing import NDArray
 
@@ -24,6 +25,7 @@ _FLEETING = ("url", "access")
 """Parts of the names of facts about a file that change though it does not: where a server sends
 whoever asks for it, and when it was read."""
 
+_LOCAL = "file://"
 _NO_SUCH = "there is no such file"
 
 
@@ -38,10 +40,26 @@ def identity(path: Path | Url) -> str:
         with _explained(path, "cannot be looked for"):
             system, inner = _opened(path)
             name: str = system.unstrip_protocol(inner)
-        if not name.startswith("file://"):
+        if not name.startswith(_LOCAL):
             return name
-        path = Path(name.removeprefix("file://"))
-    return f"file://{path.resolve()}"
+        path = Path(name.removeprefix(_LOCAL))
+    return f"{_LOCAL}{path.resolve()}"
+
+
+def file_key(path: Path | Url) -> Hashable:
+    """Return what is the same for all names of a file that exists, hard links included.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be read.
+    """
+    name = identity(path)
+    if not name.startswith(_LOCAL):
+        return name
+    with _explained(path, "cannot be read"):
+        found = Path(name.removeprefix(_LOCAL)).stat()
+    return (found.st_dev, found.st_ino) if found.st_ino else name
 
 
 def state(path: Path | Url) -> tuple[int, int | str]:
@@ -84,10 +102,10 @@ def beginning(url: Url, size: int, whole: int) -> bytes:
     with _explained(url, "cannot be read"):
         system, inner = _opened(url)
         with system.open(inner, "rb", cache_type="none") as stream:
-            found: bytes = stream.read(size)
+            start: bytes = stream.read(size)
             stream.seek(max(whole - 1, 0))
             stream.read(1)
-            return found
+            return start
 
 
 def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[Any]:
@@ -114,12 +132,12 @@ def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDA
             return np.empty(0, dtype)
         system, inner = _opened(path)
         # By name: storages have other arguments between these.
-        found = system.cat_file(inner, start=begin, end=begin + count * dtype.itemsize)
-        return np.frombuffer(found, dtype, len(found) // dtype.itemsize)
+        sent = system.cat_file(inner, start=begin, end=begin + count * dtype.itemsize)
+        return np.frombuffer(sent, dtype, len(sent) // dtype.itemsize)
 
 
-def make_folder(folder: Path | Url) -> None:
-    """Make a folder, if it is not there.
+def make_folder(folder: Path | Url) -> list[Path]:
+    """Make a folder, if it is not there; return the folders that were made, the innermost first.
 
     Behind a URL an empty file is written there, moved and removed, so that a storage that does not
     let us is known before long work starts.
@@ -130,8 +148,9 @@ def make_folder(folder: Path | Url) -> None:
         If it cannot be made, or no file be written there.
     """
     if not isinstance(folder, Url):
-        whole_file.make_folder(folder)
-        return
+        with _explained(folder, "cannot be made"):
+            parents = [*itertools.takewhile(lambda each: not each.exists(), folder.parents)]
+            return [] if whole_file.make_folder(folder) else [folder, *parents]
     with _explained(folder, "cannot be written to"):
         system, inner = _opened(folder)
         system.makedirs(inner, exist_ok=True)
@@ -140,6 +159,7 @@ def make_folder(folder: Path | Url) -> None:
         system.pipe_file(here, b"")
         system.mv(here, there)
         system.rm_file(there)
+    return []
 
 
 def refuse_existing(path: Path | Url, *, overwrite: bool) -> None:
@@ -189,6 +209,16 @@ def publish(made: Path | Url, path: Path | Url, *, overwrite: bool) -> None:
     with _explained(path, "cannot be written"):
         system, inner = _opened(path)
         system.mv(_opened(Url(made))[1], inner)
+
+
+def size_of(path: Path | Url) -> int | None:
+    """Return the bytes of a file; None if there is none."""
+    if not isinstance(path, Url):
+        return path.stat().st_size if path.is_file() else None
+    with _explained(path, "cannot be looked for"):
+        system, inner = _opened(path)
+        system.invalidate_cache()
+        return int(system.size(inner)) if system.isfile(inner) else None
 
 
 def discard(url: Url) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from ..urls import Url
 from . import storage
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Hashable, Iterator, Sequence
     from pathlib import Path
     from typing import Any
 
@@ -34,6 +34,23 @@ _HEADER = 1 << 16
 
 _PIECE = 1 << 24
 """Bytes beside the rows that are copied at a time."""
+
+
+class Source(Protocol):
+    """A run of rows of all splats, in whatever form they are stored."""
+
+    @property
+    def index(self) -> int:
+        """Which one of all."""
+        ...
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        ...
+
+    def splats(self) -> Splats:
+        """Return its splats."""
+        ...
 
 
 class Tile(NamedTuple):
@@ -172,6 +189,53 @@ class Unit:
         ends = np.cumsum([0, *(part.rows for part in self.parts)]).tolist()
         return [slice(*pair) for pair in itertools.pairwise(ends)]
 
+    def row_bytes(self) -> NDArray[np.int64]:
+        """Return how many bytes each splat takes in its file, (n,)."""
+        return np.repeat(
+            [part.tile.row_bytes for part in self.parts], [part.rows for part in self.parts]
+        )
+
+
+class Piece(NamedTuple):
+    """Rows of a tile that lie in one unit.
+
+    Attributes
+    ----------
+    unit : int
+        Index of the unit.
+    place : slice
+        Which rows of the unit they are.
+    part : Part
+        Which rows of the tile they are.
+    """
+
+    unit: int
+    place: slice
+    part: Part
+
+
+def tiles_at(paths: Sequence[Path | str]) -> list[Tile]:
+    """Look at the files of a scene.
+
+    Raises
+    ------
+    RefineError
+        See `tile_at`; also if a file is given twice, since its splats would count twice, or none
+        has a splat.
+    """
+    tiles: list[Tile] = []
+    given: dict[Hashable, Tile] = {}
+    for tile in map(tile_at, paths):
+        first = given.setdefault(storage.file_key(tile.place), tile)
+        if first is not tile:
+            msg = f"{tile.path}: is given twice"
+            raise RefineError(msg if first.path == tile.path else f"{msg}, also as {first.path}")
+        tiles.append(tile)
+    if not any(tile.splats for tile in tiles):
+        msg = f"none of {len(tiles)} tiles has a splat: there is nothing to prune"
+        raise RefineError(msg)
+    return tiles
+
 
 def tile_at(path: Path | str) -> Tile:
     """Look at a file of splats.
@@ -258,17 +322,17 @@ def bytes_of(tile: Tile, start: int, stop: int) -> Iterator[NDArray[np.uint8]]:
 
 def _read(tile: Tile, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[Any]:
     """Read an array from a tile; see `storage.array`."""
-    found = storage.array(tile.place, dtype, count, begin)
+    sent = storage.array(tile.place, dtype, count, begin)
     if storage.state(tile.place) != (tile.size, tile.changed):
         msg = f"{tile.path}: was changed while it was worked on; nothing was written"
         raise RefineError(msg)
-    if len(found) != count:
+    if len(sent) != count:
         msg = (
-            f"{tile.path}: {found.nbytes} bytes were sent, expected the {count * dtype.itemsize} "
+            f"{tile.path}: {sent.nbytes} bytes were sent, expected the {count * dtype.itemsize} "
             f"from {begin} on"
         )
         raise RefineError(msg)
-    return found
+    return sent
 
 
 def units_of(tiles: Sequence[Tile]) -> list[Unit]:
@@ -287,3 +351,13 @@ def units_of(tiles: Sequence[Tile]) -> list[Unit]:
                 units.append(Unit(len(units), tuple(parts)))
                 parts, room = [], ROWS
     return [*units, Unit(len(units), tuple(parts))] if parts else units
+
+
+def pieces_of(tiles: Sequence[Tile], units: Sequence[Unit]) -> list[list[Piece]]:
+    """Return the pieces of each tile, in the order of its rows; an empty one has none."""
+    numbers = {tile: number for number, tile in enumerate(tiles)}
+    pieces: list[list[Piece]] = [[] for _ in tiles]
+    for unit in units:
+        for part, place in zip(unit.parts, unit.slices(), strict=True):
+            pieces[numbers[part.tile]].append(Piece(unit.index, place, part))
+    return pieces

@@ -1,64 +1,76 @@
-"""Who does the steps of a job: this process, one step after the other."""
+"""Who does the steps of a job: this process, one step after the other, or what `cluster` starts."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
-from ..errors import RefineError
 from ..work import Progress, part, report, silent
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
-    from .steps import Job
+    from .folder import Folder
     from .units import Tile
 
+Context = TypeVar("Context")
+_Context_contra = TypeVar("_Context_contra", contravariant=True)
+Result = TypeVar("Result")
+_Result_co = TypeVar("_Result_co", covariant=True)
 
-class Interrupted(RefineError):  # noqa: N818 - the job is not at fault
-    """Raised where workers or a storage were lost: what is done stays for the next run."""
+
+class Step(Protocol[_Context_contra, _Result_co]):
+    """A piece of work that any process can do, which is sent there as a pickle.
+
+    It reads the tiles and the folder of the job, and writes into the folder. What it returns is
+    small. It can be done again: where its result was noted, that is returned.
+    """
+
+    def run(
+        self, context: _Context_contra, progress: Progress, threads: int | None, /
+    ) -> _Result_co:
+        """Do it.
+
+        Parameters
+        ----------
+        context : object
+            What all steps that are done together need.
+        progress : callable
+        threads : int or None
+            See `refine_addon.core.work.for_chunks`.
+        """
 
 
 class Workers(Protocol):
     """Whoever does the steps."""
 
-    def check(self, job: Job, tiles: list[Tile]) -> None:
-        """Raise `RefineError` if a worker does not see the files."""
+    def check(self, folder: Folder, tiles: Sequence[Tile]) -> None:
+        """Raise `RefineError` if a worker does not see the folder of the job, or a tile."""
 
-    def __call__(
-        self, job: object, calls: Sequence[Call], progress: Progress, what: str
-    ) -> Iterator[Any]:
-        """Yield what each call returns, in their order."""
+    def run(
+        self,
+        context: Context,
+        steps: Sequence[Step[Context, Result]],
+        progress: Progress,
+        what: str,
+        sizes: Sequence[int] = (),
+    ) -> Iterator[Result]:
+        """Do steps; yield what each returns, in their order.
 
-
-class Call(NamedTuple):
-    """A step to be done.
-
-    Attributes
-    ----------
-    step : str
-        Name of a method of `Job`.
-    arguments : tuple
-    share : float
-        How much of the work of all calls this is.
-    chunked : bool
-        Whether it takes ``progress`` and ``threads``.
-    options : dict
-        Arguments by name.
-    """
-
-    step: str
-    arguments: tuple[Any, ...]
-    share: float
-    chunked: bool = False
-    options: Mapping[str, Any] = {}
-
-    def do(self, job: object, *, progress: Progress = silent, threads: int | None = None) -> Any:  # noqa: ANN401 - of each step its own
-        """Return what the step returns; `job` has it as a method."""
-        more = {"progress": progress, "threads": threads} if self.chunked else {}
-        return getattr(job, self.step)(*self.arguments, **self.options, **more)
+        Parameters
+        ----------
+        context : object
+            See `Step`; it is sent once.
+        steps : sequence of Step
+        progress : callable
+        what : str
+            What is being done, for `progress`.
+        sizes : sequence of int, optional
+            How much work each step is, in any unit; by default all are the same.
+        """
 
 
-class Here:
+class InProcess:
     """Does all steps in this process.
 
     Parameters
@@ -70,16 +82,65 @@ class Here:
     def __init__(self, threads: int | None = None) -> None:
         self._threads = threads
 
-    def check(self, job: Job, tiles: list[Tile]) -> None:
+    def check(self, folder: Folder, tiles: Sequence[Tile]) -> None:
         """Do nothing: this process sees what it sees."""
 
-    def __call__(
-        self, job: object, calls: Sequence[Call], progress: Progress, what: str
-    ) -> Iterator[Any]:
-        """Yield what each call returns, in their order."""
+    def run(
+        self,
+        context: Context,
+        steps: Sequence[Step[Context, Result]],
+        progress: Progress,
+        what: str,
+        sizes: Sequence[int] = (),
+    ) -> Iterator[Result]:
+        """Do steps one after the other; see `Workers.run`."""
         done = 0.0
-        for call in calls:
+        for step, share in zip(steps, shares_of(steps, sizes), strict=True):
             report(progress, done, what)
-            ahead = part(progress, done, done + call.share)
-            yield call.do(job, progress=ahead, threads=self._threads)
-            done += call.share
+            yield step.run(context, part(progress, done, done + share), self._threads)
+            done += share
+
+
+@dataclass(frozen=True)
+class Runner:
+    """Has workers do steps, and tells how far they are.
+
+    Attributes
+    ----------
+    workers : Workers
+    progress : callable
+    """
+
+    workers: Workers
+    progress: Progress = silent
+
+    def part(self, start: float, end: float) -> Runner:
+        """Return a runner whose steps are a part of this one's, see `work.part`."""
+        return replace(self, progress=part(self.progress, start, end))
+
+    def run(
+        self,
+        context: Context,
+        steps: Sequence[Step[Context, Result]],
+        what: str,
+        sizes: Sequence[int] = (),
+    ) -> Iterator[Result]:
+        """Do steps; yield what each returns, in their order. See `Workers.run`."""
+        return self.workers.run(context, steps, self.progress, what, sizes)
+
+    def run_all(
+        self,
+        context: Context,
+        steps: Sequence[Step[Context, object]],
+        what: str,
+        sizes: Sequence[int] = (),
+    ) -> None:
+        """Do steps that return nothing. See `Workers.run`."""
+        for _ in self.run(context, steps, what, sizes):
+            pass
+
+
+def shares_of(steps: Sequence[object], sizes: Sequence[int]) -> list[float]:
+    """Return how much of the work of all steps each is; see `Workers.run`."""
+    total = max(sum(sizes), 1)
+    return [size / total for size in sizes] if sizes else [1 / max(len(steps), 1)] * len(steps)

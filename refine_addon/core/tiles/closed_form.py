@@ -1,0 +1,190 @@
+"""The closed form over units: `scoring.closed_form` with its arrays on a disk between steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..scores import Scores
+from ..scoring import closed_form
+from ..scoring.closed_form_block import STEPS, RowBlock
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from ..scoring.closed_form_settings import ClosedForm
+    from ..views import ViewSet
+    from ..work import Progress
+    from .folder import Folder
+    from .units import Unit
+    from .workers import Runner
+
+SHARES: Mapping[str, tuple[float, float]] = {
+    "read": (0.0, 0.24),
+    "count": (0.24, 0.24),
+    "sum_views": (0.24, 0.92),
+    "add": (0.92, 0.95),
+    "compare": (0.95, 1.0),
+}
+"""Step -> where it begins and ends in the progress of the closed form."""
+
+_NAMES = {"read": "reading", "count": "reading"}  # of steps; the others are "scoring"
+
+_REPEATED = ("count",)
+"""Steps of `STEPS` that are done with several arguments: their results are not noted."""
+
+_SMALL = 1 << 16
+"""Bytes of an argument that travels with each step; larger ones lie in the folder."""
+
+
+class Stored(NamedTuple):
+    """An argument that lies in the folder, since it is large.
+
+    Attributes
+    ----------
+    name : str
+        Under which it was noted.
+    """
+
+    name: str
+
+
+@dataclass(frozen=True)
+class ClosedFormContext:
+    """What all steps of the closed form need.
+
+    Attributes
+    ----------
+    folder : Folder
+    views : ViewSet
+        Those that are used.
+    settings : ClosedForm
+    middle : (3,) float64, float
+        Of the views, as `ViewSet.middle` returns it.
+    """
+
+    folder: Folder
+    views: ViewSet
+    settings: ClosedForm
+    middle: tuple[NDArray[np.float64], float]
+
+
+@dataclass(frozen=True)
+class ComputeRows:
+    """A step of the closed form with the rows of a unit.
+
+    Attributes
+    ----------
+    unit : Unit
+    step : str
+        One of `closed_form_block.STEPS`.
+    arguments : tuple
+    """
+
+    unit: Unit
+    step: str
+    arguments: tuple[Any, ...]
+
+    def run(self, context: ClosedFormContext, progress: Progress, threads: int | None) -> Any:  # noqa: ANN401 - of each step its own
+        """Do the step, unless it is done; return what came of it."""
+        folder, index = context.folder, self.unit.index
+        if self.step in _REPEATED:
+            return self._computed(context, progress, threads)
+        name = f"{index:06d}.{self.step}"
+        result = folder.once(name, lambda: self._computed(context, progress, threads))
+        folder.drop(index, STEPS[self.step][2])
+        return result
+
+    def _computed(self, context: ClosedFormContext, progress: Progress, threads: int | None) -> Any:  # noqa: ANN401 - of each step its own
+        folder, unit = context.folder, self.unit
+        needed, made, _ = STEPS[self.step]
+        # From a disk a unit is read chunk by chunk; behind a URL each chunk would be a request.
+        splats = unit.splats() if self.step == "read" and unit.remote else unit
+        block = RowBlock(
+            splats, context.views, context.settings, context.middle,
+            threads=threads, arrays=folder.load(unit.index, needed),
+        )  # fmt: skip
+        del splats
+        block.progress = progress
+        arguments = [
+            folder.noted(each.name)[1] if isinstance(each, Stored) else each
+            for each in self.arguments
+        ]
+        result = getattr(block, self.step)(*arguments)
+        folder.save(unit.index, {name: getattr(block, name) for name in made})
+        return result
+
+
+@dataclass
+class _Steps:
+    """Does the steps of the closed form with each unit.
+
+    Attributes
+    ----------
+    context : ClosedFormContext
+    units : sequence of Unit
+    runner : Runner
+    stored : int
+        How many arguments lie in the folder.
+    """
+
+    context: ClosedFormContext
+    units: Sequence[Unit]
+    runner: Runner
+    stored: int = 0
+
+    def each(self, step: str, *arguments: Any) -> Iterator[Any]:  # noqa: ANN401 - of each step its own
+        """Do a step with each unit."""
+        small = tuple(map(self._small, arguments))
+        steps = [ComputeRows(unit, step, small) for unit in self.units]
+        what, sizes = _NAMES.get(step, "scoring"), [*map(len, self.units)]
+        return self.runner.part(*SHARES[step]).run(self.context, steps, what, sizes)
+
+    def _small(self, argument: Any) -> Any:  # noqa: ANN401 - as given
+        """Return an argument, or where it lies if it is large."""
+        if not isinstance(argument, np.ndarray) or argument.nbytes <= _SMALL:
+            return argument
+        self.stored += 1
+        name = f"argument-{self.stored}"
+        self.context.folder.note(name, argument)
+        return Stored(name)
+
+
+def by_closed_form(
+    context: ClosedFormContext, units: Sequence[Unit], runner: Runner
+) -> tuple[Scores, float]:
+    """Score units by the closed form; the folder has ``values`` and ``seen`` of each afterwards.
+
+    Parameters
+    ----------
+    context : ClosedFormContext
+    units : sequence of Unit
+    runner : Runner
+
+    Returns
+    -------
+    scores : Scores
+        Without the values and numbers of views of any splat.
+    size : float
+        Of the scene, world units.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `closed_form.score`.
+    """
+    views, settings = context.views, context.settings
+    steps = _Steps(context, units, runner)
+    with np.errstate(under="ignore"):  # as in `pipeline.score`
+        found = closed_form.steps(
+            steps.each, sum(map(len, units)), views, settings, remember=context.folder.once
+        )
+    scores = Scores(
+        np.empty(0, np.float32), np.empty(0, np.int32), len(views), found.undrawable,
+        found.facts, method="closed-form", frustum=settings.frustum,
+    )  # fmt: skip
+    return scores, found.size

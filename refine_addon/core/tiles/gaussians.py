@@ -1,0 +1,244 @@
+"""Splats that no memory holds at once, activated and stored so that a view loads what it shows.
+
+They are activated source by source, and stored along a Z-shaped curve, so that a chunk of them is a
+box in space. A view loads the chunks whose boxes may reach into its image, and has their footprints
+together, as in memory: what it finds is the same to the bit, wherever the tiles were cut.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..scene import code_order, moments, spatial_code, splat_fingerprint
+from ..seeing import projection
+from ..seeing.projection import Gaussians
+from ..splats import drawable
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from ..scene import Scene
+    from ..seeing.measuring import Sampling
+    from ..views import View, ViewSet
+    from ..work import Progress
+    from .folder import Folder
+    from .units import Source
+    from .workers import Runner
+
+CHUNK = 1 << 16
+"""Splats of a chunk, 3.7 MB."""
+
+_MEANS, _COVARIANCES, _LARGEST, _ALPHAS, _COLORS = slice(3), slice(3, 9), 9, 10, slice(11, 14)
+"""Rows of a chunk, (14, n) float32: see `Gaussians`."""
+
+
+@dataclass(frozen=True)
+class SceneContext:
+    """What all steps need that find out what views see of all splats.
+
+    Attributes
+    ----------
+    folder : Folder
+        Of these splats alone.
+    views : ViewSet
+    sampling : Sampling
+    scene : Scene
+    """
+
+    folder: Folder
+    views: ViewSet
+    sampling: Sampling
+    scene: Scene
+
+    def footprints(self, view: View) -> tuple[projection.Footprints, NDArray[np.float32]]:
+        """Return the n footprints in a view, front to back, and their colours, (n, 3)."""
+        pieces, colors = [], [np.empty((0, 3), np.float32)]
+        boxes = self.folder.noted("boxes")[1]
+        with np.errstate(under="ignore"):
+            for number in np.flatnonzero(projection.boxes_touch(boxes, self.scene, view)).tolist():
+                chunk = self.chunk(number)
+                reaching, depth = projection.reaching(chunk, self.scene, view)
+                colors.append(chunk.colors[reaching.index])
+                pieces.append((replace(reaching, index=reaching.index + number * CHUNK), depth))
+            footprints = projection.front_to_back(pieces)
+        # Ascending, since chunks are.
+        rows = np.concatenate([np.empty(0, np.int64), *(piece.index for piece, _ in pieces)])
+        return footprints, np.concatenate(colors)[np.searchsorted(rows, footprints.index)]
+
+    def chunk(self, number: int) -> Gaussians:
+        """Return the Gaussians of a chunk."""
+        table = self.folder.load(number, ["chunk"])["chunk"]
+        return Gaussians(
+            np.arange(table.shape[1]), table[_MEANS], table[_COVARIANCES], table[_LARGEST],
+            table[_ALPHAS], np.ascontiguousarray(table[_COLORS].T),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SumMoments:
+    """Sums what the axes of the scene are made of over a source.
+
+    Attributes
+    ----------
+    source : Source
+    """
+
+    source: Source
+
+    def run(
+        self, context: SceneContext, _progress: Progress, _threads: int | None
+    ) -> NDArray[np.float64]:
+        """Return `scene.moments` of the source, (pieces, 4, 3)."""
+        splats = self.source.splats()
+        with np.errstate(under="ignore"):
+            pieces = [*moments(splats.means, drawable(splats), context.scene)]
+        return np.reshape(pieces, (-1, 4, 3))
+
+
+@dataclass(frozen=True)
+class ActivateSplats:
+    """Activates the splats of a source.
+
+    Attributes
+    ----------
+    source : Source
+    """
+
+    source: Source
+
+    def run(self, context: SceneContext, progress: Progress, threads: int | None) -> int:
+        """Save the Gaussians, unless that is done; return how many there are."""
+        name = f"{self.source.index:06d}.activated"
+        count = context.folder.once(name, lambda: self._activated(context, progress, threads))
+        return int(count)
+
+    def _activated(
+        self, context: SceneContext, progress: Progress, threads: int | None
+    ) -> NDArray[np.int64]:
+        splats, scene = self.source.splats(), context.scene
+        good, opaque = projection.classify(splats, threads=threads)
+        with np.errstate(under="ignore"):
+            rows, place = projection.near_scene(splats, opaque, scene)
+            activated = projection.activate(splats, rows, place, scene, progress, threads)
+            code = spatial_code(place)
+        table = np.empty((len(rows), 14), np.float32)
+        table[:, _MEANS], table[:, _COVARIANCES] = activated.means.T, activated.covariances.T
+        table[:, _LARGEST], table[:, _ALPHAS] = activated.largest, activated.alphas
+        table[:, _COLORS] = activated.colors
+        arrays = {"good": good, "rows": rows, "code": code, "gaussians": table}
+        arrays["ties"] = splat_fingerprint(splats, rows)
+        context.folder.save(self.source.index, arrays)
+        return np.array(len(rows))
+
+
+@dataclass(frozen=True)
+class GatherChunk:
+    """Gathers the Gaussians of a chunk from those of all sources.
+
+    Attributes
+    ----------
+    number : int
+        Which chunk.
+    starts : (sources + 1,) int64
+        How many Gaussians the sources before each have, and all.
+    """
+
+    number: int
+    starts: NDArray[np.int64]
+
+    def run(
+        self, context: SceneContext, _progress: Progress, _threads: int | None
+    ) -> NDArray[np.float32]:
+        """Save the chunk, unless that is done; return its box, (7,): `projection.boxes_touch`."""
+        name = f"{self.number:06d}.gathered"
+        box = context.folder.once(name, lambda: self._gathered(context.folder))
+        return np.asarray(box, np.float32)
+
+    def _gathered(self, folder: Folder) -> NDArray[np.float32]:
+        order = folder.mapped("order")[self.number * CHUNK : (self.number + 1) * CHUNK]
+        source = np.searchsorted(self.starts, order, side="right") - 1
+        chunk = np.empty((14, len(order)), np.float32)
+        for index in np.unique(source).tolist():
+            here = np.flatnonzero(source == index)
+            table = folder.map(index, "gaussians")
+            chunk[:, here] = table[order[here] - self.starts[index]].T
+        folder.save(self.number, {"chunk": chunk})
+        means = chunk[_MEANS]
+        return np.concatenate([means.min(axis=1), means.max(axis=1), [chunk[_LARGEST].max()]])
+
+
+class StoredGaussians:
+    """All M splats that can contribute to a picture, in a folder; see `Gaussians`.
+
+    Parameters
+    ----------
+    folder : Folder
+    index : (M,) int64
+        Rows of the splats, see `Gaussians`.
+
+    Attributes
+    ----------
+    index : (M,) int64
+    """
+
+    def __init__(self, folder: Folder, index: NDArray[np.int64]) -> None:
+        self.index, self._folder = index, folder
+        folder.note("count", np.array(len(index)))
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.index)
+
+    @property
+    def alphas(self) -> NDArray[np.float32]:
+        """Opacities of all, (M,)."""
+        return np.concatenate([chunk[_ALPHAS] for chunk in self._chunks()])
+
+    @property
+    def colors(self) -> NDArray[np.float32]:
+        """Colours of all, (M, 3)."""
+        return np.concatenate([chunk[_COLORS].T for chunk in self._chunks()])
+
+    def _chunks(self) -> Iterator[NDArray[np.float32]]:
+        yield np.empty((14, 0), np.float32)
+        for number in range(-(-len(self) // CHUNK)):
+            yield self._folder.map(number, "chunk")
+
+
+def store_gaussians(
+    context: SceneContext, sources: Sequence[Source], runner: Runner
+) -> tuple[StoredGaussians, NDArray[np.bool_]]:
+    """Activate all splats, and store them along the curve.
+
+    Returns
+    -------
+    gaussians : StoredGaussians
+    good : (N,) bool
+        Which splats can be drawn.
+    """
+    folder, sizes = context.folder, [*map(len, sources)]
+    activate = [ActivateSplats(source) for source in sources]
+    counts = [*runner.part(0.0, 0.6).run(context, activate, "reading", sizes)]
+
+    def of_all(name: str) -> NDArray[Any]:
+        return np.concatenate([folder.map(source.index, name) for source in sources])
+
+    order = folder.once(
+        "order", lambda: code_order(of_all("code"), lambda rows: of_all("ties")[rows])
+    )
+    index = (np.repeat(np.cumsum([0, *sizes[:-1]]), counts) + of_all("rows"))[order]
+    del order
+    starts = np.cumsum([0, *counts])
+    gather = [GatherChunk(number, starts) for number in range(-(-len(index) // CHUNK))]
+    boxes = [*runner.part(0.6, 1.0).run(context, gather, "reading")]
+    folder.note("boxes", np.reshape(np.array(boxes, np.float32), (-1, 7)))
+    good = of_all("good")
+    for source in sources:
+        folder.drop(source.index, ("code", "ties", "gaussians"))
+    return StoredGaussians(folder, index), good

@@ -1,0 +1,204 @@
+"""Rays into splats that no memory holds at once: `seeing.ray_sample`, with the hits on a disk."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..estimate.psnr import mean_psnr
+from ..seeing.cast import cast
+from ..seeing.ray_sample import RaySample, cast_view
+from ..seeing.rays import Rays
+from ..splats import joined
+from .splat_table import unpacked
+from .workers import Runner
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from ..scene import Scene
+    from ..seeing.projection import Footprints, Gaussians
+    from ..splats import Splats
+    from ..work import Progress
+    from .gaussians import SceneContext, StoredGaussians
+    from .units import Source
+
+    Pixels = tuple[NDArray[np.int64], NDArray[np.int64]]
+
+
+@dataclass(frozen=True)
+class CastRays:
+    """Casts the validation rays of a view.
+
+    Attributes
+    ----------
+    number : int
+        Of the view, in the order of `ViewSet.by_distance`.
+    pixels : (C,), (R,) int64, or None
+        Columns and rows that the rays go through; None chooses them as in memory.
+    """
+
+    number: int
+    pixels: Pixels | None = None
+
+    def run(self, context: SceneContext, _progress: Progress, _threads: int | None) -> None:
+        """Note the rays, unless that is done."""
+        view, _ = context.views.by_distance()[self.number]
+        note_rays(context, self.number, context.footprints(view)[0], self.pixels)
+
+
+@dataclass(frozen=True)
+class TakeSplats:
+    """Reads some splats of a source.
+
+    Attributes
+    ----------
+    source : Source
+    rows : (n,) int64
+    """
+
+    source: Source
+    rows: NDArray[np.int64]
+
+    def run(self, _context: SceneContext, _progress: Progress, _threads: int | None) -> Splats:
+        """Return the splats."""
+        return self.source.splats().take(self.rows)
+
+
+def note_rays(
+    context: SceneContext,
+    number: int,
+    footprints: Footprints,
+    pixels: Pixels | None = None,
+    *,
+    scoring: bool = False,
+) -> None:
+    """Cast rays of a view through its footprints, and note them, unless that is done.
+
+    Parameters
+    ----------
+    context : SceneContext
+    number : int
+        Of the view, in the order of `ViewSet.by_distance`.
+    footprints : Footprints
+    pixels : (C,), (R,) int64, optional
+        Columns and rows that the rays go through, if they are not to be chosen.
+    scoring : bool
+        Whether these are scoring rays, see `RaySample`.
+    """
+    name = _name(number, scoring=scoring)
+    if context.folder.noted(name)[0]:
+        return
+    with np.errstate(under="ignore"):
+        if pixels is None:
+            rays = cast_view(context.views.by_distance(), number, footprints, scoring=scoring)
+        else:
+            rays = cast(footprints, *pixels)
+    context.folder.note(name, tuple(vars(rays).values()))
+
+
+class StoredRays(RaySample):
+    """Rays of all views into one scene, whose hits lie in a folder until `load`.
+
+    Parameters
+    ----------
+    context : SceneContext
+    runner : Runner
+        Only its workers count.
+    sources : sequence of Source
+        All splats.
+    gaussians : StoredGaussians
+    scoring : bool
+        See `RaySample`.
+
+    Attributes
+    ----------
+    noted : set of int
+        Numbers of the views whose rays lie in the folder.
+    """
+
+    def __init__(
+        self,
+        context: SceneContext,
+        runner: Runner,
+        sources: Sequence[Source],
+        gaussians: StoredGaussians,
+        *,
+        scoring: bool = False,
+    ) -> None:
+        # Splats are read when it is known which are hit; of the Gaussians only their rows matter.
+        none = unpacked(np.empty((0, 14)))
+        super().__init__(context.views.by_distance(), gaussians, none, scoring=scoring)  # type: ignore[arg-type]
+        self.noted: set[int] = set()
+        self._context, self._sources = context, sources
+        self._runner = Runner(runner.workers)
+
+    def wants(self, number: int) -> bool:
+        """Return whether the rays of a view are wanted and have not been cast yet."""
+        return number not in self.noted and super().wants(number)
+
+    def cast(
+        self,
+        numbers: Sequence[int],
+        gaussians: Gaussians,  # noqa: ARG002 - as for splats in memory
+        scene: Scene,  # noqa: ARG002
+        progress: Progress,
+        threads: int | None,  # noqa: ARG002
+    ) -> None:
+        """Cast the rays of some views, and load what they hit."""
+        runner = replace(self._runner, progress=progress)
+        self._cast([CastRays(number) for number in numbers], runner)
+
+    def _cast(self, steps: Sequence[CastRays], runner: Runner) -> None:
+        runner.run_all(self._context, steps, "casting rays")
+        self.noted.update(step.number for step in steps)
+        self.load()
+
+    def psnr_against(self, other: StoredRays, runner: Runner) -> float | None:
+        """Return the estimated PSNR with other splats instead; see `estimate.psnr.psnr_against`.
+
+        Parameters
+        ----------
+        other : StoredRays
+            Into those, of the same views, none of whose rays have been cast.
+        runner : Runner
+        """
+        truth = ((number, self.rays[number]) for number in self.validating())
+        steps = [CastRays(number, (rays.columns, rays.rows)) for number, rays in truth if rays]
+        other._cast(steps, runner)
+
+        def cast_again(number: int, _rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
+            rays = other.rays[number]
+            assert rays is not None  # noqa: S101 - just cast
+            return rays, other.colors(number, rays)
+
+        return mean_psnr(self, cast_again)
+
+    def load(self) -> None:
+        """Load the rays that were noted, and the splats that they hit."""
+        for number in sorted(self.noted):
+            name = _name(number, scoring=self.scoring)
+            self.rays[number] = Rays(*self._context.folder.noted(name)[1])
+        hit = [self.index[rays.hit] for rays in self.rays if rays is not None]
+        rows = np.unique(np.concatenate([np.empty(0, np.int64), *hit]))
+        begins = np.cumsum([0, *map(len, self._sources)])
+        edges = itertools.pairwise(np.searchsorted(rows, begins).tolist())
+        steps = [
+            TakeSplats(source, rows[start:stop] - begin)
+            for source, begin, (start, stop) in zip(self._sources, begins, edges, strict=False)
+            if stop > start
+        ]
+        if steps:
+            self.splats = joined([*self._runner.run(self._context, steps, "reading")])
+        # Any number for Gaussians that no ray hits.
+        self.rows = np.searchsorted(rows, self.index)
+
+
+def _name(number: int, *, scoring: bool) -> str:
+    """Return under which name the rays of a view are noted."""
+    return f"{'scoring' if scoring else 'validation'}-rays-{number:06d}"

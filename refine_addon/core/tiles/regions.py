@@ -1,0 +1,361 @@
+"""What a worker does to absorb: with a region of a stage, or at once with all that are left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..absorbing import merge_field
+from ..absorbing.absorb import mergeable, reduced
+from ..absorbing.merge_field import Field, ViewSums
+from ..absorbing.merge_graph import MergeGraph
+from ..pipeline import absorb_removed
+from ..scores import Scores
+from ..seeing.measuring import Measured
+from ..splats import joined
+from .selecting import save_kept
+from .splat_table import packed, unpacked
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from ..scene import Scene
+    from ..splats import Splats
+    from ..task import Settings
+    from ..views import ViewSet
+    from ..work import Progress
+    from .folder import Folder
+    from .units import Source, Unit
+
+SURVIVORS = ("survivors", "places", "changed")
+"""Names of what is noted of survivors: their rows among all splats, ascending; where each is among
+those of all regions; and whether it changed."""
+
+_FIELD = tuple(item.name for item in fields(Field))
+_PRICED = ("allowed", "allowed_error", "first", "second", "cost")
+_GATHERED = ("gathered", "gathered_origin", "gathered_members", "mergeable")
+_NEEDED_NO_MORE = (*_FIELD, *_PRICED, *_GATHERED, "mass", "seen_by")
+
+
+@dataclass(frozen=True)
+class Region:
+    """The splats that are left in a region after a stage: a `Source` of the next.
+
+    Attributes
+    ----------
+    index : int
+        Which one of all.
+    count : int
+    folder : Folder
+        Of the stage.
+    """
+
+    index: int
+    count: int
+    folder: Folder
+
+    def __len__(self) -> int:
+        """Return the number of splats."""
+        return self.count
+
+    def splats(self) -> Splats:
+        """Return its splats, in float64."""
+        return unpacked(self.table())
+
+    def table(self) -> NDArray[np.float64]:
+        """Return its splats as one table, (n, 14 + 3 K), without reading it yet."""
+        return self.folder.map(self.index, "splats")
+
+
+@dataclass(frozen=True)
+class StageContext:
+    """What all steps of a stage need.
+
+    Attributes
+    ----------
+    folder : Folder
+        Of the stage. It has for each region ``rows``, those of its splats among the rows of all
+        sources, ascending, and ``sums``, what the views see of them: see `ViewSums`.
+    views : ViewSet
+    scene : Scene
+    sources : sequence of Source
+        What the stage before left.
+    factor : float
+        On the cost of merging where it is priced by regions, see `absorb.patience`.
+    """
+
+    folder: Folder
+    views: ViewSet
+    scene: Scene
+    sources: Sequence[Source]
+    factor: float = 1.0
+
+    def gathered(
+        self, rows: NDArray[np.int64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
+        """Return the table of some rows, ascending, and of each splat its origin and its members.
+
+        Those are the row of the original splat that it was, and how many originals it stands for.
+        """
+        tables, origins, members = [], [], []
+        starts = np.cumsum([0, *map(len, self.sources)])
+        edges = np.searchsorted(rows, starts)
+        for number, source in enumerate(self.sources):
+            mine = rows[edges[number] : edges[number + 1]] - starts[number]
+            if not len(mine):
+                continue
+            tables.append(source.splats().take(mine))
+            if isinstance(source, Region):
+                arrays = source.folder.load(source.index, ("origin", "members"))
+                origins.append(arrays["origin"][mine])
+                members.append(arrays["members"][mine])
+            else:
+                origins.append(mine + starts[number])
+                members.append(np.ones(len(mine), np.int64))
+        return packed(joined(tables)), np.concatenate(origins), np.concatenate(members)
+
+
+@dataclass(frozen=True)
+class SaveMeans:
+    """Saves where the splats of a source are.
+
+    Attributes
+    ----------
+    source : Source
+    """
+
+    source: Source
+
+    def run(self, context: StageContext, _progress: Progress, _threads: int | None) -> None:
+        """Save the means, in float32."""
+        means = np.asarray(self.source.splats().means, np.float32)
+        context.folder.save(self.source.index, {"means": means})
+
+
+@dataclass(frozen=True)
+class GatherRegion:
+    """Gets a region ready to merge, but for the allowance.
+
+    Attributes
+    ----------
+    index : int
+        Which region.
+    """
+
+    index: int
+
+    def run(
+        self, context: StageContext, progress: Progress, threads: int | None
+    ) -> NDArray[np.float64]:
+        """Save the region; return `merge_field.Unallowed.seen_and_whole`, (2, 2)."""
+        name = f"{self.index:06d}.gathered"
+        sums = context.folder.once(name, lambda: self._gathered(context, progress, threads))
+        return np.asarray(sums)
+
+    def _gathered(
+        self, context: StageContext, progress: Progress, threads: int | None
+    ) -> NDArray[np.float64]:
+        rows, sums = context.folder.load(self.index, ("rows", "sums")).values()
+        table, origin, members = context.gathered(rows)
+        splats = unpacked(table)
+        places = mergeable(splats, context.scene, np.zeros(len(rows), np.bool_))
+        found = merge_field.unallowed(
+            splats, places, context.views, context.scene, ViewSums(*sums),
+            progress=progress, threads=threads,
+        )  # fmt: skip
+        arrays = dict(zip(_GATHERED, (table, origin, members, places), strict=True))
+        arrays |= {"mass": found.mass, "seen_by": found.seen}
+        context.folder.save(self.index, arrays | vars(found.field))
+        return found.seen_and_whole()
+
+
+@dataclass(frozen=True)
+class PriceRegion:
+    """Finds what merging and deleting the splats of a region costs.
+
+    Attributes
+    ----------
+    index : int
+        Which region.
+    whole : (2, 2) float64
+        What `GatherRegion` returns, of all regions together.
+    """
+
+    index: int
+    whole: NDArray[np.float64]
+
+    def run(self, context: StageContext, progress: Progress, threads: int | None) -> None:
+        """Save the graph, and of each splat the cost of its cheapest operation and its weight."""
+        context.folder.once(
+            f"{self.index:06d}.priced", lambda: self._price(context, progress, threads)
+        )
+
+    def _price(self, context: StageContext, progress: Progress, threads: int | None) -> None:
+        folder = context.folder
+        arrays = folder.load(self.index, (*_FIELD, "mass", "seen_by", "rows", "mergeable"))
+        field = Field(*(arrays[name] for name in _FIELD))
+        bare = merge_field.Unallowed(field, arrays["mass"], arrays["seen_by"])
+        graph = MergeGraph(
+            bare.with_allowance(self.whole), context.scene, context.factor, threads=threads
+        )
+        graph.connect(progress)
+        best, merges = graph.best()
+        costs = np.full(len(arrays["rows"]), -1.0)  # what cannot be drawn goes first
+        weights = np.ones(len(costs), np.float32)
+        costs[arrays["mergeable"]] = best
+        # Of two splats that merge, one goes.
+        weights[arrays["mergeable"]] = np.where(merges, np.float32(0.5), np.float32(1.0))
+        priced = (
+            graph.field.contribution, graph.field.error, graph.first, graph.second, graph.cost
+        )  # fmt: skip
+        folder.save(self.index, dict(zip(_PRICED, priced, strict=True)))
+        folder.save(self.index, {"costs": costs, "weights": weights})
+
+
+@dataclass(frozen=True)
+class AbsorbRegion:
+    """Absorbs a region down to some splats.
+
+    Attributes
+    ----------
+    index : int
+        Which region.
+    count : int
+        How many survive.
+    """
+
+    index: int
+    count: int
+
+    def run(self, context: StageContext, progress: Progress, threads: int | None) -> int:
+        """Save the survivors, unless that is done; return how many there are."""
+        name = f"{self.index:06d}.absorbed"
+        left = context.folder.once(name, lambda: self._absorbed(context, progress, threads))
+        context.folder.drop(self.index, _NEEDED_NO_MORE)
+        return int(left)
+
+    def _absorbed(
+        self, context: StageContext, progress: Progress, threads: int | None
+    ) -> NDArray[np.int64]:
+        folder = context.folder
+        arrays = folder.load(self.index, (*_GATHERED, "sums"))
+
+        def graph() -> MergeGraph:
+            priced = folder.load(self.index, (*_FIELD, *_PRICED)).values()
+            *field, contribution, error, first, second, cost = priced
+            return MergeGraph.connected_by(
+                replace(Field(*field), contribution=contribution, error=error),
+                context.scene, context.factor, (first, second, cost), threads=threads,
+            )  # fmt: skip
+
+        protected = np.zeros(len(arrays["gathered"]), np.bool_)
+        with np.errstate(under="ignore"):
+            left, keep, taken, expected = reduced(
+                unpacked(arrays["gathered"]), ViewSums(*arrays["sums"]), arrays["mergeable"], graph,
+                self.count, protected=protected, progress=progress,
+            )  # fmt: skip
+        # A survivor now also stands for all that the splats it absorbed stood for.
+        stays = taken >= 0
+        members = np.bincount(taken[stays], arrays["gathered_members"][stays], len(left))
+        folder.save(
+            self.index,
+            {
+                "splats": packed(left),
+                "origin": arrays["gathered_origin"][keep],
+                "members": members.astype(np.int64),
+                "expected": np.array([expected.contribution, expected.error]),
+            },
+        )
+        return np.array(len(left))
+
+
+@dataclass(frozen=True)
+class AbsorbAtOnce:
+    """Absorbs all splats that are left, of which there is one region, as in memory.
+
+    Attributes
+    ----------
+    goal : int
+        How many survive.
+    total : int
+        How many splats there were before some of them were deleted.
+    settings : Settings
+    """
+
+    goal: int
+    total: int
+    settings: Settings
+
+    def run(
+        self, context: StageContext, progress: Progress, threads: int | None
+    ) -> tuple[int, int]:
+        """Save the survivors, unless that is done; return how many there are, and were merged."""
+        counts = context.folder.once(
+            "000000.absorbed", lambda: self._absorbed(context, progress, threads)
+        )
+        left, merged = counts.tolist()
+        return left, merged
+
+    def _absorbed(
+        self, context: StageContext, progress: Progress, threads: int | None
+    ) -> NDArray[np.int64]:
+        rows, sums = context.folder.load(0, ("rows", "sums")).values()
+        splats = unpacked(context.gathered(rows)[0])
+        none = np.zeros(len(rows), np.int32)
+        # Nothing is deleted by these scores any more: `total` says that it has been.
+        values, views = none.astype(np.float32), context.views
+        scores = Scores(values, none, len(views), 0, {}, method="occlusion")
+        absorbed = absorb_removed(
+            splats, views, self.goal, self.settings,
+            known=(scores, Measured(sums[0], sums[1], none)), began=self.total,
+            progress=progress, threads=threads,
+        )  # fmt: skip
+        context.folder.save(
+            0,
+            {
+                "splats": packed(absorbed.splats),
+                "origin": rows[absorbed.keep],
+                "changed": absorbed.changed,
+            },
+        )
+        return np.array([len(absorbed.splats), absorbed.merged])
+
+
+@dataclass(frozen=True)
+class SettleUnit:
+    """Notes which splats of a unit survive absorbing, and what those became that changed.
+
+    Attributes
+    ----------
+    unit : Unit
+    begin : int
+        How many splats lie before it.
+    regions : sequence of Region
+        Where the survivors are.
+    """
+
+    unit: Unit
+    begin: int
+    regions: Sequence[Region]
+
+    def run(self, folder: Folder, _progress: Progress, _threads: int | None) -> NDArray[np.int64]:
+        """Note them; return what `save_kept` returns."""
+        origin, place, changed = (folder.mapped(name) for name in SURVIVORS)
+        end = self.begin + len(self.unit)
+        here = slice(*np.searchsorted(origin, (self.begin, end)).tolist())
+        rows, mine = origin[here] - self.begin, changed[here]
+        keep = np.zeros(len(self.unit), np.bool_)
+        keep[rows] = True
+        starts, at = np.cumsum([0, *map(len, self.regions)]), place[here][mine]
+        region = np.searchsorted(starts, at, side="right") - 1
+        columns = self.regions[0].table().shape[1] if self.regions else 0
+        became = np.empty((len(at), columns))
+        for index in np.unique(region).tolist():
+            of_region = region == index
+            became[of_region] = self.regions[index].table()[at[of_region] - starts[index]]
+        folder.save(self.unit.index, {"changed": rows[mine], "became": became})
+        return save_kept(self.unit, folder, keep)

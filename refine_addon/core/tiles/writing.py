@@ -1,0 +1,219 @@
+"""Writing tiles: each into the folder of the job, and then all into their places."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import RefineError
+from ..formats.ply_columns import splats_from_columns
+from ..formats.ply_header import with_count
+from ..formats.ply_write import write_rows
+from ..survivors import columns_with
+from ..urls import Url
+from . import storage
+from .folder import Interrupted
+from .splat_table import unpacked
+from .units import bytes_of, header_of, rows_of
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from ..work import Progress
+    from .folder import Folder
+    from .units import Piece, Tile
+
+RENAMED = "renamed"
+"""Name of the note of all tiles, made before the first is renamed: bytes and times, (tiles, 2)."""
+
+
+@dataclass(frozen=True)
+class WriteTile:
+    """Writes what stays of a tile into the folder of the job.
+
+    Attributes
+    ----------
+    number : int
+        Which one of all.
+    tile : Tile
+    pieces : list of Piece
+        All of its rows, in their order.
+    kept : int
+        How many of its splats stay.
+    changed : bool
+        Whether some of them absorbed others.
+    url : Url or None
+        Where to copy the file.
+    """
+
+    number: int
+    tile: Tile
+    pieces: list[Piece]
+    kept: int
+    changed: bool
+    url: Url | None
+
+    def run(self, folder: Folder, _progress: Progress, _threads: int | None) -> int:
+        """Write the file, unless it is there; return its bytes."""
+        made, name = folder.tiles / self.tile.name, f"{self.number:06d}.written"
+        done, size = folder.noted(name)
+        if not (done and made.exists()):
+            size = self._write(folder, made)
+            folder.note(name, np.array(size))
+        if self.url is not None:
+            storage.upload(made, self.url)
+        return int(size)
+
+    def _write(self, folder: Folder, made: Path) -> int:
+        tile = self.tile
+        with folder.writing(made) as stream:
+            stream.write(with_count(header_of(tile), self.kept))
+            for beside in bytes_of(tile, tile.header, tile.begin):
+                stream.write(beside.data)
+            for piece in self.pieces:
+                keep, rows = folder.map(piece.unit, "keep")[piece.place], rows_of(piece.part)
+                columns = self._columns(folder, rows, piece) if self.changed else {}
+                write_rows(stream, rows, keep, columns)
+            for beside in bytes_of(tile, tile.end, tile.size):
+                stream.write(beside.data)
+            return stream.tell()
+
+    def _columns(self, folder: Folder, rows: NDArray[Any], piece: Piece) -> dict[str, NDArray[Any]]:
+        """Return the columns of rows, with what those became that absorbed others."""
+        changed = folder.map(piece.unit, "changed")
+        here = slice(*np.searchsorted(changed, (piece.place.start, piece.place.stop)).tolist())
+        splats = unpacked(folder.map(piece.unit, "became")[here])
+        degree = splats_from_columns(rows[:1]).sh_rest.shape[1]
+        splats = replace(splats, sh_rest=splats.sh_rest[:, :degree])
+        return columns_with(rows, changed[here] - piece.place.start, splats)
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """Where the tiles of a job go.
+
+    Attributes
+    ----------
+    job : Folder
+    targets : sequence of Path or Url
+        The names that all tiles get in the end.
+    waiting : sequence of Path or Url
+        Where each waits, in the same storage, until all are written.
+    overwrite : bool
+        Whether files may be replaced.
+    """
+
+    job: Folder
+    targets: Sequence[Path | Url]
+    waiting: Sequence[Path | Url]
+    overwrite: bool
+
+    @classmethod
+    def of(
+        cls, job: Folder, tiles: Sequence[Tile], folder: Path | Url, *, overwrite: bool
+    ) -> Outputs:
+        """Return where tiles go that end in a folder, which is there.
+
+        Raises
+        ------
+        RefineError
+            If two tiles have one name, or a file could not be made, or may not be replaced.
+        """
+        targets = {folder / tile.name: tile for tile in tiles}
+        if len(targets) < len(tiles):
+            name = next(tile.name for tile in tiles if targets[folder / tile.name] is not tile)
+            msg = f"{targets[folder / name].path}: another tile is called {name} too"
+            raise RefineError(msg)
+        waiting: list[Path | Url] = [
+            folder / f"{job.path.name}-{number:06d}"
+            if isinstance(folder, Url)
+            else job.tiles / tile.name
+            for number, tile in enumerate(tiles)
+        ]
+        outputs = cls(job, [*targets], waiting, overwrite)
+        read = {storage.identity(tile.place) for tile in tiles}
+        for target in targets:
+            if storage.identity(target) in read:
+                msg = f"{target}: is read until all tiles are written; write to another folder"
+                raise RefineError(msg)
+        outputs.refuse_existing()
+        return outputs
+
+    @property
+    def urls(self) -> list[Url | None]:
+        """Where to copy each tile; None on a disk, where it is written at once."""
+        return [None if isinstance(place, Path) else place for place in self.waiting]
+
+    def in_place(self) -> dict[int, int]:
+        """Return the bytes of the tiles, by number, that an interrupted run renamed already."""
+        noted, states = self.job.noted(RENAMED)
+        if not noted:
+            return {}
+        return {
+            number: size
+            for number, (size, changed) in enumerate(states.tolist())
+            if self._is_renamed(number, size, changed)
+        }
+
+    def refuse_existing(self) -> None:
+        """Raise `RefineError` if a tile that is not in its place could not get there."""
+        there = self.in_place()
+        for number, target in enumerate(self.targets):
+            if number not in there:
+                storage.refuse_existing(target, overwrite=self.overwrite)
+
+    def publish(self) -> None:
+        """Rename all tiles that are not in their places yet.
+
+        Raises
+        ------
+        Interrupted
+            If one cannot be renamed, or another file is in its place; if that is so from the
+            beginning, none is renamed.
+        """
+        there = self.in_place()
+        try:
+            self.refuse_existing()
+            _, noted = self.job.noted(RENAMED)
+            states = [
+                noted[number] if number in there else _state(waiting)
+                for number, waiting in enumerate(self.waiting)
+            ]
+            self.job.note(RENAMED, np.array(states, np.int64))
+            for number, (waiting, target) in enumerate(
+                zip(self.waiting, self.targets, strict=True)
+            ):
+                if number not in there:
+                    storage.publish(waiting, target, overwrite=self.overwrite)
+        except RefineError as error:
+            raise Interrupted(str(error)) from error
+
+    def discard(self) -> None:
+        """Remove what waits behind URLs."""
+        for url in self.urls:
+            if url is not None:
+                storage.discard(url)
+
+    def _is_renamed(self, number: int, size: int, changed: int) -> bool:
+        """Return whether a tile is in its place, given its bytes and the time of its last change.
+
+        Storages behind URLs give a file another time when they rename it.
+        """
+        target = self.targets[number]
+        if isinstance(target, Path):
+            return target.is_file() and _state(target) == (size, changed)
+        waiting = self.waiting[number]
+        return storage.size_of(waiting) is None and storage.size_of(target) == size
+
+
+def _state(path: Path | Url) -> tuple[int, int]:
+    """Return the bytes of a file, and on a disk the time of its last change, ns."""
+    if isinstance(path, Path):
+        found = path.stat()
+        return found.st_size, found.st_mtime_ns
+    return storage.size_of(path) or 0, 0
