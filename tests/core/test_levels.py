@@ -373,6 +373,7 @@ def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, monkeypat
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
+@pytest.mark.slow
 def test_no_manifest_lists_levels_of_two_runs(tmp_path, monkeypatch):
     """Where replacing fails at the second level, the first is replaced and the manifest is gone."""
     source = file_of(colourful(), tmp_path / "a.ply")

@@ -88,6 +88,7 @@ def test_what_is_nearer_covers_what_is_farther_whatever_the_order():
     assert np.abs(pictures[0][4, 4] - np.array([204.0, 25.5, 0.0])).max() <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(64, 48), (700, 90)], ids=["one strip", "two strips"])
 def test_a_picture_is_what_the_lines_of_sight_through_all_its_pixels_see(size):
     """`meet` finds the same by another way: all pairs first, then one sort for each pixel."""
@@ -106,6 +107,7 @@ def test_a_picture_is_what_the_lines_of_sight_through_all_its_pixels_see(size):
     assert apart.max() <= 0.5 / 255.0 + 1e-5
 
 
+@pytest.mark.slow
 def test_pictures_do_not_depend_on_threads_or_on_how_many_pairs_are_drawn_at_a_time(monkeypatch):
     """Blocks of footprints end anywhere; only sums of float64 may differ, by less than 1e-9 dB."""
     splats, views = crowd(), ViewSet((view_of(400, 300, 300.0),))

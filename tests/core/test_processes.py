@@ -24,6 +24,8 @@ from refine_addon.core.selection import Budget
 from refine_addon.core.task import Settings
 from refine_addon.core.work import Cancelled
 
+pytestmark = pytest.mark.slow
+
 ROOM = Path(__file__).parents[1] / "data/room_small"
 LONG = 600.0  # seconds; a tenth of it is more than any machine needs to notice
 MUCH = 1e3  # seconds of work: worth processes

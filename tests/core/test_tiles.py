@@ -119,6 +119,7 @@ def test_a_report_says_what_stays_of_each_tile(tmp_path, tiles, views):
         )
 
 
+@pytest.mark.slow
 def test_without_a_folder_the_sizes_are_told_and_nothing_is_written(tmp_path, tiles, views):
     """The same sizes as those of a run that writes."""
     before = sorted(tmp_path.rglob("*"))
@@ -359,6 +360,7 @@ def columns(path):
 # What is done after an interruption.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", [0.1, 0.5, 0.77, 0.8, 0.83, 0.9])
 def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views, monkeypatch, stop):
     """Units that were read are not read again, tiles that were written not written again.
@@ -614,6 +616,7 @@ def test_where_an_open_file_cannot_be_removed_the_folder_goes_all_the_same(tmp_p
     assert not folder.path.exists()
 
 
+@pytest.mark.slow
 def test_another_job_does_not_take_over_what_is_left(tmp_path, tiles, views):
     """Of another budget, the folder has another name."""
 
