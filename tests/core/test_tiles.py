@@ -567,6 +567,15 @@ def test_an_array_that_a_power_cut_truncated_is_made_again(tmp_path, tiles, view
     )
 
 
+def test_a_disk_that_cannot_be_read_is_an_interruption(tmp_path):
+    """A file of the job is a folder here, which is as good as a bad sector: it is named."""
+    folder = Folder(tmp_path).inner("job")
+    (folder.path / "arrays/000001/means.npy").mkdir(parents=True)
+
+    with pytest.raises(Interrupted, match=r"means\.npy: cannot be read \("):
+        folder.load(1, ["means"])
+
+
 def test_a_note_that_a_power_cut_truncated_counts_as_none(tmp_path):
     """Of one array or of several, whatever is left of it; what was whole is read as before."""
     folder = Folder(tmp_path / "job")

@@ -280,9 +280,10 @@ def _shared_out(
     """
     order, goal = np.argsort(costs, kind="stable"), len(costs) - left
     last = int(np.searchsorted(np.cumsum(weights[order], dtype=np.float64), goal))
-    weights[order[last + 1 :]] = 0.0
-    of_regions = np.split(weights, np.cumsum(sizes)[:-1])
-    gone = np.cumsum([some.sum(dtype=np.float64) for some in of_regions])
+    goes, chosen = np.zeros_like(weights), order[: last + 1]
+    goes[chosen] = weights[chosen]
+    of_regions = np.split(goes, np.cumsum(sizes)[:-1])
+    gone = np.cumsum([in_region.sum(dtype=np.float64) for in_region in of_regions])
     # Rounded so that the sum is exact: each gets what is added up to its end.
     gone = np.rint(gone * (goal / gone[-1])).astype(np.int64)
     return [size - int(go) for size, go in zip(sizes, np.diff(gone, prepend=0), strict=True)]
