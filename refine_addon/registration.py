@@ -8,45 +8,44 @@ from bpy.props import PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
-from .ui import camera_list, kept, plans, price, running, volumes
-from .ui.camera_list import REFINE_PT_camera_list, REFINE_UL_cameras, RefineCamera
+from .ui import camera_list, demand_changes, kept, plans, price, running
+from .ui.camera_list import REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
+from .ui.export_operators import REFINE_OT_export_ply
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
 from .ui.operators import (
     REFINE_OT_apply,
     REFINE_OT_convert,
-    REFINE_OT_export_ply,
     REFINE_OT_levels,
     REFINE_OT_plan,
-    REFINE_OT_preview,
     REFINE_OT_score,
 )
 from .ui.panel import (
-    REFINE_PT_advanced,
     REFINE_PT_apply,
+    REFINE_PT_camera_list,
     REFINE_PT_cameras,
     REFINE_PT_export,
     REFINE_PT_floaters,
     REFINE_PT_preview,
     REFINE_PT_score,
     REFINE_PT_splats,
+    REFINE_PT_volumes,
 )
 from .ui.preferences import RefinePreferences
 from .ui.properties import RefineSettings
+from .ui.protect import REFINE_OT_protect
 from .ui.remedies import (
     REFINE_OT_add_ring,
     REFINE_OT_keep_unseen,
     REFINE_OT_leave_out,
     REFINE_OT_turn_cameras,
 )
-from .ui.view_operators import REFINE_OT_view
+from .ui.view_operators import REFINE_OT_preview, REFINE_OT_view
 from .ui.volumes import (
     REFINE_OT_add_volume,
     REFINE_OT_crop,
     REFINE_OT_drop_volume,
-    REFINE_OT_protect,
-    REFINE_PT_volumes,
     RefineVolume,
 )
 from .viewport import draw
@@ -86,7 +85,6 @@ CLASSES = (
     REFINE_PT_floaters,
     REFINE_PT_volumes,
     REFINE_PT_score,
-    REFINE_PT_advanced,
     REFINE_PT_preview,
     REFINE_PT_apply,
     REFINE_PT_export,
@@ -107,7 +105,7 @@ def register() -> None:
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
     camera_list.register()
     kept.register()
-    volumes.register()
+    demand_changes.register()
     price.register()
     running.register()
     images.use(BlenderImages())
@@ -122,7 +120,7 @@ def unregister() -> None:
     running.unregister()
     plans.unregister()
     price.unregister()
-    volumes.unregister()
+    demand_changes.unregister()
     kept.unregister()
     camera_list.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)

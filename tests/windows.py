@@ -77,7 +77,7 @@ def event(kind, value="PRESS", **held):
 
 def until(operator, context, is_so=lambda: False):
     """Send the timer's events until something is so, or the operator ends; return its answer."""
-    for _ in range(2000):
+    for _ in range(30_000):  # five minutes
         answer = operator.modal(context, event("TIMER"))
         if answer != {"PASS_THROUGH"} or is_so():
             return answer

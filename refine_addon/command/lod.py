@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from ..core.estimate.quality import in_words
-from ..core.levels.files import lod_file
+from ..core.levels.files import LevelsRequest, lod_file
 from ..core.report import size_in_words
 from .options import levels, settings
 from .words import by, left_unseen
@@ -28,9 +28,7 @@ def make_levels(
     progress: Progress,
 ) -> dict[str, Any]:
     """Make the levels of a file and say what each costs; return the report."""
-    done = lod_file(
-        source,
-        options.output_dir,
+    request = LevelsRequest(
         views,
         levels(options),
         settings(options),
@@ -38,8 +36,8 @@ def make_levels(
         suffix=options.format,
         goal=options.distance_psnr,
         overwrite=options.overwrite,
-        progress=progress,
     )
+    done = lod_file(source, options.output_dir, request, progress=progress)
     terminal.clear()
     count, made = done["splats"]["before"], len(done["levels"])
     terminal.say(

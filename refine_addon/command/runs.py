@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core import (
+    PruneRequest,
     RefineError,
     as_written,
     clean,
@@ -29,7 +30,7 @@ from ..core.picture_files import PictureFiles
 from ..core.report import held, kept_and_removed, scoring_notes, seen_by, what_was_seen
 from ..core.tiles.storage import located
 from ..core.urls import Url
-from ..core.whole_file import make_folder, refuse_existing, refuse_mapped
+from ..core.whole_file import new_folder, refuse_existing, refuse_mapped
 from . import report, zones
 from .cameras import deciding
 from .checks import open_blend
@@ -160,39 +161,36 @@ def _prune(run: _Run) -> None:
 def _each(run: _Run, work: Callable[[_Run, Path, Path | None, ViewSet], dict[str, Any]]) -> None:
     """Do the work of every input: with its output, if there is to be one, and the views."""
     options, views = run.options, run.views()
-    if options.output_dir and not getattr(options, "dry_run", False):
-        make_folder(options.output_dir)
-    for source in options.inputs:
-        output = options.output_dir / source.name if options.output_dir else options.output
-        run.attempt(
-            str(source), lambda source=source, output=output: work(run, source, output, views)
-        )
+    writes = options.output_dir and not getattr(options, "dry_run", False)
+    with new_folder(options.output_dir) if writes else contextlib.nullcontext():
+        for source in options.inputs:
+            output = options.output_dir / source.name if options.output_dir else options.output
+            run.attempt(
+                str(source), lambda source=source, output=output: work(run, source, output, views)
+            )
 
 
-def _pictures(options: argparse.Namespace, name: str) -> PictureFiles | None:
-    """Return where the pictures of an input go, if they are wanted; makes the folder."""
-    if options.pictures is None:
-        return None
-    make_folder(options.pictures)
-    return PictureFiles(options.pictures, name, options.overwrite)
-
-
-def _prune_one(run: _Run, source: Path, output: Path | None, views: ViewSet) -> dict[str, Any]:
-    options = run.options
-    result = prune_file(
-        source,
-        output,
+def _request(options: argparse.Namespace, views: ViewSet, name: str) -> PruneRequest:
+    """Return what is asked of a prune; `name` is the first part of the names of its pictures."""
+    pictures = None
+    if options.pictures is not None:
+        pictures = PictureFiles(options.pictures, name, options.overwrite)
+    return PruneRequest(
         views,
         budget(options),
         settings(options),
-        zones=zones.of_files(options),
+        zones=() if options.object else zones.of_files(options),
         absorb=options.absorb,
         cleaning=cleaning(options) if options.clean else None,
-        pictures=_pictures(options, without_suffix(source.name)),
+        pictures=pictures,
         overwrite=options.overwrite,
         dry_run=options.dry_run,
-        progress=run.progress(source.name),
     )
+
+
+def _prune_one(run: _Run, source: Path, output: Path | None, views: ViewSet) -> dict[str, Any]:
+    request = _request(run.options, views, without_suffix(source.name))
+    result = prune_file(source, output, request, progress=run.progress(source.name))
     run.terminal.clear()
     _say_result(run, str(source), result.report)
     return result.report
@@ -239,25 +237,16 @@ def _workers(options: argparse.Namespace) -> contextlib.AbstractContextManager[W
 
 
 def _prune_object(run: _Run) -> dict[str, Any]:
-    from ..objects import splat_object  # noqa: PLC0415 - needs Blender
+    from ..objects.prune_object import prune_object  # noqa: PLC0415 - needs Blender
 
-    options = run.options
-    done = splat_object.prune_object(
-        options.object,
-        run.views(),
-        budget(options),
-        settings(options),
-        zones.of_object(options),
-        absorb=options.absorb,
-        output=options.output,
-        pictures=_pictures(options, options.object),
-        save=options.save,
-        dry_run=options.dry_run,
-        overwrite=options.overwrite,
-        progress=run.progress(options.object),
-    )
+    options, name = run.options, run.options.object
+    request, demanded = _request(options, run.views(), name), zones.of_object(options)
+    done = prune_object(
+        name, request, demanded,
+        output=options.output, save=options.save, progress=run.progress(name),
+    )  # fmt: skip
     run.terminal.clear()
-    _say_result(run, options.object, done)
+    _say_result(run, name, done)
     return done
 
 

@@ -10,11 +10,12 @@ In short::
 from .cameras.read import read_cameras
 from .cleaning.clean import REASONS, Cleaned, Cleaning, clean
 from .errors import Cancelled, RefineError
-from .file_to_file import prune_file
 from .formats.ply import SplatFile, read_ply
 from .formats.registry import as_written, read_splats
-from .levels.files import lod_file
+from .levels.files import LevelsRequest, lod_file
 from .levels.lod import Level, Levels, lod
+from .operation.files import prune_file
+from .operation.prune import PruneRequest
 from .pipeline import prune, score
 from .scores import Scores
 from .scoring.closed_form_settings import ClosedForm
@@ -26,7 +27,7 @@ from .survivors import survivor_columns
 from .task import METHODS, Result, Settings
 from .tiles.prune import prune_tiles
 from .views import View, ViewSet
-from .volumes import Box, Placed, Sphere, Zone, forced
+from .volumes import Box, MovedVolume, Sphere, Zone, forced
 
 __all__ = [
     "METHODS",
@@ -39,8 +40,10 @@ __all__ = [
     "ClosedForm",
     "Level",
     "Levels",
+    "LevelsRequest",
+    "MovedVolume",
     "Occlusion",
-    "Placed",
+    "PruneRequest",
     "RefineError",
     "Result",
     "Scores",

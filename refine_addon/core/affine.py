@@ -10,6 +10,7 @@ import numpy as np
 from . import spherical_harmonics
 from .errors import RefineError
 from .splats import Splats, rotation_matrices
+from .work import chunks
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,6 +27,9 @@ UNIFORM_TOLERANCE = 1e-4
 SMALLEST_SCALE, LARGEST_SCALE = 1e-30, 1e30
 """Of a matrix that is applied: its determinant is in the range of float64, and usual splats stay in
 that of float32."""
+
+_CHUNK = 1 << 16
+"""Splats whose covariances are computed together, which limits temporary memory."""
 
 
 def is_uniform(matrix: NDArray[Any]) -> bool:
@@ -141,8 +145,7 @@ def quaternion(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 def _stretched(splats: Splats, means: NDArray[Any], linear: NDArray[np.float64]) -> Splats:
     """Return splats with these means and the covariances ``M S M'``, M being `linear`."""
     logs, quaternions = np.empty((len(splats), 3)), np.empty((len(splats), 4))
-    for start in range(0, len(splats), 1 << 16):
-        piece = slice(start, start + (1 << 16))
+    for piece in chunks(len(splats), _CHUNK):
         stored = np.asarray(splats.log_scales[piece], np.float64)
         usable = np.isfinite(stored).all(axis=1)
         largest = np.where(usable, stored.max(axis=1), 0.0)

@@ -1,4 +1,4 @@
-"""The two exceptions that core raises on purpose."""
+"""The two exceptions that core raises on purpose, and texts for their messages."""
 
 from __future__ import annotations
 
@@ -20,6 +20,11 @@ def printable(text: str) -> str:
         char.encode("unicode_escape").decode() if unicodedata.category(char) in _OBEYED else char
         for char in text
     )
+
+
+def reason_of(error: Exception) -> str:
+    """Return why the system refuses, such as "Permission denied"."""
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
 
 
 class RefineError(Exception):

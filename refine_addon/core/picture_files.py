@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -9,12 +10,14 @@ from typing import TYPE_CHECKING, Any
 from .errors import RefineError
 from .pictures import AMPLIFIED, CAMERAS, compare
 from .png import png
-from .whole_file import refuse_existing, whole_file
+from .whole_file import new_folder, refuse_existing, whole_file
 from .work import Progress, silent
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
+    from .pictures import Comparison
     from .splats import Splats
     from .views import ViewSet
 
@@ -24,7 +27,8 @@ KINDS = ("before", "after", "difference")
 _IMAGE = re.compile(r"\.(png|jpe?g|webp|tiff?|exr|bmp)$", re.IGNORECASE)
 """The suffix of a photo, after which imported cameras are named."""
 
-_LONGEST = 80  # characters of a camera's name; systems take names of 255 bytes
+_LONGEST = 80
+"""Bytes of a camera's name that its files have: its end. Systems take names of 255 bytes."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,7 @@ class PictureFiles:
     Attributes
     ----------
     folder : Path
-        It is there.
+        Made if it is not there.
     name : str
         Of the splats: the first part of the files' names.
     overwrite : bool
@@ -45,17 +49,20 @@ class PictureFiles:
     name: str
     overwrite: bool = False
 
-    def refuse_existing(self, views: ViewSet) -> None:
-        """Refuse what could not be written, before the work.
+    @contextlib.contextmanager
+    def opened(self, views: ViewSet) -> Iterator[None]:
+        """Make the folder, and refuse what could not be written, before the work.
 
         Raises
         ------
         RefineError
-            See `refine_addon.core.whole_file.refuse_existing`.
+            See `refine_addon.core.whole_file.new_folder` and `refuse_existing`.
         """
-        for paths in self._paths(chosen(views)):
-            for path in paths.values():
-                refuse_existing(path, overwrite=self.overwrite)
+        with new_folder(self.folder):
+            for paths in self._paths(chosen(views)):
+                for path in paths.values():
+                    refuse_existing(path, overwrite=self.overwrite)
+            yield
 
     def write(
         self,
@@ -66,14 +73,14 @@ class PictureFiles:
         progress: Progress = silent,
         threads: int | None = None,
     ) -> dict[str, Any]:
-        """Draw some of the views and write their pictures.
+        """Draw the `chosen` of the views and write their pictures.
 
         Parameters
         ----------
         before, after, progress, threads
             See `refine_addon.core.pictures.compare`.
         views : ViewSet
-            Those that decided; `chosen` of them are drawn.
+            Those that decided.
 
         Returns
         -------
@@ -88,17 +95,15 @@ class PictureFiles:
         Cancelled
             If `progress` answers ``False``.
         """
-        some = chosen(views)
-        found = compare(before, after, some, progress=progress, threads=threads)
-        told = []
-        for one, paths in zip(found, self._paths(some), strict=True):
-            for kind, path in paths.items():
-                self._write(path, png(getattr(one, kind)))
-            size = [one.view.width, one.view.height]
-            names = {kind: str(path) for kind, path in paths.items()}
-            told.append({"camera": one.view.name, "size": size, "psnr": round(one.psnr, 2)} | names)
-        mean = sum(one.psnr for one in found) / len(found)
-        return {"psnr": round(mean, 2), "amplified": AMPLIFIED, "views": told}
+        drawn = chosen(views)
+        comparisons = compare(before, after, drawn, progress=progress, threads=threads)
+        paths = self._paths(drawn)
+        for comparison, files in zip(comparisons, paths, strict=True):
+            for kind, path in files.items():
+                self._write(path, png(getattr(comparison, kind)))
+        mean = sum(comparison.psnr for comparison in comparisons) / len(comparisons)
+        facts = [*map(_facts, comparisons, paths)]
+        return {"psnr": round(mean, 2), "amplified": AMPLIFIED, "views": facts}
 
     def _write(self, path: Path, data: bytes) -> None:
         try:
@@ -115,6 +120,13 @@ class PictureFiles:
             {kind: self.folder / f"{name}-{label}-{kind}.png" for kind in KINDS}
             for label in _labels([view.name for view in views])
         ]
+
+
+def _facts(comparison: Comparison, paths: dict[str, Path]) -> dict[str, Any]:
+    """Return what the report says of a view."""
+    view = comparison.view
+    facts = {"camera": view.name, "size": [view.width, view.height]}
+    return facts | {"psnr": round(comparison.psnr, 2)} | {k: str(p) for k, p in paths.items()}
 
 
 def chosen(views: ViewSet) -> ViewSet:
@@ -144,14 +156,15 @@ def _labels(names: list[str]) -> list[str]:
     >>> _labels(["left/0.png", "left/0.png", ""])
     ['left_0', 'left_0_2', 'view']
     """
-    found: list[str] = []
+    labels: list[str] = []
     for name in names:
-        label = new = _plain(_IMAGE.sub("", name))[-_LONGEST:] or "view"
+        end = _plain(_IMAGE.sub("", name)).encode()[-_LONGEST:]
+        label = new = end.decode(errors="ignore") or "view"
         number = 2
-        while new in found:
+        while new in labels:
             new, number = f"{label}_{number}", number + 1
-        found.append(new)
-    return found
+        labels.append(new)
+    return labels
 
 
 def _plain(name: str) -> str:

@@ -85,14 +85,14 @@ def counts(
     """
     kind = keys.dtype.type
     whole = shift + DIGIT == 8 * keys.dtype.itemsize
-    found = np.zeros((len(prefixes), 1 << DIGIT), np.int64)
+    occurrences = np.zeros((len(prefixes), 1 << DIGIT), np.int64)
     for index, prefix in enumerate(prefixes):
         chosen = slice(None) if whole else (keys >> kind(shift + DIGIT)) == kind(prefix)
         digits = ((keys[chosen] >> kind(shift)) & kind((1 << DIGIT) - 1)).astype(np.uint16)
         # Sums of whole numbers in float64, which are exact up to 2^53.
-        each = None if weights is None else weights[chosen]
-        found[index] = np.bincount(digits, each, minlength=1 << DIGIT)
-    return found
+        weight = None if weights is None else weights[chosen]
+        occurrences[index] = np.bincount(digits, weight, minlength=1 << DIGIT)
+    return occurrences
 
 
 class Sparse(NamedTuple):
@@ -130,7 +130,7 @@ def added(parts: Iterable[Sparse]) -> NDArray[np.int64]:
 
 
 def find(count: Count, bits: int, ranks: Sequence[int]) -> list[tuple[int, int]]:
-    """Return the numbers at some places of the order of all, the smallest at 0.
+    """Return the numbers that have certain places in ascending order, the smallest at 0.
 
     Parameters
     ----------
@@ -152,16 +152,17 @@ def find(count: Count, bits: int, ranks: Sequence[int]) -> list[tuple[int, int]]
     >>> find(lambda prefixes, shift: counts(keys, prefixes, shift), 32, [1, 2, 3])
     [(9, 1), (9, 1), (70000, 3)]
     """
-    found = [(0, 0)] * len(ranks)
+    # Of each number the digits read so far, and how many numbers are smaller than these say.
+    read = [(0, 0)] * len(ranks)
     for shift in range(bits - DIGIT, -1, -DIGIT):
-        prefixes = sorted({prefix for prefix, _ in found})
+        prefixes = sorted({prefix for prefix, _ in read})
         sums = dict(zip(prefixes, np.cumsum(count(prefixes, shift), axis=1), strict=True))
-        for index, (rank, (prefix, below)) in enumerate(zip(ranks, found, strict=True)):
+        for index, (rank, (prefix, below)) in enumerate(zip(ranks, read, strict=True)):
             upto = sums[prefix]
             digit = int(np.searchsorted(upto, rank - below, side="right"))
             less = int(upto[digit - 1]) if digit else 0
-            found[index] = (prefix << DIGIT | digit, below + less)
-    return found
+            read[index] = (prefix << DIGIT | digit, below + less)
+    return read
 
 
 def median(count: Count, dtype: np.dtype[Any], total: int) -> float:

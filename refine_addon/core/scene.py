@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .work import chunks
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio: its multiples spread numbers that differ little."""
 
-_CHUNK = 1 << 16
+_CHUNK = 1 << 16  # rows that are computed together, which limits temporary memory
 _BITS = 21  # of each coordinate in `spatial_order`; three of them fit an int64
 _SPREAD_BITS = (
     (32, 0x1F00000000FFFF),
@@ -107,7 +109,7 @@ def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -
     origin, views_squared = views.middle()
     squared = np.empty(len(means))
     with np.errstate(under="ignore"):
-        for piece in _pieces(len(means)):
+        for piece in chunks(len(means), _CHUNK):
             # Undrawable splats may hold any number, such as infinity.
             offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
             squared[piece] = np.einsum("ij,ij->i", offset, offset) + views_squared
@@ -131,15 +133,15 @@ def _principal_axes(
         Its origin and size are used.
     """
     total = np.zeros((4, 3))
-    for found in moments(means, drawable, scene):
-        total += found
+    for sums in moments(means, drawable, scene):
+        total += sums
     return principal_axes(total[:3], total[3])
 
 
 def moments(
     means: NDArray[Any], drawable: NDArray[np.bool_], scene: Scene
 ) -> Iterator[NDArray[np.float64]]:
-    """Yield of some positions after the other what `principal_axes` takes, (4, 3) float64.
+    """Yield what `principal_axes` takes, (4, 3) float64, for one chunk of positions at a time.
 
     The first three rows are the weighted sums of the products of coordinates, the last those of the
     coordinates.
@@ -149,7 +151,7 @@ def moments(
     means, drawable, scene
         See `_principal_axes`.
     """
-    for piece in _pieces(len(means)):
+    for piece in chunks(len(means), _CHUNK):
         place = scene.place(means[piece][drawable[piece]])  # (n, 3)
         nearness = (1.0 + np.einsum("ij,ij->i", place, place)) ** -2.0  # (n,)
         weighted = place * nearness[:, None]
@@ -173,11 +175,6 @@ def principal_axes(second: NDArray[np.float64], first: NDArray[np.float64]) -> N
     return np.ascontiguousarray(axes)
 
 
-def _pieces(count: int) -> Iterator[slice]:
-    """Return slices that cover `count` rows."""
-    return (slice(start, start + _CHUNK) for start in range(0, count, _CHUNK))
-
-
 def fingerprint(*columns: NDArray[Any]) -> NDArray[np.uint64]:
     """Return a hash of each row's values, (N,): the same number wherever the row stands.
 
@@ -197,7 +194,7 @@ def fingerprint(*columns: NDArray[Any]) -> NDArray[np.uint64]:
 
 
 def splat_fingerprint(splats: Splats, rows: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Return the `fingerprint` of opacity and base colour of some splats, (n,)."""
+    """Return the `fingerprint` of opacity and base colour of splats by their rows, (n,)."""
     return fingerprint(splats.opacity_logits[rows], *splats.sh_dc[rows].T)
 
 

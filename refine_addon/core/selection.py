@@ -65,12 +65,12 @@ class Budget:
         RefineError
             With the name of the value, its value and what was expected.
         """
-        given = [item.name for item in fields(self) if getattr(self, item.name) is not None]
-        if len(given) != 1:
-            names = ", ".join(item.name for item in fields(self))
-            msg = f"expected one of {names}, got {given or 'none'}"
+        names = [item.name for item in fields(self) if getattr(self, item.name) is not None]
+        if len(names) != 1:
+            known = ", ".join(item.name for item in fields(self))
+            msg = f"expected one of {known}, got {names or 'none'}"
             raise RefineError(msg)
-        value = getattr(self, given[0])
+        value = getattr(self, names[0])
         # Functions, so that only the check of the given value runs.
         checks: dict[str, tuple[str, Callable[[], bool]]] = {
             "ratio": ("0 <= ratio < 1", lambda: 0 <= value < 1),
@@ -80,9 +80,9 @@ class Budget:
             "min_seen": ("a percentage, 0 to 100", lambda: 0 <= value <= 100),  # noqa: PLR2004
             "psnr": (f"more than 0 and less than {PSNR_CAP:g} dB", lambda: 0 < value < PSNR_CAP),
         }
-        expected, holds = checks[given[0]]
+        expected, holds = checks[names[0]]
         if not holds():
-            msg = f"{given[0]} is {value}, expected {expected}"
+            msg = f"{names[0]} is {value}, expected {expected}"
             raise RefineError(msg)
 
     @property
@@ -264,7 +264,7 @@ class Tally:
         return len(self._values)
 
     def is_of(self, scores: Scores, protected: NDArray[np.bool_] | None = None) -> bool:
-        """Tell whether scores and what is protected are equal to those it was made of."""
+        """Return whether it was made of equal scores and of an equal `protected`."""
         pairs = (
             (scores.values, self.scores.values),
             (scores.seen, self.scores.seen),
@@ -412,9 +412,9 @@ def _remove_lowest(
 
     As many of them as have the weight `amount` together, or more; by default each weighs 1.
     """
-    some: slice | NDArray[np.bool_] = slice(None) if free.all() else free
-    keys = radix.keys_of(values[some])
-    weights = None if weights is None else weights[some]
+    rows: slice | NDArray[np.bool_] = slice(None) if free.all() else free
+    keys = radix.keys_of(values[rows])
+    weights = None if weights is None else weights[rows]
     amount = min(amount, len(keys) if weights is None else int(weights.sum()))
     if amount <= 0:
         return
@@ -423,7 +423,7 @@ def _remove_lowest(
         return radix.counts(keys, prefixes, shift, weights)
 
     edge, below = radix.find(count, 8 * keys.dtype.itemsize, [amount - 1])[0]
-    keep[some] = ~lowest(keys, edge, amount - below, weights)
+    keep[rows] = ~lowest(keys, edge, amount - below, weights)
 
 
 def rank(values: NDArray[np.float32]) -> NDArray[np.float64]:

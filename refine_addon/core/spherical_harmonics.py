@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .work import chunks
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -14,7 +16,7 @@ _CHUNK = 1 << 16  # splats whose coefficients are widened to float64 at a time
 
 
 def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
-    """Return the values of all harmonics in some directions.
+    """Return the values of all harmonics along directions.
 
     Parameters
     ----------
@@ -103,10 +105,10 @@ def colors(
         Coefficients above the constant, K = (degree + 1)^2 - 1.
     """
     values = basis(directions, math.isqrt(sh_rest.shape[1] + 1) - 1)  # (N, K + 1)
-    found = 0.5 + values[:, :1] * np.asarray(sh_dc, np.float64)
+    color = 0.5 + values[:, :1] * np.asarray(sh_dc, np.float64)
     if sh_rest.shape[1]:
-        found += np.einsum("nk,nkc->nc", values[:, 1:], np.asarray(sh_rest, np.float64))
-    return np.asarray(found)
+        color += np.einsum("nk,nkc->nc", values[:, 1:], np.asarray(sh_rest, np.float64))
+    return np.asarray(color)
 
 
 def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -130,10 +132,9 @@ def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.f
     points /= np.linalg.norm(points, axis=1, keepdims=True)
     here, before = basis(points, degree), basis(points @ rotation, degree)
     for band in range(1, degree + 1):
-        own = slice(band * band, (band + 1) ** 2)
-        matrix = np.linalg.lstsq(here[:, own], before[:, own], rcond=None)[0]
-        stored = slice(own.start - 1, own.stop - 1)
-        for start in range(0, len(rotated), _CHUNK):
-            rows = slice(start, start + _CHUNK)
+        columns = slice(band * band, (band + 1) ** 2)
+        matrix = np.linalg.lstsq(here[:, columns], before[:, columns], rcond=None)[0]
+        stored = slice(columns.start - 1, columns.stop - 1)
+        for rows in chunks(len(rotated), _CHUNK):
             rotated[rows, stored] = np.einsum("ij,njc->nic", matrix, sh_rest[rows, stored])
     return rotated

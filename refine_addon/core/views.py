@@ -111,6 +111,13 @@ class View:
             raise ValueError(msg)
 
 
+def is_orthonormal(matrix: NDArray[np.float64]) -> bool:
+    """Return whether a matrix (3, 3) is a rotation or a reflection, up to `ORTHONORMAL`."""
+    # Entries first: those of a rotation are at most 1, and squares of large ones could overflow.
+    small = np.abs(matrix).max() <= 2.0  # noqa: PLR2004
+    return bool(small and np.abs(matrix @ matrix.T - np.eye(3)).max() <= ORTHONORMAL)
+
+
 def _check_pose(rotation: NDArray[np.float64], center: NDArray[np.float64]) -> None:
     if rotation.shape != (3, 3) or center.shape != (3,):
         msg = f"expected rotation (3, 3) and center (3,), got {rotation.shape} and {center.shape}"
@@ -121,9 +128,7 @@ def _check_pose(rotation: NDArray[np.float64], center: NDArray[np.float64]) -> N
     if np.abs(center).max() > np.finfo(np.float32).max:
         msg = f"center {center.tolist()} is beyond the range of float32"
         raise ValueError(msg)
-    # Entries first: those of a rotation are at most 1, and squares of large ones could overflow.
-    largest = np.abs(rotation).max()
-    if largest > 2 or np.abs(rotation @ rotation.T - np.eye(3)).max() > ORTHONORMAL:  # noqa: PLR2004
+    if not is_orthonormal(rotation):
         msg = f"rotation is not orthonormal: {rotation.tolist()}"
         raise ValueError(msg)
 

@@ -60,8 +60,8 @@ class Box:
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which points, (N, 3), lie inside, (N,)."""
-        found = ((points >= self.low) & (points < self.high)).all(axis=1)
-        return np.asarray(found & np.isfinite(points).all(axis=1))
+        between = ((points >= self.low) & (points < self.high)).all(axis=1)
+        return np.asarray(between & np.isfinite(points).all(axis=1))
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ class Sphere:
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class MovedVolume:
     """A volume that a matrix has moved.
 
     Attributes
@@ -217,7 +217,7 @@ class Forced:
         return {n: 0 if mask is None else int(np.count_nonzero(mask)) for n, mask in masks}
 
     def of(self, rows: NDArray[np.bool_]) -> Forced:
-        """Return the same of some of the splats, (N,) bool."""
+        """Return the same for the splats in `rows`, (N,) bool, alone."""
         protected, removed = (
             None if mask is None else mask[rows] for mask in (self.protected, self.removed)
         )
@@ -272,11 +272,11 @@ def forced(
     return Forced(protected, removed, tuple(facts))
 
 
-def among_all(some: NDArray[Any], rest: NDArray[np.bool_]) -> NDArray[Any]:
-    """Return values of what was left of N splats, (N,) bool, as those of all: 0 for the others."""
-    values = np.zeros(len(rest), some.dtype)
-    values[rest] = some
-    return values
+def among_all(values: NDArray[Any], rest: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return values of the splats in `rest`, (N,) bool, as values of all N: 0 for the others."""
+    of_all = np.zeros(len(rest), values.dtype)
+    of_all[rest] = values
+    return of_all
 
 
 def refuse_all(removed: NDArray[np.bool_]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import itertools
 import os
 import platform
 import re
@@ -13,7 +14,7 @@ import stat
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from .errors import RefineError
+from .errors import RefineError, reason_of
 from .urls import refuse_url
 from .work import checkpoint
 
@@ -89,9 +90,30 @@ def make_folder(path: Path) -> bool:
         there = bool(mode_of(path))
         path.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
-        msg = f"{path}: cannot be made ({getattr(error, 'strerror', None) or error})"
+        msg = f"{path}: cannot be made ({reason_of(error)})"
         raise RefineError(msg) from error
     return there
+
+
+@contextlib.contextmanager
+def new_folder(path: Path) -> Iterator[None]:
+    """Make a folder and those above it; remove those that were not there and are empty at the end.
+
+    Raises
+    ------
+    RefineError
+        If it cannot be made; nothing is left then.
+    """
+    made: list[Path] = []
+    try:
+        with contextlib.suppress(OSError, ValueError):  # which `make_folder` explains
+            made += itertools.takewhile(lambda folder: not mode_of(folder), (path, *path.parents))
+        make_folder(path)
+        yield
+    finally:
+        for folder in made:
+            with contextlib.suppress(OSError):  # it holds something
+                folder.rmdir()
 
 
 def refuse_mapped(path: Path, source: Path) -> None:
@@ -139,8 +161,8 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
         raise RefineError(_explain(path, error)) from error
     _remove_abandoned(target)
     try:
-        with contextlib.ExitStack() as held:
-            temporary, mode, stream = _new_temporary(target, held)
+        with contextlib.ExitStack() as cleanup:
+            temporary, mode, stream = _new_temporary(target, cleanup)
             with stream:
                 yield stream
                 stream.flush()  # before the permissions: a write would take setuid away
@@ -158,7 +180,7 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
         raise RefineError(_explain(path, error)) from error
 
 
-def publish(made: Path, path: Path, *, overwrite: bool) -> None:
+def publish(finished: Path, path: Path, *, overwrite: bool) -> None:
     """Rename a finished file on the same disk to `path`, as `whole_file` does with its own.
 
     Raises
@@ -170,15 +192,15 @@ def publish(made: Path, path: Path, *, overwrite: bool) -> None:
     try:
         target = path.resolve()
         if not overwrite:
-            _publish_new(made, target)
-            made.unlink(missing_ok=True)  # which may be a second name now
+            _publish_new(finished, target)
+            finished.unlink(missing_ok=True)  # which may be a second name now
             return
-        with made.open("rb+") as stream:
+        with finished.open("rb+") as stream:
             mode = _inherited(
                 target, stream.fileno(), stat.S_IMODE(os.fstat(stream.fileno()).st_mode)
             )
-            made.chmod(mode)
-        made.replace(target)
+            finished.chmod(mode)
+        finished.replace(target)
     except (OSError, RuntimeError) as error:
         raise RefineError(_explain(path, error)) from error
 
@@ -193,10 +215,11 @@ def _prefix(target: Path) -> str:
     return f".refine-{hashlib.blake2b(owner, digest_size=8).hexdigest()}-"
 
 
-def _new_temporary(target: Path, held: contextlib.ExitStack) -> tuple[Path, int, BinaryIO]:
+def _new_temporary(target: Path, cleanup: contextlib.ExitStack) -> tuple[Path, int, BinaryIO]:
     """Create a file beside `target` that only its owner may read.
 
-    When `held` is closed, the file is removed. It is locked until then, or until this process dies.
+    When `cleanup` is closed, the file is removed. It is locked until then, or until this process
+    dies.
 
     Returns
     -------
@@ -208,11 +231,11 @@ def _new_temporary(target: Path, held: contextlib.ExitStack) -> tuple[Path, int,
     while True:
         temporary = target.with_name(f"{_prefix(target)}{secrets.token_hex(8)}.tmp")
         # Before the file exists, so that no interruption from here on can leave it behind.
-        held.callback(_discard, temporary)
+        cleanup.callback(_discard, temporary)
         # A file that replaces another is private from the start. A new one is created with the
         # user's permissions, which cannot be read otherwise, and made private while it is empty.
         opener = _opener(0o600 if mode_of(target) else 0o666)
-        stream = held.enter_context(open(temporary, "xb", opener=opener))  # noqa: SIM115
+        stream = cleanup.enter_context(open(temporary, "xb", opener=opener))  # noqa: SIM115
         mode = stat.S_IMODE(os.fstat(stream.fileno()).st_mode)
         with contextlib.suppress(OSError):  # a drive without permissions
             temporary.chmod(0o600)
@@ -220,7 +243,7 @@ def _new_temporary(target: Path, held: contextlib.ExitStack) -> tuple[Path, int,
             return temporary, mode, stream
         # A second descriptor keeps the lock when the file is closed, before it is renamed.
         lock = os.dup(stream.fileno())
-        held.callback(os.close, lock)
+        cleanup.callback(os.close, lock)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             taken = not os.fstat(lock).st_nlink
@@ -259,8 +282,8 @@ def _inherited(target: Path, descriptor: int, mode: int) -> int:
 
 def _owner(descriptor: int) -> tuple[int, int]:
     """Return the user and the group that own an open file."""
-    found = os.fstat(descriptor)
-    return found.st_uid, found.st_gid
+    status = os.fstat(descriptor)
+    return status.st_uid, status.st_gid
 
 
 def _opener(mode: int) -> Callable[[str, int], int]:
@@ -316,5 +339,4 @@ def _explain(path: Path, error: Exception) -> str:
         return f"{path}: no space left on the disk; nothing was changed"
     if isinstance(error, FileExistsError):
         return f"{path}: another program created this file in the meantime; it was left as it is"
-    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return f"{path}: cannot be written ({reason}); nothing was changed"
+    return f"{path}: cannot be written ({reason_of(error)}); nothing was changed"

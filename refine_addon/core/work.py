@@ -73,6 +73,18 @@ def default_threads() -> int:
     return min(os.cpu_count() or 1, 8)
 
 
+def chunks(total: int, chunk: int) -> Iterator[slice]:
+    """Yield consecutive slices of ``range(total)``, all but the last of one length.
+
+    Examples
+    --------
+    >>> [*chunks(5, 2)]
+    [slice(0, 2, None), slice(2, 4, None), slice(4, 5, None)]
+    """
+    for start in range(0, total, chunk):
+        yield slice(start, min(start + chunk, total))
+
+
 def for_chunks(
     work: Callable[[slice], Result],
     total: int,
@@ -142,18 +154,18 @@ def each_chunk(  # noqa: PLR0913 - all but three are optional
     # Freeing one 30 MB block raises glibc's mmap threshold, so chunk buffers are reused instead of
     # page-faulted. No effect on other systems.
     np.empty(_HELD, np.uint8)
-    slices = [slice(start, min(start + chunk, total)) for start in range(0, total, chunk)]
+    pieces = [*chunks(total, chunk)]
     threads = default_threads() if threads is None else threads
     # About a hundred reports are enough for a progress bar; each may cost a redraw.
-    step = max(len(slices) // 100, 1)
-    if threads <= 1 or len(slices) <= 1:
-        yield from _in_turn(work, slices, step, progress, what)
+    step = max(len(pieces) // 100, 1)
+    if threads <= 1 or len(pieces) <= 1:
+        yield from _in_turn(work, pieces, step, progress, what)
     else:
-        yield from _side_by_side(work, slices, step, progress, what, threads, stop)
+        yield from _side_by_side(work, pieces, step, progress, what, threads, stop)
 
 
 def _in_turn(
-    work: Callable[[slice], Result], slices: list[slice], step: int, progress: Progress, what: str
+    work: Callable[[slice], Result], pieces: list[slice], step: int, progress: Progress, what: str
 ) -> Iterator[Result]:
     """Do the work of `for_chunks` in this thread."""
     done = 0
@@ -162,13 +174,13 @@ def _in_turn(
     def tell() -> None:
         nonlocal told
         told = time.monotonic()
-        report(progress, done / len(slices), what)
+        report(progress, done / len(pieces), what)
 
     def check() -> None:
         if time.monotonic() - told >= _REPORT_INTERVAL:
             tell()
 
-    for done, piece in enumerate(slices):
+    for done, piece in enumerate(pieces):
         if done % step == 0:
             tell()
         with checked_by(check):
@@ -178,7 +190,7 @@ def _in_turn(
 
 def _side_by_side(  # noqa: PLR0913, PLR0917 - those of `for_chunks`
     work: Callable[[slice], Result],
-    slices: list[slice],
+    pieces: list[slice],
     step: int,
     progress: Progress,
     what: str,
@@ -197,14 +209,14 @@ def _side_by_side(  # noqa: PLR0913, PLR0917 - those of `for_chunks`
             return work(piece)
 
     with ThreadPoolExecutor(threads) as pool:
-        futures = deque(pool.submit(checked, piece) for piece in slices)
+        futures = deque(pool.submit(checked, piece) for piece in pieces)
         try:
-            for index in range(len(slices)):
+            for index in range(len(pieces)):
                 if index % step == 0:
-                    report(progress, index / len(slices), what)
+                    report(progress, index / len(pieces), what)
                 future = futures.popleft()  # and forget the result once it is used
                 while not future.done() and not wait([future], _REPORT_INTERVAL).done:
-                    report(progress, index / len(slices), what)
+                    report(progress, index / len(pieces), what)
                 yield future.result()
                 del future
         except BaseException:

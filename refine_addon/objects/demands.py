@@ -12,10 +12,11 @@ import bpy
 import numpy as np
 
 from ..cameras.objects import world_matrix
+from ..core import volumes as core_volumes
 from ..core.affine import moved
 from ..core.errors import RefineError
 from ..core.solid import Solid
-from ..core.volumes import Box, Forced, Placed, Sphere, Zone, forced
+from ..core.volumes import Box, Forced, MovedVolume, Sphere, Zone
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
@@ -32,13 +33,14 @@ if TYPE_CHECKING:
     from ..mesh.layout import SplatObject
 
 FACTS = "refine_forced"
-"""Custom property of the mesh: what was last found to stay and to go, or why not, as JSON."""
+"""Custom property of the mesh: how many splats must stay and go, or why nobody knows, as JSON."""
 
 UNFIT = "expected a mesh, or an empty that is shown as a cube or a sphere"
 
-_REMEMBERED = 16  # answers of volumes that are kept; 1 MB each at a million splats
+_MOST_MASKS = 16  # that are kept; 1 MB each at a million splats
 
-_answers: dict[bytes, NDArray[np.bool_]] = {}
+_masks: dict[bytes, NDArray[np.bool_]] = {}
+"""Which points lie in which volume, by a digest of both."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +91,7 @@ class Demands:
         if not self.zones:
             return Forced(protected)
         try:
-            return forced(self.zones, world_means(checked), protected)
+            return core_volumes.forced(self.zones, world_means(checked), protected)
         except RefineError as error:
             msg = f"object '{checked.obj.name}': {error}"
             raise RefineError(msg) from error
@@ -101,7 +103,7 @@ NONE = Demands()
 def listed(scene: bpy.types.Scene) -> list[bpy.types.PropertyGroup]:
     """Return the volumes that the panel lists, but for those that are in the scene no more.
 
-    The list holds on to an object that was deleted, which nobody sees.
+    The list keeps an object alive that was deleted from the scene.
     """
     return [
         item
@@ -120,7 +122,7 @@ def can_be_volume(obj: bpy.types.Object) -> bool:
     """Tell whether an object can be a volume, at first sight; one of splats has no faces."""
     if obj.type == "MESH":
         return bool(obj.data.polygons or obj.modifiers)
-    return obj.type == "EMPTY" and obj.empty_display_type in {"CUBE", "SPHERE"}
+    return _is_shape(obj)
 
 
 def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
@@ -136,27 +138,46 @@ def zone(role: Role, obj: bpy.types.Object, *, idle: bool = False) -> Zone:
     """
     label = f"object '{obj.name}'"
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    matrix = world_matrix(obj, depsgraph)
-    if obj.type == "EMPTY" and obj.empty_display_type in {"CUBE", "SPHERE"}:
-        size = obj.empty_display_size
-        shape = Sphere((0.0, 0.0, 0.0), size) if obj.empty_display_type == "SPHERE" else None
-        volume = shape or Box((-size,) * 3, (size,) * 3)
-        key = _digest(repr((obj.empty_display_type, size)).encode(), matrix.tobytes())
-        return Zone(role, label, _Recalled(label, key, partial(Placed, volume, matrix)), idle)
-    if obj.type != "MESH":
+    if obj.type == "MESH":
+        volume = _mesh_volume(obj, label, depsgraph)
+    elif _is_shape(obj):
+        volume = _empty_volume(obj, label, depsgraph)
+    else:
         kind = f"of type {obj.type}"
         if obj.type == "EMPTY":
             kind = f"an empty shown as {obj.empty_display_type.replace('_', ' ').lower()}"
         msg = f"{label}: is {kind}, {UNFIT}"
         raise RefineError(msg)
+    return Zone(role, label, volume, idle)
+
+
+def _is_shape(obj: bpy.types.Object) -> bool:
+    """Tell whether an object is an empty that is drawn as a volume."""
+    return obj.type == "EMPTY" and obj.empty_display_type in {"CUBE", "SPHERE"}
+
+
+def _empty_volume(
+    obj: bpy.types.Object, label: str, depsgraph: bpy.types.Depsgraph
+) -> _CachedVolume:
+    matrix, size = world_matrix(obj, depsgraph), obj.empty_display_size
+    shape: Volume = Box((-size,) * 3, (size,) * 3)
+    if obj.empty_display_type == "SPHERE":
+        shape = Sphere((0.0, 0.0, 0.0), size)
+    key = _digest(repr((obj.empty_display_type, size)).encode(), matrix.tobytes())
+    return _CachedVolume(label, key, partial(MovedVolume, shape, matrix))
+
+
+def _mesh_volume(
+    obj: bpy.types.Object, label: str, depsgraph: bpy.types.Depsgraph
+) -> _CachedVolume:
     local, triangles = _surface(obj, depsgraph)
-    vertices = moved(local, matrix)
+    vertices = moved(local, world_matrix(obj, depsgraph))
     key = _digest(vertices.tobytes(), triangles.tobytes())
-    return Zone(role, label, _Recalled(label, key, partial(Solid, vertices, triangles)), idle)
+    return _CachedVolume(label, key, partial(Solid, vertices, triangles))
 
 
-def mark(checked: SplatObject, found: Forced) -> None:
-    """Mark for the previews what must stay and what must go, and note how many it is.
+def mark(checked: SplatObject, forced: Forced) -> None:
+    """Mark for the previews what must stay and what must go, and note how many splats that is.
 
     What must go is also marked as what goes, unless scores or floaters tell that.
 
@@ -165,17 +186,17 @@ def mark(checked: SplatObject, found: Forced) -> None:
     RefineError
         If the object cannot be written to.
     """
-    mesh, removed = checked.mesh, found.removed
-    mesh_edit.mark_forced(checked.obj, found.protected, removed)
-    elsewhere = mesh_scores.record(mesh) or mesh_floaters.counts(mesh)
-    if removed is not None:
-        if mesh_scores.record(mesh) is None:
-            mesh_edit.mark_removed(checked.obj, removed)
-    elif not elsewhere:
+    mesh, forced_out = checked.mesh, forced.removed
+    mesh_edit.mark_forced(checked.obj, forced.protected, forced_out)
+    scored = mesh_scores.record(mesh) is not None
+    if forced_out is not None:
+        if not scored:
+            mesh_edit.mark_removed(checked.obj, forced_out)
+    elif not scored and not mesh_floaters.counts(mesh):
         mesh_attributes.remove_attribute(mesh, mesh_edit.REMOVE)
-    if found.facts or found.protected is not None:
-        volumes = [[fact["name"], fact["splats"]] for fact in found.facts]
-        _note(mesh, {**found.counts(), "volumes": volumes})
+    if forced.facts or forced.protected is not None:
+        volumes = [[fact["name"], fact["splats"]] for fact in forced.facts]
+        _note(mesh, {**forced.counts(), "volumes": volumes})
     elif FACTS in mesh:
         del mesh[FACTS]
 
@@ -189,12 +210,12 @@ def refresh(scene: bpy.types.Scene, checked: SplatObject) -> Forced:
         See `Demands`; it is noted as well.
     """
     try:
-        found = Demands.of_scene(scene).forced(checked)
-        mark(checked, found)
+        forced = Demands.of_scene(scene).forced(checked)
+        mark(checked, forced)
     except RefineError as error:
         _note(checked.mesh, {"error": str(error)})
         raise
-    return found
+    return forced
 
 
 def facts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
@@ -218,8 +239,8 @@ def facts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
         return {}
 
 
-def _note(mesh: bpy.types.Mesh, found: dict[str, Any]) -> None:
-    mesh[FACTS] = json.dumps({"splats": splat_count(mesh), **found})
+def _note(mesh: bpy.types.Mesh, facts: dict[str, Any]) -> None:
+    mesh[FACTS] = json.dumps({"splats": splat_count(mesh), **facts})
 
 
 def _surface(
@@ -248,15 +269,15 @@ def _surface(
 
 
 @dataclass(frozen=True, eq=False)
-class _Recalled:
-    """A volume that answers again what it, or one like it, was asked before.
+class _CachedVolume:
+    """A volume whose last answers are kept: sliders ask for the same ones again and again.
 
     Attributes
     ----------
     label : str
-        What to call it where it is none.
+        Names it in messages.
     key : bytes
-        What tells it from others.
+        Tells it from other volumes.
     make : callable
         Returns the volume itself.
     """
@@ -267,17 +288,17 @@ class _Recalled:
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which points, (N, 3), lie inside, (N,); nobody may change it."""
-        question = _digest(self.key, np.ascontiguousarray(points))
-        if question not in _answers:
+        key = _digest(self.key, np.ascontiguousarray(points))
+        if key not in _masks:
             try:
-                found = self.make().inside(points)
+                mask = self.make().inside(points)
             except RefineError as error:
                 msg = f"{self.label}: {error}"
                 raise RefineError(msg) from error
-            while len(_answers) >= _REMEMBERED:
-                del _answers[next(iter(_answers))]  # the oldest
-            _answers[question] = found
-        return _answers[question]
+            while len(_masks) >= _MOST_MASKS:
+                del _masks[next(iter(_masks))]  # the oldest
+            _masks[key] = mask
+        return _masks[key]
 
 
 def _digest(*parts: Any) -> bytes:  # noqa: ANN401 - buffers

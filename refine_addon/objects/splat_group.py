@@ -1,7 +1,7 @@
 """Several splat objects as one scene: scored against one another, and under one budget.
 
-What panel operators do to the selection goes through here. A single object is handed on to
-`splat_object` as it is.
+Operators of the panel work on the selection through here. A single object is handed on to
+`splat_object`.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from . import demands, splat_object
 from .demands import Demands
+from .splat_object import Outcome
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     from ..core.task import Result, Settings
     from ..core.views import ViewSet
     from ..mesh.layout import SplatObject
-    from .splat_object import Plan
 
 Members = list["SplatObject"]
 """The objects, by name; one at least."""
@@ -62,9 +62,9 @@ def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
     RefineError
         See `mesh.layout.check`; also if two of them share their data.
     """
-    found = [_checked(obj, active) for obj in chosen(layer, active.obj)]
+    group = [_checked(obj, active) for obj in chosen(layer, active.obj)]
     owners: dict[bpy.types.Mesh, str] = {}
-    for member in found:
+    for member in group:
         other = owners.setdefault(member.mesh, member.obj.name)
         if other != member.obj.name:
             msg = (
@@ -73,7 +73,7 @@ def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
                 "or select only one"
             )
             raise RefineError(msg)
-    return found
+    return group
 
 
 def active_first(layer: bpy.types.ViewLayer, active: SplatObject | None) -> Members:
@@ -84,21 +84,21 @@ def active_first(layer: bpy.types.ViewLayer, active: SplatObject | None) -> Memb
 
 
 def uids_of(group: Members) -> tuple[int, ...]:
-    """Return what Blender knows the objects by in this session, whatever they are called."""
+    """Return the numbers by which Blender knows the objects in this session; names may change."""
     return tuple(member.obj.session_uid for member in group)
 
 
 def by_uids(uids: tuple[int, ...], known: SplatObject) -> Members:
     """Return the objects again, in that order; see `mesh.layout.check`. One is known already."""
-    there = {obj.session_uid: obj for obj in bpy.data.objects}
-    return [_checked(there.get(uid), known) for uid in uids]
+    objects = {obj.session_uid: obj for obj in bpy.data.objects}
+    return [_checked(objects.get(uid), known) for uid in uids]
 
 
 def _checked(obj: bpy.types.Object | None, known: SplatObject) -> SplatObject:
     return known if obj == known.obj else mesh_layout.check(obj)
 
 
-def forced(scene: bpy.types.Scene, group: Members) -> list[Forced]:
+def forced_of_each(scene: bpy.types.Scene, group: Members) -> list[Forced]:
     """Return what must stay and what must go of each object, as a scene says it.
 
     A name protects in the objects that have it.
@@ -108,13 +108,13 @@ def forced(scene: bpy.types.Scene, group: Members) -> list[Forced]:
     RefineError
         See `Demands`; also if no object has a name that protects.
     """
-    wanted = Demands.of_scene(scene)
+    demanded = Demands.of_scene(scene)
     if len(group) == 1:
-        return [wanted.forced(group[0])]
-    owners = [(name, _protecting(group, name)) for name in wanted.names]
+        return [demanded.forced(group[0])]
+    protecting = [(name, _protecting(group, name)) for name in demanded.names]
     return [
-        replace(wanted, names=tuple(n for n, has in owners if has[place])).forced(member)
-        for place, member in enumerate(group)
+        replace(demanded, names=tuple(n for n, has in protecting if has[index])).forced(member)
+        for index, member in enumerate(group)
     ]
 
 
@@ -124,9 +124,9 @@ def check_forced(scene: bpy.types.Scene, group: Members, before: Sequence[Forced
     Raises
     ------
     RefineError
-        If not; also see `forced`.
+        If not; also see `forced_of_each`.
     """
-    for member, was, now in zip(group, before, forced(scene, group), strict=True):
+    for member, was, now in zip(group, before, forced_of_each(scene, group), strict=True):
         pairs = ((was.protected, now.protected), (was.removed, now.removed))
         if any(not _same_mask(*pair) for pair in pairs):
             msg = (
@@ -147,18 +147,18 @@ def refresh(scene: bpy.types.Scene, group: Members) -> list[Forced]:
     """Mark what a scene demands of each object, and return it; see `demands.refresh`."""
     if len(group) == 1:
         return [demands.refresh(scene, group[0])]
-    found = forced(scene, group)
-    for member, own in zip(group, found, strict=True):
-        demands.mark(member, own)
-    return found
+    each = forced_of_each(scene, group)
+    for member, forced_of_member in zip(group, each, strict=True):
+        demands.mark(member, forced_of_member)
+    return each
 
 
-def forced_of(found: Sequence[Forced], group: Members) -> Forced:
+def joined_forced(each: Sequence[Forced], group: Members) -> Forced:
     """Return which splats of all objects must stay and must go, without facts."""
     counts = [len(member) for member in group]
     protected, removed = (
         None if all(mask is None for mask in masks) else _joined_masks(masks, counts)
-        for masks in ([own.protected for own in found], [own.removed for own in found])
+        for masks in ([one.protected for one in each], [one.removed for one in each])
     )
     return Forced(protected, removed)
 
@@ -211,12 +211,12 @@ def store(group: Members, scores: Scores, noted: Noted) -> None:
     for member, origin, rows, protected in zip(
         group, noted.origins, _rows(group), stay, strict=True
     ):
-        own, together = scores, None
+        scores_of_member, together = scores, None
         if len(group) > 1:
-            own = _scores_of_rows(scores, rows)
+            scores_of_member = _scores_of_rows(scores, rows)
             together = mesh_scores.Together(scoring, len(scores.values), ranks[rows])
         mesh_scores.store(
-            member, own, noted.settings, origin, noted.cameras,
+            member, scores_of_member, noted.settings, origin, noted.cameras,
             protected=protected, asked=noted.asked, together=together,
         )  # fmt: skip
 
@@ -234,7 +234,7 @@ def _scores_of_rows(scores: Scores, rows: slice) -> Scores:
 def stored_task(
     group: Members,
     budget: Budget,
-    found: Sequence[Forced],
+    forced: Sequence[Forced],
     *,
     settings: Settings = DEFAULTS,
     views: ViewSet | None = None,
@@ -245,7 +245,7 @@ def stored_task(
     ----------
     group, budget, settings, views
         See there.
-    found : sequence of Forced
+    forced : sequence of Forced
         What must stay and what must go of each object.
 
     Raises
@@ -256,8 +256,8 @@ def stored_task(
     if len(group) > 1:
         _check_scored_together(group)
     tasks = [
-        splat_object.stored_task(member, budget, own, settings=settings, views=views)
-        for member, own in zip(group, found, strict=True)
+        splat_object.stored_task(member, budget, each, settings=settings, views=views)
+        for member, each in zip(group, forced, strict=True)
     ]
     if len(tasks) == 1:
         return tasks[0]
@@ -284,8 +284,8 @@ def mark_removed(group: Members, keep: NDArray[np.bool_]) -> None:
         mesh_edit.mark_removed(member.obj, ~keep[rows])
 
 
-def apply(group: Members, result: Result) -> Plan:
-    """Delete the splats that do not stay, and set what the others became: of all objects or none.
+def apply(group: Members, result: Result) -> Outcome:
+    """Delete the splats that do not stay, and store what the others became: in all objects or none.
 
     Raises
     ------
@@ -296,19 +296,19 @@ def apply(group: Members, result: Result) -> Plan:
         return splat_object.apply_object(group[0], result)
     _check_counts(group, len(result.keep))
     parts = list(zip(group, _split(group, result), strict=True))
-    for member, own in parts:
-        if not own.keep.any():
+    for member, result_of_member in parts:
+        if not result_of_member.keep.any():
             msg = (
                 f"no splat of object '{member.obj.name}' would be left; nothing was removed: "
                 "delete the object, or let more stay"
             )
             raise RefineError(msg)
-    plans = splat_object.apply_objects(parts)
+    outcomes = splat_object.apply_objects(parts)
     totals = {
-        field.name: sum(getattr(plan, field.name) for plan in plans)
-        for field in fields(splat_object.Plan)
+        field.name: sum(getattr(outcome, field.name) for outcome in outcomes)
+        for field in fields(Outcome)
     }
-    return splat_object.Plan(**totals)
+    return Outcome(**totals)
 
 
 def _rows(group: Members) -> list[slice]:
@@ -318,23 +318,23 @@ def _rows(group: Members) -> list[slice]:
 
 
 def _check_counts(group: Members, count: int) -> None:
-    found = sum(len(member) for member in group)
-    if found != count:
+    total = sum(len(member) for member in group)
+    if total != count:
         names = ", ".join(repr(member.obj.name) for member in group)
         msg = (
-            f"objects {names}: have {found} splats together and had {count} when the work began; "
+            f"objects {names}: have {total} splats together and had {count} when the work began; "
             "do it again"
         )
         raise RefineError(msg)
 
 
 def _check_scored_together(group: Members) -> None:
-    """Refuse objects of several scorings: their scores mean something else each."""
-    marks = {
+    """Refuse objects of several scorings: scores compare only within one."""
+    ids = {
         ((mesh_scores.record(member.mesh) or {}).get("together") or {}).get("id")
         for member in group
     }
-    if len(marks) > 1 or None in marks:
+    if len(ids) > 1 or None in ids:
         msg = (
             f"the {len(group)} selected objects were not scored together: score them as they are "
             "selected, or select only one"
@@ -363,24 +363,24 @@ def _scores(group: Members, parts: list[Scores], masks: dict[str, Any]) -> Score
 
 
 def _protecting(group: Members, name: str) -> list[bool]:
-    """Return which objects have something of that name that protects.
+    """Return which objects have a vertex group or an attribute of that name that protects.
 
     Raises
     ------
     RefineError
         If none has.
     """
-    found, errors = [], []
+    protecting, errors = [], []
     for member in group:
         try:
             mesh_edit.protected_mask(member.obj, name)
-            found.append(True)
+            protecting.append(True)
         except RefineError as error:
-            found.append(False)
+            protecting.append(False)
             errors.append(error)
-    if not any(found):
+    if not any(protecting):
         raise errors[0]
-    return found
+    return protecting
 
 
 def _joined_masks(parts: list[Any], counts: list[int]) -> NDArray[np.bool_]:
@@ -395,17 +395,17 @@ def _split(group: Members, result: Result) -> list[Result]:
     """Return what was decided of each object."""
     parts = []
     for member, rows in zip(group, _rows(group), strict=True):
-        own = None
+        absorbed = None
         if result.absorbed is not None:
-            own = _part(result.absorbed, rows, mesh_layout.sh_degree(member.mesh))
-        parts.append(replace(result, keep=result.keep[rows], absorbed=own))
+            absorbed = _part(result.absorbed, rows, mesh_layout.sh_degree(member.mesh))
+        parts.append(replace(result, keep=result.keep[rows], absorbed=absorbed))
     return parts
 
 
 def _part(absorbed: Absorbed, rows: slice, degree: int) -> Absorbed:
-    """Return the survivors of one object, with as many harmonics as it has."""
+    """Return the survivors of one object, with harmonics up to its own degree."""
     first = int(np.count_nonzero(absorbed.keep[: rows.start]))
     keep = absorbed.keep[rows]
-    here = slice(first, first + int(np.count_nonzero(keep)))
-    splats = absorbed.splats.take(here).up_to_degree(degree)
-    return replace(absorbed, keep=keep, splats=splats, changed=absorbed.changed[here])
+    survivors = slice(first, first + int(np.count_nonzero(keep)))
+    splats = absorbed.splats.take(survivors).up_to_degree(degree)
+    return replace(absorbed, keep=keep, splats=splats, changed=absorbed.changed[survivors])

@@ -1,4 +1,4 @@
-"""What the panel and the command do to an object: score, plan, apply, export.
+"""What the panel and the command do to an object: score, apply, export.
 
 An operation begins with `mesh.layout.check`, which finds out that an object holds splats, and hands
 what it found to all functions here. Each either does all it says, or raises `RefineError` and
@@ -18,22 +18,19 @@ from ..cameras.objects import world_matrix
 from ..core import pipeline
 from ..core.affine import is_uniform, transformed
 from ..core.errors import RefineError
-from ..core.estimate.written import written_facts
-from ..core.file_to_file import picture_facts
 from ..core.formats.ply import columns_from_splats
-from ..core.formats.registry import as_written, format_named, refuse_unknown_size
-from ..core.report import Clock, Files, complete_report, held
+from ..core.formats.registry import as_written
 from ..core.survivors import survivor_columns
 from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.volumes import FREE, Forced
 from ..core.whole_file import expanded, refuse_existing
-from ..core.work import Progress, part, silent
+from ..core.work import Progress, silent
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
 from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject, check
-from ..mesh.scores import RECORD, store, stored_scores
+from ..mesh.scores import RECORD, stored_scores
 from .demands import NONE
 
 if TYPE_CHECKING:
@@ -46,7 +43,6 @@ if TYPE_CHECKING:
     from ..core.formats.ply import SplatFile
     from ..core.formats.registry import Packed
     from ..core.levels.lod import Level
-    from ..core.picture_files import PictureFiles
     from ..core.scores import Scores
     from ..core.selection import Budget
     from ..core.splats import Splats
@@ -55,8 +51,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What a budget would do to an object.
+class Outcome:
+    """What a budget does to an object, or would.
 
     Attributes
     ----------
@@ -72,7 +68,7 @@ class Plan:
     bytes_after: int
 
     @classmethod
-    def of(cls, count: int, kept: int, row_bytes: int, fixed_bytes: int) -> Plan:
+    def of(cls, count: int, kept: int, row_bytes: int, fixed_bytes: int) -> Outcome:
         """Return what keeping so many of `count` splats does to a file.
 
         Parameters
@@ -96,8 +92,8 @@ def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
     ----------
     checked : SplatObject
     whole : bool or None
-        Whether to bring view-dependent colour along, for absorbing; the scale must be uniform then.
-        None brings it if it is, for an estimate of the pictures' quality.
+        Whether to read view-dependent colour, for absorbing; the object's scale must be uniform
+        then. None reads it if the scale is uniform, for an estimate of the pictures' quality.
 
     Raises
     ------
@@ -114,8 +110,8 @@ def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
 
 def modifier_notes(obj: bpy.types.Object) -> list[str]:
     """Return a sentence if modifiers show the object otherwise than it is scored and exported."""
-    ours = ("REFINE", "KIRI")  # they draw splats, and move none
-    names = [m.name for m in obj.modifiers if m.show_viewport and not m.name.startswith(ours)]
+    drawing = ("REFINE", "KIRI")  # these draw splats and move none
+    names = [m.name for m in obj.modifiers if m.show_viewport and not m.name.startswith(drawing)]
     if not names:
         return []
     note = (
@@ -128,7 +124,7 @@ def modifier_notes(obj: bpy.types.Object) -> list[str]:
 def stored_task(
     checked: SplatObject,
     budget: Budget,
-    found: Forced = FREE,
+    forced: Forced = FREE,
     *,
     settings: Settings = DEFAULTS,
     views: ViewSet | None = None,
@@ -139,7 +135,7 @@ def stored_task(
     ----------
     checked : SplatObject
     budget : Budget
-    found : Forced
+    forced : Forced
         What must stay and what must go; see `Demands.forced`.
     settings : Settings, optional
         For absorbing.
@@ -163,17 +159,17 @@ def stored_task(
         settings=settings,
         splats=None if views is None else gather(checked, whole=True),
         views=views,
-        scores=stored_scores(checked, found.removed),
-        protected=found.protected,
-        removed=found.removed,
+        scores=stored_scores(checked, forced.removed),
+        protected=forced.protected,
+        removed=forced.removed,
         absorb=views is not None,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
     )
 
 
-def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
-    """Delete the splats that do not stay, and set what the others became: all of it or nothing.
+def apply_object(checked: SplatObject, result: Result | Level) -> Outcome:
+    """Delete the splats that do not stay, and store what the others became: all of it or nothing.
 
     Everything else of the object and its mesh stays: attributes, vertex groups, custom properties,
     materials, modifiers. The scores stay to be looked at, but the next apply asks for new ones.
@@ -186,21 +182,20 @@ def apply_object(checked: SplatObject, result: Result | Level) -> Plan:
 
     Returns
     -------
-    Plan
-        What was done.
+    Outcome
 
     Raises
     ------
     RefineError
         See `mesh_edit.check_deletable`; also if there are no longer as many splats.
     """
-    (done,) = apply_objects([(checked, result)])
-    return done
+    (outcome,) = apply_objects([(checked, result)])
+    return outcome
 
 
-def apply_objects(parts: Sequence[tuple[SplatObject, Result | Level]]) -> list[Plan]:
+def apply_objects(parts: Sequence[tuple[SplatObject, Result | Level]]) -> list[Outcome]:
     """Do what `apply_object` does to several objects: to all of them or to none."""
-    done, columns = [], []
+    outcomes, columns = [], []
     for checked, result in parts:
         mesh_edit.check_deletable(checked.obj)
         if len(result.keep) != len(checked):
@@ -209,20 +204,20 @@ def apply_objects(parts: Sequence[tuple[SplatObject, Result | Level]]) -> list[P
                 f"{len(result.keep)} when it was decided which stay; apply again"
             )
             raise RefineError(msg)
-        done.append(_plan(checked, result.keep))
+        outcomes.append(_outcome(checked, result.keep))
         columns.append(absorbed_columns(checked, result.absorbed) if result.absorbed else {})
     with ExitStack() as stack:
         for checked, _ in parts:
             stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
         for (checked, result), changed in zip(parts, columns, strict=True):
-            _reduce(checked, result.keep, changed)
-    return done
+            reduce_object(checked, result.keep, changed)
+    return outcomes
 
 
-def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:
+def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
     """Delete the splats that do not stay, all of them or none; nothing else changes.
 
-    Scores tell what is missed of all splats together, so they are to be computed again.
+    Scores hold for all splats together, so they are to be computed again.
 
     Parameters
     ----------
@@ -238,16 +233,16 @@ def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:
     if not keep.any():
         msg = f"object '{checked.obj.name}': no splat would be left; nothing was deleted"
         raise RefineError(msg)
-    done = _plan(checked, keep)
+    outcome = _outcome(checked, keep)
     with mesh_edit.all_or_nothing(checked.obj):
-        _reduce(checked, keep, {})
-    return done
+        reduce_object(checked, keep, {})
+    return outcome
 
 
-def _reduce(
+def reduce_object(
     checked: SplatObject, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
 ) -> None:
-    """Delete what does not stay, set what the others became, and ask for new scores from here."""
+    """Delete what does not stay, store what the others became, and drop the note of the scores."""
     mesh_edit.delete_vertices(checked.obj, ~keep)
     columns = {name: values[keep] for name, values in columns.items()}
     mesh_attributes.write_columns(checked, columns)
@@ -373,137 +368,17 @@ def score_object(
         such object.
     """
     checked = check(find(name))
-    found = demands.forced(checked)
+    forced = demands.forced(checked)
     scores = pipeline.score(
         gather(checked), views, settings,
-        protected=found.protected, removed=found.removed, progress=progress,
+        protected=forced.protected, removed=forced.removed, progress=progress,
     )  # fmt: skip
-    return mesh_attributes.file_from_object(checked), scores, found, modifier_notes(checked.obj)
+    return mesh_attributes.file_from_object(checked), scores, forced, modifier_notes(checked.obj)
 
 
-def prune_object(  # noqa: PLR0913 - the command's options
-    name: str,
-    views: ViewSet,
-    budget: Budget,
-    settings: Settings,
-    demands: Demands = NONE,
-    *,
-    absorb: bool = False,
-    output: Path | None = None,
-    pictures: PictureFiles | None = None,
-    save: bool = False,
-    dry_run: bool = False,
-    overwrite: bool = False,
-    progress: Progress = silent,
-) -> dict[str, Any]:
-    """Prune an object of the open scene, export what stays, save the .blend.
-
-    Parameters
-    ----------
-    name : str
-        Of the object.
-    views, budget, settings, absorb, progress
-        See `refine_addon.core.pipeline.prune`.
-    demands : Demands
-        What must stay and what must go.
-    output : Path, optional
-        The file to make, in the format that its suffix names.
-    pictures : PictureFiles, optional
-        Where pictures before and after go; none are drawn without it.
-    save : bool
-        Whether to delete the splats from the object and save the .blend.
-    dry_run : bool
-        Whether to decide only.
-    overwrite : bool
-        Whether `output` may be replaced.
-
-    Returns
-    -------
-    dict
-        The report, as of `refine_addon.core.file_to_file.prune_file`.
-
-    Raises
-    ------
-    RefineError
-        See `gather`, `Demands.forced`, `apply_object`, `export_object` and
-        `refine_addon.core.pipeline.prune`; also if there is no such object, or the .blend cannot be
-        saved. What was exported by then stays; the object is as it was.
-    """
-    clock = Clock()
-    checked = check(find(name))
-    target = None if output is None or dry_run else expanded(output)
-    if target is not None:
-        refuse_existing(target, overwrite=overwrite)
-    if pictures is not None:
-        pictures.refuse_existing(views)
-    if save and not dry_run:
-        _check_savable(checked.obj)
-    row_bytes, fixed_bytes = _file_size(checked, budget, output)
-    seen = settings.estimates or budget.psnr is not None or pictures is not None
-    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
-    splats = gather(checked, whole=absorb or (None if seen else False))
-    found = demands.forced(checked)
-    task = Task(
-        budget=budget,
-        settings=settings,
-        splats=splats,
-        views=views,
-        protected=found.protected,
-        removed=found.removed,
-        absorb=absorb,
-        row_bytes=row_bytes,
-        fixed_bytes=fixed_bytes,
-        reusable=save and not dry_run,  # they are stored
-    )
-    clock.lap("read_s")
-    result = pipeline.decide(task, clock=clock, progress=part(progress, 0.0, 0.8))
-    sizes = _plan(checked, result.keep)
-    columns = absorbed_columns(checked, result.absorbed) if result.absorbed and not dry_run else {}
-    if target is None:
-        made = as_written(mesh_attributes.file_from_object(checked), output)
-    else:
-        made = export_object(
-            checked, target, keep=result.keep, columns=columns, overwrite=overwrite
-        )
-    result.report["splats"] |= held(made, result.keep, written=target is not None)
-    result.report["notes"] += made.notes(result.keep)
-    if save and not dry_run:
-        with mesh_edit.all_or_nothing(checked.obj):
-            store(checked, result.scores, settings)
-            _reduce(checked, result.keep, columns)
-            _save(target)
-    clock.lap("write_s")
-    if target is not None:
-        used = views.spread(settings.views)
-        result.report.update(written_facts(target, result.scores, used, matrix=matrix))
-    drawn = picture_facts(
-        pictures, splats, result, target, views,
-        clock=clock, matrix=matrix, progress=part(progress, 0.85, 1.0),
-    )  # fmt: skip
-    result.report.update(drawn)
-    result.report["volumes"] = list(found.facts)
-    result.report["notes"] += modifier_notes(checked.obj)
-    source, output_name = f"{bpy.data.filepath}#{name}", None if target is None else str(target)
-    after = sizes.bytes_after if target is None else target.stat().st_size
-    files = Files(source, output_name, sizes.bytes_before, after)
-    complete_report(result.report, clock, files)
-    return result.report
-
-
-def _file_size(checked: SplatObject, budget: Budget, output: Path | None) -> tuple[float, int]:
-    """Return the bytes that a splat takes in the output, and those of all else in it."""
-    form = None if output is None else format_named(output)
-    if form is None:
-        return mesh_attributes.file_size(checked)
-    if budget.max_mb is not None:
-        refuse_unknown_size(form)
-    sizes = form.sizes_without_more(len(checked), mesh_layout.sh_degree(checked.mesh))
-    return (sizes.row, sizes.fixed) if sizes else (0.0, 0)
-
-
-def _plan(checked: SplatObject, keep: NDArray[np.bool_]) -> Plan:
+def _outcome(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
     kept = int(np.count_nonzero(keep))
-    return Plan.of(len(keep), kept, *mesh_attributes.file_size(checked))
+    return Outcome.of(len(keep), kept, *mesh_attributes.file_size(checked))
 
 
 def _world_columns(checked: SplatObject) -> dict[str, NDArray[Any]]:
@@ -530,20 +405,3 @@ def find(name: str) -> bpy.types.Object:
         msg = f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {there})"
         raise RefineError(msg)
     return obj
-
-
-def _check_savable(obj: bpy.types.Object) -> None:
-    mesh_edit.check_deletable(obj)
-    if not bpy.data.filepath:
-        msg = "the scene is not saved in a .blend file yet: --save has nowhere to save to"
-        raise RefineError(msg)
-
-
-def _save(exported: Path | None) -> None:
-    try:
-        bpy.ops.wm.save_mainfile()
-    except RuntimeError as error:
-        msg = f"{bpy.data.filepath}: cannot be saved ({str(error).strip()}); nothing was removed"
-        if exported is not None:
-            msg += f", {exported} was written"
-        raise RefineError(msg) from error

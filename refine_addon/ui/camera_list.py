@@ -1,6 +1,6 @@
 """The list of the cameras: what lies in the view of each, and how much of its picture changes."""
 
-# ruff: noqa: N801, RUF012 - Blender's way to name classes and set options; runs annotations
+# ruff: noqa: N801 - Blender's way to name classes and set options; runs annotations
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
@@ -9,9 +9,6 @@ import bpy
 from bpy.props import BoolProperty, CollectionProperty, FloatProperty, IntProperty, StringProperty
 
 from ..core.estimate.quality import in_words
-from ..mesh import layout as mesh_layout
-from ..mesh import scores as mesh_scores
-from . import price
 from .wrapped import counted, label
 
 if TYPE_CHECKING:
@@ -115,33 +112,12 @@ class REFINE_UL_cameras(bpy.types.UIList):
         right.label(text=seen if item.seen else "nothing")
 
 
-class REFINE_PT_camera_list(bpy.types.Panel):
-    """Who sees how much."""
-
-    bl_label = "What Each Sees"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "UI"
-    bl_category = "REFINE"
-    bl_parent_id = "REFINE_PT_cameras"
-    bl_options = {"DEFAULT_CLOSED"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether there is a scoring to tell of."""
-        obj = context.object
-        return mesh_layout.looks_like_splats(obj) and bool(mesh_scores.record(obj.data))
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Draw the list."""
-        record = mesh_scores.record(context.object.data) or {}
-        manager = context.window_manager
-        if text := warning(record):
-            label(self.layout, context, text, icon="ERROR")
-        if not price.shows(context.object.data):
-            return  # the list is of the object whose chart there is
-        self.layout.template_list(
-            *("REFINE_UL_cameras", "", manager, "refine_cameras", manager, "refine_camera"),
-            rows=min(len(manager.refine_cameras) + 1, _MOST),
-        )
-        if text := _changes_most(manager):
-            label(self.layout, context, text, icon="SOLO_ON")
+def draw(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw the list, and a sentence on the camera whose picture changes most."""
+    manager = context.window_manager
+    layout.template_list(
+        *("REFINE_UL_cameras", "", manager, "refine_cameras", manager, "refine_camera"),
+        rows=min(len(manager.refine_cameras) + 1, _MOST),
+    )
+    if text := _changes_most(manager):
+        label(layout, context, text, icon="SOLO_ON")

@@ -18,8 +18,9 @@ from ..core.pictures import AMPLIFIED, Comparison, compare
 from ..core.views import ViewSet
 from ..core.work import part
 from ..objects import splat_group
-from .on_thread import Answer, OnThread
-from .operators import OnScored, apply_task
+from .on_thread import OnThread
+from .operator_bases import Answer, OnScored
+from .operators import apply_task
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -33,12 +34,12 @@ NAMES = {kind: f"Compare: {kind}" for kind in KINDS}
 """The pictures as images of the file, made anew by each comparison."""
 
 _OURS = "refine_compare"
-"""Custom property of these images: the name; whatever has none is the user's."""
+"""Custom property of these images: the name. An image without it is the user's."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
-    """What is to be decided of which splats, and from where it is looked at."""
+class _Comparing:
+    """What is to be decided of which splats, and the view of them."""
 
     task: Task
     splats: Splats
@@ -59,40 +60,42 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
         """Return nothing: the splats are not changed."""
         return []
 
-    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Look:
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Comparing:
         """Gather what Apply would decide by, the splats and the view of the active camera."""
         view = Choice("ACTIVE").views(context, checked.obj)[0]
         group = splat_group.members(context.view_layer, checked)
-        task = apply_task(context, group, splat_group.forced(context.scene, group))
+        task = apply_task(context, group, splat_group.forced_of_each(context.scene, group))
         splats = task.splats or splat_group.gather(group, whole=None)
-        return _Look(task, splats, ViewSet((replace(view, weight=1.0),)))
+        return _Comparing(task, splats, ViewSet((replace(view, weight=1.0),)))
 
     @staticmethod
-    def work(job: _Look, progress: Progress) -> tuple[Comparison, float | None]:
+    def work(job: _Comparing, progress: Progress) -> tuple[Comparison, float | None]:
         """Decide which splats stay, draw both states; return them and the estimated PSNR, dB."""
-        decided = 0.6 if job.task.absorb else 0.1
+        decided = 0.6 if job.task.absorb else 0.1  # of the time, by then
         result = pipeline.decide(job.task, progress=part(progress, 0.0, decided))
-        ahead = part(progress, decided, 1.0)
-        (found,) = compare(job.splats, result.survivors(job.splats), job.view, progress=ahead)
-        return found, result.report["estimated_psnr"]
+        survivors = result.survivors(job.splats)
+        (comparison,) = compare(
+            job.splats, survivors, job.view, progress=part(progress, decided, 1.0)
+        )
+        return comparison, result.report["estimated_psnr"]
 
     def finish(
         self,
         context: bpy.types.Context,
         _checked: SplatObject,
-        _job: _Look,
-        found: tuple[Comparison, float | None],
+        _job: _Comparing,
+        result: tuple[Comparison, float | None],
     ) -> Answer:
         """Put the pictures into images, show them, and say how close they are."""
-        pictures, estimated = found
-        images = [_image(NAMES[kind], getattr(pictures, kind)) for kind in KINDS]
+        comparison, estimated = result
+        images = [_image(NAMES[kind], getattr(comparison, kind)) for kind in KINDS]
         if not bpy.app.background and context.window is not None:
             _show(context, images)
         about = "" if estimated is None else f"; {in_words(estimated)} estimated in all views"
         self.report(
             {"INFO"},
-            f"{pictures.psnr:.1f} dB measured in '{pictures.view.name}'{about}. The difference is "
-            f"shown {AMPLIFIED} times as large",
+            f"{comparison.psnr:.1f} dB measured in '{comparison.view.name}'{about}. "
+            f"The difference is shown {AMPLIFIED} times as large",
         )
         return {"FINISHED"}
 

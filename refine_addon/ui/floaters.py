@@ -1,4 +1,4 @@
-"""Operators that find splats which float, by what the cameras see, and delete them."""
+"""Operators that find floaters, by what the cameras see, and delete them."""
 
 # ruff: noqa: D400, N801 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
@@ -16,8 +16,9 @@ from ..mesh import layout as mesh_layout
 from ..objects import splat_object
 from ..objects.demands import Demands
 from . import plans
-from .on_thread import FAILURES, Answer, OnThread, fail
-from .operators import OnSplats, chosen_views
+from .on_thread import OnThread
+from .operator_bases import Answer, AtOnce, OnSplats
+from .operators import chosen_views
 
 if TYPE_CHECKING:
     from ..core.splats import Splats
@@ -28,8 +29,8 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class _Looking:
-    """Where to look for floaters: splats and views as they stand in the world."""
+class _Searching:
+    """Where to search for floaters: splats and views as they stand in the world."""
 
     splats: Splats
     views: ViewSet
@@ -45,11 +46,11 @@ class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's way to set options
     doing = "Looking for floaters"
 
-    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Looking:
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Searching:
         """Gather splats and views."""
         settings = context.scene.refine
         mesh_edit.check_writable(checked.obj)
-        return _Looking(
+        return _Searching(
             splat_object.gather(checked),
             chosen_views(context),
             Cleaning(tuple(settings.reasons), settings.views),
@@ -57,15 +58,15 @@ class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
         )
 
     @staticmethod
-    def work(job: _Looking, progress: Progress) -> Cleaned:
-        """Look."""
+    def work(job: _Searching, progress: Progress) -> Cleaned:
+        """Search."""
         return clean(
             job.splats, job.views, job.settings,
             protected=job.forced.protected, removed=job.forced.removed, progress=progress,
         )  # fmt: skip
 
     def finish(
-        self, context: bpy.types.Context, checked: SplatObject, _job: _Looking, cleaned: Cleaned
+        self, context: bpy.types.Context, checked: SplatObject, _job: _Searching, cleaned: Cleaned
     ) -> Answer:
         """Store what was found, mark it as what goes, and say it."""
         floaters.store(checked, cleaned)
@@ -74,42 +75,36 @@ class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_delete_floaters(OnSplats, bpy.types.Operator):
+def _searched(context: bpy.types.Context) -> str:
+    """Return that floaters are to be looked for, "" if they were."""
+    return "Find floaters first" if floaters.counts(context.object.data) is None else ""
+
+
+class REFINE_OT_delete_floaters(AtOnce, OnSplats, bpy.types.Operator):
     """Delete the floaters that were found, for the reasons that are switched on"""
 
     bl_idname = "refine.delete_floaters"
     bl_label = "Delete Floaters"
     bl_options = {"REGISTER", "UNDO"}  # noqa: RUF012 - Blender's way to set options
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run, and if not, why."""
-        if not super().poll(context):
-            return False
-        if floaters.counts(context.object.data) is None:
-            cls.poll_message_set("Find floaters first")
-            return False
-        return True
+    needs = (*OnSplats.needs, _searched)
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> Answer:
         """Delete them, but for those that must stay by now."""
-        try:
-            checked = mesh_layout.check(context.object)
-            goes = floaters.mask(checked, context.scene.refine.reasons)
-            protected = Demands.of_scene(context.scene).forced(checked).protected
-            spared = ""
-            if protected is not None and (stays := int(np.count_nonzero(goes & protected))):
-                goes &= ~protected
-                spared = f"; {stays:,} more are protected by now"
-            if not goes.any():
-                self.report({"INFO"}, f"There are no floaters to delete{spared}")
-                return {"CANCELLED"}
-            done = splat_object.delete_splats(checked, ~goes)
-        except FAILURES as error:
-            return fail(self, error)
+        checked = mesh_layout.check(context.object)
+        floating = floaters.mask(checked, context.scene.refine.reasons)
+        protected = Demands.of_scene(context.scene).forced(checked).protected
+        spared = ""
+        if protected is not None and (stays := int(np.count_nonzero(floating & protected))):
+            floating &= ~protected
+            spared = f"; {stays:,} more are protected by now"
+        if not floating.any():
+            self.report({"INFO"}, f"There are no floaters to delete{spared}")
+            return {"CANCELLED"}
+        outcome = splat_object.delete_splats(checked, ~floating)
         plans.forget(checked.mesh)
         plans.refresh(context)
         self.report(
-            {"INFO"}, f"Deleted {done.removed:,} floaters, {done.kept:,} splats stay{spared}"
+            {"INFO"}, f"Deleted {outcome.removed:,} floaters, {outcome.kept:,} splats stay{spared}"
         )
         return {"FINISHED"}

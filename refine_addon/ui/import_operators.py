@@ -23,8 +23,9 @@ from ..core.work import part, report
 from ..mesh import attributes as mesh_attributes
 from ..mesh import layout as mesh_layout
 from ..viewport import draw
-from . import preferences, running
-from .on_thread import FAILURES, Answer, AskedFirst, described, fail
+from . import preferences
+from .on_thread import AskedFirst
+from .operator_bases import FAILURES, Answer, AtOnce, Needing, described, fail, idle, in_object_mode
 from .properties import UPRIGHT_TEXT
 from .wrapped import counted
 
@@ -47,21 +48,6 @@ _CAMERAS = ("cameras.json", "transforms.json", "sparse", "cameras.bin", "cameras
 _ABOVE = 3  # folders above the splats in which their cameras are looked for
 
 
-class _InObjectMode:
-    """An operator that adds objects."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run, and if not, why."""
-        if why := running.refusal():
-            cls.poll_message_set(why)
-            return False
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Go to object mode first")
-            return False
-        return True
-
-
 @dataclass(frozen=True)
 class _Read:
     """What files hold, and what is wrong with those that cannot be read."""
@@ -70,12 +56,13 @@ class _Read:
     errors: list[Exception]
 
 
-class REFINE_OT_import_ply(AskedFirst, _InObjectMode, bpy.types.Operator, ImportHelper):
+class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper):
     """Import files of splats, of any format: a vertex a splat, a point attribute a property"""
 
     bl_idname = "refine.import_ply"
     bl_label = "Import Splats"
     bl_options = {"REGISTER", "UNDO", "PRESET"}
+    needs = (idle, in_object_mode)
 
     filename_ext = ".ply"
     filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
@@ -153,12 +140,13 @@ class REFINE_OT_import_ply(AskedFirst, _InObjectMode, bpy.types.Operator, Import
         return obj
 
 
-class REFINE_OT_import_cameras(_InObjectMode, bpy.types.Operator, ImportHelper):
+class REFINE_OT_import_cameras(AtOnce, Needing, bpy.types.Operator, ImportHelper):
     """Import cameras as objects: Inria cameras.json, nerfstudio transforms.json or COLMAP"""
 
     bl_idname = "refine.import_cameras"
     bl_label = "Import Cameras"
     bl_options = {"REGISTER", "UNDO", "PRESET"}
+    needs = (idle, in_object_mode)
 
     filename_ext = ".json"
     filter_glob: StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})
@@ -184,13 +172,10 @@ class REFINE_OT_import_cameras(_InObjectMode, bpy.types.Operator, ImportHelper):
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> Answer:
         """Import the cameras into a collection of their own."""
         path = Path(bpy.path.abspath(self.filepath))
-        try:
-            views = read_cameras(_model_folder(path))
-        except FAILURES as error:
-            return fail(self, error)
+        views = read_cameras(_model_folder(path))
         scene = context.scene
         collection = bpy.data.collections.new(f"Cameras {path.stem}")
         _target(context).children.link(collection)

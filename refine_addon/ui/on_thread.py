@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 import bpy
 
 from .. import main_thread
-from ..core.errors import Cancelled, RefineError
+from ..core.errors import Cancelled
 from ..core.work import silent
 from ..mesh import layout as mesh_layout
 from . import running as at_work
+from .operator_bases import FAILURES, Answer, fail
 from .running import Running
 from .target import Target
 from .worker import Worker
@@ -20,26 +21,8 @@ if TYPE_CHECKING:
     from ..mesh.layout import SplatObject
     from .running import Sketch
 
-Answer = set[str]
-
-FAILURES = (RefineError, MemoryError)
-"""What an operator reports as an error; all else is a fault of the program."""
-
 _STEP = 0.05
 """Seconds between two looks at the thread."""
-
-
-def fail(operator: bpy.types.Operator, error: Exception) -> Answer:
-    """Report an error to the user, and return that nothing was done."""
-    operator.report({"ERROR"}, described(error))
-    return {"CANCELLED"}
-
-
-def described(error: Exception) -> str:
-    """Return one of `FAILURES` as a sentence."""
-    if isinstance(error, MemoryError):
-        return f"not enough memory ({error})" if str(error) else "not enough memory"
-    return str(error)
 
 
 class OnThread:

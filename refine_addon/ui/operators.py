@@ -1,4 +1,4 @@
-"""Operators on splat objects: each reads what the user chose and makes one call.
+"""Operators that score, prune and convert splat objects.
 
 Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* is clicked.
 """
@@ -6,43 +6,45 @@ Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* 
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
-from bpy.props import BoolProperty, EnumProperty, StringProperty
-from bpy_extras.io_utils import ExportHelper
 
 from ..cameras.sets import Choice
 from ..core import pipeline
 from ..core.estimate.quality import in_words
-from ..core.formats.registry import FORMATS, Packed, without_suffix
 from ..core.levels.lod import Level, Levels, lod
 from ..core.report import scoring_notes, sizes_in_words
 from ..core.seeing import frustum
-from ..core.work import part, report
+from ..core.work import part
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
 from ..objects import level_objects, splat_group, splat_object
 from ..objects.demands import Demands
-from ..viewport import draw
-from . import plans, preview, running, staleness
+from . import plans, staleness
 from .adjust import Adjustable
-from .import_operators import FILE_NAMES
-from .on_thread import FAILURES, Answer, AskedFirst, OnThread, fail
+from .on_thread import OnThread
+from .operator_bases import (
+    Answer,
+    AtOnce,
+    Needing,
+    OnSplats,
+    in_object_mode,
+    on_splats,
+    out_of_edit_mode,
+    scored,
+)
 from .running import Sketch
 from .wrapped import counted
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..core.formats.ply import SplatFile
     from ..core.scores import Scores
     from ..core.splats import Splats
     from ..core.task import Result, Settings, Task
@@ -52,64 +54,23 @@ if TYPE_CHECKING:
     from ..mesh.layout import SplatObject
 
 
-_FORMATS = (
-    (".ply", ".ply", "In the layout that was imported"),
-    *((form.suffix, form.suffix, f"It {form.loss}") for form in FORMATS),
-)
-"""The formats of an export as Blender lists them, with tooltips."""
-
-
-class OnSplats:
-    """An operator on the active object, which must hold splats."""
-
-    waits = True
-    """Whether it waits until another one is over that works on a thread."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run, and if not, why."""
-        if cls.waits and (why := running.refusal()):
-            cls.poll_message_set(why)
-            return False
-        obj = context.object
-        if not mesh_layout.looks_like_splats(obj):
-            cls.poll_message_set("Select an object that holds splats: import a file of splats")
-            return False
-        if obj.mode == "EDIT":
-            cls.poll_message_set("Leave edit mode first")
-            return False
-        return True
-
-
-class OnScored(OnSplats):
-    """An operator on the active object, which must be scored."""
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run, and if not, why."""
-        if not super().poll(context):
-            return False
-        if mesh_scores.record(context.object.data) is None:
-            cls.poll_message_set("Score the splats first")
-            return False
-        return True
-
-
 def chosen_views(context: bpy.types.Context) -> ViewSet:
     """Return the views of the cameras that the panel names."""
     return Choice.of_scene(context.scene).views(context, context.object)
 
 
-def apply_task(context: bpy.types.Context, group: splat_group.Members, found: list[Forced]) -> Task:
+def apply_task(
+    context: bpy.types.Context, group: splat_group.Members, forced: list[Forced]
+) -> Task:
     """Return what *Apply* has to decide of the selected objects by the settings of the panel.
 
-    `found` is what must stay and what must go of each.
+    `forced` is what must stay and what must go of each.
     """
     settings = context.scene.refine
     return splat_group.stored_task(
         group,
         settings.to_budget(),
-        found,
+        forced,
         settings=settings.to_settings(),
         views=chosen_views(context) if settings.absorb else None,
     )
@@ -120,22 +81,9 @@ def _of_objects(group: splat_group.Members) -> str:
     return f" of {len(group)} objects" if len(group) > 1 else ""
 
 
-def _new_name(obj: bpy.types.Object) -> str:
-    """Return a name for an export that no file beside the .blend has yet."""
-    mesh = obj.data
-    pruned = mesh_scores.RANK in mesh.attributes and mesh_scores.record(mesh) is None
-    name = f"{obj.name}_{'pruned' if pruned else 'copy'}"
-    names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
-    folder = Path(bpy.path.abspath("//"))  # where the file browser starts
-    return next(f"{new}.ply" for new in names if not (folder / f"{new}.ply").exists())
-
-
 @dataclass(frozen=True, eq=False)
 class _Scoring:
-    """What is to be scored, by which views and how; where all of it stood (`staleness.origin`).
-
-    What has to go is left out.
-    """
+    """What is to be scored, by which views and how; where all of it stood (`staleness.origin`)."""
 
     splats: Splats
     forced: Forced
@@ -163,7 +111,7 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         quality = settings.estimates or context.scene.refine.budget == "psnr"
         splats = splat_group.gather(group, whole=None if quality else False)
         origins = [staleness.origin(context, member.obj) for member in group]
-        forced = splat_group.forced_of(splat_group.forced(context.scene, group), group)
+        forced = splat_group.joined_forced(splat_group.forced_of_each(context.scene, group), group)
         uids = splat_group.uids_of(group)
         return _Scoring(splats, forced, views, settings, quality, uids, origins)
 
@@ -175,7 +123,7 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         """Score by the closed form first, which takes a fraction of the time."""
         if job.settings.method == "closed-form":
             return None
-        work = partial(_sketched, job)
+        work = partial(_sketch, job)
         left = "the scores are the closed form's"
         return Sketch(work, "Refining scores", "keeps the closed form's", left)
 
@@ -185,71 +133,73 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     ) -> None:
         """Store the closed form's scores, to be looked at until those asked for are there."""
         group = splat_group.by_uids(job.uids, checked)
-        noted = splat_group.Noted(_rough(job), job.origins, forced=job.forced, asked=job.settings)
+        noted = splat_group.Noted(
+            _by_closed_form(job), job.origins, forced=job.forced, asked=job.settings
+        )
         splat_group.store(group, scores, noted)
         plans.refresh(context)
 
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
         """Score, and count how many splats lie in each view."""
-        ahead = part(progress, 0.0, 0.97)
+        forced_out, means = job.forced.removed, job.splats.means
         scores = pipeline.score(
             job.splats, job.views, job.settings,
-            protected=job.forced.protected, removed=job.forced.removed,
-            quality=job.quality, progress=ahead,
+            protected=job.forced.protected, removed=forced_out,
+            quality=job.quality, progress=part(progress, 0.0, 0.97),
         )  # fmt: skip
-        ahead = part(progress, 0.97, 1.0)
-        gone, means = job.forced.removed, job.splats.means
-        means = means if gone is None else means[~gone]
-        return scores, frustum.census(means, job.views, progress=ahead)
+        means = means if forced_out is None else means[~forced_out]
+        return scores, frustum.census(means, job.views, progress=part(progress, 0.97, 1.0))
 
     def finish(
         self,
         context: bpy.types.Context,
         checked: SplatObject,
         job: _Scoring,
-        found: tuple[Scores, NDArray[np.int64]],
+        result: tuple[Scores, NDArray[np.int64]],
     ) -> Answer:
         """Store the scores on the meshes and say what came of it."""
-        scores, counts = found
+        scores, counts = result
         pairs = zip(job.views, counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
         group = splat_group.by_uids(job.uids, checked)
-        forced = job.forced.counts()["forced"]
         noted = splat_group.Noted(job.settings, job.origins, cameras, job.forced)
         splat_group.store(group, scores, noted)
         plans.refresh(context)
-        unseen = int((scores.seen == 0).sum()) - forced
-        self.report(
-            {"INFO"},
-            f"Scored {len(scores.values) - forced:,} splats{_of_objects(group)} by "
-            f"{scores.views_used} of "
-            f"{counted(scores.views_given, 'view')}; {unseen:,} lie in none",
-        )
-        modified = [note for m in group for note in splat_object.modifier_notes(m.obj)]
-        for note in (*scoring_notes(scores), *modified):
+        self.report({"INFO"}, _scored_in_words(group, scores, job.forced.counts()["forced"]))
+        modifiers = [note for each in group for note in splat_object.modifier_notes(each.obj)]
+        for note in (*scoring_notes(scores), *modifiers):
             self.report({"WARNING"}, note)
         return {"FINISHED"}
 
 
-def _rough(job: _Scoring) -> Settings:
-    """Return the settings of a sketch of the scores that a job asks for."""
-    return replace(job.settings, method="closed-form")
-
-
-def _sketched(job: _Scoring, progress: Progress) -> Scores:
-    return pipeline.score(
-        job.splats, job.views, _rough(job), removed=job.forced.removed, progress=progress
+def _scored_in_words(group: splat_group.Members, scores: Scores, forced_out: int) -> str:
+    """Return how many splats were scored by how many views, and how many of them these miss."""
+    unseen = int((scores.seen == 0).sum()) - forced_out
+    return (
+        f"Scored {len(scores.values) - forced_out:,} splats{_of_objects(group)} by "
+        f"{scores.views_used} of {counted(scores.views_given, 'view')}; {unseen:,} lie in none"
     )
 
 
-class REFINE_OT_plan(OnScored, bpy.types.Operator):
+def _by_closed_form(job: _Scoring) -> Settings:
+    """Return the settings of the sketch of the scores that a job asks for."""
+    return replace(job.settings, method="closed-form")
+
+
+def _sketch(job: _Scoring, progress: Progress) -> Scores:
+    return pipeline.score(
+        job.splats, job.views, _by_closed_form(job), removed=job.forced.removed, progress=progress
+    )
+
+
+class REFINE_OT_plan(Needing, bpy.types.Operator):
     """Work out again how many splats stay and go"""
 
     bl_idname = "refine.plan"
     bl_label = "Update"
     bl_options = {"INTERNAL"}
-    waits = False
+    needs = (on_splats, out_of_edit_mode, scored)
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Work it out."""
@@ -266,6 +216,14 @@ class _Applying:
     forced: list[Forced]
 
 
+def _scored_or_applied(context: bpy.types.Context) -> str:
+    """Return that scores are needed, "" if there are any.
+
+    Also where they led to an *Apply*: to adjust that, Blender asks before it undoes it.
+    """
+    return "" if mesh_scores.RANK in context.object.data.attributes else scored(context)
+
+
 class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
     """Delete the splats that the budget does not keep; with Absorb, survivors take them over"""
 
@@ -274,19 +232,7 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
     doing = "Absorbing splats"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run, and if not, why.
-
-        Also where it has run: to adjust it, Blender asks before it undoes it.
-        """
-        if not super().poll(context):
-            return False
-        mesh = context.object.data
-        if mesh_scores.record(mesh) is None and mesh_scores.RANK not in mesh.attributes:
-            cls.poll_message_set("Score the splats first")
-            return False
-        return True
+    needs = (*OnSplats.needs, _scored_or_applied)
 
     def execute(self, context: bpy.types.Context) -> Answer:
         """Do all of it at once; adjusted, by another budget than that of the panel."""
@@ -308,8 +254,8 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         group = splat_group.members(context.view_layer, checked)
         for member in group:
             mesh_edit.check_deletable(member.obj)
-        found = splat_group.forced(context.scene, group)
-        return _Applying(apply_task(context, group, found), splat_group.uids_of(group), found)
+        forced = splat_group.forced_of_each(context.scene, group)
+        return _Applying(apply_task(context, group, forced), splat_group.uids_of(group), forced)
 
     def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
         """Return the objects that lose splats, the active one first."""
@@ -328,12 +274,9 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         group = splat_group.by_uids(job.uids, checked)
         if job.task.absorb:  # on a thread, while volumes can be moved
             splat_group.check_forced(context.scene, group, job.forced)
-        stay = splat_group.parts_of(job.task.protected, group)
-        pairs = zip((member.obj for member in group), stay, strict=True)
-        changed = staleness.changes_of(context, dict(pairs))
-        if result.absorbed and not job.task.budget.needs_scores:
-            changed = []  # nothing went by the scores
-        done = splat_group.apply(group, result)
+        decided = job.task.budget.needs_scores or not result.absorbed  # by the scores
+        changed = _changes_since_scoring(context, group, job) if decided else []
+        outcome = splat_group.apply(group, result)
         for member in group:
             plans.forget(member.mesh)
         plans.refresh(context)
@@ -342,8 +285,8 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
             self.report({"INFO"}, result.absorbed.note())
         self.report(
             {"INFO"},
-            f"Kept {done.kept:,} splats{_of_objects(group)}, removed {done.removed:,}: "
-            + sizes_in_words(done.bytes_before, "->", done.bytes_after)
+            f"Kept {outcome.kept:,} splats{_of_objects(group)}, removed {outcome.removed:,}: "
+            + sizes_in_words(outcome.bytes_before, "->", outcome.bytes_after)
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
         if changed:
@@ -355,8 +298,17 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         return {"FINISHED"}
 
 
+def _changes_since_scoring(
+    context: bpy.types.Context, group: splat_group.Members, job: _Applying
+) -> list[str]:
+    """Return what changed since the objects were scored, in a few words each."""
+    protected = splat_group.parts_of(job.task.protected, group)
+    pairs = zip((member.obj for member in group), protected, strict=True)
+    return staleness.changes_of(context, dict(pairs))
+
+
 @dataclass(frozen=True, eq=False)
-class _Detail:
+class _MakingLevels:
     """What levels are to be made of, by which views and how; what must stay and go."""
 
     splats: Splats
@@ -374,21 +326,13 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
     doing = "Making levels"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        """Tell whether the operator can run, and if not, why."""
-        if not super().poll(context):
-            return False
-        if context.mode != "OBJECT":
-            cls.poll_message_set("Go to object mode first")
-            return False
-        return True
+    needs = (*OnSplats.needs, in_object_mode)
 
-    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Detail:
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _MakingLevels:
         """Gather splats, views and settings."""
         settings = context.scene.refine
         levels = settings.to_levels()
-        return _Detail(
+        return _MakingLevels(
             splat_object.gather(checked, whole=True if levels.absorb else None),
             chosen_views(context),
             levels,
@@ -397,7 +341,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         )
 
     @staticmethod
-    def work(job: _Detail, progress: Progress) -> list[Level]:
+    def work(job: _MakingLevels, progress: Progress) -> list[Level]:
         """Make the levels."""
         return lod(
             job.splats, job.views, job.levels, job.settings,
@@ -408,198 +352,34 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         self,
         _context: bpy.types.Context,
         checked: SplatObject,
-        job: _Detail,
+        job: _MakingLevels,
         levels: list[Level],
     ) -> Answer:
         """Make the objects and say what each level costs."""
         collection = level_objects.add_levels(checked, levels)
-        told = [
+        counts = [
             f"{len(level.splats):,}" + (f" ({in_words(level.psnr)})" if level.psnr else "")
             for level in levels
         ]
-        self.report({"INFO"}, f"'{collection.name}': {', '.join(told)} splats")
+        self.report({"INFO"}, f"'{collection.name}': {', '.join(counts)} splats")
         for note in job.levels.notes({level.asked: level.remark for level in levels}):
             self.report({"WARNING"}, note)
         return {"FINISHED"}
 
 
-class REFINE_OT_preview(OnSplats, bpy.types.Operator):
-    """Show the splats as points, or in renders as they are, without changing them"""
-
-    bl_idname = "refine.preview"
-    bl_label = "Preview"
-    bl_options = {"REGISTER", "UNDO"}
-    waits = False
-
-    mode: EnumProperty(
-        name="Show",
-        description="What the points show",
-        items=(
-            ("HEAT", "Heat Map", "Rank of each splat: dark goes first, yellow last"),
-            ("COLOR", "Colour", "The splat's own colour"),
-            ("OFF", "Off", "Show the plain mesh again"),
-        ),
-    )
-    hide_removed: BoolProperty(
-        name="Hide What Goes", description="Hide the splats that the budget removes"
-    )
-    style: EnumProperty(
-        name="Style",
-        description="What is made of each splat",
-        items=(
-            ("POINTS", "Points", "A sphere, for the viewport"),
-            ("SPLATS", "For Renders", "The Gaussian itself, for pictures that Cycles renders"),
-        ),
-        options={"SKIP_SAVE"},
-    )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: Any) -> str:  # noqa: ANN401
-        """Return the tooltip of a button."""
-        if properties.style == "SPLATS" and properties.mode != "OFF":
-            return (
-                "Let renders show the splats as they are; sets the scene to Cycles, without light "
-                "and with the view transform Standard"
-            )
-        if properties.mode == "OFF":
-            return "Show the plain mesh again"
-        if properties.hide_removed:
-            return "Hide the splats that would be removed; nothing is deleted"
-        return {
-            "HEAT": "Colour each splat by its rank: dark goes first, yellow goes last",
-            "COLOR": "Show each splat in its own colour",
-        }[properties.mode]
-
-    def execute(self, context: bpy.types.Context) -> Answer:
-        """Add, change or remove the preview."""
-        obj = context.object
-        try:
-            if self.mode == "OFF":
-                preview.hide(obj)
-            else:
-                hide, style = self.hide_removed, self.style
-                preview.show(obj, self.mode, hide_removed=hide, style=style)
-        except FAILURES as error:
-            return fail(self, error)
-        if self.mode != "OFF" and self.style == "SPLATS":
-            preview.set_up_render(context.scene)
-            return {"FINISHED"}  # too slow for the viewport, which draws them by itself
-        draw.stop()
-        shading = getattr(context.space_data, "shading", None)
-        # Solid mode draws every point in one grey.
-        if self.mode != "OFF" and shading and shading.type in {"SOLID", "WIREFRAME"}:
-            shading.type = "MATERIAL"
-        overlay = getattr(context.space_data, "overlay", None)
-        if overlay:  # outlines of a million selected points hide their colours
-            overlay.show_outline_selected = self.mode == "OFF"
-        return {"FINISHED"}
-
-
-class REFINE_OT_convert(OnSplats, bpy.types.Operator):
+class REFINE_OT_convert(AtOnce, OnSplats, bpy.types.Operator):
     """Turn a splat mesh into a point cloud of Blender's own splats, or such a point cloud back"""
 
     bl_idname = "refine.convert"
     bl_label = "Convert Splats"
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> Answer:
         """Put the other form in the place of the active object."""
-        try:
-            obj, notes = converted(mesh_layout.check(context.object))
-        except FAILURES as error:
-            return fail(self, error)
+        obj, notes = converted(mesh_layout.check(context.object))
         plans.refresh(context)
         for note in notes:
             self.report({"WARNING"}, note)
         kind = "a point cloud" if obj.type == "POINTCLOUD" else "a mesh"
         self.report({"INFO"}, f"'{obj.name}' is {kind} now")
-        return {"FINISHED"}
-
-
-@dataclass(frozen=True, eq=False)
-class _Export:
-    """What is to be written where."""
-
-    file: SplatFile
-    target: Path
-    overwrite: bool
-
-
-class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelper):
-    """Write the active object's splats to a file, in the format that its suffix names"""
-
-    bl_idname = "refine.export_ply"
-    bl_label = "Export Splats"
-    bl_options = {"REGISTER", "PRESET"}
-    doing = "Writing splats"
-
-    filename_ext = ".ply"
-    filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
-    suffix: EnumProperty(
-        name="Format",
-        description="Of the file that is picked here; a suffix that is typed chooses it",
-        items=_FORMATS,
-        options={"SKIP_SAVE"},
-    )
-    settled: StringProperty(default=_FORMATS[0][0], options={"HIDDEN", "SKIP_SAVE"})
-    apply_transform: BoolProperty(
-        name="Apply Transform",
-        description="Write the splats as they stand in the world: positions, rotations, scales "
-        "and view-dependent colour follow the object",
-    )
-    overwrite: BoolProperty(
-        name="Overwrite",
-        description="Replace the file if it exists",
-        options={"SKIP_SAVE"},
-    )
-
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
-        """Ask for the file; whoever picks an existing one in the browser means to replace it."""
-        if not self.filepath:
-            self.filepath = _new_name(context.object)
-        self.overwrite = True
-        return ExportHelper.invoke(self, context, event)
-
-    def check(self, _context: bpy.types.Context) -> bool:
-        """Bring name and format together, whichever was changed; return whether either changed."""
-        before = self.filepath, self.suffix
-        name = without_suffix(self.filepath)
-        typed = self.filepath[len(name) :].lower()
-        if typed and self.suffix == self.settled:
-            self.suffix = typed
-        self.filepath = name + self.suffix
-        self.settled = self.suffix
-        return before != (self.filepath, self.suffix)
-
-    def written(
-        self, _context: bpy.types.Context, _checked: SplatObject | None
-    ) -> list[SplatObject]:
-        """Return none: the object is only read."""
-        return []
-
-    def prepare(self, _context: bpy.types.Context, checked: SplatObject) -> _Export:
-        """Refuse what cannot be written, and gather what is."""
-        target = splat_object.export_target(
-            bpy.path.abspath(self.filepath), overwrite=self.overwrite
-        )
-        file = splat_object.export_source(checked, apply_transform=self.apply_transform)
-        return _Export(file, target, self.overwrite)
-
-    @staticmethod
-    def work(job: _Export, progress: Progress) -> SplatFile | Packed:
-        """Write the file."""
-        report(progress, 0.0, job.target.name)
-        return splat_object.write_export(job.file, job.target, overwrite=job.overwrite)
-
-    def finish(
-        self,
-        _context: bpy.types.Context,
-        _checked: SplatObject | None,
-        _job: _Export,
-        file: SplatFile | Packed,
-    ) -> Answer:
-        """Say what was written."""
-        if isinstance(file, Packed):
-            self.report({"INFO"}, "; ".join(file.notes(np.ones(len(file.file), np.bool_))))
-        self.report({"INFO"}, f"Wrote the splats to {self.filepath}")
         return {"FINISHED"}

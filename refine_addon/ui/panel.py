@@ -1,4 +1,4 @@
-"""The panel REFINE in the 3D view's sidebar: draws settings and stored results."""
+"""The panel REFINE in the 3D view's sidebar: it draws settings and stored results."""
 
 # ruff: noqa: N801, RUF012 - Blender's way to name classes and set options
 from __future__ import annotations
@@ -14,15 +14,17 @@ from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
-from ..objects import splat_group
+from ..objects import demands, splat_group
 from ..viewport import draw as viewport_draw
-from . import kept, plans, preview, price, running, staleness, wrapped
+from . import camera_list, kept, plans, preview, price, running, staleness, wrapped
 from .properties import FLOATERS
 from .view_operators import MODES
+from .volumes import ROLES
 from .wrapped import counted
 
 if TYPE_CHECKING:
     from .properties import RefineSettings
+    from .volumes import RefineVolume
 
 
 _NONE = "Select an object that holds splats"
@@ -32,6 +34,14 @@ class _InSidebar:
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
     bl_category = "REFINE"
+
+
+def _named_column(layout: bpy.types.UILayout) -> bpy.types.UILayout:
+    """Return a column of settings with their names beside them."""
+    column = layout.column()
+    column.use_property_split = True
+    column.use_property_decorate = False
+    return column
 
 
 class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
@@ -74,10 +84,7 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the choice of cameras."""
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
-        settings = context.scene.refine
+        layout, settings = _named_column(self.layout), context.scene.refine
         layout.operator("refine.import_cameras", icon="IMPORT")
         layout.operator("refine.add_ring", icon="OUTLINER_OB_CAMERA")
         layout.prop(settings, "source")
@@ -88,6 +95,27 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
         elif settings.source != "ACTIVE":
             count = kept.answer("cameras", context, lambda: len(_cameras(context)))
             layout.label(text=counted(count, "camera"), icon="CAMERA_DATA")
+
+
+class REFINE_PT_camera_list(_InSidebar, bpy.types.Panel):
+    """Who sees how much."""
+
+    bl_label = "What Each Sees"
+    bl_parent_id = "REFINE_PT_cameras"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether there is a scoring to tell of."""
+        return _record(context.object) is not None
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw the list."""
+        record = _record(context.object) or {}
+        if text := camera_list.warning(record):
+            wrapped.label(self.layout, context, text, icon="ERROR")
+        if price.shows(context.object.data):  # the list is of the object whose chart there is
+            camera_list.draw(self.layout, context)
 
 
 class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
@@ -116,6 +144,50 @@ class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
         _draw_progress(layout, context, "refine.find_floaters")
 
 
+class REFINE_PT_volumes(_InSidebar, bpy.types.Panel):
+    """What must stay and what must go."""
+
+    bl_label = "Protect and Crop"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw marks, volumes, and how many splats they concern."""
+        layout, settings, obj = self.layout, context.scene.refine, context.object
+        facts = demands.facts(obj.data) if mesh_layout.looks_like_splats(obj) else {}
+        layout.prop(settings, "protect", text="", icon="GROUP_VERTEX", placeholder="Vertex group")
+        row = layout.row(align=True)
+        row.operator("refine.protect", text="Protect Selected", icon="LOCKED").mode = "ADD"
+        row.operator("refine.protect", text="", icon="REMOVE").mode = "SUBTRACT"
+        row.operator("refine.protect", text="", icon="X").mode = "CLEAR"
+        column = layout.column(align=True)
+        for role, text, _, icon, _ in ROLES:
+            button = column.operator_menu_enum("refine.add_volume", "shape", text=text, icon=icon)
+            button.role = role
+        for index, item in enumerate(settings.volumes):
+            _draw_volume(layout, index, item, facts.get("volumes", {}))
+        if "error" in facts:
+            wrapped.label(layout, context, facts["error"], icon="ERROR")
+            return
+        if facts.get("protected"):
+            layout.label(text=f"Stay: {facts['protected']:,}", icon="LOCKED")
+        if facts.get("forced"):
+            layout.label(text=f"Go: {facts['forced']:,}", icon="TRASH")
+            layout.operator("refine.crop", icon="TRASH")
+
+
+def _draw_volume(
+    layout: bpy.types.UILayout, index: int, item: RefineVolume, counts: dict[str, int]
+) -> None:
+    """Draw a line of the list, with how many splats lie in the volume if that is known."""
+    row = layout.row(align=True)
+    row.prop(item, "role", text="", icon_only=True)
+    row.prop(item, "object", text="")
+    count = counts.get(f"object '{item.object.name}'") if item.object else None
+    if count is not None:
+        row.label(text=f"{count:,}")
+    row.operator("refine.drop_volume", text="", icon="X").index = index
+
+
 class REFINE_PT_score(_InSidebar, bpy.types.Panel):
     """The scoring."""
 
@@ -125,15 +197,14 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         """Draw the method, the button and what came of it."""
         layout = self.layout
         settings = context.scene.refine
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
+        column = _named_column(layout)
         column.prop(settings, "method")
         if settings.method == "auto":
             column.prop(settings, "tolerance")
+        column.prop(settings, "views")
         layout.operator("refine.score", icon="CAMERA_DATA")
         obj = context.object
-        record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        record = _record(obj)
         if record:
             views = counted(record["views_given"], "view")
             layout.label(text=f"Scored by {record['views_used']} of {views}", icon="CHECKMARK")
@@ -145,29 +216,6 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
         elif mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes:
             wrapped.label(layout, context, "Applied: score again for more", icon="INFO")
         _draw_progress(layout, context, "refine.score")
-
-
-class REFINE_PT_advanced(_InSidebar, bpy.types.Panel):
-    """Settings of the scoring that seldom need a change."""
-
-    bl_label = "Advanced"
-    bl_parent_id = "REFINE_PT_score"
-    bl_options = {"DEFAULT_CLOSED"}
-
-    def draw(self, context: bpy.types.Context) -> None:
-        """Draw the settings of the method."""
-        layout = self.layout
-        layout.use_property_split = True
-        layout.use_property_decorate = False
-        settings = context.scene.refine
-        layout.prop(settings, "views")
-        if settings.method != "closed-form":
-            return  # the others are settings of the closed form
-        layout.prop(settings, "depth")
-        layout.prop(settings, "published")
-        column = layout.column()
-        column.enabled = not settings.published
-        column.prop(settings, "frustum")
 
 
 class REFINE_PT_preview(_InSidebar, bpy.types.Panel):
@@ -209,17 +257,15 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         """Draw the budget, what it would do, and the button."""
         layout = self.layout
         settings = context.scene.refine
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
+        column = _named_column(layout)
         column.prop(settings, "budget")
         column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
         column.prop(settings, "absorb")
         obj = context.object
-        record = mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        record = _record(obj)
         if record:
+            _draw_price(layout, context)
             _draw_plan(layout, context, record)
-        if record:
             layout.operator("refine.compare", icon="IMAGE_DATA")
             _draw_progress(layout, context, "refine.compare")
         row = layout.row()
@@ -237,9 +283,7 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
         """Draw the buttons."""
         layout, settings = self.layout, context.scene.refine
         layout.operator("refine.export_ply", icon="EXPORT")
-        column = layout.column()
-        column.use_property_split = True
-        column.use_property_decorate = False
+        column = _named_column(layout)
         column.prop(settings, "levels")
         column.prop(settings, "nested")
         column.operator("refine.levels", icon="MOD_DECIM")
@@ -284,6 +328,11 @@ def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> Non
         layout.label(text=viewport_draw.failure(), icon="ERROR")
 
 
+def _record(obj: bpy.types.Object | None) -> dict[str, Any] | None:
+    """Return the note of the scores of an object, None without."""
+    return mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
+
+
 def _has(obj: bpy.types.Object | None, attribute: str) -> bool:
     return obj is not None and attribute in obj.data.attributes
 
@@ -301,32 +350,38 @@ def _changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
     return kept.answer(question, context, lambda: staleness.changes_of(context, marked))
 
 
-def _draw_plan(
-    layout: bpy.types.UILayout, context: bpy.types.Context, record: dict[str, Any]
-) -> None:
-    obj, settings = context.object, context.scene.refine
-    plans.ask(context, obj)
-    if price.shows(obj.data):
+def _draw_price(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Draw the chart of the active object, and have it made if it is missing."""
+    plans.ask(context, context.object)
+    if price.shows(context.object.data):
         header, body = layout.panel("REFINE_price")
         header.label(text="Price")
         if body:
             row = body.row()
             row.alignment = "CENTER"
             row.template_icon(icon_value=price.icon(), scale=price.WIDTH)
+
+
+def _draw_plan(
+    layout: bpy.types.UILayout, context: bpy.types.Context, record: dict[str, Any]
+) -> None:
+    """Draw what the budget comes to, and what the cameras do not know of it."""
+    obj, settings = context.object, context.scene.refine
     plan = plans.stored(obj, settings)
     if plan is None:
         layout.operator("refine.plan", icon="FILE_REFRESH")
-    elif "error" in plan:
+        return
+    if "error" in plan:
         waits = mesh_scores.unrefined(record) and settings.budget == "psnr"
         text = plans.remark(plan, record) if waits else plan["error"]
         wrapped.label(layout, context, text, icon="INFO" if waits else "ERROR")
-    else:
-        wrapped.label(layout, context, plans.sentence(plan, absorb=settings.absorb))
-        if remark := plans.remark(plan, record):
-            wrapped.label(layout, context, remark, icon="INFO")
-        for warning in plans.warnings(plan, record):
-            wrapped.label(layout, context, warning.text, icon="ERROR")
-            if warning.remedy and not _changes(context, obj):  # else these may be put right
-                button = layout.operator(warning.remedy)
-                for name, value in warning.options.items():
-                    setattr(button, name, value)
+        return
+    wrapped.label(layout, context, plans.sentence(plan, absorb=settings.absorb))
+    if remark := plans.remark(plan, record):
+        wrapped.label(layout, context, remark, icon="INFO")
+    for warning in plans.warnings(plan, record):
+        wrapped.label(layout, context, warning.text, icon="ERROR")
+        if warning.remedy and not _changes(context, obj):  # else these may be put right
+            button = layout.operator(warning.remedy)
+            for name, value in warning.options.items():
+                setattr(button, name, value)

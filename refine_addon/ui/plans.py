@@ -1,8 +1,8 @@
 """What the budget of the panel would do, worked out when something changes, not when drawn.
 
-What a slider needs at once, the number of splats that stay and what they cost, is looked up in what
-is known of the last scoring (`_Known`). What takes longer at a million splats waits until the
-slider has come to rest (`refresh`): reading what is protected, marking what goes.
+What a slider needs at once, the number of splats that stay and what they cost, is looked up in a
+table of the last scoring (`_Known`). What takes longer at a million splats waits until the slider
+has come to rest (`refresh`): reading what is protected, marking what goes.
 """
 
 from __future__ import annotations
@@ -25,7 +25,8 @@ from ..core.selection import Tally, quality_of
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.notes import parsed
-from ..objects import demands, splat_group, splat_object
+from ..objects import demands, splat_group
+from ..objects.splat_object import Outcome
 from . import camera_list, price
 from .chart import Place
 
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ..core.scores import Scores
+    from ..core.selection import Budget
     from ..core.task import Task
     from .chart import Histogram
 
@@ -52,7 +54,7 @@ class _Known:
 
     Attributes
     ----------
-    holds : tuple
+    state : tuple
         What it depends on; see `_state`.
     tally : Tally
     row_bytes, fixed_bytes : int
@@ -64,7 +66,7 @@ class _Known:
         Splats that go before all others, which all of the above leaves out.
     """
 
-    holds: tuple[Any, ...]
+    state: tuple[Any, ...]
     tally: Tally
     row_bytes: int
     fixed_bytes: int
@@ -97,7 +99,7 @@ def unregister() -> None:
 
 
 def key(settings: Any) -> str:  # noqa: ANN401 - RefineSettings, which imports this module
-    """Return what a plan depends on, to tell whether a stored one still holds."""
+    """Return what a plan depends on; a stored plan of another key is out of date."""
     budget = f"{settings.budget} {getattr(settings, settings.budget)!r} {_demanded(settings)!r}"
     return f"{budget} absorb" if settings.absorb else budget
 
@@ -116,7 +118,7 @@ def at_once(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     """Store what the budget comes to, if enough is known of the object; nothing is marked yet."""
     settings, mesh = scene.refine, obj.data
     objects = _objects(obj)
-    if not _known or _known[0].holds != _state(objects, settings):
+    if not _known or _known[0].state != _state(objects, settings):
         return
     plan = _noted(_known[0], settings) | {"key": _key(settings, objects)}
     mesh[PLAN] = json.dumps(plan | {"marked": False})
@@ -185,10 +187,10 @@ def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:  # no
         noted: dict[str, Any] = parsed(obj.data[PLAN])
         objects = _objects(obj)
         count = sum(mesh_layout.splat_count(each.data) for each in objects)
-        holds = noted["key"] == _key(settings, objects) and noted["splats"] == count
+        current = noted["key"] == _key(settings, objects) and noted["splats"] == count
     except (KeyError, TypeError, ValueError):
         return None
-    return noted if holds else None
+    return noted if current else None
 
 
 def forget(mesh: bpy.types.Mesh) -> None:
@@ -267,27 +269,26 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[Warned]:
     record : dict
         The note of the scoring.
     """
-    found = []
-    stands = Alignment.from_facts(record.get("alignment"))
-    if stands.turn:
-        options = {"quarter": str(stands.turn)}
-        found.append(Warned(_sentence(stands.turned()), "refine.turn_cameras", options))
+    warned = []
+    alignment = Alignment.from_facts(record.get("alignment"))
+    if alignment.turn:
+        options = {"quarter": str(alignment.turn)}
+        warned.append(Warned(_sentence(alignment.turned()), "refine.turn_cameras", options))
     if record["views_used"] == 1:
         text = "One camera decides: add others if the splats are seen from elsewhere too"
-        found.append(Warned(text, "refine.add_ring"))
-    useless = camera_list.useless(record)
-    least = len(useless) < len(record.get("cameras") or ())
-    remedy = "refine.leave_out" if least else "refine.add_ring"
-    texts = (camera_list.warning(record), _sentence(stands.distant()))
-    found += [Warned(text, remedy) for text in texts if text]
+        warned.append(Warned(text, "refine.add_ring"))
+    some_useful = len(camera_list.useless(record)) < len(record.get("cameras") or ())
+    remedy = "refine.leave_out" if some_useful else "refine.add_ring"
+    texts = (camera_list.warning(record), _sentence(alignment.distant()))
+    warned += [Warned(text, remedy) for text in texts if text]
     unseen = plan.get("unseen", 0)
     if unseen >= MANY_UNSEEN * plan["splats"]:
         text = f"{unseen / plan['splats']:.0%} of the splats lie in no view"
         if "unseen_gone" in plan:
             text += f"; {plan['unseen_gone'] / unseen:.0%} of these go"
-        keeps = plan.get("unseen_gone") != 0
-        found.append(Warned(text, "refine.keep_unseen" if keeps else ""))
-    return found
+        some_go = plan.get("unseen_gone") != 0
+        warned.append(Warned(text, "refine.keep_unseen" if some_go else ""))
+    return warned
 
 
 def _sentence(note: str) -> str:
@@ -325,14 +326,14 @@ def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
     bpy.context.view_layer.update()  # or volumes that a script moved are not yet there
     camera_list.fill(mesh_scores.record(mesh) or {})
     count = sum(mesh_layout.splat_count(each.data) for each in objects)
-    own: dict[str, Any] = {"key": _key(settings, objects), "splats": count}
-    plan = own
+    depends: dict[str, Any] = {"key": _key(settings, objects), "splats": count}
+    plan = depends
     try:
         group = splat_group.members(bpy.context.view_layer, mesh_layout.check(obj))
-        found = splat_group.refresh(scene, group)
-        task = splat_group.stored_task(group, settings.to_budget(), found)
+        forced = splat_group.refresh(scene, group)
+        task = splat_group.stored_task(group, settings.to_budget(), forced)
         known = _know(task, _state(objects, settings))
-        plan = _noted(known, settings) | own
+        plan = _noted(known, settings) | depends
         keep = pipeline.decide(task).keep
         splat_group.mark_removed(group, keep)
         keep = keep if task.removed is None else keep[~task.removed]
@@ -363,7 +364,7 @@ def _know(task: Task, state: tuple[Any, ...]) -> _Known:
     scores = task.scores
     assert scores is not None  # noqa: S101 - a task of what is stored
     old = _known[0] if _known else None
-    if old is not None and old.holds == state and old.tally.is_of(scores, task.protected):
+    if old is not None and old.state == state and old.tally.is_of(scores, task.protected):
         return old
     kinds = price.histogram(scores)
     tally, unseen = Tally(scores, task.protected), int(np.count_nonzero(scores.seen == 0))
@@ -386,7 +387,7 @@ def _state(objects: list[bpy.types.Object], settings: Any) -> tuple[Any, ...]:  
 
 
 def _demanded(settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
-    """Return what the settings name as to stay or to go, and where volumes stand."""
+    """Return the names and the volumes that say what must stay and go, and where these stand."""
     return (
         settings.protect,
         *(
@@ -398,32 +399,43 @@ def _demanded(settings: Any) -> tuple[Any, ...]:  # noqa: ANN401
 
 def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
     """Return the plan for a budget as plain values."""
-    scores, count, forced = known.tally.scores, known.count, known.forced
-    rest, curve = count - forced, scores.quality
-    noted: dict[str, Any] = {"key": key(settings), "splats": count, "unseen": known.unseen}
+    count, rest = known.count, known.count - known.forced
+    plan: dict[str, Any] = {"key": key(settings), "splats": count, "unseen": known.unseen}
     try:
         budget = settings.to_budget()
-        if budget.psnr is not None and settings.absorb:
-            gone = math.floor(quality_of(scores).share(budget.psnr, absorb=True) * rest)
-            gone = min(gone, known.tally.free)
-            noted["about"] = True
-        else:
-            left = budget.after(forced, count)
-            gone = known.tally.removed(left, known.row_bytes, known.fixed_bytes)
+        removed, about = _removed(known, budget, absorb=settings.absorb)
     except RefineError as error:
-        return noted | {"error": str(error)}
-    sizes = splat_object.Plan.of(count, rest - gone, known.row_bytes, known.fixed_bytes)
-    noted |= {**vars(sizes), "forced": forced}
+        return plan | {"error": str(error)}
+    if about:
+        plan["about"] = True
+    outcome = Outcome.of(count, rest - removed, known.row_bytes, known.fixed_bytes)
+    plan |= {**vars(outcome), "forced": known.forced}
+    curve = known.tally.scores.quality
     if curve is None:
-        return noted
-    noted["psnr"] = curve.at(gone / rest)
+        return plan
+    plan["psnr"] = curve.at(removed / rest)
     if curve.foretold:
-        noted["psnr_absorbed"] = curve.at(gone / rest, absorb=True)
+        plan["psnr_absorbed"] = curve.at(removed / rest, absorb=True)
     if budget.psnr is not None:
-        psnr = curve.at(gone / rest, absorb=settings.absorb)
-        remark = out_of_reach(budget.psnr, gone, rest, psnr)
-        noted["remark"] = remark[:1].upper() + remark[1:]
-    return noted
+        psnr = curve.at(removed / rest, absorb=settings.absorb)
+        plan["remark"] = _sentence(out_of_reach(budget.psnr, removed, rest, psnr))
+    return plan
+
+
+def _removed(known: _Known, budget: Budget, *, absorb: bool) -> tuple[int, bool]:
+    """Return how many splats a budget removes beside those forced out, and whether it is a guess.
+
+    Raises
+    ------
+    RefineError
+        If the budget means nothing to the scores.
+    """
+    if budget.psnr is not None and absorb:
+        share = quality_of(known.tally.scores).share(budget.psnr, absorb=True)
+        rest = known.count - known.forced
+        return min(math.floor(share * rest), known.tally.free), True
+    left = budget.after(known.forced, known.count)
+    return known.tally.removed(left, known.row_bytes, known.fixed_bytes), False
 
 
 def _tell_cameras(scores: Scores, plan: dict[str, Any], settings: Any) -> None:  # noqa: ANN401

@@ -22,7 +22,6 @@ from ..core.cleaning.clean import DEFAULT_REASONS
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED
 from ..core.levels.lod import Levels
-from ..core.scoring.closed_form_settings import ClosedForm
 from ..core.selection import Budget
 from ..core.task import Settings
 from ..mesh import floaters
@@ -192,24 +191,6 @@ class RefineSettings(bpy.types.PropertyGroup):
     """Settings of the panel, at ``scene.refine``."""
 
     method: EnumProperty(name="Method", description="How splats are scored", items=METHODS)
-    depth: EnumProperty(
-        name="Depth",
-        description="What counts as the distance between a splat and a view",
-        items=(
-            ("z", "Along Axis", "Depth along the camera's axis, as in the paper"),
-            ("distance", "Distance", "Distance to the camera, as in the authors' code"),
-        ),
-    )
-    published: BoolProperty(
-        name="Published Constants",
-        description="Use the constants of the paper or its code as they are; they assume a scene "
-        "in metres and count splats that lie outside the frame",
-    )
-    frustum: BoolProperty(
-        name="Only in Frame",
-        description="Count a view only for the splats that lie in its frame or reach into it",
-        default=True,
-    )
     views: IntProperty(**VIEWS)
     tolerance: FloatProperty(
         name="Tolerance",
@@ -283,11 +264,7 @@ class RefineSettings(bpy.types.PropertyGroup):
         RefineError
             If they cannot be.
         """
-        if self.published:
-            form = ClosedForm.published(self.depth)
-        else:
-            form = ClosedForm(self.depth, frustum=self.frustum)
-        return Settings(self.method, self.views, form, tolerance=decimal(self.tolerance))
+        return Settings(self.method, self.views, tolerance=decimal(self.tolerance))
 
     def to_budget(self) -> Budget:
         """Return the budget of core.

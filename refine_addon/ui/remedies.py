@@ -20,8 +20,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..objects import splat_group
 from . import camera_list, plans
-from .on_thread import FAILURES, Answer, fail
-from .operators import OnSplats
+from .operator_bases import Answer, AtOnce, OnSplats
 from .wrapped import counted
 
 if TYPE_CHECKING:
@@ -44,7 +43,7 @@ class _Bounds(NamedTuple):
     radius: float
 
 
-class REFINE_OT_turn_cameras(OnSplats, bpy.types.Operator):
+class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
     """Turn the cameras that decide a quarter about the world's X axis"""
 
     bl_idname = "refine.turn_cameras"
@@ -60,14 +59,11 @@ class REFINE_OT_turn_cameras(OnSplats, bpy.types.Operator):
         ),
     )
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> Answer:
         """Turn them."""
         context.view_layer.update()  # or what a script just made stands at the origin
-        try:
-            cameras = _deciding(context)
-            roots = _roots(cameras, context.object)
-        except FAILURES as error:
-            return fail(self, error)
+        cameras = _deciding(context)
+        roots = _roots(cameras, context.object)
         turn = mathutils.Matrix(UPRIGHT.tolist())
         if self.quarter == "-1":
             turn = turn.inverted()
@@ -82,7 +78,7 @@ class REFINE_OT_turn_cameras(OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_add_ring(OnSplats, bpy.types.Operator):
+class REFINE_OT_add_ring(AtOnce, OnSplats, bpy.types.Operator):
     """Add cameras around the splats that see all of them; they decide with those there are"""
 
     bl_idname = "refine.add_ring"
@@ -91,12 +87,9 @@ class REFINE_OT_add_ring(OnSplats, bpy.types.Operator):
 
     count: IntProperty(name="Cameras", default=16, min=3, max=360)
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> Answer:
         """Add them."""
-        try:
-            bounds = _bounds(context)
-        except FAILURES as error:
-            return fail(self, error)
+        bounds = _bounds(context)
         collection = bpy.data.collections.new("Ring of Cameras")
         for number in range(self.count):
             collection.objects.link(_camera(context.scene, bounds, number, self.count))
@@ -105,55 +98,49 @@ class REFINE_OT_add_ring(OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_leave_out(OnSplats, bpy.types.Operator):
+class REFINE_OT_leave_out(AtOnce, OnSplats, bpy.types.Operator):
     """Give cameras that see nothing, or all from far away, the weight 0: they no longer decide"""
 
     bl_idname = "refine.leave_out"
     bl_label = "Leave Them Out"
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> Answer:
         """Leave them out."""
         record = mesh_scores.record(context.object.data) or {}
         out = camera_list.useless(record)
-        try:
-            cameras = _deciding(context)
-            leave = [camera for camera in cameras if camera.name in out]
-            _refuse_libraries(leave)
-            if not leave:
-                msg = "none of the cameras is known to see nothing; score first"
-                raise RefineError(msg)
-            if all(camera in leave or camera.get(WEIGHT, 1.0) == 0.0 for camera in cameras):
-                msg = "no camera would be left; add a ring of cameras"
-                raise RefineError(msg)
-        except FAILURES as error:
-            return fail(self, error)
+        cameras = _deciding(context)
+        leave = [camera for camera in cameras if camera.name in out]
+        _refuse_libraries(leave)
+        if not leave:
+            msg = "none of the cameras is known to see nothing; score first"
+            raise RefineError(msg)
+        if all(camera in leave or camera.get(WEIGHT, 1.0) == 0.0 for camera in cameras):
+            msg = "no camera would be left; add a ring of cameras"
+            raise RefineError(msg)
         for camera in leave:
             camera[WEIGHT] = 0.0
         self.report({"INFO"}, f"Left out {counted(len(leave), 'camera')}; score again")
         return {"FINISHED"}
 
 
-class REFINE_OT_keep_unseen(OnSplats, bpy.types.Operator):
+class REFINE_OT_keep_unseen(AtOnce, OnSplats, bpy.types.Operator):
     """Mark the splats that lie in no view to stay, with those that are marked"""
 
     bl_idname = "refine.keep_unseen"
     bl_label = "Keep What Is Unseen"
     bl_options = {"REGISTER", "UNDO"}
 
-    def execute(self, context: bpy.types.Context) -> Answer:
+    def act(self, context: bpy.types.Context) -> Answer:
         """Mark them."""
-        try:
-            group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
-            found = splat_group.forced(context.scene, group)
-            masks = [_unseen(*pair) for pair in zip(group, found, strict=True)]
-            for member in group:
-                mesh_edit.check_writable(member.obj)
-            for member, unseen in zip(group, masks, strict=True):
-                marked = mesh_edit.protected_mask(member.obj, "")
-                mesh_edit.mark_protected(member.obj, unseen if marked is None else unseen | marked)
-        except FAILURES as error:
-            return fail(self, error)
+        group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
+        found = splat_group.forced_of_each(context.scene, group)
+        masks = [_unseen(*pair) for pair in zip(group, found, strict=True)]
+        for member in group:
+            mesh_edit.check_writable(member.obj)
+        for member, unseen in zip(group, masks, strict=True):
+            marked = mesh_edit.protected_mask(member.obj, "")
+            mesh_edit.mark_protected(member.obj, unseen if marked is None else unseen | marked)
         plans.refresh(context)
         count = sum(int(np.count_nonzero(unseen)) for unseen in masks)
         self.report({"INFO"}, f"{count:,} splats that lie in no view stay")

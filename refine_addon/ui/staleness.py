@@ -144,8 +144,8 @@ def _moved(then: dict[str, Any], scene: bpy.types.Scene, obj: bpy.types.Object) 
 
 def _deciding(settings: dict[str, Any]) -> dict[str, Any]:
     """Return those settings of core that a method looks at, as far as the panel has them."""
-    more = {"closed-form": ["closed_form"], "auto": ["tolerance"]}
-    return {name: settings[name] for name in ("method", "views", *more.get(settings["method"], ()))}
+    more = ["tolerance"] if settings["method"] == "auto" else []
+    return {name: settings[name] for name in ("method", "views", *more)}
 
 
 def _cameras(context: bpy.types.Context) -> dict[str, Any]:

@@ -85,8 +85,10 @@ def test_the_command_on_an_object_writes_the_same_survivors(addon, few, room_vie
     count = len(room.data.vertices)
     out = tmp_path / "out.ply"
 
-    report = addon.objects.splat_object.prune_object(
-        room.name, room_views, budget, addon.core.Settings(), absorb=True, output=out
+    report = addon.objects.prune_object.prune_object(
+        room.name,
+        addon.core.PruneRequest(room_views, budget, addon.core.Settings(), absorb=True),
+        output=out,
     )
 
     written = addon.core.read_ply(out).splats()
@@ -102,8 +104,10 @@ def test_saving_leaves_in_the_blend_what_apply_leaves(addon, few, room_views, tm
     expected = absorbed_in_core(addon, room, room_views, budget).absorbed
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
 
-    addon.objects.splat_object.prune_object(
-        room.name, room_views, budget, addon.core.Settings(), absorb=True, save=True
+    addon.objects.prune_object.prune_object(
+        room.name,
+        addon.core.PruneRequest(room_views, budget, addon.core.Settings(), absorb=True),
+        save=True,
     )
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
 

@@ -358,9 +358,9 @@ def test_esc_before_anything_is_shown_leaves_the_old_scores(start, addon, few, m
             time.sleep(0.01)
         raise addon.core.Cancelled
 
-    monkeypatch.setattr(module, "_sketched", slow)
+    monkeypatch.setattr(module, "_sketch", slow)
     operator, context, said = start()
-    tell.wait(10.0)
+    assert tell.wait(60.0)
     operator.modal(context, event("ESC"))
 
     assert until_over(operator, context) == {"CANCELLED"}
@@ -417,28 +417,27 @@ def test_what_ends_the_session_ends_the_thread(start, gate, addon, how):  # noqa
     assert bpy.ops.refine.import_ply.poll()
 
 
-def test_work_that_listens_to_nobody_is_left_behind_within_a_second(start, addon, few, monkeypatch):
-    """What it comes to later is dropped."""
+def test_work_that_listens_to_nobody_is_left_behind(start, addon, few, monkeypatch):
+    """It still waits when the operator is over; what it comes to later is dropped."""
     free, expected = threading.Event(), scored_by(few, "auto")
-    monkeypatch.setattr(addon.ui.operators, "_sketched", lambda _job, _progress: free.wait(20.0))
+    monkeypatch.setattr(addon.ui.operators, "_sketch", lambda _job, _progress: free.wait(600.0))
     operator, context, _ = start()
-    begun = time.monotonic()
     operator.modal(context, event("ESC"))
     answer = until_over(operator, context)
-    passed = time.monotonic() - begun
+    waits = len(threads())
     free.set()
     for thread in threads():
         thread.join()
 
     assert answer == {"CANCELLED"}
-    assert passed < 1.0
+    assert waits == 1
     assert np.array_equal(values(few), expected)
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".sog"])
 def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, few, tmp_path, suffix):
     """The same bytes, images of a SOG by Blender's library on the main thread included."""
-    export, read = addon.ui.operators.REFINE_OT_export_ply, addon.ui.import_operators
+    export, read = addon.ui.export_operators.REFINE_OT_export_ply, addon.ui.import_operators
     at_once, later = (tmp_path / f"{name}{suffix}" for name in ("now", "later"))
     bpy.ops.refine.export_ply(filepath=str(at_once))
     options = {"overwrite": False, "apply_transform": False}
@@ -463,14 +462,14 @@ def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, 
     def write(stream, _splats):
         stream.write(b"half")
         begun.set()
-        free.wait(20.0)
+        free.wait(600.0)
 
     held = SimpleNamespace(suffix=".splat", degree=form.degree, write=write, loss="", sizes=None)
     monkeypatch.setattr(registry, "format_named", lambda _path: held)
-    export = addon.ui.operators.REFINE_OT_export_ply
+    export = addon.ui.export_operators.REFINE_OT_export_ply
     options = {"overwrite": False, "apply_transform": False}
     operator, context, _ = start(export, filepath=str(tmp_path / "out.splat"), **options)
-    begun.wait(10.0)
+    assert begun.wait(60.0)
     operator.modal(context, event("ESC"))
     answer = until_over(operator, context)
     free.set()
@@ -506,7 +505,7 @@ def test_an_answer_just_after_the_time_out_is_no_time_out(addon, monkeypatch):
                 return super().result(timeout)
             except TimeoutError:
                 timed_out.set()
-                answered.wait(10.0)
+                answered.wait(60.0)
                 raise
 
     monkeypatch.setattr(addon.main_thread, "Future", Late)

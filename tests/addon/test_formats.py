@@ -53,7 +53,7 @@ def test_the_file_name_follows_the_format_that_is_chosen(addon):
     """
 
     class Browser:
-        check = addon.ui.operators.REFINE_OT_export_ply.check
+        check = addon.ui.export_operators.REFINE_OT_export_ply.check
 
     browser = Browser()
     browser.filepath, browser.suffix, browser.settled = "a.compressed.ply", ".spz", ".ply"
@@ -88,16 +88,15 @@ def test_an_object_is_pruned_to_a_size_in_another_format(addon, small, tmp_path)
     """3,200 bytes hold 100 splats of a .splat; the size of a .spz does not follow from them."""
     bpy.ops.refine.import_ply(filepath=str(small))
     core, views = addon.core, addon.core.read_cameras(ROOM / "cameras.json")
-    prune, name = addon.objects.splat_object.prune_object, bpy.context.object.name
+    prune, name = addon.objects.prune_object.prune_object, bpy.context.object.name
 
-    report = prune(
-        name, views, core.Budget(max_mb=0.0032), core.Settings(), output=tmp_path / "a.splat"
-    )
+    small_enough = core.PruneRequest(views, core.Budget(max_mb=0.0032))
+    report = prune(name, small_enough, output=tmp_path / "a.splat")
 
     assert len(core.read_splats(tmp_path / "a.splat")) == report["splats"]["kept"] == 100
     assert report["files"]["output_bytes"] == 3200
     with pytest.raises(core.RefineError, match=r"a size cannot be kept to in \.spz"):
-        prune(name, views, core.Budget(max_mb=1.0), core.Settings(), output=tmp_path / "a.spz")
+        prune(name, core.PruneRequest(views, core.Budget(max_mb=1.0)), output=tmp_path / "a.spz")
 
 
 def test_the_images_of_blender_are_those_of_pillow(addon):

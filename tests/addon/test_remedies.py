@@ -125,12 +125,11 @@ def test_the_command_notes_what_the_panel_warns_of(addon, imported):
     """On an object of the scene, by the cameras that the panel chooses."""
     obj = imported(splats=True, cameras=False)
     views = addon.cameras.sets.Choice.of_scene(bpy.context.scene).views(bpy.context, obj)
-    report = addon.objects.splat_object.prune_object(
+    report = addon.objects.prune_object.prune_object(
         obj.name,
-        views,
-        addon.core.Budget(ratio=0.5),
-        addon.core.Settings("closed-form"),
-        dry_run=True,
+        addon.core.PruneRequest(
+            views, addon.core.Budget(ratio=0.5), addon.core.Settings("closed-form"), dry_run=True
+        ),
     )
 
     assert [note for note in report["notes"] if "do not share an up axis" in note]

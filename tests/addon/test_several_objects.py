@@ -126,7 +126,7 @@ def test_the_curve_is_that_of_all_and_of_no_part(addon, halves):
     group, scores = addon.objects.splat_group, addon.mesh.scores
     members = group.members(bpy.context.view_layer, addon.mesh.layout.check(halves[1]))
 
-    found = group.forced(bpy.context.scene, members)
+    found = group.forced_of_each(bpy.context.scene, members)
     task = group.stored_task(members, settings.to_budget(), found)
 
     assert task.scores.quality is not None

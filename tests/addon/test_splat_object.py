@@ -51,13 +51,15 @@ def test_save_prunes_the_object_in_the_blend(addon, scene_file):
 def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):  # noqa: ARG001
     """Nor does it write."""
     unchanged.start()
-    report = addon.objects.splat_object.prune_object(
+    report = addon.objects.prune_object.prune_object(
         "room",
-        addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None),
-        addon.core.Budget(keep=1000),
-        addon.core.Settings("closed-form"),
+        addon.core.PruneRequest(
+            addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None),
+            addon.core.Budget(keep=1000),
+            addon.core.Settings("closed-form"),
+            dry_run=True,
+        ),
         output=tmp_path / "out.ply",
-        dry_run=True,
     )
 
     assert report["splats"]["kept"] == 1000
@@ -71,8 +73,10 @@ def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_f
     """The message lists the splat objects of the scene."""
     views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
     with pytest.raises(addon.core.RefineError, match=r"no object 'rooom'.*splat objects: room"):
-        addon.objects.splat_object.prune_object(
-            "rooom", views, addon.core.Budget(ratio=0.5), addon.core.Settings(), **options
+        addon.objects.prune_object.prune_object(
+            "rooom",
+            addon.core.PruneRequest(views, addon.core.Budget(ratio=0.5)),
+            **options,
         )
 
 
@@ -80,8 +84,10 @@ def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_ca
     """There is no file to save to."""
     views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
     with pytest.raises(addon.core.RefineError, match="not saved in a"):
-        addon.objects.splat_object.prune_object(
-            "room", views, addon.core.Budget(ratio=0.5), addon.core.Settings(), save=True
+        addon.objects.prune_object.prune_object(
+            "room",
+            addon.core.PruneRequest(views, addon.core.Budget(ratio=0.5), addon.core.Settings()),
+            save=True,
         )
     assert len(room.data.vertices) == 39755
 

@@ -61,17 +61,13 @@ def _choose_views(_room, _camera):
     bpy.context.scene.refine.views = 8
 
 
-def _choose_depth(_room, _camera):
-    bpy.context.scene.refine.depth = "distance"
-
-
 @pytest.mark.parametrize(
     ("change", "expected"),
     [(_move, "object moved"), (_move_parent, "object moved"), (_move_camera, "cameras changed"),
      (_turn_camera, "cameras changed"), (_zoom, "cameras changed"), (_weigh, "cameras changed"),
      (_fit, "cameras changed"), (_remove_camera, "cameras changed"),
      (_choose_others, "cameras changed"), (_choose_method, "settings changed"),
-     (_choose_views, "settings changed"), (_choose_depth, "settings changed")],
+     (_choose_views, "settings changed")],
 )  # fmt: skip
 def test_what_changed_since_scoring_is_said(addon, room, room_cameras, change, expected):
     """One of 72 cameras, a hundredth of a unit, any of the settings that the method looks at."""

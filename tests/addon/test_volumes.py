@@ -484,7 +484,7 @@ def test_a_volume_that_moves_marks_all_splats_anew(addon, room, room_cameras):  
     held = addon.ui.plans.key(bpy.context.scene.refine)
     box.location.x += 0.4
     bpy.context.view_layer.update()
-    addon.ui.volumes.again(bpy.context)
+    addon.ui.demand_changes.mark_again(bpy.context)
     now = mask(addon, room, "refine_force")
 
     assert not np.array_equal(before, now)

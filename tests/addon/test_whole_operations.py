@@ -84,10 +84,14 @@ def test_an_apply_that_fails_leaves_the_mesh_as_it_was(few, fail_at, stage):
 
 def pruned(addon, room_views, tmp_path, **options):
     """Prune the object as the command does, to a file and in the .blend."""
-    return addon.objects.splat_object.prune_object(
-        "room", room_views, addon.core.Budget(ratio=0.6), addon.core.Settings(views=4),
-        output=tmp_path / "out.ply", save=True, **options,
-    )  # fmt: skip
+    return addon.objects.prune_object.prune_object(
+        "room",
+        addon.core.PruneRequest(
+            room_views, addon.core.Budget(ratio=0.6), addon.core.Settings(views=4), **options
+        ),
+        output=tmp_path / "out.ply",
+        save=True,
+    )
 
 
 @pytest.mark.parametrize("absorb", [False, True])

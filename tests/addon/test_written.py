@@ -20,10 +20,11 @@ def test_the_file_of_a_moved_object_is_compared_where_the_object_stands(
     bpy.context.view_layer.update()
     views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None).take(range(0, 72, 6))
 
-    report = addon.objects.splat_object.prune_object(
-        "room", views, core.Budget(ratio=0.3), core.Settings("occlusion"),
+    report = addon.objects.prune_object.prune_object(
+        "room",
+        addon.core.PruneRequest(views, core.Budget(ratio=0.3), core.Settings("occlusion")),
         output=tmp_path / "a.glb",
-    )  # fmt: skip
+    )
 
     assert report["written_psnr"] == pytest.approx(report["estimated_psnr"], abs=0.05)
 
@@ -37,10 +38,16 @@ def test_the_report_of_an_object_counts_what_the_file_holds(
     for vertex in room.data.vertices[:3]:
         vertex.co.x = np.nan
 
-    report = addon.objects.splat_object.prune_object(
-        "room", room_views.take(range(4)), core.Budget(ratio=0.0), core.Settings("closed-form"),
-        output=out, dry_run=dry_run,
-    )  # fmt: skip
+    report = addon.objects.prune_object.prune_object(
+        "room",
+        addon.core.PruneRequest(
+            room_views.take(range(4)),
+            core.Budget(ratio=0.0),
+            core.Settings("closed-form"),
+            dry_run=dry_run,
+        ),
+        output=out,
+    )
 
     count = len(room.data.vertices)
     assert report["splats"]["left_out"] == 3

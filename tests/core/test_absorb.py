@@ -43,8 +43,8 @@ def flat(opacities, means, variances, *, colors=None, error=None):
     )
 
 
-def look(means, views):
-    return merge_field.look(means, views, scene_of(means, np.ones(len(means), bool), views))
+def viewing(means, views):
+    return merge_field.viewing(means, views, scene_of(means, np.ones(len(means), bool), views))
 
 
 def field_of(splats, views, seen):
@@ -326,9 +326,9 @@ def test_a_survivor_has_the_colours_of_all_it_absorbed_by_what_is_seen_of_each(o
     assert result.keep.tolist() == [index > 1 for index in order]
     (survivor,) = np.flatnonzero(result.changed)
     assert np.flatnonzero(result.keep)[survivor] == place[2]
-    looked = look(splats.means[place], around())
-    mass = 0.01 * (np.exp(-4.0) + 0.3 * looked.pixel) / looked.pixel
-    allowance = mass * 26 / (looked.seen @ mass) / (looked.seen + 1)
+    viewed = viewing(splats.means[place], around())
+    mass = 0.01 * (np.exp(-4.0) + 0.3 * viewed.pixel) / viewed.pixel
+    allowance = mass * 26 / (viewed.seen @ mass) / (viewed.seen + 1)
     shares = np.array([1, 2, 5]) + allowance[:3]
     shares /= shares.sum()
     for name in ("sh_dc", "sh_rest"):
@@ -398,7 +398,7 @@ def test_protected_splats_stay_though_nobody_sees_them_or_can_draw_them():
     assert not result.keep[6]
 
 
-# From where splats are looked at
+# From where splats are viewed
 
 
 def looking(at, center, **changes):
@@ -412,24 +412,24 @@ def looking(at, center, **changes):
     return View(rotation, np.array(center, float), **lens | changes)
 
 
-def test_a_splat_is_looked_at_along_the_mean_direction_of_what_sees_it():
+def test_a_splat_is_viewed_along_the_mean_direction_of_what_sees_it():
     """From 45 degrees either side: along the bisector, with a deviation of sin 45 to the side."""
     views = ViewSet((looking([0, 0, 0], [2, 0, -2]), looking([0, 0, 0], [-2, 0, -2])))
 
-    found = look(np.zeros((1, 3)), views)
+    viewed = viewing(np.zeros((1, 3)), views)
 
-    np.testing.assert_allclose(found.direction, [[0, 0, 1]], atol=1e-12)
-    np.testing.assert_allclose(np.abs(found.deviation), [[np.sqrt(0.5), 0, 0]], atol=1e-12)
-    np.testing.assert_allclose(found.pixel, [8 / (200 * 250)])
+    np.testing.assert_allclose(viewed.direction, [[0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(np.abs(viewed.deviation), [[np.sqrt(0.5), 0, 0]], atol=1e-12)
+    np.testing.assert_allclose(viewed.pixel, [8 / (200 * 250)])
 
 
 def test_a_nearer_view_counts_by_its_pixels():
     """At distances 1 and 2 as 4 to 1."""
     views = ViewSet((looking([0, 0, 0], [1, 0, 0]), looking([0, 0, 0], [0, 0, -2])))
 
-    found = look(np.zeros((1, 3)), views)
+    viewed = viewing(np.zeros((1, 3)), views)
 
-    np.testing.assert_allclose(found.direction, [np.array([-4, 0, 1]) / np.sqrt(17)], atol=1e-12)
+    np.testing.assert_allclose(viewed.direction, [np.array([-4, 0, 1]) / np.sqrt(17)], atol=1e-12)
 
 
 @pytest.mark.parametrize("aside", [[0.85, 0, 0], [0, 0.5, 0]])
@@ -439,10 +439,10 @@ def test_a_view_beside_whose_image_a_splat_lies_hardly_counts(aside):
         (looking([0, 0, 1], [0, 0, 0]), looking(np.add([0, 0, 1], aside), [-3, 0, 1.0]))
     )
 
-    found = look(np.add([[0.0, 0, 1]], aside), views)
+    viewed = viewing(np.add([[0.0, 0, 1]], aside), views)
 
     expected = np.add([0, 0, 1], aside) - [-3, 0, 1]
-    np.testing.assert_allclose(found.direction, [expected / np.linalg.norm(expected)], atol=1e-4)
+    np.testing.assert_allclose(viewed.direction, [expected / np.linalg.norm(expected)], atol=1e-4)
 
 
 def test_a_view_between_whose_planes_a_splat_does_not_lie_hardly_counts():
@@ -451,10 +451,10 @@ def test_a_view_between_whose_planes_a_splat_does_not_lie_hardly_counts():
     for planes in ({"near": 1.1}, {"far": 0.9}):
         views = ViewSet((replace(looking([0, 0, 1], [0, 0, 0]), **planes), far_off))
 
-        found = look(np.array([[0.0, 0, 1]]), views)
+        viewed = viewing(np.array([[0.0, 0, 1]]), views)
 
-        np.testing.assert_allclose(found.direction, [[1, 0, 0]], atol=1e-4)
-        assert found.seen.tolist() == [1]
+        np.testing.assert_allclose(viewed.direction, [[1, 0, 0]], atol=1e-4)
+        assert viewed.seen.tolist() == [1]
 
 
 def test_colour_is_that_seen_along_the_mean_direction_and_blur_a_third_of_a_pixel():
@@ -633,6 +633,54 @@ def test_when_half_have_gone_neighbours_are_found_anew():
     graph.reduce(1)
 
     assert graph.deleted == 0
+
+
+def heaps(places, each, hidden):
+    """Return a field of copies of one splat at some places, each behind the one before.
+
+    What is seen of each is less than of the one before by the share `hidden`.
+    """
+    means = np.repeat(np.outer(np.arange(places) * 100.0, [1, 0, 0]), each, axis=0)
+    field = flat([0.2] * len(means), means, np.ones((len(means), 3)))
+    seen = (1.0 - hidden) ** np.tile(np.arange(each), places)
+    return replace(field, contribution=field.contribution * seen, error=field.error * seen)
+
+
+@pytest.mark.parametrize("hidden", [0.0, 0.001])
+@pytest.mark.parametrize(("places", "each"), [(1, 2000), (20, 100), (1000, 2)])
+def test_copies_of_a_splat_do_not_merge_one_by_one(monkeypatch, places, each, hidden):
+    """Rounds that remove at least a quarter of 3 % halve them in log(1/2) / log(1 - .0075) = 92.
+
+    Half as many rounds are left for the last splats, of which no whole quarter can go. Each merge
+    prices the pairs of the two anew: 8 for each, and up to as many that have a splat for neighbour.
+    """
+    graph = MergeGraph(heaps(places, each, hidden), SCENE, 1.0)
+    rounds, priced = [], []
+    carry_out, price = MergeGraph._round, MergeGraph._price
+    monkeypatch.setattr(
+        MergeGraph, "_round", lambda *args: rounds.append(carry_out(*args)) or rounds[-1]
+    )
+    monkeypatch.setattr(
+        MergeGraph, "_price", lambda *args: priced.append(len(args[1])) or price(*args)
+    )
+
+    graph.reduce(1000)
+
+    assert np.count_nonzero(graph.alive) == 1000
+    assert len(rounds) <= 92 + 46
+    assert sum(priced) <= (8 + 2 * 2 * 8) * 2000
+
+
+def test_of_pairs_in_a_chain_as_many_are_chosen_as_share_no_splat():
+    """The first of all is chosen; of two that wait for each other one is, or both wait for one."""
+    first = np.arange(500)
+
+    chosen = merge_graph._disjoint(first, first + 1)
+
+    taken = np.concatenate([chosen, chosen + 1])
+    assert chosen[0] == 0
+    assert len(np.unique(taken)) == len(taken)
+    assert (np.isin(first, taken) | np.isin(first + 1, taken)).all()
 
 
 @pytest.fixture

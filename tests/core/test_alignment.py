@@ -191,6 +191,18 @@ def test_absurd_splats_are_measured_without_a_warning(value):
     assert np.isfinite(found.fineness).all()
 
 
+def test_a_signalling_nan_is_no_place_and_makes_no_warning():
+    """Converting one to float64 is an invalid operation to the processor; warnings are errors."""
+    means = cloud().means.astype(np.float32)
+    means.view(np.uint32)[::7, 0] = 0x7FA00000
+
+    found = alignment(replace(cloud(), means=means), ring(20))
+
+    assert found == alignment(
+        replace(cloud(), means=np.where(np.isnan(means), np.nan, means)), ring(20)
+    )
+
+
 def test_measuring_can_be_cancelled():
     """At the first report."""
     with pytest.raises(Cancelled):
@@ -221,3 +233,15 @@ def test_sentences_count_and_name_what_to_do():
         "2 cameras see the splats from so far away that they fill less than 2% of a picture"
     ]
     assert Alignment().notes() == []
+
+
+def test_a_signalling_nan_as_a_position_makes_no_warning():
+    """It lies in no view; converted to float64 it became a quiet one with a warning of NumPy's."""
+    splats = cloud()
+    means = np.array(splats.means, np.float32)
+    means.view(np.uint32)[0, 0] = 0x7FA00001
+
+    with np.errstate(all="raise"):
+        found = alignment(replace(splats, means=means), ring())
+
+    assert found == alignment(splats, ring())

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from refine_addon.core import RefineError, ViewSet, read_cameras, read_ply
-from refine_addon.core.cameras.place import Place
+from refine_addon.core.cameras.place import CameraPlace
 from tests.users import closed_folder
 
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
@@ -353,7 +353,7 @@ def test_files_beside_that_may_not_be_looked_for_say_why(tmp_path, monkeypatch, 
 
 
 def test_what_a_view_refuses_is_refused_with_the_place():
-    place = Place(Path("cameras.json"), "camera 3")
+    place = CameraPlace(Path("cameras.json"), "camera 3")
 
     with pytest.raises(RefineError, match=r"^cameras\.json: camera 3: view 'a': .*focal lengths"):
         place.view("a", np.eye(3), np.zeros(3), (-1, 1), (0, 0), (1, 1))

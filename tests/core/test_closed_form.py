@@ -414,8 +414,8 @@ def test_views_that_are_left_out_or_see_all_of_a_run_change_nothing(monkeypatch,
         return np.ones_like(said[-1][0]), np.zeros_like(said[-1][1])
 
     scores = closed_form.score(splats, views, settings)
-    look = Frustums.look
-    monkeypatch.setattr(Frustums, "look", every)
+    look = Frustums.classify
+    monkeypatch.setattr(Frustums, "classify", every)
     expected = closed_form.score(splats, views, settings)
 
     np.testing.assert_allclose(scores.values, expected.values, rtol=2e-7)

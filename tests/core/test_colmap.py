@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -263,6 +264,18 @@ def test_the_line_of_points_may_be_empty_or_absent(tmp_path, images):
 
     assert project(view, POINT) == pytest.approx([57, 39], abs=1e-12)
     assert view.name == "a.png"
+
+
+def test_empty_lines_take_no_memory(tmp_path):
+    """A place was made for each and kept: 250 bytes of memory for one of the file."""
+    text = b"\n" * 100_000 + b"1 0.5 0.5 0.5 -0.5 -2 3 1 1 a.png"
+    write(tmp_path, ".txt", images=text)
+    tracemalloc.start()
+
+    assert len(read_cameras(tmp_path)) == 1
+
+    assert tracemalloc.get_traced_memory()[1] < 1_000_000
+    tracemalloc.stop()
 
 
 def test_an_image_without_points_does_not_swallow_the_next(tmp_path):

@@ -18,6 +18,7 @@ import pytest
 from refine_addon import command
 from refine_addon.core import (
     Budget,
+    PruneRequest,
     Settings,
     prune,
     prune_file,
@@ -123,7 +124,7 @@ def test_every_budget_and_setting_keeps_the_rows_that_the_interface_keeps(
 def test_the_room_is_pruned_to_the_same_file_from_python_and_from_the_command(folder):
     """39,755 splats by the 64 most spread of 72 views, file to file."""
     source, cameras = ROOM / "point_cloud.ply", ROOM / "cameras.json"
-    prune_file(source, "api.ply", read_cameras(cameras), Budget(ratio=0.3))
+    prune_file(source, "api.ply", PruneRequest(read_cameras(cameras), Budget(ratio=0.3)))
 
     done = command.main(
         ["prune", str(source), "--cameras", str(cameras), "-o", "out.ply", "--ratio", ".3"]
@@ -455,6 +456,35 @@ def test_pictures_that_exist_are_left_alone_and_nothing_is_pruned(folder, capsys
     assert (folder / "shown/in-0.0-after.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_pictures_have_names_that_the_system_takes(folder):
+    """Of a camera's name its last 80 bytes: 26 characters of 3; systems take names of 255 bytes."""
+    told = json.loads((folder / "cameras.json").read_text())
+    for number, camera in enumerate(told):
+        camera["img_name"] = f"{'像' * 120}{number}.jpg"
+    (folder / "cameras.json").write_text(json.dumps(told))
+
+    assert command.main([*PRUNE, "--dry-run", "--pictures", "shown"]) == 0
+
+    label = "像" * 26
+    assert {name for name in names(folder / "shown") if "after" in name} == {
+        f"in-{label}{number}-after.png" for number in (0, 2, 4)
+    }
+
+
+@pytest.mark.parametrize("more", [["--pictures", "a/new"], ["--output-dir", "a/new"]])
+def test_what_is_refused_leaves_no_empty_folder(folder, more):
+    """A file whose pictures have longer names than there are, and one that is not there."""
+    long = "x" * 245 + ".ply"
+    (folder / "in.ply").rename(folder / long)
+    source = long if "--pictures" in more else "in.ply"
+    output = [] if "--output-dir" in more else ["-o", "out.ply"]
+    before = sorted(folder.iterdir())
+
+    assert command.main(["prune", source, *PRUNE[2:], *output, *more]) == 1
+
+    assert sorted(folder.iterdir()) == before
+
+
 @pytest.mark.slow
 def test_a_name_that_the_terminal_cannot_show_is_no_error(folder):
     """As bytes that are no UTF-8, and on a terminal that knows ASCII alone."""
@@ -680,7 +710,7 @@ def run(*arguments: str, environment: dict[str, str] | None = None, **options):
         [sys.executable, "-W", "error", "-m", "refine_addon", *arguments],
         env={**os.environ, **paths},
         capture_output=options.pop("capture_output", True),
-        timeout=60,
+        timeout=600,
         check=False,
         **options,
     )
@@ -746,7 +776,7 @@ def test_progress_is_drawn_on_a_terminal_and_wiped_away():
 def read_all(descriptor: int) -> bytes:
     """Return what a terminal was sent, until its other end is closed."""
     drawn = b""
-    end = time.monotonic() + 10
+    end = time.monotonic() + 60
     while time.monotonic() < end:
         try:
             more = os.read(descriptor, 4096)

@@ -52,7 +52,7 @@ def run(*arguments: str, program: tuple[str, ...] = ("-m", "refine_addon"), **op
     return subprocess.run(
         [sys.executable, *program, *arguments],
         env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": ""},
-        timeout=60,
+        timeout=600,
         check=False,
         **options,
     )

@@ -181,6 +181,18 @@ def test_files_that_the_new_manifest_does_not_name_go(files, capsys):  # noqa: F
     assert (files / "outside.lod3.ply").exists()
 
 
+def test_levels_with_names_that_are_too_long_leave_no_empty_folder(files, capsys):  # noqa: F811
+    """The source's 251 bytes and .lod1 are 256; neither the folder nor the one above it is left."""
+    long = files / f"{'x' * 247}.ply"
+    (files / "scene.ply").rename(long)
+
+    code = main(["lod", str(long), "--cameras", str(files), "-o", str(files / "a/new"), *QUICK])
+
+    assert code == 1
+    assert "cannot be written (File name too long)" in capsys.readouterr().err
+    assert not (files / "a").exists()
+
+
 @pytest.mark.parametrize("told", ["[" * 100_000, "}", '{"file": 1}', "[{}]"])
 def test_a_manifest_that_cannot_be_read_names_no_files(files, told):  # noqa: F811
     """It is replaced; brackets within brackets are more than the parser of JSON follows."""

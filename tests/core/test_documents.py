@@ -43,6 +43,27 @@ def test_every_python_file_and_folder_that_is_named_exists(text):
     assert missing == []
 
 
+def test_every_name_that_is_given_with_its_file_is_defined_there(text):
+    """``core/views.py::View``: a class, function, method, constant or test of that name."""
+    given = re.findall(r"`([\w./-]+\.py)::(\w+)(_\.\.\.)?`", text)
+
+    missing = [
+        f"{path}::{name}"
+        for path, name, cut in given
+        if not any(
+            re.search(
+                rf"^\s*(?:def|class) {name}{'' if cut else chr(92) + 'b'}|^(?:\w+, )*{name}\b.* = ",
+                (ROOT / file[1:]).read_text(encoding="utf-8"),
+                re.MULTILINE,
+            )
+            for file in FILES
+            if file.endswith("/" + path)
+        )
+    ]
+
+    assert missing == []
+
+
 def _names(name: str, file: str) -> bool:
     return file.endswith("/" + name) or (not name.endswith(".py") and file.startswith("/" + name))
 
@@ -73,6 +94,25 @@ def test_every_link_leads_somewhere(document):
             lines = file.read_text(encoding="utf-8").splitlines()
             headings = [line.lstrip("# ").lower() for line in lines if line.startswith("#")]
             assert heading in [re.sub(r"[^\w -]", "", line).replace(" ", "-") for line in headings]
+
+
+PROSE = [path for path in DOCUMENTS if path.name not in {"trade.md", "CHANGELOG.md"}]
+"""Documents but the generated one, and the one in which an entry is a line."""
+
+
+@pytest.mark.parametrize("document", PROSE, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_lines_end_where_sentences_do(document):
+    """So a change of a sentence is a change of its line. Tables and fenced blocks are as they are.
+
+    A bold heading, a date or a list's number may stand before a sentence.
+    """
+    text = document.read_text(encoding="utf-8")
+    text = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    lines = [line for line in text.splitlines() if not line.startswith(("|", "#", "    ", "!["))]
+    begun = re.compile(r"^\s*(?:- |\d+\. )?(?:\*\*[^*]+\*\*|\d{4}-\d\d-\d\d\.)?")
+    plain = [re.sub(r"`[^`]*`", "x", begun.sub("", line)) for line in lines]
+
+    assert [line for line in plain if re.search(r'(?<!Eq)[.!?][)"*]* +["(*[]*[A-Z]', line)] == []
 
 
 def decisions():

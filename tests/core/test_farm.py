@@ -47,7 +47,7 @@ def openjd(action, template, folder, **parameters):
     return subprocess.run(
         [OPENJD, action, ROOT / "docs" / "farm" / template, *(words if action == "run" else [])],
         env=os.environ | {"PYTHONPATH": str(ROOT)},
-        capture_output=True, text=True, check=False, timeout=120,
+        capture_output=True, text=True, check=False, timeout=600,
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from refine_addon.core import (
     Budget,
     Cleaning,
     Levels,
+    PruneRequest,
     RefineError,
     Settings,
     Zone,
@@ -22,10 +23,10 @@ from refine_addon.core import (
     read_ply,
     score,
 )
-from refine_addon.core.file_to_file import forced as forced_by
-from refine_addon.core.levels.files import lod_file
+from refine_addon.core.levels.files import LevelsRequest, lod_file
 from refine_addon.core.pipeline import decide
 from refine_addon.core.task import Task
+from refine_addon.core.volumes import forced as forced_by
 from tests.core.test_cleaning import FLOATER, cameras, joined, wall
 from tests.core.test_levels import cameras as level_cameras
 from tests.core.test_levels import colourful
@@ -267,7 +268,9 @@ def test_a_file_is_pruned_by_volumes_as_by_masks(splats, views, tmp_path, cleani
     masks = forced_by(ZONES, loaded.means)
     budget = Budget(ratio=0.8)
 
-    found = prune_file(path, tmp_path / "out.ply", views, budget, zones=ZONES, cleaning=cleaning)
+    found = prune_file(
+        path, tmp_path / "out.ply", PruneRequest(views, budget, zones=ZONES, cleaning=cleaning)
+    )
 
     x, y = loaded.means[:, 0], loaded.means[:, 1]
     protected, removed = x < -2, ((x >= 1) | (y < -1)) & (x >= -2)
@@ -290,7 +293,7 @@ def test_levels_of_a_file_go_by_volumes(splats, views, tmp_path):
     """No level holds what is forced out, and each holds what is protected."""
     path = scene(splats, tmp_path / "in.ply")
 
-    told = lod_file(path, tmp_path / "out", views, Levels((0.5, 0.4)), zones=ZONES)
+    told = lod_file(path, tmp_path / "out", LevelsRequest(views, Levels((0.5, 0.4)), zones=ZONES))
 
     x = splats.means[:, 0].astype(np.float32)
     for entry in told["levels"]:

@@ -14,6 +14,7 @@ import pytest
 from refine_addon.command import main
 from refine_addon.core import (
     Budget,
+    PruneRequest,
     RefineError,
     Splats,
     as_written,
@@ -36,7 +37,7 @@ FORMATS = [form for form in registry.FORMATS if form.suffix != ".sog" or find_sp
 """All but plain PLY; SOG where Pillow is installed."""
 
 SUFFIX = [form.suffix for form in FORMATS]
-FIXED = [form.suffix for form in FORMATS if form.sizes(1, 0)]
+FIXED = [form.suffix for form in FORMATS if form.sizes]
 COUNT = 600
 """Splats of the test scene: two whole chunks of a compressed PLY and a part of one."""
 
@@ -249,7 +250,9 @@ def test_a_size_is_kept_to(tmp_path, suffix, cameras):
     limit = (sizes.fixed + 300.5 * sizes.row) / 1e6
     path = tmp_path / f"out{suffix}"
 
-    report = prune_file(tmp_path / "in.ply", path, cameras, Budget(max_mb=limit)).report
+    report = prune_file(
+        tmp_path / "in.ply", path, PruneRequest(cameras, Budget(max_mb=limit))
+    ).report
 
     assert report["splats"]["kept"] == len(read_splats(path)) == 300
     assert 300 * sizes.row <= path.stat().st_size <= limit * 1e6
@@ -262,7 +265,11 @@ def test_a_size_is_refused_where_only_writing_tells_it(tmp_path, suffix, cameras
     (tmp_path / "in.ply").write_bytes(ply_of(scene()))
 
     with pytest.raises(RefineError, match=f"a size cannot be kept to in {suffix}, which is compr"):
-        prune_file(tmp_path / "in.ply", tmp_path / f"out{suffix}", cameras, Budget(max_mb=0.01))
+        prune_file(
+            tmp_path / "in.ply",
+            tmp_path / f"out{suffix}",
+            PruneRequest(cameras, Budget(max_mb=0.01)),
+        )
     assert not (tmp_path / f"out{suffix}").exists()
 
 
@@ -271,7 +278,11 @@ def test_survivors_that_absorbed_are_written_as_they_became(tmp_path, suffix, ca
     """The same prune to a PLY and to the format: the same splats within the bounds."""
     (tmp_path / "in.ply").write_bytes(ply_of(scene()))
     for name in (f"out{suffix}", "out.ply"):
-        prune_file(tmp_path / "in.ply", tmp_path / name, cameras, Budget(keep=300), absorb=True)
+        prune_file(
+            tmp_path / "in.ply",
+            tmp_path / name,
+            PruneRequest(cameras, Budget(keep=300), absorb=True),
+        )
 
     kept = read_splats(tmp_path / f"out{suffix}").splats()
     plain = read_splats(tmp_path / "out.ply").splats()
@@ -296,9 +307,13 @@ def test_a_file_that_may_not_be_read_is_replaced(cameras):
         output.chmod(0o200)
 
         report = prune_file(
-            folder / "in.ply", output, cameras, Budget(keep=300), overwrite=True,
-            pictures=PictureFiles(folder, "a"), threads=1,
-        ).report  # fmt: skip
+            folder / "in.ply",
+            output,
+            PruneRequest(
+                cameras, Budget(keep=300), overwrite=True, pictures=PictureFiles(folder, "a")
+            ),
+            threads=1,
+        ).report
 
         assert report["written_psnr"] is None
         assert len(report["pictures"]["views"]) == 2
@@ -366,7 +381,9 @@ def test_a_dry_run_counts_the_bytes_of_the_output(tmp_path, capsys, cameras):
     assert not (tmp_path / "a.splat").exists()
     for suffix, size in ((".splat", 500 * 32), (".spz", None)):
         result = prune_file(
-            tmp_path / "in.ply", tmp_path / f"a{suffix}", cameras, Budget(keep=500), dry_run=True
+            tmp_path / "in.ply",
+            tmp_path / f"a{suffix}",
+            PruneRequest(cameras, Budget(keep=500), dry_run=True),
         )
         assert result.report["files"]["output_bytes"] == size
 

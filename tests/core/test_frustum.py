@@ -44,7 +44,7 @@ def answers(seed: int) -> tuple[np.ndarray, ...]:
     frustums = Frustums(cameras, np.zeros(3), 0.01)
     low = random.normal(size=(3, 200)) * 2
     high = low + random.exponential(0.3, size=low.shape)
-    some, whole = frustums.look(low, high, np.full(200, REACH))
+    some, whole = frustums.classify(low, high, np.full(200, REACH))
     corners = np.indices((2, 2, 2)).reshape(3, -1)
     share = np.concatenate([corners, random.random((3, 8))], axis=1)  # (3, n)
     points = np.ones((4, 200, share.shape[1]))
@@ -80,7 +80,7 @@ def test_a_box_that_touches_an_edge_is_neither_left_out_nor_whole_for_certain():
     cameras = ViewSet((View(np.eye(3), np.zeros(3), 50.0, 50.0, 50.0, 50.0, 100, 100),))
     edge = np.array([[1.0], [0.0], [1.0]])
 
-    some, whole = Frustums(cameras, np.zeros(3), 0.01).look(edge, edge, np.zeros(1) + 1e-9)
+    some, whole = Frustums(cameras, np.zeros(3), 0.01).classify(edge, edge, np.zeros(1) + 1e-9)
 
     assert some.all()
     assert not whole.any()

@@ -14,6 +14,7 @@ from refine_addon.core import (
     Budget,
     Cancelled,
     Levels,
+    LevelsRequest,
     RefineError,
     Settings,
     Splats,
@@ -328,7 +329,7 @@ def test_files_of_levels_and_a_manifest_are_written(tmp_path):
     source = file_of(colourful(), tmp_path / "a.ply")
     out = tmp_path / "out"
 
-    done = lod_file(source, out, cameras(2), DELETED, QUICK)
+    done = lod_file(source, out, LevelsRequest(cameras(2), DELETED, QUICK))
 
     assert sorted(path.name for path in out.iterdir()) == ["a.lod1.ply", "a.lod2.ply", "lod.json"]
     told = json.loads((out / "lod.json").read_text())
@@ -349,7 +350,7 @@ def test_files_of_absorbed_levels_hold_the_survivors(tmp_path):
     source = file_of(colourful(), tmp_path / "a.ply")
     levels = lod(read_ply(source).splats(), cameras(), Levels((0.5, 0.25)))
 
-    lod_file(source, tmp_path, cameras(), Levels((0.5, 0.25)))
+    lod_file(source, tmp_path, LevelsRequest(cameras(), Levels((0.5, 0.25))))
 
     written = read_ply(tmp_path / "a.lod2.ply").splats()
     np.testing.assert_array_equal(written.means, levels[1].splats.means.astype(np.float32))
@@ -364,7 +365,7 @@ def test_levels_are_written_in_any_format(tmp_path, suffix):
     source = file_of(colourful(), tmp_path / "a.ply")
     levels = Levels((0.5,), absorb=False)
 
-    done = lod_file(source, tmp_path, cameras(2), levels, QUICK, suffix=suffix)
+    done = lod_file(source, tmp_path, LevelsRequest(cameras(2), levels, QUICK, suffix=suffix))
 
     assert done["levels"][0]["file"] == f"a.lod1{suffix}"
     assert len(read_splats(tmp_path / f"a.lod1{suffix}")) == 288
@@ -378,10 +379,10 @@ def test_no_file_is_replaced_unless_told(tmp_path, name):
     (tmp_path / name).write_text("mine")
 
     with pytest.raises(RefineError, match="exists already"):
-        lod_file(source, tmp_path, cameras(), Levels((0.5, 0.25)))
+        lod_file(source, tmp_path, LevelsRequest(cameras(), Levels((0.5, 0.25))))
 
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["a.ply", name])
-    lod_file(source, tmp_path, cameras(2), DELETED, QUICK, overwrite=True)
+    lod_file(source, tmp_path, LevelsRequest(cameras(2), DELETED, QUICK, overwrite=True))
     assert (tmp_path / name).read_bytes()[:4] != b"mine"
 
 
@@ -405,7 +406,7 @@ def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, monkeypat
     failing_second(monkeypatch, error)
 
     with pytest.raises(type(error)):
-        lod_file(source, tmp_path / "out", cameras(2), DELETED, QUICK)
+        lod_file(source, tmp_path / "out", LevelsRequest(cameras(2), DELETED, QUICK))
 
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
@@ -413,11 +414,11 @@ def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, monkeypat
 def test_no_manifest_lists_levels_of_two_runs(tmp_path, monkeypatch):
     """Where replacing fails at the second level, the first is replaced and the manifest is gone."""
     source = file_of(colourful(), tmp_path / "a.ply")
-    lod_file(source, tmp_path, cameras(2), DELETED, QUICK)
+    lod_file(source, tmp_path, LevelsRequest(cameras(2), DELETED, QUICK))
     failing_second(monkeypatch, RefineError("no space"))
 
     with pytest.raises(RefineError):
-        lod_file(source, tmp_path, cameras(2), DELETED, QUICK, overwrite=True)
+        lod_file(source, tmp_path, LevelsRequest(cameras(2), DELETED, QUICK, overwrite=True))
 
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["a.lod1.ply", "a.lod2.ply", "a.ply"]
@@ -427,4 +428,4 @@ def test_no_manifest_lists_levels_of_two_runs(tmp_path, monkeypatch):
 def test_a_distance_for_no_psnr_is_refused(tmp_path, goal):
     """Before anything is read: there is no such file."""
     with pytest.raises(RefineError, match="PSNR for a distance"):
-        lod_file(tmp_path / "a.ply", tmp_path, cameras(), Levels((0.5,)), goal=goal)
+        lod_file(tmp_path / "a.ply", tmp_path, LevelsRequest(cameras(), Levels((0.5,)), goal=goal))

@@ -17,6 +17,7 @@ from refine_addon.core import (
     Cancelled,
     ClosedForm,
     Occlusion,
+    PruneRequest,
     RefineError,
     Scores,
     Settings,
@@ -109,7 +110,7 @@ def test_protected_splats_stay_and_others_go_in_their_place(file, views):
 
 def test_a_size_in_megabytes_is_kept_to_the_row(views, tmp_path):
     """The file fits in 2 MB, and one row of 248 bytes more would not."""
-    result = prune_file(PLY, tmp_path / "out.ply", views, Budget(max_mb=2.0), FAST)
+    result = prune_file(PLY, tmp_path / "out.ply", PruneRequest(views, Budget(max_mb=2.0), FAST))
 
     size = (tmp_path / "out.ply").stat().st_size
 
@@ -119,7 +120,7 @@ def test_a_size_in_megabytes_is_kept_to_the_row(views, tmp_path):
 
 def test_the_pruned_file_holds_the_kept_rows_and_the_report_is_json(file, views, tmp_path):
     """Rows bit for bit, in order; every number of the report is finite."""
-    result = prune_file(PLY, tmp_path / "out.ply", views, Budget(ratio=0.5), FAST)
+    result = prune_file(PLY, tmp_path / "out.ply", PruneRequest(views, Budget(ratio=0.5), FAST))
 
     assert read_ply(tmp_path / "out.ply").rows.tobytes() == file.rows[result.keep].tobytes()
     assert json.loads(json.dumps(result.report, allow_nan=False))["splats"]["before"] == 39755
@@ -139,7 +140,7 @@ def test_faces_that_count_splats_are_noted_once_splats_go(small, views, tmp_path
     path.write_bytes(header.replace(b"end_header", faces + b"end_header") + body + face)
 
     fewer, same = (
-        prune_file(path, output, views, Budget(ratio=ratio), FAST).report["notes"]
+        prune_file(path, output, PruneRequest(views, Budget(ratio=ratio), FAST)).report["notes"]
         for output, ratio in ((tmp_path / "out.ply", 0.5), (None, 0.0))
     )
 
@@ -152,7 +153,7 @@ def test_faces_that_count_splats_are_noted_once_splats_go(small, views, tmp_path
 
 def test_no_output_writes_nothing(views, tmp_path):
     """A dry run decides and reports."""
-    result = prune_file(PLY, None, views, Budget(ratio=0.5), FAST)
+    result = prune_file(PLY, None, PruneRequest(views, Budget(ratio=0.5), FAST))
 
     assert result.report["files"]["output"] is None
     assert list(tmp_path.iterdir()) == []
@@ -172,9 +173,11 @@ def test_cancelling_leaves_nothing(views, tmp_path, last):
 
     with pytest.raises(Cancelled):
         prune_file(
-            PLY, tmp_path / "out.ply", views, Budget(ratio=0.5),
+            PLY,
+            tmp_path / "out.ply",
+            PruneRequest(views, Budget(ratio=0.5)),
             progress=lambda _fraction, _what: next(calls) < last,
-        )  # fmt: skip
+        )
 
     assert list(tmp_path.iterdir()) == []
 
@@ -321,7 +324,9 @@ def test_absorbing_file_to_file_writes_the_changed_survivors_and_the_rest_bit_fo
 ):
     """The budget says how many survive; the report and a note say how many of them changed."""
     before = read_ply(small)
-    result = prune_file(small, tmp_path / "out.ply", views, Budget(ratio=0.6), absorb=True)
+    result = prune_file(
+        small, tmp_path / "out.ply", PruneRequest(views, Budget(ratio=0.6), absorb=True)
+    )
 
     after = read_ply(tmp_path / "out.ply")
 
@@ -352,7 +357,9 @@ def test_survivors_of_doubles_are_doubles(small, views, tmp_path):
     )
 
     result = prune_file(
-        tmp_path / "in.ply", tmp_path / "out.ply", moved, Budget(ratio=0.6), absorb=True
+        tmp_path / "in.ply",
+        tmp_path / "out.ply",
+        PruneRequest(moved, Budget(ratio=0.6), absorb=True),
     )
 
     written, changed = read_ply(tmp_path / "out.ply").splats(), result.absorbed.changed
@@ -377,7 +384,9 @@ def text(small, tmp_path_factory):
 @pytest.mark.slow
 def test_absorbing_text_changes_the_words_of_what_changed_and_no_other(text, views, tmp_path):
     """A survivor that absorbed nothing is its own line; the others read back as they became."""
-    result = prune_file(text, tmp_path / "out.ply", views, Budget(ratio=0.6), absorb=True)
+    result = prune_file(
+        text, tmp_path / "out.ply", PruneRequest(views, Budget(ratio=0.6), absorb=True)
+    )
 
     before, after = read_ply(text), read_ply(tmp_path / "out.ply")
     kept, changed = np.flatnonzero(result.keep), result.absorbed.changed
@@ -398,7 +407,9 @@ def test_the_report_says_how_large_a_text_file_is_before_it_is_written(
 ):
     """Of a dry run as of what stands on the disk, though changed rows are longer than they were."""
     done, dry = (
-        prune_file(text, output, views, Budget(ratio=0.6), absorb=absorb).report["files"]
+        prune_file(text, output, PruneRequest(views, Budget(ratio=0.6), absorb=absorb)).report[
+            "files"
+        ]
         for output in (tmp_path / "out.ply", None)
     )
 
@@ -408,7 +419,7 @@ def test_the_report_says_how_large_a_text_file_is_before_it_is_written(
 @pytest.mark.slow
 def test_a_size_in_megabytes_holds_for_text_whose_rows_grow(text, views, tmp_path):
     """Numbers of three digits become numbers of nine: the rows are counted as they may become."""
-    prune_file(text, tmp_path / "out.ply", views, Budget(max_mb=0.3), absorb=True)
+    prune_file(text, tmp_path / "out.ply", PruneRequest(views, Budget(max_mb=0.3), absorb=True))
 
     assert 0.1e6 < (tmp_path / "out.ply").stat().st_size <= 0.3e6
 
@@ -430,7 +441,9 @@ def test_a_text_file_that_fits_loses_nothing(uneven, front, tmp_path, absorb):
     """However long its longest row is: its limit is its own size, byte by byte."""
     size = uneven.stat().st_size
 
-    prune_file(uneven, tmp_path / "out.ply", front, Budget(max_mb=size / 1e6), absorb=absorb)
+    prune_file(
+        uneven, tmp_path / "out.ply", PruneRequest(front, Budget(max_mb=size / 1e6), absorb=absorb)
+    )
 
     assert (tmp_path / "out.ply").read_bytes() == uneven.read_bytes()
 
@@ -438,7 +451,9 @@ def test_a_text_file_that_fits_loses_nothing(uneven, front, tmp_path, absorb):
 def test_a_text_file_is_cut_to_its_limit_by_no_more_than_one_row(uneven, front, tmp_path):
     """The next splat in the order of removal would not have fit any more."""
     file, limit = read_ply(uneven), 3000
-    result = prune_file(uneven, tmp_path / "out.ply", front, Budget(max_mb=limit / 1e6))
+    result = prune_file(
+        uneven, tmp_path / "out.ply", PruneRequest(front, Budget(max_mb=limit / 1e6))
+    )
     order = np.argsort(rank(result.scores.values), kind="stable")
     last = order[~result.keep[order]][-1]
     more = result.keep.copy()
@@ -592,21 +607,29 @@ def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, vi
         np.testing.assert_allclose(sums.error, 2.0 + 0.75 * expected.error)
 
 
-@pytest.mark.parametrize("method", ["occlusion", "auto"])
-@pytest.mark.parametrize("ratio", [0.05, 0.3, 0.55, 0.7, 0.93])
-@pytest.mark.parametrize("zoned", ["", "a seventh stays", "half stays"])
-def test_scoring_for_one_budget_decides_what_scores_for_all_would(
-    small, views, method, ratio, zoned
-):
-    """Scoring ends with the round that removes the last of its splats: the same report, too."""
+@pytest.fixture(
+    scope="module",
+    params=itertools.product(["occlusion", "auto"], ["", "a seventh stays", "half stays"]),
+    ids=" ".join,
+)
+def scored_for_all(request, small, views):
+    """Return a task without scores, one with the scores for every budget, and what has to stay."""
+    method, zoned = request.param
     splats = read_ply(small).splats()
     every = np.arange(len(splats))
     held = every % 2 == 0 if zoned.startswith("half") else every % 7 == 0
     demands = {"protected": held, "removed": every % 11 == 0} if zoned else {}
-    task = Task(Budget(ratio=ratio), Settings(method, views=24), splats, views, **demands)
-    some = decide(task)
+    task = Task(Budget(ratio=0.5), Settings(method, views=12), splats, views, **demands)
+    return task, replace(task, scores=decide(replace(task, reusable=True)).scores), zoned
 
-    whole = decide(replace(task, reusable=True))
+
+@pytest.mark.parametrize("ratio", [0.05, 0.55, 0.93])
+def test_scoring_for_one_budget_decides_what_scores_for_all_would(scored_for_all, ratio):
+    """Scoring ends with the round that removes the last of its splats: the same report, too."""
+    task, scored, zoned = scored_for_all
+    some = decide(replace(task, budget=Budget(ratio=ratio)))
+
+    whole = decide(replace(scored, budget=Budget(ratio=ratio)))
 
     assert whole.scores.settled is None
     np.testing.assert_array_equal(some.keep, whole.keep)

@@ -118,17 +118,26 @@ def _file(name, data):
 
 
 FAULTS = {
-    "version 1": (_meta("version", 1), "meta.json: version 1, expected 2"),
-    "no version": (_meta("version", None), "meta.json: version none, expected 2"),
-    "many": (_meta("count", 10**9), "meta.json: count: 1000000000, expected 1 to "),
-    "none": (_meta("count", 0), "meta.json: count: 0, expected 1 to "),
-    "half": (_meta("count", 1.5), "meta.json: count: none, expected 1 to "),
+    "version 1": (_meta("version", 1), "meta.json version: expected 2, got 1"),
+    "no version": (_meta("version", None), "meta.json version: expected 2, got null"),
+    "many": (_meta("count", 10**9), "meta.json count: expected a whole number from 1 to "),
+    "none": (_meta("count", 0), "meta.json count: expected a whole number from 1 to "),
+    "half": (_meta("count", 1.5), "meta.json count: expected a whole number from 1 to "),
     "a few too many": (_meta("count", 100), "image 'means_l.webp': "),
-    "no means": (_meta("means", []), "meta.json: means: is not there, expected an object"),
-    "two limits": (_meta("means", "mins", [0, 0]), "meta.json: means.mins: expected 3 numbers"),
-    "a huge limit": (_meta("means", "maxs", [10**400] * 3), "meta.json: means.maxs: a number too"),
-    "a short table": (_meta("sh0", "codebook", [0.0]), "meta.json: sh0.codebook: expected 256 nu"),
-    "no file": (_meta("scales", "files", []), "meta.json: scales.files: expected at least 1 nam"),
+    "no means": (_meta("means", []), "meta.json means: expected an object, got a list"),
+    "two limits": (
+        _meta("means", "mins", [0, 0]),
+        "meta.json means mins: expected a list of 3 numbers",
+    ),
+    "a huge limit": (
+        _meta("means", "maxs", [10**400] * 3),
+        "meta.json means maxs [0]: expected a finite n",
+    ),
+    "a short table": (
+        _meta("sh0", "codebook", [0.0]),
+        "meta.json sh0 codebook: expected a list of 256",
+    ),
+    "no file": (_meta("scales", "files", []), "meta.json scales files: expected at least 1"),
     "another file": (_meta("scales", "files", ["x"]), "'x' in the archive cannot be read ("),
     "no image": (_file("sh0.webp", b"RIFF"), "image 'sh0.webp': cannot be read ("),
     "another image": (_file("sh0.webp", b"\x89PNG\r\n\x1a\n"), "image 'sh0.webp': cannot be read"),
@@ -142,8 +151,11 @@ FAULTS = {
         _file("quats.webp", picture(8, 8, (0, 0, 0, 9))),
         "rotation of splat 0: alpha 9, expected 252 to 255",
     ),
-    "bands": (_meta("shN", "bands", 4), "meta.json: shN.bands: expected 1, 2 or 3"),
-    "entries": (_meta("shN", "count", 70_000), "meta.json: shN.count: expected 1 to 65536"),
+    "bands": (_meta("shN", "bands", 4), "meta.json shN bands: expected a whole number from 1 to 3"),
+    "entries": (
+        _meta("shN", "count", 70_000),
+        "meta.json shN count: expected a whole number from 1 to 65536",
+    ),
     "a narrow palette": (
         _file("shN_centroids.webp", picture(64, 8)),
         "image 'shN_centroids.webp': 64 pixels wide, expected 192",

@@ -15,6 +15,7 @@ import pytest
 
 from refine_addon.core import (
     Budget,
+    PruneRequest,
     RefineError,
     Settings,
     prune_file,
@@ -78,7 +79,9 @@ def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budg
     if budget.max_mb:
         assert 0 <= 400_000 - report["files"]["output_bytes"] < 2 * 248
         budget = Budget(keep=report["splats"]["kept"])
-    whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", views, budget, CLOSED)
+    whole = prune_file(
+        tmp_path / "whole.ply", tmp_path / "pruned.ply", PruneRequest(views, budget, CLOSED)
+    )
     assert joined(tmp_path / "out" / path.name for path in tiles) == joined(
         [tmp_path / "pruned.ply"]
     )

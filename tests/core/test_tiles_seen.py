@@ -12,6 +12,7 @@ from numpy.lib.recfunctions import drop_fields
 
 from refine_addon.core import (
     Budget,
+    PruneRequest,
     RefineError,
     Settings,
     prune,
@@ -76,6 +77,7 @@ def read(folder, paths):
 # Occlusion, auto and what they estimate.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("settings", [OCCLUSION, AUTO], ids=["occlusion", "auto"])
 @pytest.mark.parametrize(
     "budget", [Budget(ratio=0.7), Budget(psnr=36.0), Budget(min_seen=60)], ids=str
@@ -83,7 +85,9 @@ def read(folder, paths):
 def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budget, settings):
     """To the byte, and the estimates are the same but for how rounding adds up."""
     told = prune_tiles(tiles, tmp_path / "out", views, budget, settings)
-    whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", views, budget, settings)
+    whole = prune_file(
+        tmp_path / "whole.ply", tmp_path / "pruned.ply", PruneRequest(views, budget, settings)
+    )
 
     expected = read_ply(tmp_path / "pruned.ply").rows
     assert read(tmp_path / "out", tiles).tobytes() == expected.tobytes()
@@ -99,7 +103,7 @@ def test_views_of_nothing_are_refused_as_of_one_file(tmp_path, tiles, views):
     """Near planes behind all splats: the message is that of one file, and nothing is left."""
     away = ViewSet(tuple(replace(view, near=1e6) for view in views))
     with pytest.raises(RefineError) as alone:
-        prune_file(tmp_path / "whole.ply", None, away, Budget(ratio=0.5), OCCLUSION)
+        prune_file(tmp_path / "whole.ply", None, PruneRequest(away, Budget(ratio=0.5), OCCLUSION))
 
     with pytest.raises(RefineError) as together:
         prune_tiles(tiles, tmp_path / "out", away, Budget(ratio=0.5), OCCLUSION)
@@ -108,36 +112,50 @@ def test_views_of_nothing_are_refused_as_of_one_file(tmp_path, tiles, views):
     assert not list((tmp_path / "out").glob("*"))
 
 
-@pytest.mark.parametrize("stop", [0.1, 0.3, 0.55, 0.7])
+@pytest.mark.slow
 @pytest.mark.parametrize("absorb", [False, True], ids=["deleted", "absorbed"])
 def test_a_job_that_was_interrupted_goes_on_where_it_was(
-    tmp_path, tiles, views, monkeypatch, stop, absorb
+    tmp_path, tiles, views, monkeypatch, absorb
 ):
-    """What a block of views has measured is not measured again, and the bytes are the same."""
-    budget, done = Budget(ratio=0.5), []
-    prune_tiles(tiles, tmp_path / "once", views, budget, OCCLUSION, absorb=absorb)
+    """What a block of views has measured is not measured again, and the bytes are the same.
+
+    Interrupted once, and four times in one job, when a tenth, three tenths, ... are done.
+    """
+    budget, settings, done = Budget(ratio=0.5), replace(OCCLUSION, views=8), []
     measure = measuring.measure_footprints
     monkeypatch.setattr(
         measuring, "measure_footprints", lambda *some: done.append(some) or measure(*some)
     )
 
-    def interrupt(fraction, _what):
-        if fraction > stop:
-            raise KeyboardInterrupt
+    def measured(folder, *stops):
+        """Return how many views are measured until a job is done that is stopped some times."""
+        done.clear()
 
-    prune_tiles(tiles, tmp_path / "count", views, budget, OCCLUSION, absorb=absorb)
-    needed = len(done)
-    done.clear()
-    with pytest.raises(KeyboardInterrupt):
-        prune_tiles(
-            tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=absorb, progress=interrupt
+        def interrupt(fraction, _what):
+            if stops and fraction > stops[0]:
+                raise KeyboardInterrupt
+
+        def run():
+            prune_tiles(
+                tiles, tmp_path / folder, views, budget, settings, absorb=absorb, progress=interrupt
+            )
+
+        while stops:
+            with pytest.raises(KeyboardInterrupt):
+                run()
+            stops = stops[1:]
+        run()
+        return len(done)
+
+    needed = measured("once")
+    for folder, stops in (("late", (0.7,)), ("often", (0.1, 0.3, 0.55, 0.7))):
+        taken = measured(folder, *stops)
+
+        assert needed <= taken <= needed + 2 * len(stops)  # the views of the blocks under way
+        assert read(tmp_path / folder, tiles).tobytes() == read(tmp_path / "once", tiles).tobytes()
+        assert sorted(path.name for path in (tmp_path / folder).iterdir()) == sorted(
+            path.name for path in tiles
         )
-    prune_tiles(tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=absorb)
-
-    once, again = (read(tmp_path / folder, tiles).tobytes() for folder in ("once", "out"))
-    assert once == again
-    assert needed <= len(done) <= needed + 2  # the views of the block under way
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in tiles}
 
 
 # Absorbing.
@@ -186,6 +204,7 @@ def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views,
     assert psnr_against(rays, made, others) > one - 0.3
 
 
+@pytest.mark.slow
 def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, rows, views):
     """Kept, merged and deleted add up to all; survivors that did not change are their old bytes.
 
@@ -213,9 +232,8 @@ def test_absorbing_a_single_region_is_absorbing_one_file(
     monkeypatch.setattr(absorbing, "REGION", COUNT)
     budget = Budget(ratio=ratio)
     told = prune_tiles(tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=True)
-    whole = prune_file(
-        tmp_path / "whole.ply", tmp_path / "pruned.ply", views, budget, OCCLUSION, absorb=True
-    )
+    request = PruneRequest(views, budget, OCCLUSION, absorb=True)
+    whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", request)
 
     assert told["absorbed"] == whole.report["absorbed"]
     assert told["absorbed"]["changed"] > 100
@@ -241,19 +259,22 @@ def test_stored_rays_know_which_are_wanted(tmp_path, views):
     assert rays.seeing() == []
 
 
+@pytest.mark.slow
 def test_what_is_deleted_alone_needs_no_merging(tmp_path, tiles, views):
     """Up to a tenth is deleted as in memory: the same rows, and nothing changes."""
     told = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.1), OCCLUSION, absorb=True)
     whole = prune_file(
-        tmp_path / "whole.ply", tmp_path / "pruned.ply", views, Budget(ratio=0.1), OCCLUSION,
-        absorb=True,
-    )  # fmt: skip
+        tmp_path / "whole.ply",
+        tmp_path / "pruned.ply",
+        PruneRequest(views, Budget(ratio=0.1), OCCLUSION, absorb=True),
+    )
 
     assert told["absorbed"] == whole.report["absorbed"]
     expected = read_ply(tmp_path / "pruned.ply").rows
     assert read(tmp_path / "out", tiles).tobytes() == expected.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_tiles_of_other_degrees_absorb_one_another(tmp_path, rows, views):
     """Each keeps its own properties, and no number is lost that it has room for."""
@@ -316,6 +337,7 @@ def test_regions_of_one_stage_cross_those_of_the_next():
 # What a view loads.
 
 
+@pytest.mark.slow
 def test_a_view_loads_no_chunk_behind_it(tmp_path, tiles, views, monkeypatch):
     """Of 100 chunks all are loaded by some view, and a fifth of the times none was needed."""
     monkeypatch.setattr(gaussians, "CHUNK", 50)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from refine_addon.core import Box, Placed, RefineError, Solid, Sphere, Zone, forced
+from refine_addon.core import Box, MovedVolume, RefineError, Solid, Sphere, Zone, forced
 from refine_addon.core.volumes import parse
 
 CORNERS = np.array(list(itertools.product((0.0, 1.0), repeat=3)))
@@ -177,7 +177,7 @@ WILD = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [0, -np.inf, 0], [1e300, 0, 0],
         Box((0, 0, 0), (1e9, 1, np.inf)),
         Sphere((0.5, 0.5, 0.5), 0.1),
         Solid(CORNERS, CUBE),
-        Placed(Box((-1, -1, -1), (1, 1, 1)), np.eye(4)),
+        MovedVolume(Box((-1, -1, -1), (1, 1, 1)), np.eye(4)),
     ],
     ids=["box", "endless", "sphere", "solid", "placed"],
 )
@@ -197,7 +197,7 @@ def test_a_placed_sphere_is_an_ellipsoid():
     """Stretched to 2, 1 and 1/2 and moved by 1 in x: its ends lie at those lengths."""
     matrix = np.diag([2.0, 1.0, 0.5, 1.0])
     matrix[0, 3] = 1.0
-    volume = Placed(Sphere((0, 0, 0), 1.0), matrix)
+    volume = MovedVolume(Sphere((0, 0, 0), 1.0), matrix)
     points = np.array(
         [[2.9, 0, 0], [3.1, 0, 0], [1, 0.9, 0], [1, 1.1, 0], [1, 0, 0.4], [1, 0, 0.6]]
     )
@@ -220,7 +220,7 @@ def test_a_sphere_holds_its_surface():
 def test_a_flat_matrix_is_refused():
     """A scale of 0 leaves no volume."""
     with pytest.raises(RefineError, match="is flat"):
-        Placed(Sphere((0, 0, 0), 1.0), np.diag([1.0, 0.0, 1.0, 1.0]))
+        MovedVolume(Sphere((0, 0, 0), 1.0), np.diag([1.0, 0.0, 1.0, 1.0]))
 
 
 @pytest.mark.parametrize(

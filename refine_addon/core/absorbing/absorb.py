@@ -1,16 +1,16 @@
 """Absorbing: reduce splats to a number by the cheapest merges and deletions.
 
 `merging` computes what a merge costs, and `merge_graph` carries out the cheapest operations. What
-the views see of the survivors changes meanwhile, so the work is done in stages, and the splats left
-are measured before each. Survivors that absorb nothing stay as they were, to the bit.
+is hidden changes as splats go, so the work is done in stages: before each, the splats left are
+measured again. Survivors that absorb nothing stay as they were, to the bit.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -28,26 +28,32 @@ if TYPE_CHECKING:
 
     from ..scene import Scene
     from ..views import ViewSet
-    from .merge_field import Array, Index
+    from .merge_field import Array, Field, Index
 
 Measure = Callable[[Splats, "ViewSums | None", Progress], ViewSums]
 """``measure(splats, expected, progress)`` returns what the views see of each of these splats.
 
-`expected` is what they would see by the measuring before, if merging and deleting had not changed
-what is hidden; None before the first stage.
+`expected` is what the stage before predicts: right, but for what is now hidden or no longer hidden
+by others. It is None before the first stage.
 """
 
 STAGE = 0.6
-"""One of several stages leaves at least this share of its splats."""
+"""Least share of its splats that each of several stages leaves.
+
+At least a half: tiles count a splat whose cheapest operation is a merge as half a splat, and would
+run out of splats to remove beyond that (`_staying` in `tiles/absorbing.py`).
+"""
 
 ALONE = 0.55
-"""A single stage leaves at least this share: half of all splats, once a tenth of all was deleted.
+"""Least share that a stage leaves where one is enough; at least a half, as `STAGE`.
+
+Just below 5/9, so that one stage removes half of all splats of which a tenth was deleted before.
 """
 
 PATIENCE = 2.0
 """Factor on the cost of merging if half of the splats go; see `patience`."""
 
-_CHUNK = 1 << 14
+_CHUNK = 1 << 14  # covariances turned into axes at a time: some MB of temporaries a thread
 
 
 class Counts:
@@ -168,32 +174,35 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     count = len(splats)
     spared = np.zeros(count, np.bool_) if protected is None else np.array(protected, np.bool_)
     goal = max(keep_count, int(np.count_nonzero(spared)), 0)
-    # In float64, since merged splats merge again, and rounding between would depend on the frame.
-    columns = {}
-    for name, values in vars(splats).items():
-        report(progress, 0.0, "absorbing")
-        columns[name] = np.asarray(values, np.float64)
-    splats = Splats(**columns)
+    splats = _in_float64(splats, progress)
     scene = scene_of(splats.means, drawable(splats), views)
     # Of each splat left: its row among the N, and how many of the N it stands for.
     origin, members = np.arange(count), np.ones(count, np.int64)
     factor = patience(1.0 - goal / max(began or count, 1))
     left_after = stages(count, goal)
     sums: ViewSums | None = None
-    for stage, left in enumerate(left_after):
-        ahead = part(progress, stage / len(left_after), (stage + 1) / len(left_after))
-        sums = measure(splats, sums, part(ahead, 0.0, 0.5))
-        splats, kept, taken, sums = absorb_once(
+    for number, left in enumerate(left_after):
+        of_stage = part(progress, number / len(left_after), (number + 1) / len(left_after))
+        sums = measure(splats, sums, part(of_stage, 0.0, 0.5))
+        stage = absorb_once(
             splats, views, scene, sums, left, protected=spared[origin],
-            factor=factor, progress=part(ahead, 0.5, 1.0), threads=threads,
+            factor=factor, progress=part(of_stage, 0.5, 1.0), threads=threads,
         )  # fmt: skip
-        # A survivor now also stands for all that the splats it absorbed stood for.
-        members = np.bincount(taken[taken >= 0], members[taken >= 0], len(splats)).astype(np.int64)
-        origin = origin[kept]
+        splats, sums, origin = stage.splats, stage.expected, origin[stage.keep]
+        members = stage.sums_of(members)
     keep = np.zeros(count, np.bool_)
     keep[origin] = True
     merged = int(members.sum()) - len(origin)
     return Absorbed(splats, keep, members > 1, merged, count - len(origin) - merged)
+
+
+def _in_float64(splats: Splats, progress: Progress) -> Splats:
+    """Return splats in float64: merged ones merge again, and rounding depends on the frame."""
+    columns = {}
+    for name, values in vars(splats).items():
+        report(progress, 0.0, "absorbing")
+        columns[name] = np.asarray(values, np.float64)
+    return Splats(**columns)
 
 
 def stages(count: int, goal: int, alone: float = ALONE) -> list[int]:
@@ -216,6 +225,33 @@ def stages(count: int, goal: int, alone: float = ALONE) -> list[int]:
     ]
 
 
+class Stage(NamedTuple):
+    """What a stage makes of N splats.
+
+    Attributes
+    ----------
+    splats : Splats
+        The K survivors.
+    keep : (N,) bool
+        Which splats survive.
+    survivor : (N,) int64
+        Which of the K survivors each splat is, or was absorbed by; -1 if it was deleted.
+    expected : ViewSums
+        Of the K survivors, predicted from the sums before the stage and the merges' own errors.
+    """
+
+    splats: Splats
+    keep: NDArray[np.bool_]
+    survivor: Index
+    expected: ViewSums
+
+    def sums_of(self, members: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return for how many splats each survivor stands, (K,), given it for the N."""
+        stays = self.survivor >= 0
+        sums = np.bincount(self.survivor[stays], members[stays], len(self.splats))
+        return sums.astype(np.int64)
+
+
 def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     splats: Splats,
     views: ViewSet,
@@ -227,7 +263,7 @@ def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     factor: float,
     progress: Progress = silent,
     threads: int | None = None,
-) -> tuple[Splats, NDArray[np.bool_], Index, ViewSums]:
+) -> Stage:
     """Do one stage of `absorb`.
 
     Parameters
@@ -239,29 +275,21 @@ def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
         Of these splats.
     factor : float
         On the cost of merging, see `patience`.
-
-    Returns
-    -------
-    splats : Splats
-        The K survivors of N.
-    keep : (N,) bool
-        Which splats survive.
-    taken : (N,) int64
-        Which of the K survivors each splat is, or was absorbed by; -1 if it was deleted.
-    expected : ViewSums
-        Of the K survivors, as far as these sums and the costs of the merges tell.
     """
     sums = ViewSums(np.asarray(sums.contribution, np.float64), np.asarray(sums.error, np.float64))
     rows = mergeable(splats, scene, protected)
     report(progress, 0.0, "absorbing")
 
-    def graph() -> MergeGraph:
-        ahead = part(progress, 0.0, 0.1)
-        found = merge_field.field(splats, rows, views, scene, sums, progress=ahead, threads=threads)
-        return MergeGraph(found, scene, factor, threads=threads)
+    def make_graph() -> MergeGraph:
+        field = merge_field.field(
+            splats, rows, views, scene, sums, progress=part(progress, 0.0, 0.1), threads=threads
+        )
+        return MergeGraph(field, scene, factor, threads=threads)
 
-    ahead = part(progress, 0.1, 1.0)
-    return reduced(splats, sums, rows, graph, keep_count, protected=protected, progress=ahead)
+    return reduced(
+        splats, sums, rows, make_graph, keep_count,
+        protected=protected, progress=part(progress, 0.1, 1.0),
+    )  # fmt: skip
 
 
 def mergeable(splats: Splats, scene: Scene, protected: NDArray[np.bool_]) -> Index:
@@ -271,52 +299,55 @@ def mergeable(splats: Splats, scene: Scene, protected: NDArray[np.bool_]) -> Ind
     """
     rows = np.flatnonzero(drawable(splats) & ~protected)
     place = scene.place(splats.means[rows])
-    return rows[spatial_order(place, lambda some: splat_fingerprint(splats, rows[some]))]
+    return rows[spatial_order(place, lambda tied: splat_fingerprint(splats, rows[tied]))]
 
 
 def reduced(  # noqa: PLR0913 - as `absorb_once`
     splats: Splats,
     sums: ViewSums,
     rows: Index,
-    graph: Callable[[], MergeGraph],
+    make_graph: Callable[[], MergeGraph],
     keep_count: int,
     *,
     protected: NDArray[np.bool_],
     progress: Progress = silent,
-) -> tuple[Splats, NDArray[np.bool_], Index, ViewSums]:
-    """Reduce splats by a graph; parameters and results as `absorb_once`.
+) -> Stage:
+    """Reduce splats by a graph: undrawable ones go first, then the graph's cheapest operations.
 
     Parameters
     ----------
+    splats, sums, keep_count, protected, progress
+        See `absorb_once`.
     rows : (M,) int64
         Rows of the splats that the graph holds, see `mergeable`.
-    graph : callable
-        Returns the graph; called only if some of these go.
+    make_graph : callable
+        Returns the graph; called only if some of its splats go.
     """
     excess = max(len(splats) - keep_count, 0)
-    may = np.zeros(len(splats), np.bool_)
-    may[rows] = True
+    in_graph = np.zeros(len(splats), np.bool_)
+    in_graph[rows] = True
     keep = np.ones(len(splats), np.bool_)
-    hopeless = np.flatnonzero(~protected & ~may)[:excess]
-    keep[hopeless] = False
-    excess = min(excess - len(hopeless), len(rows))
+    undrawable = np.flatnonzero(~protected & ~in_graph)[:excess]
+    keep[undrawable] = False
+    excess = min(excess - len(undrawable), len(rows))
     if excess <= 0:
-        return splats.take(keep), keep, np.where(keep, np.cumsum(keep) - 1, -1), sums.take(keep)
-    found = graph()
-    found.reduce(len(rows) - excess, part(progress, 0.0, 0.95))
-    keep[rows[~found.alive]] = False
-    return _written(splats, sums, keep, rows, found, part(progress, 0.95, 1.0))
+        survivor = np.where(keep, np.cumsum(keep) - 1, -1)
+        return Stage(splats.take(keep), keep, survivor, sums.take(keep))
+    graph = make_graph()
+    graph.reduce(len(rows) - excess, part(progress, 0.0, 0.95))
+    keep[rows[~graph.alive]] = False
+    return _with_merged(splats, sums, keep, rows, graph, part(progress, 0.95, 1.0))
 
 
-def _written(
+def _with_merged(
     splats: Splats,
     sums: ViewSums,
     keep: NDArray[np.bool_],
     rows: Index,
     graph: MergeGraph,
     progress: Progress,
-) -> tuple[Splats, NDArray[np.bool_], Index, ViewSums]:
-    """Return the results of `absorb_once`, with the merged splats in place of the survivors.
+) -> Stage:
+    """Return what a stage makes of splats, with the merged splats in place of survivors.
 
     Parameters
     ----------
@@ -330,52 +361,76 @@ def _written(
         Reduced; its field shrinks to the changed survivors.
     progress : callable
     """
-    own, threads = np.arange(len(rows)), graph.threads
-    # (M,) each: the survivor that each splat went into, and its share of the survivor's colour.
-    owner, share = own.copy(), np.ones(len(rows))
-    # From the last round to the first: a survivor of one round may be absorbed in a later one.
-    for into, gone, kept_share in reversed(graph.merges):
-        owner[gone] = owner[into]
-        share[gone] = share[into] * (1.0 - kept_share)
-        share[into] *= kept_share
+    owner, share = _owners(graph.merges, len(rows))  # (M,) each
     changed = np.zeros(len(rows), np.bool_)  # (M,), survivors that absorbed others
-    changed[owner[owner != own]] = True
+    changed[owner[owner != np.arange(len(rows))]] = True
     changed &= graph.alive
-    place = np.cumsum(keep) - 1  # (N,), row of each survivor among the K
-    target = place[rows[changed]]  # (C,)
+    new_row = np.cumsum(keep) - 1  # (N,), of each survivor among the K
+    survivor = np.where(keep, new_row, -1)
+    survivor[rows] = np.where(graph.alive[owner], new_row[rows[owner]], -1)
     members = np.flatnonzero(changed[owner])  # all that went into one of them, themselves included
-    harmonics = _Blend(rows[members], place[rows[owner[members]]], share[members])
+    harmonics = _Blend(rows[members], survivor[rows[members]], share[members])
     # Drop the rest of the field before the survivors are copied, to save memory.
     merged = graph.field = graph.field.take(np.flatnonzero(changed))
     report(progress, 0.0, "absorbing")
+    left, target = splats.take(keep), new_row[rows[changed]]  # (K,), (C,)
+    _put_shapes(left, target, merged, part(progress, 0.0, 0.3), graph.threads)
     with np.errstate(under="ignore"):
-        logs, quaternions = _axes(merged.covariances, part(progress, 0.0, 0.3), threads)
-        ahead = part(progress, 0.3, 1.0)
-        result = Splats(
-            _put(splats.means[keep], target, merged.means),
-            _put(splats.log_scales[keep], target, logs),
-            _put(splats.quaternions[keep], target, quaternions),
-            _put(splats.opacity_logits[keep], target, _logit(merged.opacity)),
-            harmonics.put(splats.sh_dc[:, None], splats.sh_dc[keep][:, None], ahead, threads)[:, 0],
-            harmonics.put(splats.sh_rest, splats.sh_rest[keep], ahead, threads),
-        )
-    taken = np.where(keep, place, -1)
-    taken[rows] = np.where(graph.alive[owner], place[rows[owner]], -1)
+        for values, kept in ((splats.sh_dc[:, None], left.sh_dc[:, None]),
+                             (splats.sh_rest, left.sh_rest)):  # fmt: skip
+            harmonics.put(values, kept, part(progress, 0.3, 1.0), graph.threads)
     expected = sums.take(keep)
     expected.contribution[target], expected.error[target] = merged.contribution, merged.error
-    return result, keep, taken, expected
+    return Stage(left, keep, survivor, expected)
+
+
+def _owners(merges: Sequence[tuple[Index, Index, Array]], count: int) -> tuple[Index, Array]:
+    """Return the splat that each of `count` went into, and its share of that one's colour.
+
+    A splat that went into none is its own.
+
+    Parameters
+    ----------
+    merges : sequence of (survivor, absorbed, share)
+        See `MergeGraph.merges`.
+    count : int
+    """
+    owner, share = np.arange(count), np.ones(count)
+    # From the last round to the first: a survivor of one round may be absorbed in a later one.
+    for into, gone, kept_share in reversed(merges):
+        owner[gone] = owner[into]
+        share[gone] = share[into] * (1.0 - kept_share)
+        share[into] *= kept_share
+    return owner, share
+
+
+def _put_shapes(
+    left: Splats, target: Index, merged: Field, progress: Progress, threads: int | None
+) -> None:
+    """Write place, shape and opacity of merged splats to some rows of `left`."""
+    logs, quaternions = np.empty((len(target), 3)), np.empty((len(target), 4))
+
+    def fill(piece: slice) -> None:
+        logs[piece], quaternions[piece] = merging.axes(merged.covariances[piece])
+
+    with np.errstate(under="ignore"):
+        for_chunks(fill, len(target), _CHUNK, progress=progress, what="absorbing", threads=threads)
+        left.means[target], left.log_scales[target] = merged.means, logs
+        left.quaternions[target] = quaternions
+        left.opacity_logits[target] = np.log(merged.opacity) - np.log1p(-merged.opacity)
 
 
 class _Blend:
-    """Means of rows in groups, weighted by shares that sum to 1 in each group.
+    """Weighted means of rows in groups; the shares of a group sum to 1.
 
     Parameters
     ----------
     members : (m,) int64
         Rows to take means of.
     targets : (m,) int64
-        To which row the mean is written that each member belongs to.
+        The row that the mean of a member's group is written to.
     share : (m,) float64
+        Weight of each member.
     """
 
     def __init__(self, members: Index, targets: Index, share: Array) -> None:
@@ -386,38 +441,13 @@ class _Blend:
 
     def put(
         self, values: NDArray[Any], kept: NDArray[Any], progress: Progress, threads: int | None
-    ) -> NDArray[Any]:
-        """Write the means of `values`, (N, K, 3), to the target rows of `kept`; return `kept`."""
+    ) -> None:
+        """Write the means of `values`, (N, n, 3), to the target rows of `kept`, (K, n, 3)."""
 
         def fill(piece: slice) -> None:
-            # One column at a time, to save memory.
-            own = np.asarray(values[self.members, piece.start], np.float64)
-            means = np.add.reduceat(own * self.share[:, None], self.starts)
-            kept[self.targets, piece.start] = means
+            # One harmonic at a time, to save memory.
+            weighted = values[self.members, piece.start] * self.share[:, None]  # (m, 3)
+            kept[self.targets, piece.start] = np.add.reduceat(weighted, self.starts)
 
-        columns = values.shape[1] if len(self.starts) else 0
-        for_chunks(fill, columns, 1, progress=progress, what="absorbing", threads=threads)
-        return kept
-
-
-def _axes(covariances: Array, progress: Progress, threads: int | None) -> tuple[Array, Array]:
-    """Return `merging.axes` of M covariances, computed in chunks."""
-    logs, quaternions = np.empty((len(covariances), 3)), np.empty((len(covariances), 4))
-
-    def fill(piece: slice) -> None:
-        logs[piece], quaternions[piece] = merging.axes(covariances[piece])
-
-    for_chunks(fill, len(covariances), _CHUNK, progress=progress, what="absorbing", threads=threads)
-    return logs, quaternions
-
-
-def _logit(opacity: Array) -> Array:
-    """Return the logit of an opacity, (M,): the inverse of `splats.opacity`."""
-    logit: Array = np.log(opacity) - np.log1p(-opacity)
-    return logit
-
-
-def _put(kept: NDArray[Any], rows: Index, values: Array) -> NDArray[Any]:
-    """Write `values` to some rows of `kept`, which is a copy already; return it."""
-    kept[rows] = values
-    return kept
+        harmonics = values.shape[1] if len(self.starts) else 0
+        for_chunks(fill, harmonics, 1, progress=progress, what="absorbing", threads=threads)

@@ -1,4 +1,4 @@
-"""Splats as merging needs them: covariance, what the views see of each, and from where."""
+"""Splats as merging needs them: covariance, what the views see of each, and from which side."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     Index = NDArray[np.int64] | NDArray[np.int32]
     Footprint = tuple[Array, Array, Array]
 
-LOOKS = 32
-"""How many views, spread evenly, decide from which directions splats are viewed."""
+DIRECTION_VIEWS = 32
+"""At most so many views, spread evenly, decide from which directions splats are viewed."""
 
 BESIDE = 1e-6
 """Factor on the weight of views that a splat's centre does not lie in. Such views decide the
@@ -34,7 +34,7 @@ viewing direction only of splats that lie in no view."""
 LARGEST_LENS = 1e18
 """Largest product of the focal lengths of a view, px^2, and one over the smallest."""
 
-_CHUNK = 1 << 14
+_CHUNK = 1 << 14  # splats at a time: some MB of temporary memory a thread
 _LOG_RANGE = 80.0  # of log scales, either way, so that squares of scales stay finite
 
 
@@ -72,7 +72,7 @@ class Field:
     contribution, error : (N,) float64
         See `ViewSums`.
     direction, deviation : (N, 3) float64
-        See `Look`.
+        See `Viewing`.
     color : (N, 3) float64
         As viewed along `direction`.
     blur : (N,) float64
@@ -100,8 +100,8 @@ class Field:
         return Field(*(getattr(self, item.name).take(rows, axis=0) for item in fields(self)))
 
 
-class Look(NamedTuple):
-    """From where the views look at each of N splats, hidden or not.
+class Viewing(NamedTuple):
+    """From where the views see each of N splats, hidden or not.
 
     Attributes
     ----------
@@ -122,15 +122,15 @@ class Look(NamedTuple):
     seen: Array
 
 
-def look(
+def viewing(
     means: NDArray[Any],
     views: ViewSet,
     scene: Scene,
     *,
     progress: Progress = silent,
     threads: int | None = None,
-) -> Look:
-    """Return from where the views look at splats.
+) -> Viewing:
+    """Return from where the views see splats.
 
     Each view has the weight 1 / distance^2, in proportion to the pixels that a splat covers in it,
     and nearly none where the splat's centre does not lie in it (`frustum`).
@@ -140,61 +140,71 @@ def look(
     means : (N, 3) floating
         Of drawable splats.
     views : ViewSet
-        At most `LOOKS` of them are used.
+        At most `DIRECTION_VIEWS` of them are used.
     scene : Scene
         A camera is at least `NEAR_RELATIVE` of its size away from a splat.
     progress : callable, optional
     threads : int, optional
     """
     count = len(means)
-    result = Look(np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count))
-    some = views.spread(LOOKS)
-    looks = [(view, counts) for view, counts in zip(some, some.weights, strict=True) if counts]
-    closest = (NEAR_RELATIVE * scene.size) ** 2
+    result = Viewing(np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count))
+    spread = views.spread(DIRECTION_VIEWS)
+    weighted = [pair for pair in zip(spread, spread.weights, strict=True) if pair[1]]
+    closest = NEAR_RELATIVE * scene.size
 
     def fill(piece: slice) -> None:
         points = np.asarray(means[piece], np.float64).T
         with np.errstate(under="ignore"):
-            found = _look(points, looks, closest)
-        for values, part_of in zip(result, found, strict=True):
-            values[piece] = part_of
+            of_piece = _viewing(points, weighted, closest)
+        for values, chunk in zip(result, of_piece, strict=True):
+            values[piece] = chunk
 
     for_chunks(fill, count, _CHUNK, progress=progress, what="absorbing", threads=threads)
     return result
 
 
-def _look(points: Array, looks: list[tuple[View, float]], closest: float) -> Look:
-    """Return from where views look at M points.
+def _viewing(points: Array, views: list[tuple[View, float]], closest: float) -> Viewing:
+    """Return from where views see M points.
 
     Parameters
     ----------
     points : (3, M) float64
         World units.
-    looks : list of (View, float)
+    views : list of (View, float)
         Views and their weights.
     closest : float
-        Least squared distance of a camera.
+        Least distance of a camera.
     """
     rows, columns = np.triu_indices(3)
-    total, finest, seen = np.zeros((3, points.shape[1]))  # sums over views, (M,) each
-    toward, second = np.zeros((3, points.shape[1])), np.zeros((6, points.shape[1]))
-    for view, counts in looks:
-        ray = points - view.center[:, None]  # (3, M)
-        planes = frustum.clip_planes(view, closest**0.5)
-        inside = frustum.contains(view, view.rotation @ ray, planes)  # (M,)
+    # Sums over views: of the weights, of pixels per squared world unit, of views; (M,) each.
+    total, density, seen = np.zeros((3, points.shape[1]))
+    first, second = np.zeros((3, points.shape[1])), np.zeros((6, points.shape[1]))
+    for view, counts in views:
+        inside, ray, squared = _seen_from(view, points, closest)
         seen += inside
-        squared = np.maximum(np.einsum("ij,ij->j", ray, ray), closest)
         weight = np.where(inside, counts, counts * BESIDE) / squared  # (M,)
-        ray /= np.sqrt(squared)
-        weighted = ray * weight
-        toward += weighted
+        weighted = ray * weight  # (3, M)
+        first += weighted
         second += weighted[rows] * ray[columns]  # xx, xy, xz, yy, yz, zz
         total += weight
         # Limited, so that the area of a pixel is neither 0 nor infinite.
         pixels = min(max(view.fx * view.fy, 1.0 / LARGEST_LENS), LARGEST_LENS)
-        finest += weight * (pixels / squared)  # pixels per squared world unit
-    direction = normalized(toward.T)
-    return Look(direction, _deviation(direction, (second / total).T), total / finest, seen)
+        density += weight * (pixels / squared)
+    direction = normalized(first.T)
+    return Viewing(direction, _deviation(direction, (second / total).T), total / density, seen)
+
+
+def _seen_from(view: View, points: Array, closest: float) -> tuple[NDArray[np.bool_], Array, Array]:
+    """Return which points lie in a view, the rays to them, and their squared distances.
+
+    (M,), (3, M) and (M,). Points nearer than `closest` count as that far away, and their rays are
+    shorter than 1.
+    """
+    ray = points - view.center[:, None]
+    planes = frustum.clip_planes(view, closest)
+    inside = frustum.contains(view, view.rotation @ ray, planes)
+    squared = np.maximum(np.einsum("ij,ij->j", ray, ray), closest**2)
+    return inside, ray / np.sqrt(squared), squared
 
 
 def _deviation(direction: Array, second: Array) -> Array:
@@ -267,57 +277,65 @@ def unallowed(  # noqa: PLR0913 - as `field`
     threads: int | None = None,
 ) -> Unallowed:
     """Return some splats as merging needs them, but for the allowance; parameters as `field`."""
-    count = len(rows)
-    covariances, color = np.empty((count, 6)), np.empty((count, 3))
-    ahead = part(progress, 0.0, 0.5)
-    looked = look(splats.means[rows], views, scene, progress=ahead, threads=threads)
-    upper = np.triu_indices(3)
+    viewed = viewing(
+        splats.means[rows], views, scene, progress=part(progress, 0.0, 0.5), threads=threads
+    )
+    covariances, color = np.empty((len(rows), 6)), np.empty((len(rows), 3))
 
     def fill(piece: slice) -> None:
         chunk = splats.take(rows[piece])
-        logs = np.asarray(chunk.log_scales, np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
-        axes = rotation_matrices(chunk.quaternions) * np.exp(logs)[:, None, :]  # (n, 3, 3)
-        covariances[piece] = (axes @ np.swapaxes(axes, 1, 2))[:, upper[0], upper[1]]
+        covariances[piece] = _covariances(chunk)
         color[piece] = spherical_harmonics.colors(
-            looked.direction[piece], chunk.sh_dc, chunk.sh_rest
+            viewed.direction[piece], chunk.sh_dc, chunk.sh_rest
         )
 
-    ahead = part(progress, 0.5, 1.0)
-    for_chunks(fill, count, _CHUNK, progress=ahead, what="absorbing", threads=threads)
-    alpha, blur = opacity(splats.opacity_logits[rows]), LOW_PASS * looked.pixel  # (M,) each
-    with np.errstate(under="ignore"):
-        xx, xy, yy = footprint(covariances, across(looked.direction), blur)  # (M,) each
-        # In pixels of a view, over 2 pi; a constant factor does not matter here.
-        mass = alpha * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / looked.pixel
-    found = Field(
+    for_chunks(
+        fill, len(rows), _CHUNK, progress=part(progress, 0.5, 1.0), what="absorbing",
+        threads=threads,
+    )  # fmt: skip
+    field = Field(
         np.asarray(splats.means[rows], np.float64),
         covariances,
-        alpha,
+        opacity(splats.opacity_logits[rows]),
         sums.contribution[rows],
         sums.error[rows],
-        looked.direction,
-        looked.deviation,
+        viewed.direction,
+        viewed.deviation,
         np.maximum(color, 0.0, out=color),
-        blur,
+        LOW_PASS * viewed.pixel,
     )
-    return Unallowed(found, mass, looked.seen)
+    with np.errstate(under="ignore"):
+        xx, xy, yy = footprint(covariances, across(field.direction), field.blur)  # (M,) each
+        # In pixels of a view, over 2 pi; a constant factor does not matter here.
+        mass = field.opacity * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / viewed.pixel
+    return Unallowed(field, mass, viewed.seen)
+
+
+def _covariances(splats: Splats) -> Array:
+    """Return the covariances of splats, (n, 6): xx, xy, xz, yy, yz, zz; world units squared."""
+    rows, columns = np.triu_indices(3)
+    logs = np.asarray(splats.log_scales, np.float64).clip(-_LOG_RANGE, _LOG_RANGE)
+    axes = rotation_matrices(splats.quaternions) * np.exp(logs)[:, None, :]  # (n, 3, 3)
+    full: Array = axes @ np.swapaxes(axes, 1, 2)
+    return full[:, rows, columns]
 
 
 class Unallowed(NamedTuple):
-    """Splats as merging needs them, without an allowance for what one more view may see of each.
+    """Splats as merging needs them, but without the allowance for views that were not given.
 
-    If nothing were hidden, each view would see the worth of the splats whose centre lies in it. The
-    views saw some share of that, summed over all splats, and another view is expected to see the
-    same share. If none of the n views that a splat lies in showed it, the next view shows it with a
-    probability of about 1 / (n + 1), by the rule of succession.
+    If nothing were hidden, each view would see the whole mass of every splat whose centre lies in
+    it. The given views saw a share of that, summed over all splats, and another view is expected to
+    see the same share. If none of the n views that a splat lies in showed it, the next one shows it
+    with a probability of about 1 / (n + 1), by the rule of succession. So the allowance of a splat
+    is what a view sees of it if nothing hides it, times that share, over n + 1.
 
     Attributes
     ----------
     field : Field
         Contribution and error are as measured, summed over views.
     mass : (M,) float64
-        What one view sees of each splat if nothing hides it: its worth, beside the contribution;
-        beside the error that is ``mass opacity``.
+        What one view adds to a splat's contribution if nothing hides it. To its error it adds
+        ``mass opacity``, for a contrast of 1.
     seen : (M,) float64
         In how many views each centre lies.
     """
@@ -327,30 +345,33 @@ class Unallowed(NamedTuple):
     seen: Array
 
     def seen_and_whole(self) -> Array:
-        """Return of contribution and of error the sum, and what it were if nothing hid anything.
+        """Return the sums over all splats of contribution and error, as seen and if none is hidden.
 
         Returns
         -------
         (2, 2) float64
-            Those of parts of a scene add up to those of the scene.
+            ``[[contribution, its sum if nothing hid anything], [error, the same of it]]``. The sums
+            of the parts of a scene add up to those of the scene.
         """
-        found, worth = self.field, self.mass * self.field.opacity
+        unhidden = self.mass * self.field.opacity
         return np.array(
             [
-                [found.contribution.sum(), self.seen @ self.mass],
-                [found.error.sum(), self.seen @ worth],
+                [self.field.contribution.sum(), self.seen @ self.mass],
+                [self.field.error.sum(), self.seen @ unhidden],
             ]
         )
 
     def with_allowance(self, scene: Array) -> Field:
         """Return the field with the allowance; `scene`: `seen_and_whole` of the whole scene."""
-        first, second = (seen / whole if whole > 0.0 else 0.0 for seen, whole in scene.tolist())
-        found, worth = self.field, self.mass * self.field.opacity
+        shares = [seen / whole if whole > 0.0 else 0.0 for seen, whole in scene.tolist()]
+        unhidden = self.mass * self.field.opacity
         with np.errstate(under="ignore"):
+            contribution = self.mass * shares[0] / (1.0 + self.seen)
+            error = unhidden * shares[1] / (1.0 + self.seen)
             return replace(
-                found,
-                contribution=found.contribution + self.mass * first / (1.0 + self.seen),
-                error=found.error + worth * second / (1.0 + self.seen),
+                self.field,
+                contribution=self.field.contribution + contribution,
+                error=self.field.error + error,
             )
 
 

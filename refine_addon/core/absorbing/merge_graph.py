@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..scene import MIX
 from ..work import Progress, for_chunks, part, report, silent
 from . import merging
 from .neighbours import nearest
@@ -24,7 +25,12 @@ NEIGHBOURS = 8
 BATCH = 0.03
 """Share of the splats that one round removes at most; then costs are computed again."""
 
-_CHUNK = 1 << 14
+FILLED = 0.25
+"""A round that removes less than this share of its quota also merges pairs that are not the
+cheapest operation for both of their splats. Ordinary scenes fill .64 of it or more. Of copies of a
+splat, each costs less than the one before it, so that only one pair would merge in a round."""
+
+_CHUNK = 1 << 14  # pairs at a time: some MB of temporary memory a thread
 
 
 class MergeGraph:
@@ -111,11 +117,11 @@ class MergeGraph:
             self.connect(part(progress, 0.0, 0.3))
         while count > goal:
             done = 0.3 + 0.7 * (start - count) / (start - goal)
-            here = part(progress, done, done)
-            report(here, 0.0, "absorbing")
+            of_round = part(progress, done, done)
+            report(of_round, 0.0, "absorbing")
             if count < self.connected / 2:
-                self.connect(here)
-            count -= self._round(min(max(int(BATCH * count), 1), count - goal), here)
+                self.connect(of_round)
+            count -= self._round(min(max(int(BATCH * count), 1), count - goal), of_round)
         # The pairs are no longer needed; a large scene has ten million of them.
         self.first = self.second = np.empty(0, np.int32)
         self.cost = np.empty(0)
@@ -124,24 +130,25 @@ class MergeGraph:
         """Find the pairs of neighbouring splats, and price them."""
         rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))  # (R,)
         place = self.scene.place(self.field.means[rows])  # (R, 3)
-        ahead = part(progress, 0.0, 0.4)
-        near = nearest(place, NEIGHBOURS, progress=ahead, threads=self.threads)  # (R, k)
+        near = nearest(
+            place, NEIGHBOURS, progress=part(progress, 0.0, 0.4), threads=self.threads
+        )  # (R, k)
 
         def pairs(piece: slice) -> tuple[Rows, Rows]:
-            own, others = np.arange(piece.start, piece.stop)[:, None], near[piece]  # (n, 1), (n, k)
+            of_piece, others = np.arange(piece.start, piece.stop)[:, None], near[piece]  # (n, 1)
             # Two splats that are neighbours of each other make one pair, not two.
-            once = (own < others) | ~(near[others] == own[:, :, None]).any(axis=2)
-            own = np.broadcast_to(own, others.shape)
-            return rows[own[once]].astype(np.int32), rows[others[once]].astype(np.int32)
+            once = (of_piece < others) | ~(near[others] == of_piece[:, :, None]).any(axis=2)
+            first = np.broadcast_to(of_piece, others.shape)[once]
+            return rows[first].astype(np.int32), rows[others[once]].astype(np.int32)
 
-        ahead = part(progress, 0.4, 0.5)
-        found = for_chunks(
-            pairs, len(rows), _CHUNK, progress=ahead, what="absorbing", threads=self.threads
-        )
+        chunks = for_chunks(
+            pairs, len(rows), _CHUNK,
+            progress=part(progress, 0.4, 0.5), what="absorbing", threads=self.threads,
+        )  # fmt: skip
         none = np.empty(0, np.int32)
         # int32 takes half the memory of int64, and no file holds two billion splats.
-        self.first = np.concatenate([none, *(first for first, _ in found)])
-        self.second = np.concatenate([none, *(second for _, second in found)])
+        self.first = np.concatenate([none, *(first for first, _ in chunks)])
+        self.second = np.concatenate([none, *(second for _, second in chunks)])
         self.cost = np.empty(len(self.first))
         self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.5, 1.0))
         self.connected = int(np.count_nonzero(self.alive))
@@ -150,12 +157,12 @@ class MergeGraph:
         """Set the costs of some pairs; infinite where deleting one of the two costs less."""
 
         def price(piece: slice) -> None:
-            mine = edges[piece]
-            first, second = self.first[mine], self.second[mine]
+            rows = edges[piece]
+            first, second = self.first[rows], self.second[rows]
             least = np.minimum(self.field.error[first], self.field.error[second])
             with np.errstate(under="ignore"):
                 cost = merging.costs(self.field, first, second, least / self.patience)
-            self.cost[mine] = self.patience * cost
+            self.cost[rows] = self.patience * cost
 
         for_chunks(
             price, len(edges), _CHUNK, progress=progress, what="absorbing", threads=self.threads
@@ -165,29 +172,60 @@ class MergeGraph:
         """Carry out the cheapest operations that share no splat; return how many, 1 to `quota`.
 
         A pair is merged if it is the cheapest operation for both of its splats. A splat is deleted
-        if that is cheaper than all of its pairs.
+        if that is cheaper than all of its pairs. If these are few, see `FILLED`.
         """
         error = self._errors()  # (N,)
-        costs = np.concatenate([error[self.alive], self.cost[np.isfinite(self.cost)]])
-        # Look at twice the quota, since operations that share a splat exclude each other.
-        last = min(2 * quota, len(costs)) - 1
-        limit = np.partition(costs, last)[last]
+        limit = self._limit(error, quota)
         edges = np.flatnonzero(self.cost <= limit)  # (e,)
+        alone, chosen = self._cheapest(error, edges, limit)
+        if np.count_nonzero(alone) + len(chosen) < FILLED * quota:
+            chosen = self._completed(chosen, edges)
+        alone[self.first[chosen]] = alone[self.second[chosen]] = False
+        doomed = np.flatnonzero(alone)  # (d,)
+        costs = np.concatenate([error[doomed], self.cost[chosen]])  # (d + m,)
+        order = np.argsort(costs, kind="stable")[:quota]
+        is_merge = order >= len(doomed)
+        self._carry_out(doomed[order[~is_merge]], chosen[order[is_merge] - len(doomed)], progress)
+        return len(order)
+
+    def _limit(self, error: Array, quota: int) -> float:
+        """Return the cost of the most expensive operation that a round looks at.
+
+        These are twice the quota, since operations that share a splat exclude each other.
+        """
+        costs = np.concatenate([error[self.alive], self.cost[np.isfinite(self.cost)]])
+        last = min(2 * quota, len(costs)) - 1
+        return float(np.partition(costs, last)[last])
+
+    def _cheapest(
+        self, error: Array, edges: Index, limit: float
+    ) -> tuple[NDArray[np.bool_], Index]:
+        """Return which splats cost least by deleting them, (N,), and which pairs by merging, (m,).
+
+        Parameters
+        ----------
+        error : (N,) float64
+            Costs of deleting.
+        edges : (e,) int64
+            Pairs whose cost is at most `limit`.
+        limit : float
+        """
         first, second, cost = self.first[edges], self.second[edges], self.cost[edges]  # (e,) each
         best = error.copy()  # (N,), the cost of each splat's cheapest operation
         np.minimum.at(best, first, cost)
         np.minimum.at(best, second, cost)
         mutual = (cost == best[first]) & (cost == best[second])  # (e,)
-        edges = edges[mutual][_disjoint(first[mutual], second[mutual])]  # (m,)
-        alone = self.alive & (best == error) & (error <= limit)
-        alone[self.first[edges]] = False
-        alone[self.second[edges]] = False
-        doomed = np.flatnonzero(alone)  # (d,)
-        costs = np.concatenate([error[doomed], self.cost[edges]])  # (d + m,)
-        order = np.argsort(costs, kind="stable")[:quota]
-        is_merge = order >= len(doomed)
-        self._carry_out(doomed[order[~is_merge]], edges[order[is_merge] - len(doomed)], progress)
-        return len(order)
+        chosen = edges[mutual][_disjoint(first[mutual], second[mutual])]
+        return self.alive & (best == error) & (error <= limit), chosen
+
+    def _completed(self, chosen: Index, edges: Index) -> Index:
+        """Return the chosen pairs, and of the others as many as share no splat with any, (m,)."""
+        taken = np.zeros(len(self.alive), np.bool_)
+        taken[self.first[chosen]] = taken[self.second[chosen]] = True
+        free = edges[~(taken[self.first[edges]] | taken[self.second[edges]])]
+        others = free[_disjoint(self.first[free], self.second[free])]
+        every: Index = np.concatenate([chosen, others])
+        return every
 
     def _errors(self) -> Array:
         """Return the costs of deleting splats, (N,); infinite where unknown.
@@ -200,47 +238,66 @@ class MergeGraph:
 
     def _carry_out(self, doomed: Index, edges: Index, progress: Progress) -> None:
         """Delete splats, merge pairs, and price the pairs of the merged splats again."""
-        field, first, second = self.field, self.first[edges], self.second[edges]
-        with np.errstate(under="ignore"):
-            pairs = merging.price(field, first, second)
-            merged = merging.merge(field, first, second, pairs)
-        swap = field.contribution[second] > field.contribution[first]
-        into, gone = np.where(swap, second, first), np.where(swap, first, second)  # (m,) each
-        self.merges.append((into, gone, np.where(swap, 1.0 - pairs.color, pairs.color)))
-        field.put(into, merged)
+        into, gone = self._merge(edges)  # (m,) each
         self.alive[doomed] = False
         self.alive[gone] = False
         self.deleted += len(doomed)
         changed = np.zeros(len(self.alive), np.bool_)
         changed[doomed] = changed[gone] = changed[into] = True
-        # Most pairs are not concerned, so that only these are looked at twice.
-        mine = np.flatnonzero(changed.take(self.first) | changed.take(self.second))  # (e,)
+        # Few pairs are concerned; the rest are not looked at again.
+        concerned = np.flatnonzero(changed.take(self.first) | changed.take(self.second))  # (e,)
         # Pairs of an absorbed splat become pairs of the splat that absorbed it.
-        heir = np.arange(len(self.alive), dtype=np.int32)  # (N,)
-        heir[gone] = into
-        first, second = heir.take(self.first[mine]), heir.take(self.second[mine])
-        self.first[mine], self.second[mine] = first, second
-        there = self.alive[first] & self.alive[second] & (first != second)
-        self._price(mine[there], progress)
+        survivor = np.arange(len(self.alive), dtype=np.int32)  # (N,)
+        survivor[gone] = into
+        first = survivor.take(self.first[concerned])
+        second = survivor.take(self.second[concerned])
+        self.first[concerned], self.second[concerned] = first, second
+        remain = self.alive[first] & self.alive[second] & (first != second)
+        self._price(concerned[remain], progress)
         valid = np.ones(len(self.first), np.bool_)
-        valid[mine[~there]] = False
+        valid[concerned[~remain]] = False
         self.first, self.second, self.cost = self.first[valid], self.second[valid], self.cost[valid]
+
+    def _merge(self, edges: Index) -> tuple[Index, Index]:
+        """Merge pairs; return the survivors and the splats they absorbed, (m,) each.
+
+        Of each pair the splat of which the views see more survives.
+        """
+        field, first, second = self.field, self.first[edges], self.second[edges]
+        with np.errstate(under="ignore"):
+            pairs = merging.price(field, first, second)
+            merged = merging.merge(field, first, second, pairs)
+        swap = field.contribution[second] > field.contribution[first]
+        into, gone = np.where(swap, second, first), np.where(swap, first, second)
+        self.merges.append((into, gone, np.where(swap, 1.0 - pairs.color, pairs.color)))
+        field.put(into, merged)
+        return into, gone
 
 
 def _disjoint(first: Index, second: Index) -> Index:
-    """Return the indices of pairs that share no splat with an earlier pair, (k,).
-
-    Pairs only share a splat where their costs are equal.
+    """Return the indices of pairs that share no splat, ascending, (k,); each other pair shares one.
 
     Parameters
     ----------
     first, second : (m,) int
         Rows of the pairs.
     """
-    own = np.arange(len(first))
+    count = len(first)
+    chosen = np.zeros(count, np.bool_)
     _, ends = np.unique(np.concatenate([first, second]), return_inverse=True)  # (2 m,)
-    one, two = ends[: len(first)], ends[len(first) :]
-    earliest = np.full(len(ends), len(first))  # the first pair that holds each splat
-    np.minimum.at(earliest, one, own)
-    np.minimum.at(earliest, two, own)
-    return np.flatnonzero((earliest[one] == own) & (earliest[two] == own))
+    # Of the pairs left, (l,) each: index, both splats, and a rank by which they are chosen.
+    left, one, two = np.arange(count), ends[:count], ends[count:]
+    rank = left.astype(np.uint64)
+    while len(left):
+        lowest = np.full(2 * count, 2**64 - 1, np.uint64)  # of the pairs of each splat
+        np.minimum.at(lowest, one, rank)
+        np.minimum.at(lowest, two, rank)
+        leads = (lowest[one] == rank) & (lowest[two] == rank)
+        chosen[left[leads]] = True
+        taken = np.zeros(2 * count, np.bool_)
+        taken[one[leads]] = taken[two[leads]] = True
+        free = ~(taken[one] | taken[two])
+        left, one, two = left[free], one[free], two[free]
+        # Shuffled, since a chain of pairs in the order of their ranks would give one at a time.
+        rank = rank[free] * MIX
+    return np.flatnonzero(chosen)

@@ -21,7 +21,7 @@ that both cover is covered only once; its opacity follows from that mass. Where 
 exceed `ALPHA_MAX`, the covariance grows instead.
 
 Seen along the mean viewing direction, merging two splats one behind the other costs nothing, though
-other views see both. So the cost of a pair is the mean of its costs from two directions: one
+views from aside see both. So the cost of a pair is the mean of its costs from two directions: one
 standard deviation of the viewing directions to either side of their mean (`costs`).
 """
 
@@ -48,6 +48,8 @@ CHANNELS = 3
 
 _CANCELLED = 1e-6  # a mean of two unit vectors with a smaller squared length counts as 0
 _TINY = 1e-280  # replaces 0 as a divisor
+_THINNEST = 1e-12  # least determinant over xx yy; rounding leaves less of thinner footprints
+_FARTHEST = 700.0  # standard deviations, squared: exp(-350) is as good as 0 and does not underflow
 
 
 class Pairs(NamedTuple):
@@ -116,7 +118,7 @@ class _Ends(NamedTuple):
     color, rest : (M,) float64
         Shares of the first and of the second splat in the colour.
     direction, deviation : (M, 3) float64
-        From where the pair is viewed; see `merge_field.Look`.
+        From where the pair is viewed; see `merge_field.Viewing`.
     blur : (M,) float64
         Variance of the low-pass, world units squared.
     apart : (M,) float64
@@ -174,24 +176,33 @@ def _price(ends: _Ends, tilt: float) -> Pairs:
     All masses and inner products here are divided by 2 pi, a factor that cancels. All arrays are
     (M,).
     """
-    first, second, color, rest = ends.one, ends.two, ends.color, ends.rest
     signals = _signals(ends, tilt)
-    mass_1, mass_2 = signals.masses
     products = _products(signals)
     contrasts = _contrasts(ends, signals.masses, products)
+    tau = (ends.one.contribution + ends.two.contribution) / (signals.masses[0] + signals.masses[1])
+    # The contrast of the merged splat is l_i s_i + l_j s_j.
+    color, rest = ends.color, ends.rest
+    mixed = color * color * contrasts.one + 2.0 * color * rest * contrasts.both
+    mixed += rest * rest * contrasts.two
+    return Pairs(
+        tau * np.maximum(_change(ends, contrasts, products), 0.0),
+        signals.position,
+        color,
+        signals.mass / signals.areas[2],
+        signals.growth,
+        tau * np.maximum(mixed, 0.0) * products.merged,
+    )
+
+
+def _change(ends: _Ends, contrasts: _Contrasts, products: _Products) -> Array:
+    """Return the squared change of the picture by merges, unhidden: `cost` over tau, (M,)."""
+    color, rest = ends.color, ends.rest
     pp = products.one - 2.0 * color * products.one_merged + color * color * products.merged
     qq = products.two - 2.0 * rest * products.two_merged + rest * rest * products.merged
     pq = products.overlap - rest * products.one_merged - color * products.two_merged
     pq += color * rest * products.merged
-    tau = (first.contribution + second.contribution) / (mass_1 + mass_2)
-    cost = contrasts.one * pp + 2.0 * contrasts.both * pq + contrasts.two * qq
-    cost = tau * np.maximum(cost, 0.0)
-    # The contrast of the merged splat is l_i s_i + l_j s_j.
-    mixed = color * color * contrasts.one + 2.0 * color * rest * contrasts.both
-    mixed += rest * rest * contrasts.two
-    error = tau * np.maximum(mixed, 0.0) * products.merged
-    opacity = signals.mass / signals.areas[2]
-    return Pairs(cost, signals.position, color, opacity, signals.growth, error)
+    change: Array = contrasts.one * pp + 2.0 * contrasts.both * pq + contrasts.two * qq
+    return change
 
 
 class _Signals(NamedTuple):
@@ -234,18 +245,20 @@ class _Signals(NamedTuple):
 def _signals(ends: _Ends, tilt: float) -> _Signals:
     """Return footprints and masses of pairs and of the merged splats."""
     one, two, x, y = _plane(ends, tilt)
-    area_1, area_2 = _area(one), _area(two)
-    mass_1, mass_2 = ends.one.opacity * area_1, ends.two.opacity * area_2
-    position, other = _shares(mass_1, mass_2)
-    overlap = mass_1 * mass_2 * _product(one, two, x, y)
+    areas = _area(one), _area(two)
+    masses = ends.one.opacity * areas[0], ends.two.opacity * areas[1]
+    position, other = _shares(*masses)
+    overlap = masses[0] * masses[1] * _product(one, two, x, y)
     between = position * other
     merged = _mixed(one, two, position, (between * x * x, between * x * y, between * y * y))
     # The estimated overlap of nearly opaque splats can exceed the smaller mass; the true one never.
-    mass = mass_1 + mass_2 - np.minimum(overlap, np.minimum(mass_1, mass_2))
+    mass = masses[0] + masses[1] - np.minimum(overlap, np.minimum(*masses))
     growth = np.maximum(mass / (_area(merged) * ALPHA_MAX), 1.0)
     merged = (merged[0] * growth, merged[1] * growth, merged[2] * growth)
-    areas, masses = (area_1, area_2, _area(merged)), (mass_1, mass_2)
-    return _Signals(one, two, merged, x, y, areas, masses, mass, position, other, growth, overlap)
+    return _Signals(
+        one, two, merged, x, y, (*areas, _area(merged)), masses, mass, position, other, growth,
+        overlap,
+    )  # fmt: skip
 
 
 class _Products(NamedTuple):
@@ -363,7 +376,7 @@ def _squared_contrast(error: Array, whole: Array) -> Array:
     error : (M,) float64
         As measured.
     whole : (M,) float64
-        What the error would be for |s| = 1.
+        What it would be for |s| = 1.
     """
     squared: Array = np.minimum(error, CHANNELS * whole) / np.maximum(whole, _TINY)
     return squared
@@ -424,7 +437,7 @@ def _mixed(one: Footprint, two: Footprint, share: Array, between: Footprint) -> 
 def _determinant(footprint: Footprint) -> Array:
     """Return the determinant, (M,), kept above 0 where rounding would leave 0 or less."""
     xx, xy, yy = footprint
-    return np.maximum(xx * yy - xy * xy, 1e-12 * xx * yy + _TINY)
+    return np.maximum(xx * yy - xy * xy, _THINNEST * xx * yy + _TINY)
 
 
 def _area(footprint: Footprint) -> Array:
@@ -441,5 +454,5 @@ def _product(one: Footprint, other: Footprint, x: Array, y: Array) -> Array:
     total = (one[0] + other[0], one[1] + other[1], one[2] + other[2])
     determinant = _determinant(total)
     square = (total[2] * x * x - 2.0 * total[1] * x * y + total[0] * y * y) / determinant
-    product: Array = np.exp(-0.5 * np.clip(square, 0.0, 700.0)) / np.sqrt(determinant)
+    product: Array = np.exp(-0.5 * np.clip(square, 0.0, _FARTHEST)) / np.sqrt(determinant)
     return product

@@ -2,7 +2,7 @@
 
 Points are sorted along a few space-filling curves, each turned and shifted against the others.
 Most points near a given one are within a few places of it on at least one curve, so only those
-places are looked at (Liao, Lopez and Leutenegger 2001, "High dimensional similarity search with
+places are searched (Liao, Lopez and Leutenegger 2001, "High dimensional similarity search with
 space filling curves"). The work is the same for every point of any cloud. In trained scenes 87 to
 89 % of the 8 nearest are found, and 97 to 98 % of the very nearest.
 """
@@ -31,14 +31,15 @@ SHIFTS = np.array([[0.0, 0, 0], [0.21, 0.13, 0.17], [-0.11, 0.23, -0.19], [0.15,
 """How far each curve is moved, scene sizes, so that their cells do not meet in one place."""
 
 WINDOW = 6
-"""Places looked at before and behind a point on each curve."""
+"""Places before and behind a point on each curve whose points are its candidates."""
 
 SMALL = 128
 """Up to this many points, all are compared with all."""
 
-_CHUNK = 1 << 14
+_CHUNK = 1 << 14  # points at a time: some MB of temporary memory a thread
 _NOBODY = np.uint64(2**64 - 1)  # sorts behind every candidate
-_INDEX = np.uint64(2**32 - 1)
+_INDEX = np.uint64(2**32 - 1)  # the bits of a key that hold the index
+_ROUNDED = np.uint32(4)  # last bits of a distance in float32, in which equal ones may differ
 
 
 def nearest(
@@ -74,24 +75,24 @@ def nearest(
     count = min(count, total - 1)
     if count <= 0:
         return np.empty((total, 0), np.int32)
-    ahead = part(progress, 0.0, 0.4)
-    around = _candidates(points, max((count + 1) // 2, WINDOW), ahead, threads)
-    found = np.empty((total, count), np.int32)
+    window = max((count + 1) // 2, WINDOW)
+    candidates = _candidates(points, window, part(progress, 0.0, 0.4), threads)
+    near = np.empty((total, count), np.int32)
 
     def search(piece: slice) -> None:
-        found[piece] = _nearest_of(points, piece, around(piece), count)
+        near[piece] = _nearest_of(points, piece, candidates(piece), count)
 
     for_chunks(
         search, total, _CHUNK,
         progress=part(progress, 0.4, 1.0), what="finding neighbours", threads=threads,
     )  # fmt: skip
-    return found
+    return near
 
 
 def _candidates(
     points: NDArray[np.float64], window: int, progress: Progress, threads: int | None
 ) -> Callable[[slice], NDArray[np.int32]]:
-    """Return a function that gives the candidates of n points, (n, C) indices.
+    """Return a function that gives the candidates of a slice of n points, (n, C) indices.
 
     A candidate may appear more than once, and a point is among its own.
     """
@@ -136,8 +137,7 @@ def _nearest_of(
             squared += np.multiply(step, step, out=step)
         distance = np.minimum(squared, np.finfo(np.float32).max).astype(np.float32)
     # The bits of numbers >= 0 sort as they do; the index behind them decides between equal ones.
-    # Without the last four bits, what differs by rounding alone is equal.
-    key = (distance.view(np.uint32) >> np.uint32(4)).astype(np.uint64) << np.uint64(32)
+    key = (distance.view(np.uint32) >> _ROUNDED).astype(np.uint64) << np.uint64(32)
     key |= candidates.astype(np.uint64)
     key[candidates == np.arange(piece.start, piece.stop)[:, None]] = _NOBODY
     key.sort(axis=1)

@@ -18,16 +18,17 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 import numpy as np
 
+from ..errors import reason_of
 from ..foreign_files import refuse_pointer
+from ..splats import rotation_matrices
 from ..views import View, ViewSet
 from .lenses import MODELS, MODELS_BY_NAME, Model, counted, lens_note
-from .place import Place, is_file
+from .place import CameraPlace, is_file
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
 
 SUFFIXES = (".bin", ".txt")
 """Binary files are preferred, as in COLMAP itself."""
@@ -61,7 +62,7 @@ class Lens:
 class Image:
     """A registered image: its pose, world to camera, and its place in the file."""
 
-    place: Place
+    place: CameraPlace
     image_id: int
     quaternion: tuple[float, ...]
     translation: tuple[float, ...]
@@ -106,55 +107,36 @@ def read_colmap(folder: Path, suffix: str) -> ViewSet:
     """
     cameras, images = folder / f"cameras{suffix}", folder / f"images{suffix}"
     if suffix == ".bin":
-        lenses, found = _binary_cameras(cameras), _binary_images(images)
+        lenses, registered = _binary_cameras(cameras), _binary_images(images)
     else:
-        lenses, found = _text_cameras(cameras), _text_images(images)
-    if not found:
-        Place(images).fail("no registered image, expected at least one")
-    for image in found:
+        lenses, registered = _text_cameras(cameras), _text_images(images)
+    if not registered:
+        CameraPlace(images).fail("no registered image, expected at least one")
+    for image in registered:
         if image.camera_id not in lenses:
             image.place.fail(
                 f"refers to camera {image.camera_id}, expected one of the {len(lenses)} "
                 f"in {cameras.name}"
             )
-    found.sort(key=lambda image: (image.name, image.image_id))
-    views = tuple(_view(image, lenses[image.camera_id]) for image in found)
-    used = (lenses[camera_id] for camera_id in sorted({image.camera_id for image in found}))
+    registered.sort(key=lambda image: (image.name, image.image_id))
+    views = tuple(_view(image, lenses[image.camera_id]) for image in registered)
+    used = (lenses[camera_id] for camera_id in sorted({image.camera_id for image in registered}))
     counts = Counter(lens.model for lens in used if lens.distorted)
     return ViewSet(views, lens_note(counts, "camera"))
 
 
 def _view(image: Image, lens: Lens) -> View:
     """Return the view of an image."""
-    quaternion = _unit(image.place, image.quaternion)
-    rotation = _rotation(quaternion)
+    if not any(image.quaternion):
+        image.place.fail("expected a quaternion (w, x, y, z) of a rotation, got all zeros")
+    rotation = rotation_matrices(np.array(image.quaternion))
     center = -rotation.T @ np.array(image.translation)
     return image.place.view(image.name, rotation, center, lens.focal, lens.principal, lens.size)
 
 
-def _unit(place: Place, quaternion: Sequence[float]) -> list[float]:
-    """Return a quaternion scaled to length 1."""
-    largest = max(map(abs, quaternion))
-    if not largest:
-        place.fail("expected a quaternion (w, x, y, z) of a rotation, got all zeros")
-    scaled = [value / largest for value in quaternion]  # so that squares do not overflow
-    norm = sum(value * value for value in scaled) ** 0.5
-    return [value / norm for value in scaled]
-
-
-def _rotation(quaternion: Sequence[float]) -> NDArray[np.float64]:
-    """Return the matrix, (3, 3), of a unit quaternion w x y z."""
-    w, x, y, z = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def _lens(place: Place, model: Model, size: Sequence[object], values: Sequence[object]) -> Lens:
+def _lens(
+    place: CameraPlace, model: Model, size: Sequence[object], values: Sequence[object]
+) -> Lens:
     """Return the lens of a camera model, image size and parameters."""
     if not model.focals:
         place.fail(f"camera model {model.name} is a panorama, expected one with a focal length")
@@ -175,7 +157,7 @@ class _Binary:
     """A little-endian file, read from start to end; refused where it is truncated."""
 
     def __init__(self, path: Path) -> None:
-        self.file = Place(path)
+        self.file = CameraPlace(path)
         self.offset = 0
         try:
             with path.open("rb") as stream:
@@ -186,7 +168,7 @@ class _Binary:
                 self.data = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
                 refuse_pointer(path, self.data[:SHORT_LINE])
         except (OSError, ValueError) as error:
-            self.file.fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
+            self.file.fail(f"cannot be read ({reason_of(error)})")
 
     def take(self, layout: str, what: str) -> tuple[Any, ...]:
         """Return the next values, of a `struct` layout."""
@@ -267,23 +249,24 @@ def _binary_images(path: Path) -> list[Image]:
         return images
 
 
-def _lines(path: Path) -> list[tuple[Place, bytes]]:
-    """Return the lines of a text file, each with its place, without comments."""
-    file = Place(path)
+def _lines(path: Path) -> Iterator[tuple[CameraPlace, bytes]]:
+    """Yield the lines of a text file, each with its place, without comments."""
+    file = CameraPlace(path)
+    empty = True
     try:
         with path.open("rb") as stream:
-            lines = [line.strip() for line in stream]
+            for number, text in enumerate(stream, 1):
+                line = text.strip()
+                if number == 1:
+                    refuse_pointer(path, line)
+                    line = line.removeprefix(codecs.BOM_UTF8)
+                empty = empty and not line
+                if not line.startswith(b"#"):
+                    yield file.at(f"line {number}"), line
     except (OSError, ValueError) as error:
-        file.fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
-    if not any(lines):
+        file.fail(f"cannot be read ({reason_of(error)})")
+    if empty:
         file.fail("the file is empty, expected a COLMAP model")
-    refuse_pointer(path, lines[0])
-    lines[0] = lines[0].removeprefix(codecs.BOM_UTF8)
-    return [
-        (file.at(f"line {number}"), line)
-        for number, line in enumerate(lines, 1)
-        if not line.startswith(b"#")
-    ]
 
 
 def _text_cameras(path: Path) -> dict[int, Lens]:
@@ -311,7 +294,7 @@ def _text_cameras(path: Path) -> dict[int, Lens]:
 def _text_images(path: Path) -> list[Image]:
     """Return the images of ``images.txt``."""
     images: list[Image] = []
-    lines = iter(_lines(path))
+    lines = _lines(path)
     for place, line in lines:
         if not line:
             continue
@@ -335,7 +318,9 @@ def _text_images(path: Path) -> list[Image]:
     return images
 
 
-def _image(place: Place, image_id: int, pose: Sequence[object], camera_id: int, name: str) -> Image:
+def _image(
+    place: CameraPlace, image_id: int, pose: Sequence[object], camera_id: int, name: str
+) -> Image:
     numbers = [
         place.at(key).number(value)
         for key, value in zip(("QW", "QX", "QY", "QZ", "TX", "TY", "TZ"), pose, strict=True)
@@ -343,21 +328,21 @@ def _image(place: Place, image_id: int, pose: Sequence[object], camera_id: int, 
     return Image(place, image_id, tuple(numbers[:4]), tuple(numbers[4:]), camera_id, name)
 
 
-def _add(lenses: dict[int, Lens], place: Place, camera_id: int, lens: Lens) -> None:
+def _add(lenses: dict[int, Lens], place: CameraPlace, camera_id: int, lens: Lens) -> None:
     """Add a lens; refuse an id that is there already."""
     if camera_id in lenses:
         place.fail(f"camera {camera_id} is there twice, expected each id once")
     lenses[camera_id] = lens
 
 
-def _parsed(place: Place, field: str) -> float:
+def _parsed(place: CameraPlace, field: str) -> float:
     try:
         return float(field)
     except ValueError:
         place.fail(f"expected a number, got {field[:40]!r}")
 
 
-def _whole(place: Place, key: str, field: str) -> int:
+def _whole(place: CameraPlace, key: str, field: str) -> int:
     try:
         return int(field)
     except ValueError:

@@ -22,10 +22,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..views import View, ViewSet
+from ..views import ORTHONORMAL, View, ViewSet
 from .image_size import image_size
 from .lenses import FISHEYE624, MODELS_BY_NAME, PANORAMAS, Model, counted, lens_note
-from .place import ORTHONORMAL_TOLERANCE, Place, described, is_file, is_folder, read_json
+from .place import CameraPlace, is_file, is_folder, read_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -76,11 +76,9 @@ def read_transforms(path: Path, data: object) -> ViewSet:
     RefineError
         If a key is missing or wrong, with the frame and the key.
     """
-    place = Place(path)
+    place = CameraPlace(path)
     shared = place.members(data, ("frames",))
-    frames = shared["frames"]
-    if not isinstance(frames, list):
-        place.at("'frames'").fail(f"expected a list, got {described(frames)}")
+    frames = place.at("'frames'").items(shared["frames"])
     if not frames:
         place.at("'frames'").fail("the list is empty, expected at least one frame")
     world, notes = _splat_world(place, shared)
@@ -99,20 +97,22 @@ def read_transforms(path: Path, data: object) -> ViewSet:
 class _Entry:
     """One item of ``frames``; its own keys override those of the whole file."""
 
-    def __init__(self, place: Place, shared: Mapping[str, Any], item: object, index: int) -> None:
+    def __init__(
+        self, place: CameraPlace, shared: Mapping[str, Any], item: object, index: int
+    ) -> None:
         self.place = place
         self.shared = shared
-        self.own = place.members(item, ("transform_matrix",))
-        self.name = place.at("'file_path'").text(self.own.get("file_path", str(index)))
+        self.frame = place.members(item, ("transform_matrix",))
+        self.name = place.at("'file_path'").text(self.frame.get("file_path", str(index)))
         self.remarks: list[str] = []
 
     def has(self, key: str) -> bool:
-        return key in self.own or key in self.shared
+        return key in self.frame or key in self.shared
 
     def get(self, key: str) -> object:
-        return self.own[key] if key in self.own else self.shared[key]
+        return self.frame[key] if key in self.frame else self.shared[key]
 
-    def at(self, key: str) -> Place:
+    def at(self, key: str) -> CameraPlace:
         return self.place.at(repr(key))
 
     def view(self, world: Similarity) -> View:
@@ -134,11 +134,11 @@ class _Entry:
         picture, so it is removed.
         """
         place = self.at("transform_matrix")
-        matrix = place.matrix(self.own["transform_matrix"], (3, 4), 4)
+        matrix = place.matrix(self.frame["transform_matrix"], (3, 4), 4)
         if len(matrix) > 3 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:  # noqa: PLR2004
             place.at("row 3").fail(f"expected [0, 0, 0, 1], got {matrix[3].tolist()}")
         axes, scale = without_scale(place, matrix[:3, :3])
-        if abs(scale - 1) > ORTHONORMAL_TOLERANCE:
+        if abs(scale - 1) > ORTHONORMAL:
             self.remarks.append("uniform scale taken out")
         if np.linalg.det(axes) < 0:
             self.remarks.append("mirrored pose (determinant -1)")
@@ -151,8 +151,8 @@ class _Entry:
             return width, height
         place = self.at("file_path")
         base = place.path.parent / self.name.replace("\\", "/")
-        found = (image_size(Path(f"{base}{suffix}")) for suffix in IMAGE_SUFFIXES)
-        size = next(filter(None, found), None)
+        sizes = (image_size(Path(f"{base}{suffix}")) for suffix in IMAGE_SUFFIXES)
+        size = next(filter(None, sizes), None)
         if size is None:
             missing = "w" if not self.has("w") else "h"
             self.place.fail(
@@ -170,7 +170,7 @@ class _Entry:
 
     def axis_focal(self, axis: str, side: int) -> float | None:
         """Return the focal length along an axis by the first key that exists, or None."""
-        for keys in (self.own, self.shared):
+        for keys in (self.frame, self.shared):
             key = f"fl_{axis}"
             if key in keys:
                 return self.at(key).focal(keys[key])
@@ -203,12 +203,14 @@ class _Entry:
         return [model] if model.fisheye or distorted else []
 
 
-def without_scale(place: Place, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
+def without_scale(
+    place: CameraPlace, matrix: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
     """Return an orthonormal matrix and the uniform scale that was removed from it.
 
     Parameters
     ----------
-    place : Place
+    place : CameraPlace
         For the error.
     matrix : (3, 3) float64
         Finite numbers.
@@ -225,13 +227,13 @@ def without_scale(place: Place, matrix: NDArray[np.float64]) -> tuple[NDArray[np
     return place.rotation(matrix), 1.0
 
 
-def _splat_world(place: Place, shared: Mapping[str, Any]) -> tuple[Similarity, list[str]]:
+def _splat_world(place: CameraPlace, shared: Mapping[str, Any]) -> tuple[Similarity, list[str]]:
     """Return the transform from the file's world to the splats', and notes about it."""
     beside = place.path.parent / DATAPARSER_FILE
     if not is_file(beside):
         hint = f"splats of ns-export need {DATAPARSER_FILE} beside it"
         return Similarity(), [hint] if "applied_transform" in shared else []
-    source = Place(beside)
+    source = CameraPlace(beside)
     parsed = source.members(read_json(beside), ("transform", "scale"))
     at = source.at("'transform'")
     matrix = at.matrix(parsed["transform"], (3,), 4)

@@ -1,31 +1,23 @@
-"""Checks of numbers, lists and JSON for all camera formats; errors name the place.
-
-A `Place` is a position in a file, such as "cameras.json: camera 3". Each check is one method of it,
-and each error names the file, the place, what was found and what was expected.
-"""
+"""Checks of what camera files hold, and how they are read: for every format of cameras alike."""
 
 from __future__ import annotations
 
-import json
 import stat
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import RefineError
+from ..errors import RefineError, reason_of
 from ..foreign_files import foreign_kind, refuse_pointer
-from ..views import View
+from ..place import LARGEST_NUMBER, Place, described
+from ..views import View, is_orthonormal
 from ..whole_file import mode_of
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
-
-LARGEST_NUMBER = 1e18
-"""Largest coordinate or focal length: its square still fits float32."""
 
 SMALLEST_LENGTH = 1e-6
 """Smallest focal length (pixels) or scale."""
@@ -33,54 +25,12 @@ SMALLEST_LENGTH = 1e-6
 LARGEST_SIDE = 1_000_000
 """Largest width or height of an image, pixels."""
 
-NEGLIGIBLE = 1e-30
-"""Smaller numbers are read as 0, so that products of two numbers do not underflow."""
-
-ORTHONORMAL_TOLERANCE = 1e-3
-"""Largest entry of ``R Rᵀ - I`` that rounding in a text file may cause; as in `View`."""
-
 SNIFFED_BYTES = 4096
 """How many bytes are read to find out whether a file can be JSON."""
 
 
-@dataclass(frozen=True)
-class Place:
-    """A file and a place in it.
-
-    Attributes
-    ----------
-    path : Path
-        The file.
-    where : str
-        The place, "" for the whole file.
-    """
-
-    path: Path
-    where: str = ""
-
-    def at(self, where: str) -> Place:
-        """Return a place within this one."""
-        return Place(self.path, f"{self.where} {where}" if self.where else where)
-
-    def fail(self, problem: str) -> NoReturn:
-        """Raise the error of this place.
-
-        Raises
-        ------
-        RefineError
-            Always.
-        """
-        where = f"{self.where}: " if self.where else ""
-        msg = f"{self.path}: {where}{problem}"
-        raise RefineError(msg)
-
-    def number(self, value: object) -> float:
-        """Return `value` if it is a number of at most `LARGEST_NUMBER`."""
-        if not isinstance(value, (int, float)) or isinstance(value, bool):
-            self.fail(f"expected a number, got {described(value)}")
-        if not abs(value) <= LARGEST_NUMBER:  # also refuses NaN, and integers too large for float
-            self.fail(f"expected a finite number up to 1e18, got {described(value)}")
-        return float(value) if abs(value) >= NEGLIGIBLE else 0.0
+class CameraPlace(Place):
+    """A place in a file of cameras."""
 
     def positive(self, value: object, what: str) -> float:
         """Return `value` if it is a number of 1e-6 to 1e18; `what` names it in messages."""
@@ -103,18 +53,6 @@ class Place:
             )
         return int(number)
 
-    def text(self, value: object) -> str:
-        """Return `value` if it is a string."""
-        if not isinstance(value, str):
-            self.fail(f"expected a string, got {described(value)}")
-        return value
-
-    def numbers(self, value: object, count: int) -> list[float]:
-        """Return `value` if it is a list of `count` numbers."""
-        if not isinstance(value, list) or len(value) != count:
-            self.fail(f"expected a list of {count} numbers, got {described(value)}")
-        return [self.at(f"[{index}]").number(item) for index, item in enumerate(value)]
-
     def matrix(self, value: object, rows: Sequence[int], columns: int) -> NDArray[np.float64]:
         """Return `value` if it is a list of rows of numbers; `rows` are the allowed counts."""
         sizes = " or ".join(f"{count} x {columns}" for count in rows)
@@ -123,20 +61,9 @@ class Place:
         table = [self.at(f"row {index}").numbers(row, columns) for index, row in enumerate(value)]
         return np.array(table, np.float64)
 
-    def members(self, value: object, required: Sequence[str] = ()) -> Mapping[str, Any]:
-        """Return `value` if it is a JSON object with these keys."""
-        if not isinstance(value, dict):
-            self.fail(f"expected an object, got {described(value)}")
-        missing = [key for key in required if key not in value]
-        if missing:
-            self.fail(f"missing {missing[0]!r}, expected the keys {', '.join(required)}")
-        return value
-
     def rotation(self, matrix: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return `matrix` (3, 3) if it is orthonormal up to the rounding of a text file."""
-        # Without the first test, squares of large entries could overflow.
-        small = np.abs(matrix).max() <= 2  # noqa: PLR2004
-        if not small or np.abs(matrix @ matrix.T - np.eye(3)).max() > ORTHONORMAL_TOLERANCE:
+        if not is_orthonormal(matrix):
             self.fail(f"expected an orthonormal rotation, got {np.round(matrix, 6).tolist()}")
         return matrix
 
@@ -198,17 +125,7 @@ def _mode(path: Path) -> int:
     try:
         return mode_of(path)
     except (OSError, ValueError) as error:
-        Place(path).fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
-
-
-def described(value: object) -> str:
-    """Return a short description of a JSON value, for messages."""
-    if isinstance(value, dict):
-        return f"an object with {len(value)} keys"
-    if isinstance(value, list):
-        return f"a list of {len(value)}"
-    text = json.dumps(value)
-    return text if len(text) <= 40 else f"{text[:37]}..."  # noqa: PLR2004
+        Place(path).fail(f"cannot be read ({reason_of(error)})")
 
 
 def read_json(path: Path) -> object:
@@ -239,14 +156,7 @@ def read_json(path: Path) -> object:
     except (OSError, ValueError) as error:
         if isinstance(error, UnicodeDecodeError):
             place.at(f"byte {error.start}").fail(f"not UTF-8 text ({error.reason})")
-        place.fail(f"cannot be read ({getattr(error, 'strerror', None) or error})")
+        place.fail(f"cannot be read ({reason_of(error)})")
     if not text.strip():
         place.fail("the file is empty, expected cameras as JSON")
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError as error:
-        place.at(f"line {error.lineno} column {error.colno}").fail(f"invalid JSON: {error.msg}")
-    except RecursionError:
-        place.fail("invalid JSON: nested too deeply, expected cameras")
-    except ValueError as error:  # an integer of thousands of digits
-        place.fail(f"invalid JSON: {error}")
+    return place.parsed(text)

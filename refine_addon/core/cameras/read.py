@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..place import described
 from ..views import View, ViewSet
 from ..whole_file import expanded
 from .colmap import MODEL_FILES, SUFFIXES, find_colmap, read_colmap
 from .nerfstudio import read_transforms
-from .place import Place, described, exists, is_file, is_folder, read_json
+from .place import CameraPlace, exists, is_file, is_folder, read_json
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -56,7 +57,7 @@ def read_cameras(path: Path | str) -> ViewSet:
         return _read_folder(path)
     if not is_file(path):
         problem = "is neither a file nor a folder" if exists(path) else "no such file or folder"
-        Place(path).fail(f"{problem}, expected cameras")
+        CameraPlace(path).fail(f"{problem}, expected cameras")
     if path.suffix in SUFFIXES and path.stem in MODEL_FILES:
         return read_colmap(path.parent, path.suffix)
     return _read_json_cameras(path)
@@ -67,7 +68,7 @@ def _read_folder(folder: Path) -> ViewSet:
     files = [folder / name for name in JSON_NAMES if is_file(folder / name)]
     colmap = find_colmap(folder)
     if not files and not colmap:
-        Place(folder).fail(
+        CameraPlace(folder).fail(
             f"no cameras in this folder, expected {', '.join(JSON_NAMES)}, or a COLMAP model "
             "(cameras and images, both .bin or both .txt) in it, sparse/0 or sparse"
         )
@@ -89,7 +90,7 @@ def _read_json_cameras(path: Path) -> ViewSet:
     if isinstance(data, list):
         return read_inria(path, data)
     if not isinstance(data, dict) or "frames" not in data:
-        Place(path).fail(
+        CameraPlace(path).fail(
             "expected a list of cameras (cameras.json) or an object with 'frames' "
             f"(transforms.json), got {described(data)}"
         )
@@ -115,13 +116,13 @@ def read_inria(path: Path, data: list[object]) -> ViewSet:
     RefineError
         If the list is empty, or a camera is wrong; with its index and key.
     """
-    place = Place(path)
+    place = CameraPlace(path)
     if not data:
         place.fail("the list of cameras is empty, expected at least one")
     return ViewSet(tuple(_inria_view(place, index, item) for index, item in enumerate(data)))
 
 
-def _inria_view(file: Place, index: int, item: object) -> View:
+def _inria_view(file: CameraPlace, index: int, item: object) -> View:
     """Return the view of one camera."""
     place = file.at(f"camera {index}")
     camera = place.members(item)

@@ -172,7 +172,8 @@ def alignment(
     Cancelled
         If `progress` answers ``False``.
     """
-    means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        means = splats.means[_spread_rows(splats, POINTS)].astype(np.float64)  # (n, 3)
     far, in_pictures, count = [], 0, 0
     with np.errstate(under="ignore"):
         for view in views:

@@ -16,7 +16,7 @@ from ..seeing import projection
 from ..seeing.cast import cast
 from ..seeing.ray_sample import colors_from
 from ..work import Progress, for_chunks, part, silent
-from .quality import FEWEST, PSNR_CAP, SHARES, TAKEN_OVER, Quality, absorbed_from
+from .quality import ABSORBED_SHARES, FEWEST, PSNR_CAP, SHARES, Quality, absorbed_from
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -86,7 +86,7 @@ def quality_curve(
         last -= int(np.count_nonzero(protected))
     removed, absorbed = (
         [count for share in shares if (count := math.floor(share * len(values))) <= last]
-        for shares in (SHARES, TAKEN_OVER)
+        for shares in (SHARES, ABSORBED_SHARES)
     )
     if not removed:
         return None

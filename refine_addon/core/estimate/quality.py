@@ -1,7 +1,7 @@
 """How close the pictures of the views stay to those of the unpruned splats, as a curve.
 
 The measure is PSNR in dB of pictures clipped to 0..1, as a screen shows them: of each view by
-itself, at most 100, and of these the mean. `scoring.sight_lines` estimates it.
+itself, at most 100, and of these the mean. `estimate.psnr` estimates it.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ PSNR_CAP = 100.0
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 """Shares of the splats removed at which the estimate is made; between them it is interpolated."""
 
-TAKEN_OVER = (0.3, 0.5, 0.7, 0.9)
-"""Shares removed at which it is looked at what survivors could take over; see `absorbed_from`."""
+ABSORBED_SHARES = (0.3, 0.5, 0.7, 0.9)
+"""Shares removed at which kept splats stand in for removed ones; see `absorbed_from`."""
 
 GAIN = (3.0, 4.5, 4.5, 4.3), (0.5, 0.55, 0.7, 0.85)
-"""What absorbing gains over deleting at those shares, dB: a constant, and a part of what it gains
-on lines of sight."""
+"""What absorbing gains over deleting at those shares, dB: a constant, and a part of what
+standing in gains on rays."""
 
-ENOUGH = 40_000
+FULL_GAIN = 40_000
 """So many splats have, and more, gain that much."""
 
 FEWER = 0.2, 0.4, 0.8, 1.3
@@ -64,7 +64,7 @@ class Quality:
     foretold : bool
         Whether that is near enough to be told to anybody.
     views : dict of str to (L,) float64
-        As `psnr`, of single views by their names; those that no line of sight tells of are missing.
+        As `psnr`, of single views by their names; those that no ray tells of are missing.
 
     Examples
     --------
@@ -157,8 +157,8 @@ class Quality:
 def needed(gone: int | None, count: int) -> int | None:
     """Return how many of `count` splats the curve must be known for where `gone` are removed.
 
-    That is up to the next of `TAKEN_OVER`, so that nothing it says up to there differs from what
-    the whole curve says. None if the whole is needed.
+    That is up to the next of `ABSORBED_SHARES`, so that what it says up to there is what the whole
+    curve says. None if the whole is needed.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def needed(gone: int | None, count: int) -> int | None:
     >>> needed(40, 100), needed(50, 100), needed(95, 100)
     (50, 50, None)
     """
-    places = (math.floor(share * count) for share in TAKEN_OVER)
+    places = (math.floor(share * count) for share in ABSORBED_SHARES)
     return None if gone is None else next((place for place in places if place >= gone), None)
 
 
@@ -180,24 +180,24 @@ def absorbed_from(
 ) -> NDArray[np.float64]:
     """Return about what absorbing reaches at the first L of `SHARES`, without absorbing; dB.
 
-    On lines of sight it is known what the pictures would be if what goes stayed as opaque as it is
-    and took the colour of the nearest splat that stays. That is neither an upper nor a lower bound
-    of what absorbing reaches, but goes up and down with it from scene to scene.
+    Rays tell what the pictures would be if removed splats stayed as opaque as they are, in the
+    colour of the nearest kept hit (`Rays.colors_by_nearest_kept`). That is neither an upper nor a
+    lower bound of what absorbing reaches, but goes up and down with it from scene to scene.
 
     Parameters
     ----------
     psnr : (L,) float64
         With the splats deleted, at those shares.
     gains : (G,) float64
-        By how much it is higher with them taken over in that way, at the first G of `TAKEN_OVER`,
+        By how much it is higher with kept splats standing in, at the first G of `ABSORBED_SHARES`,
         which go as far.
     count : int
         How many splats there are.
     """
     constant, part, fewer = np.array([*GAIN, FEWER])[:, : len(gains)]
-    halvings = max(math.log2(ENOUGH / max(count, 1)), 0.0)
+    halvings = max(math.log2(FULL_GAIN / max(count, 1)), 0.0)
     found = (constant + part * gains - halvings * fewer).clip(0.0)
-    known = (PLAIN, *TAKEN_OVER[: len(gains)])
+    known = (PLAIN, *ABSORBED_SHARES[: len(gains)])
     gain = np.interp(SHARES[: len(psnr)], known, np.concatenate([[0.0], found]))
     return np.minimum.accumulate(np.minimum(psnr + gain, PSNR_CAP))
 

@@ -1,9 +1,10 @@
 """SuperSplat's compressed PLY: 16 bytes a splat, in chunks of 256 that share their ranges.
 
-A chunk has the least and the largest position, log scale and colour of its splats; a splat has its
-place between them in 11, 10 and 11 bits of x, y and z (8 of each colour), its opacity in 8, and of
-its rotation the three smaller components in 10. Harmonics have 8 bits each. Splats are sorted, so
-that those of a chunk are near each other.
+A chunk stores the least and the largest position, log scale and colour of its splats. Each splat
+stores its position and log scale as fractions of these ranges, in 11, 10 and 11 bits for x, y and
+z, its colour likewise, in 8 bits a channel, its opacity in 8 bits, and the three smaller components
+of its rotation in 10 each. Harmonics have 8 bits each. Splats are sorted, so that those of a chunk
+are near each other and their ranges small.
 """
 
 from __future__ import annotations
@@ -105,19 +106,23 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     file, splats = new_file(path, Origin(NAME, len(data)), count, degree)
     with np.errstate(invalid="ignore", over="ignore"):  # ranges that are not finite
         for piece in pieces(count):
-            rows = packed[piece]
-            own = chunks[piece.start // SPLATS : -(-piece.stop // SPLATS)]
-            splats.means[piece] = _between(rows["packed_position"], own, _POSITION)
-            splats.log_scales[piece] = _between(rows["packed_scale"], own, _SCALE)
-            _fill_colors(splats, piece, rows["packed_color"], own if colored else None)
+            rows, ranges = packed[piece], chunks[_chunks_of(piece)]
+            splats.means[piece] = _between(rows["packed_position"], ranges, _POSITION)
+            splats.log_scales[piece] = _between(rows["packed_scale"], ranges, _SCALE)
+            _fill_colors(splats, piece, rows["packed_color"], ranges if colored else None)
             splats.quaternions[piece] = _quaternions(rows["packed_rotation"])
             splats.sh_rest[piece] = _harmonics(rest[piece])
     return file
 
 
+def _chunks_of(piece: slice) -> slice:
+    """Return which chunks the splats of a piece are in; pieces begin with a chunk."""
+    return slice(piece.start // SPLATS, -(-piece.stop // SPLATS))
+
+
 def _elements(header: Header, body: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
     """Return the rows of every element by its name; those of lists are refused."""
-    found, at = {}, 0
+    elements, at = {}, 0
     for element, count in zip(header.elements, header.counts, strict=True):
         if any(isinstance(prop, plyfile.PlyListProperty) for prop in element.properties):
             msg = f"{header.path}: element {shown(element.name)} has a list, expected numbers"
@@ -125,9 +130,9 @@ def _elements(header: Header, body: NDArray[np.uint8]) -> dict[str, NDArray[Any]
         kind = np.dtype(element.dtype(header.order))
         # There are as many bytes: without lists, `check_counts` counts them all.
         end = at + count * kind.itemsize
-        found[element.name] = body[at:end].view(kind) if count else np.empty(0, kind)
+        elements[element.name] = body[at:end].view(kind) if count else np.empty(0, kind)
         at = end
-    return found
+    return elements
 
 
 def _named(path: Path, elements: dict[str, NDArray[Any]], name: str) -> NDArray[Any]:
@@ -142,9 +147,9 @@ def _expect(
 ) -> None:
     """Refuse rows that lack a property, or have it in another type."""
     for name in names:
-        found = rows.dtype[name].str[1:] if name in (rows.dtype.names or ()) else "none"
-        if found != kind:
-            msg = f"{path}: element '{element}': property '{name}' is {found}, expected {kind}"
+        stored = rows.dtype[name].str[1:] if name in (rows.dtype.names or ()) else "none"
+        if stored != kind:
+            msg = f"{path}: element '{element}': property '{name}' is {stored}, expected {kind}"
             raise RefineError(msg)
 
 
@@ -238,19 +243,18 @@ def write(stream: BinaryIO, splats: Splats) -> None:
     packed = np.empty((count, 4), "<u4")
     harmonics = np.empty((count, rest), np.uint8)
     for piece in pieces(count):
-        some = splats.take(order[piece])
-        own = ranges[piece.start // SPLATS : -(-piece.stop // SPLATS)]
-        scales = np.clip(some.log_scales, -SCALE_LIMIT, SCALE_LIMIT)
-        colors = some.sh_dc * np.float64(SH_C0) + 0.5
-        packed[piece, 0] = _packed(_places(some.means, own[:, :6]), _PLACES)
-        packed[piece, 1] = _rotations(some.quaternions)
-        packed[piece, 2] = _packed(_places(scales, own[:, 6:12]), _PLACES)
-        shares = np.empty((len(some), 4))
-        shares[:, :3] = _places(colors, own[:, 12:])
+        batch, ends = splats.take(order[piece]), ranges[_chunks_of(piece)]
+        scales = np.clip(batch.log_scales, -SCALE_LIMIT, SCALE_LIMIT)
+        colors = batch.sh_dc * np.float64(SH_C0) + 0.5
+        packed[piece, 0] = _packed(_places(batch.means, ends[:, :6]), _PLACES)
+        packed[piece, 1] = _rotations(batch.quaternions)
+        packed[piece, 2] = _packed(_places(scales, ends[:, 6:12]), _PLACES)
+        shares = np.empty((len(batch), 4))
+        shares[:, :3] = _places(colors, ends[:, 12:])
         with np.errstate(under="ignore"):
-            shares[:, 3] = opacity(some.opacity_logits)
+            shares[:, 3] = opacity(batch.opacity_logits)
         packed[piece, 3] = _packed(shares, _CHANNELS)
-        planes = np.asarray(some.sh_rest, np.float64).transpose(0, 2, 1).reshape(len(some), rest)
+        planes = np.asarray(batch.sh_rest, np.float64).transpose(0, 2, 1).reshape(len(batch), rest)
         # Each code stands for the middle of its step, so that it is the whole part, not rounded.
         steps = np.clip((planes / REST_RANGE + 0.5) * 256.0, 0.0, 255.0)
         harmonics[piece] = steps.astype(np.uint8)

@@ -73,14 +73,14 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
 def write(stream: BinaryIO, splats: Splats) -> None:
     """Write splats as a ``.splat`` file."""
     for piece in pieces(len(splats)):
-        some = splats.take(piece)
-        rows = np.empty(len(some), _ROW)
-        rows["mean"] = some.means
+        batch = splats.take(piece)
+        rows = np.empty(len(batch), _ROW)
+        rows["mean"] = batch.means
         with np.errstate(under="ignore"):
-            rows["scale"] = scales(some.log_scales)
-            rows["color"][:, :3] = codes(base_color(some.sh_dc))
-            rows["color"][:, 3] = codes(opacity(some.opacity_logits))
-        turns = np.rint(unit_quaternions(some.quaternions) * _NO_TURN + _NO_TURN)
+            rows["scale"] = scales(batch.log_scales)
+            rows["color"][:, :3] = codes(base_color(batch.sh_dc))
+            rows["color"][:, 3] = codes(opacity(batch.opacity_logits))
+        turns = np.rint(unit_quaternions(batch.quaternions) * _NO_TURN + _NO_TURN)
         rows["rotation"] = np.clip(turns, 0.0, 255.0)
         stream.write(rows.data)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import RefineError
 from ..scene import spatial_order
+from ..work import chunks
 from .ply import Origin, SplatFile
 from .ply_columns import empty_rows
 from .ply_header import new_header
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from ..splats import Splats
 
 CHUNK = 1 << 15
-"""Splats that are converted at a time: 8 MB at degree 3."""
+"""Splats that are converted at a time: 8 MB at degree 3. A multiple of `compressed_ply.SPLATS`."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +63,8 @@ class Format:
         ``read(path, data)`` returns a `SplatFile`; `data` is the file, (M,) uint8.
     write : callable
         ``write(stream, splats)``; all of the splats can be drawn.
-    sizes : callable
-        ``sizes(count, degree)`` returns `Sizes`; None where a file is compressed as a whole.
+    sizes : callable or None
+        ``sizes(count, degree)`` returns `Sizes`; None if a file is compressed as a whole.
     """
 
     name: str
@@ -73,11 +74,11 @@ class Format:
     matches: Callable[[Path, bytes], bool]
     read: Callable[[Path, NDArray[np.uint8]], SplatFile]
     write: Callable[[BinaryIO, Splats], None]
-    sizes: Callable[[int, int], Sizes | None]
+    sizes: Callable[[int, int], Sizes] | None
 
     def sizes_without_more(self, count: int, degree: int) -> Sizes | None:
         """Return `sizes` of splats of any degree: without the harmonics that it does not hold."""
-        return self.sizes(count, min(degree, self.degree))
+        return self.sizes(count, min(degree, self.degree)) if self.sizes else None
 
 
 def new_file(path: Path, origin: Origin, count: int, degree: int) -> tuple[SplatFile, Splats]:
@@ -97,14 +98,13 @@ def new_file(path: Path, origin: Origin, count: int, degree: int) -> tuple[Splat
 
 
 def pieces(count: int) -> Iterator[slice]:
-    """Yield the slices of ``range(count)`` that are converted at a time."""
-    for start in range(0, count, CHUNK):
-        yield slice(start, min(start + CHUNK, count))
+    """Return the slices of ``range(count)`` that are converted at a time."""
+    return chunks(count, CHUNK)
 
 
-def codes(shares: NDArray[Any], largest: int = 255) -> NDArray[np.uint8]:
-    """Return shares of 0..1 as the nearest of ``0..largest``; those outside count as an end."""
-    return np.asarray(np.rint(np.clip(shares, 0.0, 1.0) * largest), np.uint8)
+def codes(shares: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return shares of 0..1 as the nearest of 0..255; those outside count as the nearer end."""
+    return np.asarray(np.rint(np.clip(shares, 0.0, 1.0) * 255), np.uint8)
 
 
 def refuse_short(path: Path, needed: int, available: int, what: str) -> None:
@@ -150,10 +150,13 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 def near_ones_together(means: NDArray[Any]) -> NDArray[np.int64]:
     """Return an order of finite positions (N, 3) in which near ones are near, (N,)."""
-    some = np.asarray(means[:: max(len(means) // 10_000, 1)], np.float64)
-    middle = np.median(some, axis=0)
-    size = float(np.median(np.abs(some - middle))) or 1.0
+    sample = np.asarray(means[:: max(len(means) // _SAMPLE, 1)], np.float64)
+    middle = np.median(sample, axis=0)
+    size = float(np.median(np.abs(sample - middle))) or 1.0
     with np.errstate(over="ignore", under="ignore"):
         place = (np.asarray(means, np.float64) - middle) / size
-        # Farther than that all are in one direction; their squares must stay finite.
-        return spatial_order(np.clip(place, -1e100, 1e100))
+        return spatial_order(np.clip(place, -_FARTHEST, _FARTHEST))
+
+
+_SAMPLE = 10_000  # positions, at least, that tell middle and size: medians of more differ little
+_FARTHEST = 1e100  # in sizes: the order knows only directions by far, and squares must be finite

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..affine import transformed
 from ..errors import RefineError
+from ..place import described
 from ..splats import (
     SINGLE_MARGIN,
     Splats,
@@ -37,7 +38,6 @@ from .glb_document import (
     VERSION,
     Document,
     opened,
-    shown,
 )
 from .ply import Origin, SplatFile
 
@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from typing import BinaryIO
 
     from numpy.typing import NDArray
+
+    from ..place import Place
 
 NAME = "GLB"
 EXTENSION = "KHR_gaussian_splatting"
@@ -59,8 +61,6 @@ _POINTS, _VERTICES = 0, 34962
 
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Between the frame of captures and that of glTF, either way."""
-
-_TRANSLATION, _ROTATION, _SCALE = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), (1.0, 1.0, 1.0)
 
 
 def matches(_path: Path, head: bytes) -> bool:
@@ -108,60 +108,68 @@ def _shown(document: Document, most: int) -> list[_Mesh]:
             mesh.nodes.append(_Node(count, place, matrix))
         count += len(mesh)
         if count > most:
-            msg = (
-                f"{document.path}: its nodes show {count} splats or more, expected at most {most}, "
-                "the bytes of the file"
+            document.place.fail(
+                f"its nodes show {count} splats or more, expected at most {most}, the bytes of the "
+                "file"
             )
-            raise RefineError(msg)
     return [mesh for mesh in meshes.values() if mesh.parts]
 
 
-def _nodes(document: Document) -> Iterator[tuple[int, str, NDArray[np.float64]]]:
+def _nodes(document: Document) -> Iterator[tuple[int, Place, NDArray[np.float64]]]:
     """Yield the mesh of each node of a scene that has one, the node's place, its matrix (4, 4)."""
     if "scenes" not in document.content:
         return
-    scene = document.item("scenes", document.content.get("scene", 0), "scene")
-    left = [(index, np.eye(4)) for index in document.indices(scene, "nodes", "scene")]
-    left.reverse()
+    scene, place = document.item(
+        "scenes", document.content.get("scene", 0), document.place.at("scene")
+    )
+    left = [(index, place, np.eye(4)) for index in _listed(scene, "nodes", place)[::-1]]
     visited: set[int] = set()
     while left:
-        index, above = left.pop()
-        node = document.item("nodes", index, "a node")
-        place = f"nodes[{index}]"
+        index, above, frame = left.pop()
+        node, place = document.item("nodes", index, above)
         if index in visited:
-            raise document.wrong(place, "belongs to two nodes, expected a tree")
+            place.fail("belongs to two nodes, expected a tree")
         visited.add(index)
         with np.errstate(over="ignore", invalid="ignore", under="ignore"):
-            matrix = above @ _matrix(document, node, place)
-        left += [(child, matrix) for child in reversed(document.indices(node, "children", place))]
+            matrix = frame @ _matrix(node, place)
+        left += [(child, place, matrix) for child in _listed(node, "children", place)[::-1]]
         if "mesh" in node:
             document.item("meshes", node["mesh"], place)
             yield node["mesh"], place, matrix
 
 
-def _matrix(document: Document, node: dict[str, Any], place: str) -> NDArray[np.float64]:
+def _listed(holder: dict[str, Any], key: str, place: Place) -> list[Any]:
+    """Return a list, empty if it is not there."""
+    return place.at(key).items(holder.get(key, []))
+
+
+def _matrix(node: dict[str, Any], place: Place) -> NDArray[np.float64]:
     """Return the matrix of a node, (4, 4)."""
     if "matrix" in node:
-        columns = document.numbers(node, "matrix", place, tuple(np.eye(4).ravel().tolist()))
-        return columns.reshape(4, 4).T
-    x, y, z, w = document.numbers(node, "rotation", place, _ROTATION)
+        columns = place.at("matrix").numbers(node["matrix"], 16)
+        return np.array(columns).reshape(4, 4).T
+
+    def numbers(key: str, default: list[float]) -> list[float]:
+        return place.at(key).numbers(node.get(key, default), len(default))
+
+    x, y, z, w = numbers("rotation", [0.0, 0.0, 0.0, 1.0])
     matrix = np.eye(4)
-    scale = document.numbers(node, "scale", place, _SCALE)
+    scale = numbers("scale", [1.0, 1.0, 1.0])
     matrix[:3, :3] = rotation_matrices(np.array([w, x, y, z])) * scale
-    matrix[:3, 3] = document.numbers(node, "translation", place, _TRANSLATION)
+    matrix[:3, 3] = numbers("translation", [0.0, 0.0, 0.0])
     return matrix
 
 
-def _check(document: Document, extension: Any, place: str) -> None:  # noqa: ANN401 - from JSON
+def _refuse_unread(extension: Any, place: Place) -> None:  # noqa: ANN401 - from JSON
     """Refuse splats of another kernel, and compressed ones."""
     held = extension if isinstance(extension, dict) else {}
     kernel = held.get("kernel", "ellipse")
     if kernel != "ellipse":
-        raise document.wrong(place, f"splats of kernel {shown(kernel)}, expected 'ellipse'")
+        place.fail(f'splats of kernel {described(kernel)}, expected "ellipse"')
     more = held.get("extensions")
     if isinstance(more, dict) and more:
-        name = shown(next(iter(more)))
-        raise document.wrong(place, f"splats by {name}, expected plain accessors")
+        name = described(next(iter(more)))
+        place.fail(f"splats by {name}, expected plain accessors")
 
 
 @dataclass(frozen=True)
@@ -172,14 +180,13 @@ class _Node:
     ----------
     start : int
         Where its splats begin among those of the file.
-    place : str
-        For messages.
+    place : Place
     matrix : (4, 4) float64
         From the frame of the mesh to that of the scene.
     """
 
     start: int
-    place: str
+    place: Place
     matrix: NDArray[np.float64]
 
 
@@ -191,8 +198,8 @@ class _Mesh:
     document : Document
     index : int
         Of the mesh.
-    place : str
-        Of the node that shows it first, for messages.
+    place : Place
+        Of the node that shows it first.
 
     Attributes
     ----------
@@ -204,18 +211,16 @@ class _Mesh:
         Highest of the harmonics.
     """
 
-    def __init__(self, document: Document, index: int, place: str) -> None:
-        self._document = document
+    def __init__(self, document: Document, index: int, place: Place) -> None:
         self.parts: list[_Part] = []
         self.nodes: list[_Node] = []
-        primitives = document.indices(document.item("meshes", index, place), "primitives", place)
-        for number, primitive in enumerate(primitives):
-            where = f"meshes[{index}].primitives[{number}]"
-            if not isinstance(primitive, dict):
-                raise document.wrong(where, f"expected an object, got {shown(primitive)}")
+        mesh, place = document.item("meshes", index, place)
+        for number, item in enumerate(_listed(mesh, "primitives", place)):
+            where = place.at(f"primitives[{number}]")
+            primitive = where.members(item)
             extensions = primitive.get("extensions")
             if isinstance(extensions, dict) and EXTENSION in extensions:
-                _check(document, extensions[EXTENSION], where)
+                _refuse_unread(extensions[EXTENSION], where)
                 self.parts.append(_Part(document, primitive, where))
         self.degree = max((part.degree for part in self.parts), default=0)
         self._count = sum(map(len, self.parts))
@@ -247,7 +252,7 @@ class _Mesh:
         try:
             return transformed(splats, _HALF_TURN @ node.matrix)
         except RefineError as error:
-            raise self._document.wrong(node.place, str(error)) from error
+            node.place.fail(str(error))
 
 
 class _Part:
@@ -257,18 +262,15 @@ class _Part:
     ----------
     document : Document
     primitive : dict
-    place : str
-        For messages.
+    place : Place
     """
 
-    def __init__(self, document: Document, primitive: dict[str, Any], place: str) -> None:
-        self._document, self._place = document, place
-        attributes = primitive.get("attributes")
-        if not isinstance(attributes, dict):
-            raise document.wrong(place, f"attributes are {shown(attributes)}, expected an object")
-        if primitive.get("mode", 4) != _POINTS:
-            raise document.wrong(place, f"mode is {shown(primitive.get('mode', 4))}, expected 0")
-        self._attributes = attributes
+    def __init__(self, document: Document, primitive: dict[str, Any], place: Place) -> None:
+        self._document, self._place = document, place.at("attributes")
+        self._attributes = attributes = self._place.members(primitive.get("attributes"))
+        mode = primitive.get("mode", 4)
+        if mode != _POINTS:
+            place.at("mode").fail(f"expected {_POINTS}, got {described(mode)}")
         self.degree = 0
         while self.degree < _DEGREES and _harmonic(self.degree + 1, 0) in attributes:
             self.degree += 1
@@ -279,21 +281,19 @@ class _Part:
         self._harmonics = [self._values(name, 3) for name in _harmonics(self.degree)]
 
     def __len__(self) -> int:
-        return len(self._means(slice(None)))
+        return self._count
 
     def _values(self, name: str, width: int) -> Callable[[slice], NDArray[Any]]:
         """Return a function that returns some of the values of an attribute, (n, width)."""
-        document, place = self._document, f"{self._place}.attributes"
         if name not in self._attributes:
-            raise document.wrong(place, f"no {name}")
-        index = self._attributes[name]
-        values = document.accessor(index, f"{place}.{name}", width)
-        first = values if name == "POSITION" else self._means(slice(None))
-        if len(values) != len(first):
-            problem = f"{len(values)} values, expected {len(first)} as for POSITION"
-            where = f"accessors[{index}]"
-            raise document.wrong(where, problem)
-        if values.dtype.kind != "f" and document.normalized(index):
+            self._place.fail(f"no {name}")
+        index, place = self._attributes[name], self._place.at(name)
+        values = self._document.accessor(index, place, width)
+        if name == "POSITION":
+            self._count = len(values)
+        if len(values) != self._count:
+            place.fail(f"{len(values)} values, expected {self._count} as for POSITION")
+        if values.dtype.kind != "f" and self._document.normalized(index):
             largest = np.iinfo(values.dtype).max
             return lambda piece: np.maximum(values[piece] / largest, -1.0)
         return lambda piece: values[piece]

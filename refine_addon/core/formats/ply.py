@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 import plyfile
 
-from ..errors import RefineError
+from ..errors import RefineError, reason_of
 from ..whole_file import expanded, refuse_mapped, whole_file
 from .ply_body import check_counts, read_text, vertex_range
 from .ply_columns import REQUIRED, REST_COUNTS, columns_from_splats, splats_from_columns
@@ -249,7 +249,7 @@ def read_ply(path: Path | str) -> SplatFile:
             header, vertex = splat_header(path, stream)
             whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
-        msg = f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
+        msg = f"{path}: cannot be read ({reason_of(error)})"
         raise RefineError(msg) from error
     body = np.frombuffer(whole, np.uint8)[len(header.raw) :]
     check_counts(header, len(body))
@@ -284,14 +284,14 @@ def _vertex_index(header: Header) -> int:
     if "vertex" not in names:
         msg = (
             f"{header.path}: not a splat file: expected an element 'vertex', "
-            f"got {_first(names) or 'none'}"
+            f"got {_listed(names) or 'none'}"
         )
         raise RefineError(msg)
     return names.index("vertex")
 
 
-def _first(names: list[str]) -> str:
-    """Return the first of some names, cut to 40 characters each, for a message."""
+def _listed(names: list[str]) -> str:
+    """Return at most `_NAMES_SHOWN` names, cut to 40 characters each, for a message."""
     return ", ".join(name[:40] for name in names[:_NAMES_SHOWN])
 
 
@@ -309,11 +309,11 @@ def _check_properties(header: Header, vertex: int) -> None:
         raise RefineError(msg)
     missing = [name for name in REQUIRED if name not in kinds]
     if missing:
-        some = _first([*kinds])
-        some += ", ..." if len(kinds) > _NAMES_SHOWN else ""
+        present = _listed([*kinds])
+        present += ", ..." if len(kinds) > _NAMES_SHOWN else ""
         msg = (
             f"{header.path}: {_guess(header, kinds)}: vertex lacks {', '.join(missing)} "
-            f"(it has {some or 'no property'})"
+            f"(it has {present or 'no property'})"
         )
         raise RefineError(msg)
     rest = [name for name in kinds if name.startswith("f_rest_")]

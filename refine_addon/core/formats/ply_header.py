@@ -128,10 +128,10 @@ def with_count(raw: bytes, count: int) -> bytes:
     """Return the header with this number of vertices; nothing else in it changes."""
     lines = _lines(raw)
     index = _vertex_line(lines)
-    found = re.match(rb"(\s*element\s+vertex\s+)(\d+)", lines[index])
-    if not found or int(found[2]) == count:
+    announced = re.match(rb"(\s*element\s+vertex\s+)(\d+)", lines[index])
+    if not announced or int(announced[2]) == count:
         return raw
-    lines[index] = b"%s%d%s" % (found[1], count, lines[index][found.end() :])
+    lines[index] = b"%s%d%s" % (announced[1], count, lines[index][announced.end() :])
     return _line_end(raw).join(lines)
 
 

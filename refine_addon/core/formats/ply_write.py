@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RefineError
+from ..work import chunks
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -43,8 +44,7 @@ def write_rows(
 ) -> None:
     """Write the kept rows as bytes, a chunk at a time, with `columns` set or appended."""
     plain = rows.view(np.dtype((np.void, rows.dtype.itemsize)))
-    for start in range(0, len(plain), _ROWS):
-        piece = slice(start, start + _ROWS)
+    for piece in chunks(len(plain), _ROWS):
         chosen = slice(None) if keep is None else keep[piece]
         chunk = np.ascontiguousarray(plain[piece][chosen])
         if columns:

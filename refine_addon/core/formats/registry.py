@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import RefineError
+from ..errors import RefineError, reason_of
 from ..foreign_files import refuse_pointer
 from ..splats import drawable
 from ..whole_file import expanded, whole_file
@@ -79,7 +79,7 @@ def read_splats(path: Path | str) -> SplatFile:
         with path.open("rb") as stream:
             whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
     except (OSError, ValueError) as error:
-        msg = f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})"
+        msg = f"{path}: cannot be read ({reason_of(error)})"
         raise RefineError(msg) from error
     return form.read(path, np.frombuffer(whole, np.uint8))
 
@@ -144,8 +144,8 @@ def without_suffix(name: str) -> str:
 
 def refuse_unknown_size(form: Format) -> None:
     """Raise `RefineError` if the size of a file does not follow from the number of its splats."""
-    if form.sizes(0, 0) is None:
-        fixed = ", ".join(other.suffix for other in FORMATS if other.sizes(0, 0))
+    if form.sizes is None:
+        fixed = ", ".join(other.suffix for other in FORMATS if other.sizes)
         msg = (
             f"a size cannot be kept to in {form.suffix}, which is compressed as a whole: choose "
             f"another budget, or write .ply, {fixed}"

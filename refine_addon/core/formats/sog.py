@@ -20,10 +20,10 @@ import numpy as np
 
 from ..errors import RefineError
 from ..foreign_files import foreign_kind
+from ..place import Place, described
 from ..splats import above_constant, opacity, opacity_logits, unit_quaternions
 from .format import (
     Format,
-    Sizes,
     codes,
     join_largest,
     near_ones_together,
@@ -49,16 +49,29 @@ _DEGREES = 3
 _ACROSS = 64
 """Entries of the palette in a row of its image."""
 
-_LARGEST_PALETTE = 16
-"""It has 2 to the power of this many entries at most: labels have 16 bits."""
+_LABEL_BITS = 16
+"""Of the number of an entry of the palette: two channels of an image."""
 
 _TABLE = 256
+"""Values of a table, whose places are a byte."""
+
+_COORDINATE = 65535.0
+"""Largest code of a coordinate: two bytes, in two images."""
+
 _ROTATIONS = 252
 """In the alpha of a rotation: this, and which component is the largest."""
 
-_META_LIMIT = 1 << 22
+_NO_SIZE = -20.0
+"""Log scale written for anything smaller, since tables hold finite numbers."""
+
+_META_LIMIT = 1 << 20
+"""Bytes of the longest ``meta.json`` that is read; with four tables it has some 20,000."""
+
 _MOST_PIXELS = 16383
 """Of a side of a WebP image."""
+
+_SPARE_PIXELS = 1 << 16
+"""An image may have so many pixels more than four times those needed, as images are padded."""
 
 _BROKEN = (
     zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError,
@@ -76,34 +89,22 @@ def matches(path: Path, head: bytes) -> bool:
 class _Bundle:
     """An archive, and what its ``meta.json`` says."""
 
-    path: Path
+    place: Place
     archive: zipfile.ZipFile
     folder: str
     meta: dict[str, Any]
     size: int
     codec: Codec
 
-    def wrong(self, place: str, problem: str) -> RefineError:
-        """Return the error for a place in ``meta.json``."""
-        return RefineError(f"{self.path}: meta.json: {place}: {problem}")
-
-    def section(self, name: str) -> dict[str, Any]:
-        """Return what is said of an attribute."""
-        found = self.meta.get(name)
-        if not isinstance(found, dict):
-            raise self.wrong(place=name, problem="is not there, expected an object")
-        return found
+    def section(self, name: str) -> tuple[dict[str, Any], Place]:
+        """Return what is said of an attribute, and its place."""
+        place = self.place.at(name)
+        return place.members(self.meta.get(name)), place
 
     def numbers(self, name: str, key: str, count: int) -> NDArray[np.float64]:
         """Return a list of numbers."""
-        values = self.section(name).get(key)
-        plain = values if isinstance(values, list) else []
-        if len(plain) != count or not all(type(value) in (int, float) for value in plain):
-            raise self.wrong(place=f"{name}.{key}", problem=f"expected {count} numbers")
-        try:
-            return np.array(plain, np.float64)
-        except OverflowError:
-            raise self.wrong(place=f"{name}.{key}", problem="a number too large for this") from None
+        section, place = self.section(name)
+        return np.array(place.at(key).numbers(section.get(key), count))
 
     def pixels(self, name: str, index: int, count: int, width: int = 0) -> NDArray[np.uint8]:
         """Return an image of at least `count` pixels, (height, width, 4).
@@ -117,17 +118,17 @@ class _Bundle:
         width : int
             What the width must be; 0 for any.
         """
-        files = self.section(name).get("files")
-        if not isinstance(files, list) or len(files) <= index or not isinstance(files[index], str):
-            raise self.wrong(
-                place=f"{name}.files", problem=f"expected at least {index + 1} names of images"
-            )
-        label = files[index][:80]
-        data = _entry(self.path, self.archive, self.folder + files[index], 4 * self.size)
+        section, place = self.section(name)
+        files = place.at("files").items(section.get("files"))
+        if len(files) <= index:
+            place.at("files").fail(f"expected at least {index + 1} names of images")
+        file = place.at(f"files [{index}]").text(files[index])
+        path = self.place.path
+        data = _entry(path, self.archive, self.folder + file, 4 * self.size)
         try:
             across, down = self.codec.size(data)
             problem = ""
-            if across * down < count or across * down > 4 * count + (1 << 16):
+            if not count <= across * down <= 4 * count + _SPARE_PIXELS:
                 problem = f"{across} x {down} pixels, expected {count}"
             elif width and across != width:
                 problem = f"{across} pixels wide, expected {width}"
@@ -135,8 +136,12 @@ class _Bundle:
                 return self.codec.decode(data)
         except ValueError as error:
             problem = f"cannot be read ({str(error)[:100]})"
-        msg = f"{self.path}: image {label!r}: {problem}"
+        msg = f"{path}: image {file[:80]!r}: {problem}"
         raise RefineError(msg)
+
+    def rows(self, name: str, index: int, count: int) -> NDArray[np.uint8]:
+        """Return the pixels of `count` splats, (count, 4), of an image; see `pixels`."""
+        return self.pixels(name, index, count).reshape(-1, 4)[:count]
 
 
 def _entry(path: Path, archive: zipfile.ZipFile, name: str, limit: int) -> bytes:
@@ -164,12 +169,9 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     """
     with _opened(path, data) as archive:
         bundle = _bundle(path, archive, len(data))
-        count = bundle.meta.get("count")
-        if type(count) is not int or not 0 < count <= len(data):
-            shown = str(count)[:30] if type(count) is int else "none"
-            problem = f"{shown}, expected 1 to {len(data)}, the bytes of the file"
-            raise bundle.wrong(place="count", problem=problem)
-        return _read(bundle, count)
+        # A splat takes more than a byte.
+        count = bundle.place.at("count").whole(bundle.meta.get("count"), 1, len(data))
+        return _splats(bundle, count)
 
 
 def _opened(path: Path, data: NDArray[np.uint8]) -> zipfile.ZipFile:
@@ -186,47 +188,32 @@ def _bundle(path: Path, archive: zipfile.ZipFile, size: int) -> _Bundle:
     if name is None:
         msg = f"{path}: no meta.json in the archive, which a SOG file has"
         raise RefineError(msg)
-    try:
-        meta = json.loads(_entry(path, archive, name, _META_LIMIT))
-    except (ValueError, RecursionError) as error:
-        what = str(error) if isinstance(error, ValueError) else "nested too deeply"
-        msg = f"{path}: meta.json cannot be read: {what[:100]}"
-        raise RefineError(msg) from error
-    version = meta.get("version") if isinstance(meta, dict) else None
+    place = Place(path, "meta.json")
+    meta = place.members(place.parsed(_entry(path, archive, name, _META_LIMIT)))
+    version = meta.get("version")
     if version != _VERSION:
-        shown = repr(version)[:30] if type(version) in (int, float, str) else "none"
-        msg = f"{path}: meta.json: version {shown}, expected {_VERSION}"
-        raise RefineError(msg)
-    return _Bundle(path, archive, name[: -len("meta.json")], meta, size, codec_for(path))
+        place.at("version").fail(f"expected {_VERSION}, got {described(version)}")
+    return _Bundle(place, archive, name[: -len("meta.json")], meta, size, codec_for(path))
 
 
-def _read(bundle: _Bundle, count: int) -> SplatFile:
-    def flat(name: str, index: int = 0) -> NDArray[np.uint8]:
-        return bundle.pixels(name, index, count).reshape(-1, 4)[:count]
-
+def _splats(bundle: _Bundle, count: int) -> SplatFile:
+    """Return the splats of an archive."""
     low, high = (bundle.numbers("means", key, 3) for key in ("mins", "maxs"))
-    lower, upper = flat("means", 0), flat("means", 1)
-    turns, scales, colors = flat("quats"), flat("scales"), flat("sh0")
-    scale_table, color_table = (bundle.numbers(n, "codebook", _TABLE) for n in ("scales", "sh0"))
-    if turns[:, 3].min() < _ROTATIONS:
-        index = int(np.argmax(turns[:, 3] < _ROTATIONS))
-        msg = (
-            f"{bundle.path}: rotation of splat {index}: alpha {turns[index, 3]}, "
-            f"expected {_ROTATIONS} to 255"
-        )
-        raise RefineError(msg)
+    lower, upper = bundle.rows("means", 0, count), bundle.rows("means", 1, count)
+    turns = bundle.rows("quats", 0, count)
+    scales, scale_table = bundle.rows("scales", 0, count), bundle.numbers("scales", *_CODEBOOK)
+    colors, color_table = bundle.rows("sh0", 0, count), bundle.numbers("sh0", *_CODEBOOK)
+    _check_rotations(bundle, turns)
     palette, labels = _palette(bundle, count)
     degree = math.isqrt(palette.shape[1] + 1) - 1
-    file, splats = new_file(bundle.path, Origin(f"{NAME} version 2", bundle.size), count, degree)
+    path = bundle.place.path
+    file, splats = new_file(path, Origin(f"{NAME} version 2", bundle.size), count, degree)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in meta.json
         for piece in pieces(count):
-            whole = lower[piece, :3] + upper[piece, :3] * 256.0
-            places = low + (high - low) * (whole / 65535.0)
-            splats.means[piece] = np.sign(places) * np.expm1(np.abs(places))
-            others = (turns[piece, :3] / 127.5 - 1.0) / math.sqrt(2.0)
-            splats.quaternions[piece] = join_largest(
-                (turns[piece, 3] - _ROTATIONS).astype(np.intp), others
-            )
+            code = lower[piece, :3] + upper[piece, :3] * 256.0
+            logs = low + (high - low) * (code / _COORDINATE)
+            splats.means[piece] = np.sign(logs) * np.expm1(np.abs(logs))
+            splats.quaternions[piece] = _quaternions(turns[piece])
             splats.log_scales[piece] = scale_table[scales[piece, :3]]
             splats.sh_dc[piece] = color_table[colors[piece, :3]]
             splats.opacity_logits[piece] = opacity_logits(colors[piece, 3] / 255.0)
@@ -234,29 +221,47 @@ def _read(bundle: _Bundle, count: int) -> SplatFile:
     return file
 
 
+_CODEBOOK = ("codebook", _TABLE)
+"""In ``meta.json``: the key of a table, and how many numbers it has."""
+
+
+def _check_rotations(bundle: _Bundle, turns: NDArray[np.uint8]) -> None:
+    """Refuse pixels of rotations that do not say which component is the largest."""
+    wrong = turns[:, 3] < _ROTATIONS
+    if wrong.any():
+        index = int(np.argmax(wrong))
+        Place(bundle.place.path, f"rotation of splat {index}").fail(
+            f"alpha {turns[index, 3]}, expected {_ROTATIONS} to 255"
+        )
+
+
+def _quaternions(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Return quaternions w x y z, (n, 4), of pixels; see `_rotation_pixels`."""
+    others = (pixels[:, :3] / 127.5 - 1.0) / math.sqrt(2.0)
+    return join_largest((pixels[:, 3] - _ROTATIONS).astype(np.intp), others)
+
+
 def _palette(bundle: _Bundle, count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
     """Return the palette of harmonics (P, K, 3), and the entry of each splat."""
     if "shN" not in bundle.meta:
         return np.zeros((1, 0, 3), np.float32), np.zeros(count, np.intp)
-    held = bundle.section("shN")
-    bands, entries = held.get("bands"), held.get("count")
-    if type(bands) is not int or not 1 <= bands <= _DEGREES:
-        raise bundle.wrong(place="shN.bands", problem="expected 1, 2 or 3")
-    if type(entries) is not int or not 0 < entries <= 1 << _LARGEST_PALETTE:
-        raise bundle.wrong(place="shN.count", problem=f"expected 1 to {1 << _LARGEST_PALETTE}")
-    table = bundle.numbers("shN", "codebook", _TABLE)
+    held, place = bundle.section("shN")
+    bands = place.at("bands").whole(held.get("bands"), 1, _DEGREES)
+    entries = place.at("count").whole(held.get("count"), 1, 1 << _LABEL_BITS)
+    table = bundle.numbers("shN", *_CODEBOOK)
     coefficients = above_constant(bands)
-    width, rows = _ACROSS * coefficients, -(-entries // _ACROSS)
-    image = bundle.pixels("shN", 0, width * rows, width)
-    places = image[:rows, :, :3].reshape(rows * _ACROSS, coefficients, 3)[:entries]
-    pixels = bundle.pixels("shN", 1, count).reshape(-1, 4)[:count].astype(np.intp)
+    width, height = _ACROSS * coefficients, -(-entries // _ACROSS)
+    image = bundle.pixels("shN", 0, width * height, width)
+    codes_of = image[:height, :, :3].reshape(height * _ACROSS, coefficients, 3)[:entries]
+    pixels = bundle.rows("shN", 1, count).astype(np.intp)
     labels = pixels[:, 0] + 256 * pixels[:, 1]
     if labels.max() >= entries:
         index = int(np.argmax(labels >= entries))
-        msg = f"{bundle.path}: splat {index}: entry {labels[index]} of {entries} in the palette"
-        raise RefineError(msg)
+        Place(bundle.place.path, f"splat {index}").fail(
+            f"entry {labels[index]} of {entries} in the palette"
+        )
     with np.errstate(over="ignore"):
-        return table.astype(np.float32)[places], labels
+        return table.astype(np.float32)[codes_of], labels
 
 
 def write(stream: BinaryIO, splats: Splats) -> None:
@@ -267,71 +272,113 @@ def write(stream: BinaryIO, splats: Splats) -> None:
     RefineError
         If there is no library for its images, or there are more splats than pixels in them.
     """
-    count = len(splats)
-    width = -(-math.isqrt(count - 1) // 4) * 4 + 4 if count > 1 else 4
-    if width > _MOST_PIXELS:
-        msg = f"{count} splats: {NAME} holds {(_MOST_PIXELS // 4 * 4) ** 2}"
-        raise RefineError(msg)
-    height = -(-count // width)
+    size = _image_size(len(splats))
     codec = codec_for(Path(str(getattr(stream, "name", NAME))))
     splats = splats.take(near_ones_together(splats.means))
-    images: dict[str, NDArray[np.uint8]] = {}
-
-    def blank(name: str) -> NDArray[np.uint8]:
-        images[name] = np.zeros((height, width, 4), np.uint8)
-        images[name][..., 3] = 255
-        flat: NDArray[np.uint8] = images[name].reshape(-1, 4)[:count]
-        return flat
-
-    means = np.asarray(splats.means, np.float64)
-    places = np.sign(means) * np.log1p(np.abs(means))
-    low, high = places.min(axis=0), places.max(axis=0)
-    extent = np.where(high > low, high - low, 1.0)
-    whole = np.rint((places - low) / extent * 65535.0).astype(np.uint16)
-    blank("means_l.webp")[:, :3] = whole & 255
-    blank("means_u.webp")[:, :3] = whole >> 8
-    largest, others = split_largest(unit_quaternions(splats.quaternions))
-    turns = blank("quats.webp")
-    turns[:, :3] = codes(others * math.sqrt(0.5) + 0.5)
-    turns[:, 3] = largest + _ROTATIONS
-    # Of no size at all is e^-20: tables hold finite numbers.
-    scale_table, scales = _tabulated(np.maximum(splats.log_scales, -20.0))
-    blank("scales.webp")[:, :3] = scales
+    low, high, lower, upper = _coordinates(splats.means)
+    scale_table, scales = _tabulated(np.maximum(splats.log_scales, _NO_SIZE))
     color_table, colors = _tabulated(splats.sh_dc)
-    pixels = blank("sh0.webp")
-    pixels[:, :3] = colors
     with np.errstate(under="ignore"):
-        pixels[:, 3] = codes(opacity(splats.opacity_logits))
+        alpha = codes(opacity(splats.opacity_logits))
     meta: dict[str, Any] = {
         "version": _VERSION,
         "asset": {"generator": "REFINE for Blender"},
-        "count": count,
+        "count": len(splats),
         "means": {
             "mins": low.tolist(),
-            "maxs": (low + extent).tolist(),
+            "maxs": high.tolist(),
             "files": ["means_l.webp", "means_u.webp"],
         },
         "scales": {"codebook": scale_table.tolist(), "files": ["scales.webp"]},
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
     }
+    images = {
+        "means_l.webp": _image(size, lower),
+        "means_u.webp": _image(size, upper),
+        "quats.webp": _image(size, _rotation_pixels(splats.quaternions)),
+        "scales.webp": _image(size, scales),
+        "sh0.webp": _image(size, np.column_stack([colors, alpha])),
+    }
     if splats.sh_degree:
-        labels = _grouped(splats.sh_rest.reshape(count, -1))
-        entries = int(labels.max()) + 1
-        flat = blank("shN_labels.webp")
-        flat[:, 0], flat[:, 1], flat[:, 2] = labels & 255, labels >> 8, 0
-        table, images["shN_centroids.webp"] = _centroids(splats.sh_rest, labels, entries)
-        meta["shN"] = {
-            "count": entries,
-            "bands": splats.sh_degree,
-            "codebook": table.tolist(),
-            "files": ["shN_centroids.webp", "shN_labels.webp"],
-        }
+        meta["shN"], images["shN_labels.webp"], images["shN_centroids.webp"] = _grouped_harmonics(
+            splats.sh_rest, size
+        )
     # A ZipInfo has no date of today, so a file is the same whenever it is made.
     with zipfile.ZipFile(stream, "w") as archive:
         archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
         for name, image in images.items():
             archive.writestr(zipfile.ZipInfo(name), codec.encode(image))
+
+
+def _image_size(count: int) -> tuple[int, int]:
+    """Return height and width of images of so many pixels: about a square, the width in fours."""
+    width = 4 * (-(-math.isqrt(max(count - 1, 0)) // 4) + 1)
+    if width > _MOST_PIXELS:
+        msg = f"{count} splats: {NAME} holds {(_MOST_PIXELS // 4 * 4) ** 2}"
+        raise RefineError(msg)
+    return -(-count // width), width
+
+
+def _image(size: tuple[int, int], values: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return an image (height, width, 4) of a pixel for each splat, opaque where nothing is said.
+
+    Parameters
+    ----------
+    size : tuple of int
+        Height and width.
+    values : (N, C) uint8
+        The first C channels of each pixel.
+    """
+    image = np.zeros((*size, 4), np.uint8)
+    image[..., 3] = 255
+    image.reshape(-1, 4)[: len(values), : values.shape[1]] = values
+    return image
+
+
+def _coordinates(
+    means: NDArray[Any],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return the range of the logarithms of positions (N, 3), and their places in it.
+
+    Returns
+    -------
+    low, high : (3,) float64
+    lower, upper : (N, 3) uint8
+        The two bytes of the places.
+    """
+    means = np.asarray(means, np.float64)
+    logs = np.sign(means) * np.log1p(np.abs(means))
+    low, high = logs.min(axis=0), logs.max(axis=0)
+    extent = np.where(high > low, high - low, 1.0)
+    code = np.rint((logs - low) / extent * _COORDINATE).astype(np.uint16)
+    return low, low + extent, (code & 255).astype(np.uint8), (code >> 8).astype(np.uint8)
+
+
+def _rotation_pixels(quaternions: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return pixels (N, 4): the three smaller components, and which is left out."""
+    largest, others = split_largest(unit_quaternions(quaternions))
+    return np.column_stack([codes(others * math.sqrt(0.5) + 0.5), largest + _ROTATIONS]).astype(
+        np.uint8
+    )
+
+
+def _grouped_harmonics(
+    sh_rest: NDArray[Any], size: tuple[int, int]
+) -> tuple[dict[str, Any], NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return what ``meta.json`` says of harmonics (N, K, 3), and two images: labels, palette."""
+    count = len(sh_rest)
+    labels = _grouped(sh_rest.reshape(count, -1))
+    entries = int(labels.max()) + 1
+    table, centroids = _centroids(sh_rest, labels, entries)
+    held = {
+        "count": entries,
+        "bands": math.isqrt(sh_rest.shape[1]),
+        "codebook": table.tolist(),
+        "files": ["shN_centroids.webp", "shN_labels.webp"],
+    }
+    pixels = np.column_stack([labels & 255, labels >> 8]).astype(np.uint8)
+    return held, _image(size, pixels), centroids
 
 
 def _tabulated(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -358,22 +405,29 @@ def _grouped(rows: NDArray[Any]) -> NDArray[np.int64]:
     """
     columns = np.ascontiguousarray(np.asarray(rows, np.float32).T)  # (D, N)
     labels = np.zeros(rows.shape[0], np.int64)
-    for _ in range(min(_LARGEST_PALETTE, int(rows.shape[0]).bit_length() - 1)):
-        groups = int(labels.max()) + 1
-        sizes = np.bincount(labels, minlength=groups)
-        widest = np.full(groups, -1.0)
-        axis = np.zeros(groups, np.intp)
-        middle = np.zeros(groups)
-        for index, column in enumerate(columns):
-            with np.errstate(under="ignore"):
-                mean = np.bincount(labels, column, groups) / sizes
-                square = np.bincount(labels, np.square(column, dtype=np.float64), groups) / sizes
-                spread = square - np.square(mean)
-            wider = spread > widest
-            widest[wider], axis[wider], middle[wider] = spread[wider], index, mean[wider]
+    for _ in range(min(_LABEL_BITS, int(rows.shape[0]).bit_length() - 1)):
+        axis, middle = _widest(columns, labels)
         above = columns[axis[labels], np.arange(len(labels))] > middle[labels]
         labels = np.unique(2 * labels + above, return_inverse=True)[1].reshape(-1)
     return labels
+
+
+def _widest(
+    columns: NDArray[np.float32], labels: NDArray[np.int64]
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Return in which of D columns (D, N) each group varies most, and its mean there, (G,) each."""
+    sizes = np.bincount(labels)
+    groups = len(sizes)
+    largest = np.full(groups, -1.0)
+    axis, middle = np.zeros(groups, np.intp), np.zeros(groups)
+    for index, column in enumerate(columns):
+        with np.errstate(under="ignore"):
+            mean = np.bincount(labels, column, groups) / sizes
+            square = np.bincount(labels, np.square(column, dtype=np.float64), groups) / sizes
+            variance = square - np.square(mean)
+        wider = variance > largest
+        largest[wider], axis[wider], middle[wider] = variance[wider], index, mean[wider]
+    return axis, middle
 
 
 def _centroids(
@@ -395,11 +449,6 @@ def _centroids(
     return table, image.reshape(rows, _ACROSS * coefficients, 4)
 
 
-def sizes(_count: int, _degree: int) -> Sizes | None:
-    """Return None: images are compressed as a whole."""
-    return None
-
-
 FORMAT = Format(
     name=NAME,
     suffix=".sog",
@@ -408,5 +457,5 @@ FORMAT = Format(
     matches=matches,
     read=read,
     write=write,
-    sizes=sizes,
+    sizes=None,
 )

@@ -23,7 +23,6 @@ from .format import Format, codes, join_largest, new_file, pieces, refuse_short,
 from .ply import Origin, SplatFile
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
     from typing import BinaryIO
 
@@ -116,13 +115,13 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     origin = Origin(f"{NAME} version {header.version}", len(data))
     file, splats = new_file(path, origin, header.count, header.degree)
     for piece in pieces(header.count):
-        some = {name: block[piece] for name, block in blocks.items()}
-        splats.means[piece] = _positions(some["mean"], header.fraction)
-        splats.opacity_logits[piece] = opacity_logits(some["opacity"][:, 0] / 255.0)
-        splats.sh_dc[piece] = (some["color"] / 255.0 - 0.5) / _COLOR_STEP
-        splats.log_scales[piece] = some["scale"] / _SCALE_STEPS + _LOWEST_SCALE
-        splats.quaternions[piece] = _rotations(some["rotation"])
-        rest = some["rest"].reshape(splats.sh_rest[piece].shape)
+        stored = {name: block[piece] for name, block in blocks.items()}
+        splats.means[piece] = _positions(stored["mean"], header.fraction)
+        splats.opacity_logits[piece] = opacity_logits(stored["opacity"][:, 0] / 255.0)
+        splats.sh_dc[piece] = (stored["color"] / 255.0 - 0.5) / _COLOR_STEP
+        splats.log_scales[piece] = stored["scale"] / _SCALE_STEPS + _LOWEST_SCALE
+        splats.quaternions[piece] = _rotations(stored["rotation"])
+        rest = stored["rest"].reshape(splats.sh_rest[piece].shape)
         splats.sh_rest[piece] = (rest - np.float32(128.0)) / np.float32(128.0)
     return file
 
@@ -239,23 +238,16 @@ def _streams(path: Path, data: NDArray[np.uint8], header: _Header) -> dict[str, 
         if announced != length:
             msg = f"{path}: stream '{name}' announces {announced} bytes, expected {length}"
             raise RefineError(msg)
-        refuse_short(path, start + packed, len(data), f"stream '{name}' and what is before it")
-        found = bytearray()
-        for piece in _zstd(path, name, data[start : start + packed].tobytes()):
-            found += piece
-            if len(found) > length:
-                break
-        if len(found) != length:
-            more = "more" if len(found) > length else str(len(found))
-            msg = f"{path}: stream '{name}' holds {more} bytes, expected {length}"
-            raise RefineError(msg)
-        blocks[name] = _table(np.frombuffer(bytes(found), np.uint8), header.count)
-        start += packed
+        end = start + packed
+        refuse_short(path, end, len(data), f"stream '{name}' and what is before it")
+        content = _zstd(path, name, data[start:end].tobytes(), length)
+        blocks[name] = _table(np.frombuffer(content, np.uint8), header.count)
+        start = end
     return blocks
 
 
-def _zstd(path: Path, name: str, packed: bytes) -> Iterator[bytes]:
-    """Yield what is in a zstd stream, a piece at a time."""
+def _zstd(path: Path, name: str, packed: bytes, length: int) -> bytearray:
+    """Return what is in a zstd stream; refuse it if that has another length."""
     try:
         reader, failure = _zstd_reader(packed)
     except ImportError as error:
@@ -264,12 +256,18 @@ def _zstd(path: Path, name: str, packed: bytes) -> Iterator[bytes]:
             "one, or 'pip install zstandard'; or write the file as version 3"
         )
         raise RefineError(msg) from error
+    content = bytearray()
     try:
-        while piece := reader.read(_PIECE):
-            yield piece
+        while len(content) <= length and (piece := reader.read(_PIECE)):
+            content += piece
     except (failure, EOFError) as error:
         msg = f"{path}: stream '{name}' is damaged ({error})"
         raise RefineError(msg) from error
+    if len(content) != length:
+        held = "more" if len(content) > length else str(len(content))
+        msg = f"{path}: stream '{name}' holds {held} bytes, expected {length}"
+        raise RefineError(msg)
+    return content
 
 
 def _zstd_reader(packed: bytes) -> tuple[Any, type[Exception]]:
@@ -320,18 +318,18 @@ def write(stream: BinaryIO, splats: Splats) -> None:
     header = _Header(3, count, splats.sh_degree, fraction, 0)
     blocks = {name: np.empty((count, n // count), np.uint8) for name, n in header.blocks().items()}
     for piece in pieces(count):
-        some = splats.take(piece)
-        places = np.rint(np.ldexp(np.asarray(some.means, np.float64), fraction)).astype("<i4")
+        batch = splats.take(piece)
+        places = np.rint(np.ldexp(np.asarray(batch.means, np.float64), fraction)).astype("<i4")
         blocks["mean"][piece] = places.view(np.uint8).reshape(-1, 3, 4)[..., :3].reshape(-1, 9)
         with np.errstate(under="ignore"):
-            blocks["opacity"][piece, 0] = codes(opacity(some.opacity_logits))
-        blocks["color"][piece] = codes(np.asarray(some.sh_dc, np.float64) * _COLOR_STEP + 0.5)
-        steps = (np.asarray(some.log_scales, np.float64) - _LOWEST_SCALE) * _SCALE_STEPS
+            blocks["opacity"][piece, 0] = codes(opacity(batch.opacity_logits))
+        blocks["color"][piece] = codes(np.asarray(batch.sh_dc, np.float64) * _COLOR_STEP + 0.5)
+        steps = (np.asarray(batch.log_scales, np.float64) - _LOWEST_SCALE) * _SCALE_STEPS
         blocks["scale"][piece] = np.rint(np.clip(steps, 0.0, 255.0))
-        turns = _packed_rotations(some.quaternions)
+        turns = _packed_rotations(batch.quaternions)
         blocks["rotation"][piece] = turns.view(np.uint8).reshape(-1, 4)
         if rest:
-            blocks["rest"][piece] = _harmonic_codes(some.sh_rest).reshape(-1, rest)
+            blocks["rest"][piece] = _harmonic_codes(batch.sh_rest).reshape(-1, rest)
     engine = zlib.compressobj(wbits=16 + zlib.MAX_WBITS)
     stream.write(engine.compress(_HEADER.pack(MAGIC, 3, count, header.degree, fraction, 0, 0)))
     stream.writelines(engine.compress(block.data) for block in blocks.values())
@@ -381,5 +379,5 @@ FORMAT = Format(
     matches=matches,
     read=read,
     write=write,
-    sizes=lambda _count, _degree: None,
+    sizes=None,
 )

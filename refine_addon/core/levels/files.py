@@ -5,31 +5,40 @@ from __future__ import annotations
 import contextlib
 import json
 import re
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING
 
 from ..errors import RefineError
 from ..estimate.quality import PSNR_CAP
-from ..formats.registry import SUFFIXES, as_written, read_splats, without_suffix
-from ..report import Clock, held, scoring_notes, seen_by
+from ..formats.registry import SUFFIXES, as_written, without_suffix
+from ..operation.files import FileSource
+from ..operation.run import Written, run
+from ..report import held, scoring_notes, seen_by
 from ..selection import Budget
-from ..survivors import survivor_columns
 from ..task import DEFAULTS, Task
-from ..volumes import forced
-from ..whole_file import expanded, make_folder, mode_of, refuse_existing, refuse_mapped, whole_file
+from ..whole_file import (
+    expanded,
+    mode_of,
+    new_folder,
+    refuse_existing,
+    refuse_mapped,
+    whole_file,
+)
 from ..work import Progress, silent
-from .lod import Levels, each_level, short
+from .lod import each_level, short
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
     from typing import Any
 
-    from ..formats.ply import SplatFile
+    from ..formats.format import Format
+    from ..operation.loaded import Loaded
+    from ..operation.run import Runtime
     from ..task import Settings
     from ..views import ViewSet
     from ..volumes import Zone
-    from .lod import Level
+    from .lod import Level, Levels
 
 MANIFEST = "lod.json"
 
@@ -69,17 +78,173 @@ def check_goal(goal: float) -> None:
         raise RefineError(msg)
 
 
-def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
+@dataclass(frozen=True, eq=False)
+class LevelsRequest:
+    """What is asked of levels of detail as files.
+
+    Attributes
+    ----------
+    views, levels, settings
+        See `lod`.
+    zones : sequence of Zone
+        Volumes that say which splats must stay and which must go, in the frame of the views.
+    suffix : str
+        Of the files, which names their format.
+    goal : float
+        The PSNR that the manifest's ``distance_psnr`` is for, dB.
+    overwrite : bool
+        Whether files may be replaced.
+    """
+
+    views: ViewSet
+    levels: Levels
+    settings: Settings = DEFAULTS
+    zones: Sequence[Zone] = ()
+    suffix: str = ".ply"
+    goal: float = GOAL
+    overwrite: bool = False
+
+    @contextlib.contextmanager
+    def opened(self, _form: Format | None) -> Iterator[None]:
+        """Refuse a PSNR that none can be."""
+        check_goal(self.goal)
+        yield
+
+    def decide(self, loaded: Loaded, runtime: Runtime) -> LevelSeries:
+        """Return the levels, each of which is made when it is asked for."""
+        scene = Task(
+            Budget(ratio=0.0), self.settings, loaded.splats, self.views,
+            protected=loaded.forced.protected, removed=loaded.forced.removed,
+        )  # fmt: skip
+        levels = each_level(scene, self.levels, progress=runtime.progress, threads=runtime.threads)
+        return LevelSeries(levels, {"settings": asdict(self.settings), "notes": []})
+
+    def compare(
+        self, _loaded: Loaded, _series: LevelSeries, _path: Path | None, _runtime: Runtime
+    ) -> dict[str, Any]:
+        """Return nothing: what a lossy format costs is not measured of levels."""
+        return {}
+
+
+@dataclass(frozen=True, eq=False)
+class LevelSeries:
+    """Levels of detail that are made one by one, so that no two are in memory.
+
+    Attributes
+    ----------
+    levels : iterator of Level
+    report : dict
+    """
+
+    levels: Iterator[Level]
+    report: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class LevelSink:
+    """A folder to be filled with a file of each level, and `MANIFEST`, written last.
+
+    Attributes
+    ----------
+    source : Path
+        Level 0, which is not written again.
+    folder : Path
+        Made if it is not there.
+    request : LevelsRequest
+    made : list of Path
+        The files that were written so far.
+    """
+
+    source: Path
+    folder: Path
+    request: LevelsRequest
+    made: list[Path] = field(default_factory=list)
+    timing: str = "levels_s"
+
+    @property
+    def form(self) -> None:
+        """No budget of levels counts bytes."""
+        return
+
+    @property
+    def paths(self) -> list[Path]:
+        """The files of the levels."""
+        request = self.request
+        return level_paths(self.source, self.folder, len(request.levels), request.suffix)
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[None]:
+        """Refuse what cannot be written; if the block fails, remove files that are new.
+
+        Raises
+        ------
+        RefineError
+            If the folder cannot be made, or a file exists and may not be replaced.
+        """
+        paths = [*self.paths, self.folder / MANIFEST]
+        with new_folder(self.folder):
+            for path in paths:
+                refuse_existing(path, overwrite=self.request.overwrite)
+                refuse_mapped(path, self.source)
+            old = [path for path in paths if mode_of(path)]
+            try:
+                yield
+            except BaseException:
+                for path in self.made:
+                    if path not in old:
+                        with contextlib.suppress(OSError):
+                            path.unlink()
+                raise
+
+    def write(self, loaded: Loaded, series: LevelSeries, _runtime: Runtime) -> Written:
+        """Write each level when it is made, then the manifest.
+
+        Raises
+        ------
+        RefineError, Cancelled
+            See `lod` and `SplatFile.write`.
+        """
+        request, entries = self.request, []
+        notes: list[str] = []
+        remarks: dict[float, str] = {}
+        for level, path in zip(series.levels, self.paths, strict=False):
+            if level.number == 1:
+                # From here on files of an earlier run are replaced, so its manifest goes first.
+                before = _unlisted(self.folder) if request.overwrite else []
+                facts = self._facts(loaded, level)
+                notes += scoring_notes(level.scores)
+            entry, more = _write(loaded, level, path, overwrite=request.overwrite)
+            self.made.append(path)
+            notes += [note for note in more if note not in notes]
+            entries.append({**level.facts(request.goal), **entry})
+            remarks[level.asked] = level.remark
+        notes += request.levels.notes(remarks)
+        notes += _remove(set(before) - {*self.made}, self.source)
+        facts["levels"] = entries
+        with whole_file(self.folder / MANIFEST, overwrite=request.overwrite) as stream:
+            stream.write(json.dumps(facts, indent=2, allow_nan=False).encode() + b"\n")
+        files = {"input": loaded.name, "folder": str(self.folder), "manifest": MANIFEST}
+        return Written(files, notes=notes, facts=facts)
+
+    def _facts(self, loaded: Loaded, first: Level) -> dict[str, Any]:
+        """Return what the manifest says beside the levels, given the first of them."""
+        seen = seen_by(first.scores)
+        seen["splats"] |= {"before": len(loaded.splats), **loaded.forced.counts()}
+        return {
+            "lod": 1,  # first: by this a manifest is known, see `is_manifest`
+            "source": {"file": self.source.name, "bytes": loaded.bytes},
+            **seen,
+            "distances": [short(distance) for distance, _ in first.reach.psnr],
+            "nested": not self.request.levels.absorb,
+            "goal_psnr": self.request.goal,
+        }
+
+
+def lod_file(
     source: Path | str,
     folder: Path | str,
-    views: ViewSet,
-    levels: Levels,
-    settings: Settings = DEFAULTS,
+    request: LevelsRequest,
     *,
-    zones: Sequence[Zone] = (),
-    suffix: str = ".ply",
-    goal: float = GOAL,
-    overwrite: bool = False,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> dict[str, Any]:
@@ -91,16 +256,10 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
         The file to read, of any format (`read_splats`); level 0, which is not written again.
     folder : path-like
         Where the files go, named as by `level_paths`; made if it is not there.
-    views, levels, settings, progress, threads
-        See `lod`.
-    zones : sequence of Zone
-        Volumes that say which splats must stay and which must go.
-    suffix : str
-        Of the files, which names their format.
-    goal : float
-        The PSNR that the manifest's ``distance_psnr`` is for, dB.
-    overwrite : bool
-        Whether files may be replaced.
+    request : LevelsRequest
+        What is asked.
+    progress, threads
+        See `operation.run.run`.
 
     Returns
     -------
@@ -113,69 +272,17 @@ def lod_file(  # noqa: PLR0913 - as `file_to_file.prune_file`
         See `lod`, `volumes.forced`, `read_splats` and `SplatFile.write`. Files that were new are
         removed again then, and where one was to be replaced, no manifest is left.
     """
-    clock = Clock()
-    folder, source = expanded(folder), expanded(source)
-    check_goal(goal)
-    paths = level_paths(source, folder, len(levels), suffix)
-    with _new_files(folder, [*paths, folder / MANIFEST], overwrite=overwrite) as written:
-        file = read_splats(source)
-        for path in paths:
-            refuse_mapped(path, source)
-        clock.lap("read_s")
-        entries: list[dict[str, Any]] = []
-        notes: list[str] = []
-        remarks: dict[float, str] = {}
-        splats = file.splats()
-        given = forced(zones, splats.means)
-        scene = Task(
-            Budget(ratio=0.0), settings, splats, views,
-            protected=given.protected, removed=given.removed,
-        )  # fmt: skip
-        for level in each_level(scene, levels, progress=progress, threads=threads):
-            if level.number == 1:
-                # From here on files of an earlier run are replaced, so its manifest goes first.
-                before = _unlisted(folder) if overwrite else []
-                distances = [short(far) for far, _ in level.reach.psnr]
-                seen, notes = seen_by(level.scores), scoring_notes(level.scores)
-                seen["splats"] |= {"before": len(file), **given.counts()}
-            path = paths[level.number - 1]
-            facts, found = _write(file, level, path, overwrite=overwrite)
-            written.append(path)
-            remarks[level.asked] = level.remark
-            notes += [note for note in found if note not in notes]
-            entries.append({**level.facts(goal), **facts})
-        notes += levels.notes(remarks)
-        notes += _remove(set(before) - set(written), source)
-        clock.lap("levels_s")
-        facts = {
-            "lod": 1,
-            "source": {"file": source.name, "bytes": file.stored_bytes},
-            **seen,
-            "distances": distances,
-            "nested": not levels.absorb,
-            "goal_psnr": goal,
-            "levels": entries,
-        }
-        with whole_file(folder / MANIFEST, overwrite=overwrite) as stream:
-            stream.write(json.dumps(facts, indent=2, allow_nan=False).encode() + b"\n")
-    clock.stop()
-    return {
-        **facts,
-        "files": {"input": str(source), "folder": str(folder), "manifest": MANIFEST},
-        "settings": asdict(settings),
-        "volumes": list(given.facts),
-        "timings": clock.timings,
-        "notes": notes,
-    }
+    sink = LevelSink(expanded(source), expanded(folder), request)
+    read = FileSource(source, request.zones)
+    return run(read, request, sink, progress=progress, threads=threads).report
 
 
 def _write(
-    file: SplatFile, level: Level, path: Path, *, overwrite: bool
+    loaded: Loaded, level: Level, path: Path, *, overwrite: bool
 ) -> tuple[dict[str, Any], list[str]]:
     """Write the file of a level; return what the manifest says of it, and sentences."""
-    made = as_written(file, path)
-    columns = survivor_columns(file.rows, level.absorbed) if level.absorbed else {}
-    made.write(path, level.keep, columns=columns, overwrite=overwrite)
+    made = as_written(loaded.file(), path)
+    made.write(path, level.keep, columns=loaded.columns(level.absorbed), overwrite=overwrite)
     counts = held(made, level.keep)
     facts = {
         "splats": counts["written"],
@@ -215,34 +322,3 @@ def _remove(paths: Iterable[Path], source: Path) -> list[str]:
         except OSError as error:
             notes.append(f"{path.name} of the run before is not removed ({error.strerror})")
     return notes
-
-
-@contextlib.contextmanager
-def _new_files(folder: Path, paths: list[Path], *, overwrite: bool) -> Iterator[list[Path]]:
-    """Make a folder for files; if the block fails, remove those that it wrote anew.
-
-    Yields
-    ------
-    list of Path
-        To be filled with what was written.
-
-    Raises
-    ------
-    RefineError
-        If the folder cannot be made, or a file exists and may not be replaced.
-    """
-    written: list[Path] = []
-    there = make_folder(folder)
-    try:
-        for path in paths:
-            refuse_existing(path, overwrite=overwrite)
-        old = [path for path in paths if mode_of(path)]
-        yield written
-    except BaseException:
-        with contextlib.suppress(OSError):
-            for path in written:
-                if path not in old:
-                    path.unlink()
-            if not there:
-                folder.rmdir()
-        raise

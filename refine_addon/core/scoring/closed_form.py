@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from ..splats import Splats
     from ..views import ViewSet
-    from .closed_form_block import Crowds
+    from .closed_form_block import NeighbourhoodSums
 
     Each = Callable[..., Iterable[Any]]
 
@@ -86,17 +86,17 @@ def score(
         RowBlock(splats.take(slice(start, start + ROWS)), views, settings, middle, threads=threads)
         for start in range(0, total, ROWS)
     ]
-    done, whole = 0.0, progress
+    done = 0.0
 
     def each(step: str, *arguments: Any) -> Iterator[Any]:  # noqa: ANN401 - of each step its own
         nonlocal done
         share = SHARES[step] / len(blocks)
         for block in blocks:
-            block.progress = part(whole, done, done + share)
+            block.progress = part(progress, done, done + share)
             yield block.step(step, *arguments)
             done += share
 
-    found = steps(each, total, views, settings)
+    scene = steps(each, total, views, settings)
     values, seen = (
         np.concatenate([getattr(block, name) for block in blocks]) for name in ("values", "seen")
     )
@@ -104,16 +104,16 @@ def score(
         values=values,
         seen=seen,
         views_used=len(views),
-        undrawable=found.undrawable,
-        facts=found.facts,
+        undrawable=scene.undrawable,
+        facts=scene.facts,
         method="closed-form",
         frustum=settings.frustum,
     )
 
 
 @dataclass(frozen=True)
-class Found:
-    """What the steps found out of all splats.
+class SceneFacts:
+    """What the steps tell of all splats together.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ def steps(
     settings: ClosedForm,
     *,
     remember: Callable[[str, Callable[[], Any]], Any] = lambda _name, make: make(),
-) -> Found:
+) -> SceneFacts:
     """Score splats block by block; each `RowBlock` has its scores afterwards.
 
     Parameters
@@ -179,10 +179,8 @@ def steps(
         )
         raise RefineError(msg)
     statistics = _statistics(tallies)
-    lambdas = (1 / 3, 1 / 3, 1 / 3)
-    if not settings.equal_weights:
-        lambdas = adaptive.lambdas(statistics, offset=settings.anisotropy_offset or 0.0)
-    means = np.sum(sums[:, :3], axis=0) / total
+    lambdas = _lambdas(statistics, settings)
+    means = np.sum(sums[:, :3], axis=0) / total  # of H G, for each of the three G
     factors = np.divide(lambdas, means, out=np.zeros(3), where=means > 0.0)
     powers, overall = _powers(each("add", factors), local=settings.local)
     for _ in each("compare", powers, overall):
@@ -191,7 +189,14 @@ def steps(
         "lambda": dict(zip(adaptive.TERMS, lambdas, strict=True)),
         "statistics": vars(statistics).copy(),
     }
-    return Found(total - good, float(size), facts)
+    return SceneFacts(total - good, float(size), facts)
+
+
+def _lambdas(statistics: adaptive.Statistics, settings: ClosedForm) -> tuple[float, float, float]:
+    """Return lambda of geometry, colour and opacity."""
+    if settings.equal_weights:
+        return (1 / 3, 1 / 3, 1 / 3)
+    return adaptive.lambdas(statistics, offset=settings.anisotropy_offset or 0.0)
 
 
 def _frame(
@@ -227,17 +232,17 @@ def _frame(
 
 
 def _powers(
-    crowds: Iterable[Crowds | None], *, local: bool
+    neighbourhoods: Iterable[NeighbourhoodSums | None], *, local: bool
 ) -> tuple[NDArray[np.float64] | None, float]:
     """Return the powers of `RowBlock.compare`, and the mean score of all."""
     if not local:
-        for _ in crowds:
+        for _ in neighbourhoods:
             pass
         return None, 0.0
     powers, count, end = np.zeros(CELLS**3), np.zeros(CELLS**3, np.int64), 0
-    for crowd in crowds:
-        assert crowd is not None  # noqa: S101 - as blocks are told
-        cells, sums, counts = crowd
+    for of_block in neighbourhoods:
+        assert of_block is not None  # noqa: S101 - as blocks are told
+        cells, sums, counts = of_block
         powers[cells] += sums
         count[cells] += counts
         end = max(end, int(cells[-1]) + 1)

@@ -81,8 +81,8 @@ class Frame(NamedTuple):
     near: float
 
 
-class Crowds(NamedTuple):
-    """Neighbourhoods, those of them that occur.
+class NeighbourhoodSums(NamedTuple):
+    """Sums over the neighbourhoods that occur in a block.
 
     Attributes
     ----------
@@ -246,12 +246,12 @@ class RowBlock:
         self.means = np.empty((count, 3), kind)
         self.squared, self.alpha, self.area, self.reach = (np.empty(count) for _ in range(4))
         self.luma = np.empty(count, np.float32)
-        found = for_chunks(
+        statistics = for_chunks(
             self._read, count, 4 * _CHUNK,
             progress=self.progress, what="reading", threads=self.threads,
         )  # fmt: skip
         self.splats = None
-        tallies, moments = zip(*found, strict=True)
+        tallies, moments = zip(*statistics, strict=True)
         return np.array(tallies), np.array(moments), *self.count([0], HIGHEST)
 
     def _read(self, piece: slice) -> tuple[tuple[float, ...], NDArray[np.float64]]:
@@ -332,20 +332,24 @@ class RowBlock:
         self.visibility = np.empty(count)
         self.seen = np.empty(count, np.int32)
         self.cells = np.zeros(count, np.int32)
-        look, sums = part(self.progress, 0.0, 0.9), part(self.progress, 0.9, 1.0)
         # Without a frustum every view counts for all, wherever they lie.
         order = near_order(self.means) if self.settings.frustum else np.arange(count)
         for_chunks(
-            partial(self._look, order), count, 8 * _CHUNK,
-            progress=look, what="scoring", threads=self.threads,
+            partial(self._sum_visibility, order), count, 8 * _CHUNK,
+            progress=part(self.progress, 0.0, 0.9), what="scoring", threads=self.threads,
         )  # fmt: skip
         return np.array(
             for_chunks(
-                self._sum, count, _CHUNK, progress=sums, what="scoring", threads=self.threads
+                self._sum,
+                count,
+                _CHUNK,
+                progress=part(self.progress, 0.9, 1.0),
+                what="scoring",
+                threads=self.threads,
             )
         )
 
-    def _look(self, order: NDArray[np.int64], piece: slice) -> None:
+    def _sum_visibility(self, order: NDArray[np.int64], piece: slice) -> None:
         """Set H before alpha, and in how many views each splat lies, of a slice of an order.
 
         Splats of a run lie near each other, so most views see none of them, and many see all.
@@ -359,22 +363,22 @@ class RowBlock:
         low, high = (each.reduceat(points[:3], starts, axis=1) for each in (np.minimum, np.maximum))
         visibility, seen = np.empty(len(rows)), np.empty(len(rows), np.int32)
         with np.errstate(under="ignore"):
-            some, whole = self.frustums.look(low, high, np.maximum.reduceat(reach, starts))
+            touching, whole = self.frustums.classify(low, high, np.maximum.reduceat(reach, starts))
             if not self.settings.frustum:
-                some[:] = whole[:] = True
+                touching[:] = whole[:] = True
             # Views of which a run is partly outside come first, then those that see all of it.
-            views = np.argsort(whole * 1 - some * 2, axis=0, kind="stable")  # (V, runs)
-            counts = np.count_nonzero(some, axis=0).tolist()
-            partly = np.count_nonzero(some & ~whole, axis=0).tolist()
+            views = np.argsort(whole * 1 - touching * 2, axis=0, kind="stable")  # (V, runs)
+            counts = np.count_nonzero(touching, axis=0).tolist()
+            partly = np.count_nonzero(touching & ~whole, axis=0).tolist()
             for run, start in enumerate(starts.tolist()):
                 here = slice(start, start + _RUN)
-                visibility[here], seen[here] = self._run(
+                visibility[here], seen[here] = self._visibility_of_run(
                     points[:, here], reach[here], views[: counts[run], run], partly[run]
                 )
         self.visibility[rows] = visibility
         self.seen[rows] = seen
 
-    def _run(
+    def _visibility_of_run(
         self,
         points: NDArray[np.float64],
         reach: NDArray[np.float64],
@@ -394,21 +398,21 @@ class RowBlock:
         total = np.zeros(points.shape[1])  # (n,), H before alpha
         seen = np.full(points.shape[1], len(views) - partly, np.int32)
         for start in range(0, len(views), _VIEW_BLOCK):
-            block = views[start : start + _VIEW_BLOCK]
-            count = min(max(partly - start, 0), len(block))
-            depth, beyond, between = self.frustums.project(points, block, count)
+            some_views = views[start : start + _VIEW_BLOCK]
+            count = min(max(partly - start, 0), len(some_views))
+            depth, beyond, between = self.frustums.project(points, some_views, count)
             inside = fringe = None
             if count:
                 inside = beyond <= 0.0  # (c, n)
                 inside &= between
-                fringe = self._fringe(depth, beyond, between > inside, reach, block[:count])
+                fringe = self._fringe(depth, beyond, between > inside, reach, some_views[:count])
                 # A byte can count the at most 64 views of a block.
                 seen += np.add.reduce(inside.view(np.uint8), axis=0, dtype=np.uint8)
-            total += self._block(points, depth, inside, fringe, block)
+            total += self._visibility_from(points, depth, inside, fringe, some_views)
         return total, seen
 
     def _sum(self, piece: slice) -> list[float]:
-        """Make H of what `_look` left, and return its sums; see `sum_views`."""
+        """Make H of what `_sum_visibility` left, and return its sums; see `sum_views`."""
         points = np.empty((3, piece.stop - piece.start))
         np.subtract(self.means[piece].T, self.origin[:, None], out=points)
         visibility, good = self.visibility[piece], self.good[piece]
@@ -433,7 +437,7 @@ class RowBlock:
         x, y, z = np.minimum((place + CELLS / 2).astype(np.int32), CELLS - 1)
         return np.asarray((x * CELLS + y) * CELLS + z)
 
-    def _block(
+    def _visibility_from(
         self,
         points: NDArray[np.float64],
         depth: NDArray[np.float64],
@@ -498,12 +502,12 @@ class RowBlock:
             depth += np.multiply(step, step, out=step)
         return depth
 
-    def add(self, factors: NDArray[np.float64]) -> Crowds | None:
+    def add(self, factors: NDArray[np.float64]) -> NeighbourhoodSums | None:
         """Set the scores: the sum of the three terms, each times its factor.
 
         Returns
         -------
-        Crowds or None
+        NeighbourhoodSums or None
             None where splats are not compared with those around them.
         """
         self.plain = np.empty(len(self.good), np.float32)
@@ -512,10 +516,10 @@ class RowBlock:
             return None
         sums = np.bincount(self.cells, self.plain).astype(np.float64, copy=False)
         counts = np.bincount(self.cells)
-        there = np.flatnonzero(counts).astype(np.int32)
+        cells = np.flatnonzero(counts).astype(np.int32)
         if not self.good.all():
             counts = np.bincount(self.cells, self.good).astype(np.int64)
-        return Crowds(there, sums[there], counts[there])
+        return NeighbourhoodSums(cells, sums[cells], counts[cells])
 
     def _add(self, factors: NDArray[np.float64], piece: slice) -> None:
         visibility = self.visibility[piece]

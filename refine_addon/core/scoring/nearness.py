@@ -35,8 +35,8 @@ def near_order(means: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
     (N,) int64
         Those of a cell, and those beyond the same face of the grid, keep their order.
     """
-    some = means[:: max(len(means) // _SAMPLE, 1)].astype(np.float64)
-    low, high = np.quantile(some, _MOST, axis=0)  # (3,) each
+    sample = means[:: max(len(means) // _SAMPLE, 1)].astype(np.float64)
+    low, high = np.quantile(sample, _MOST, axis=0)  # (3,) each
     # Cubes: a run is about as wide as high, however flat the scene.
     scale = (1 << _BITS) / max(float(np.max(high - low)), _LEAST_SPAN)
     cell = np.zeros(len(means), np.uint16)
@@ -73,8 +73,8 @@ def _places() -> NDArray[np.uint16]:
     for bit in range(_BITS - 1, 0, -1):
         turns ^= np.where(axes[2] >> bit & 1, (1 << bit) - 1, 0)
     axes ^= turns
-    found = np.zeros_like(cells)
+    places = np.zeros_like(cells)
     for bit in range(_BITS - 1, -1, -1):
         for axis in axes:
-            found = found << 1 | axis >> bit & 1
-    return found.astype(np.uint16)
+            places = places << 1 | axis >> bit & 1
+    return places.astype(np.uint16)

@@ -13,6 +13,7 @@ from ..work import checkpoint
 from .rays import Rays
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
     from typing import Any
 
     from numpy.typing import NDArray
@@ -82,30 +83,69 @@ def cast(footprints: Footprints, columns: NDArray[np.int64], rows: NDArray[np.in
     columns, rows : (C,), (R,) int64
         See `Rays`; ascending.
     """
+    pieces = [_compact(np.empty(0), np.empty(0), np.empty(0))]
+    pieces += [_compact(*piece) for piece in hits(footprints, columns, rows, _PAIRS)]
+    footprint, ray, alpha = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
+    order = np.argsort(ray, kind="stable")  # footprints are front to back, and so stay hits
+    hit, owner = _members(footprints.index, footprint.take(order))
+    alpha = alpha.take(order)
+    return Rays(
+        columns, rows, ray.take(order).astype(np.int32), owner, alpha, np.log1p(-alpha), hit
+    )
+
+
+def hits(
+    footprints: Footprints,
+    columns: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    limit: int,
+    see_through: Callable[[NDArray[np.int32]], NDArray[np.bool_]] | None = None,
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]]:
+    """Yield which pixels footprints hit, some footprints at a time.
+
+    Parameters
+    ----------
+    footprints : Footprints
+        Front to back.
+    columns, rows : (C,), (R,) int64
+        Of the pixels; ascending.
+    limit : int
+        About how many pairs of a footprint and a pixel in its bounding box are looked at together,
+        which limits temporary memory.
+    see_through : callable, optional
+        Which of some pixels are of interest still, (p,) bool; by default all.
+
+    Yields
+    ------
+    footprint : (h,) int64
+        Row of the footprint, ascending.
+    pixel : (h,) int32
+        Number of the pixel, row by row.
+    alpha : (h,) float32
+        Of the footprint there, at most `ALPHA_MAX`.
+    """
     reach = squared_reach(footprints.alphas)  # (n,)
     # Of each footprint: the first column and row in its bounding box, and how many lie in it.
-    (left, wide), (top, tall) = (
+    across, down = (
         boxes(footprints, reach, axis, places) for axis, places in enumerate((columns, rows))
     )
-    boxed = np.flatnonzero(wide * tall > 0)  # (r,)
-    hits = [_hits(np.empty(0), np.empty(0), np.empty(0))]
-    for start, end in slices((wide * tall)[boxed], _PAIRS):
+    boxed = np.flatnonzero(across[1] * down[1] > 0)  # (r,)
+    for start, end in _slices((across[1] * down[1])[boxed], limit):
         checkpoint()
-        owner, column, row = boxed_pixels(boxed[start:end], (left, wide), (top, tall))
+        owner, column, row = boxed_pixels(boxed[start:end], across, down)
+        pixel = row * np.int32(len(columns)) + column
+        if see_through is not None:
+            left = np.flatnonzero(see_through(pixel))
+            owner, pixel = owner[left], pixel[left]
+            column, row = column[left], row[left]
         squared = mahalanobis(footprints, owner, columns.take(column), rows.take(row))
         inside = np.flatnonzero(squared < reach.take(owner))
         owner = owner[inside]
-        alpha = footprints.alphas.take(owner) * np.exp(squared[inside] / -2.0)
-        hits.append(_hits(owner, row[inside] * len(columns) + column[inside], alpha))
-    footprint, ray, alphas = (np.concatenate(arrays) for arrays in zip(*hits, strict=True))
-    order = np.argsort(ray, kind="stable")  # footprints are front to back, and so stay hits
-    hit, place = _members(footprints.index, footprint.take(order))
-    alphas = np.minimum(alphas.take(order), np.float32(ALPHA_MAX))
-    ray = ray.take(order).astype(np.int32)
-    return Rays(columns, rows, ray, place, alphas, np.log1p(-alphas), hit)
+        alpha = footprints.alphas.take(owner) * np.exp(squared[inside] / np.float32(-2.0))
+        yield owner, pixel[inside], np.minimum(alpha, np.float32(ALPHA_MAX))
 
 
-def _hits(
+def _compact(
     owner: NDArray[Any], ray: NDArray[Any], alpha: NDArray[Any]
 ) -> tuple[NDArray[np.int32], NDArray[np.uint16], NDArray[np.float32]]:
     """Return hits in the smallest types that hold them.
@@ -115,7 +155,7 @@ def _hits(
     return owner.astype(np.int32), ray.astype(np.uint16), alpha.astype(np.float32)
 
 
-def slices(sizes: NDArray[np.int64], limit: int) -> list[tuple[int, int]]:
+def _slices(sizes: NDArray[np.int64], limit: int) -> list[tuple[int, int]]:
     """Return slices of consecutive groups, (r,) sizes, with about `limit` members each."""
     ends = np.cumsum(sizes, dtype=np.int64)
     if not len(ends):

@@ -117,12 +117,12 @@ class Frustums:
         self._near, self._far = planes[:, :1], planes[:, 1:]
         self._ends = bool(np.isfinite(self._far).any())
         # One buffer a thread is reused, since allocating one costs as much as the product.
-        self._own = threading.local()
+        self._buffers = threading.local()
 
-    def look(
+    def classify(
         self, low: NDArray[np.float64], high: NDArray[np.float64], reach: NDArray[np.float64]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return which views may see something of boxes, and which surely see all of them.
+        """Return which views may see a part of some boxes, and which surely see all of them.
 
         Parameters
         ----------
@@ -133,7 +133,7 @@ class Frustums:
 
         Returns
         -------
-        some : (V, k) bool
+        touching : (V, k) bool
             Where it is False, each point of the box lies beyond a plane, or ``beyond`` of `project`
             is at least `reach` times `steepness`.
         whole : (V, k) bool
@@ -153,9 +153,9 @@ class Frustums:
             most.append(at + around)
         near, far = self._near, self._far
         outside = np.maximum.reduce(least[:4])
-        some = (outside < reach * self.steepness) & (most[4] >= near) & (least[4] <= far)
+        touching = (outside < reach * self.steepness) & (most[4] >= near) & (least[4] <= far)
         whole = (np.maximum.reduce(most[:4]) <= 0.0) & (least[4] >= near) & (most[4] <= far)
-        return some, whole
+        return touching, whole
 
     def project(
         self, points: NDArray[np.float64], views: NDArray[np.int64], count: int
@@ -203,9 +203,9 @@ class Frustums:
     def _memory(self, shape: tuple[int, ...]) -> NDArray[np.float64]:
         """Return this thread's buffer in a shape; its content is arbitrary."""
         size = math.prod(shape)
-        held: NDArray[np.float64] | None = getattr(self._own, "memory", None)
+        held: NDArray[np.float64] | None = getattr(self._buffers, "memory", None)
         if held is None or held.size < size:
-            held = self._own.memory = np.empty(size)
+            held = self._buffers.memory = np.empty(size)
         return held[:size].reshape(shape)
 
 
@@ -235,20 +235,22 @@ def census(
     """
     origin = views.middle()[0]
     frustums = Frustums(views, origin, float(np.finfo(np.float64).tiny))
-    found = np.zeros((-(-len(points) // _POINTS), len(views)), np.int64)
-    every = np.arange(len(views))
+    counts = np.zeros((-(-len(points) // _POINTS), len(views)), np.int64)
+    numbers = np.arange(len(views))
 
-    def work(piece: slice) -> None:
+    def count_in_views(piece: slice) -> None:
         local = np.ones((4, min(piece.stop, len(points)) - piece.start))
         with np.errstate(invalid="ignore", over="ignore", under="ignore"):
             local[:3] = (points[piece] - origin).T
             local[:, ~np.isfinite(local).all(axis=0)] = np.nan
-            _, beyond, between = frustums.project(local, every, len(every))
+            _, beyond, between = frustums.project(local, numbers, len(numbers))
             inside = between & (beyond <= 0.0)
-        found[piece.start // _POINTS] = np.count_nonzero(inside, axis=1)
+        counts[piece.start // _POINTS] = np.count_nonzero(inside, axis=1)
 
-    for_chunks(work, len(points), _POINTS, progress=progress, what="counting", threads=threads)
-    return np.asarray(found.sum(axis=0))
+    for_chunks(
+        count_in_views, len(points), _POINTS, progress=progress, what="counting", threads=threads
+    )
+    return np.asarray(counts.sum(axis=0))
 
 
 def _rows(views: ViewSet, centers: NDArray[np.float64]) -> NDArray[np.float64]:

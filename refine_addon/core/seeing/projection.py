@@ -34,6 +34,9 @@ _LOG_SCALE_RANGE = (-16.0, 5.0)  # relative to the size of the scene; keeps floa
 _LARGEST_VARIANCE = 1e12  # px^2; a footprint a million pixels wide is flat over any image
 _FARTHEST_VIEW = 1e18  # scene sizes; a view farther away sees the scene as one point
 _LARGEST_LENS = 1e9  # px; beyond this or `_FARTHEST_VIEW` float32 would overflow
+_NEAREST = 1e-5  # scene sizes; nearer footprints could overflow float32, and no renderer draws them
+_NO_END = 1e30  # scene sizes; farther than any splat, and still in float32's range
+_SLACK = 1e-4  # of a coordinate; far more than rounding moves a mean by
 _BEYOND = 0.15  # of the image's size; farther outside, the projection is linearised at this edge
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
@@ -125,35 +128,37 @@ def prepare(
     good : (N,) bool
         Which splats can be drawn.
     """
-    good, opaque = judge(splats, progress=part(progress, 0.0, 0.4), threads=threads)
+    good, opaque = classify(splats, progress=part(progress, 0.0, 0.4), threads=threads)
     scene = scene_of(splats.means, good, views)
     report(progress, 0.4, "reading")
-    index, place = near(splats, opaque, scene)
+    index, place = near_scene(splats, opaque, scene)
     report(progress, 0.4, "reading")
     order = spatial_order(place, lambda rows: splat_fingerprint(splats, index[rows]))
-    ahead = part(progress, 0.4, 1.0)
-    return activate(splats, index[order], place[order], scene, ahead, threads), scene, good
+    gaussians = activate(
+        splats, index[order], place[order], scene, part(progress, 0.4, 1.0), threads
+    )
+    return gaussians, scene, good
 
 
-def judge(
+def classify(
     splats: Splats, *, progress: Progress = silent, threads: int | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return which splats can be drawn, and which of these exceed `ALPHA_CUT`, (N,) each."""
     good, opaque = np.empty((2, len(splats)), np.bool_)
 
-    def look(piece: slice) -> None:
+    def classify_chunk(piece: slice) -> None:
         chunk = splats.take(piece)
         good[piece] = drawable(chunk)
         logits = np.where(good[piece], chunk.opacity_logits, -np.inf)
         opaque[piece] = opacity(logits) > ALPHA_CUT
 
     for_chunks(
-        look, len(splats), 4 * _CHUNK, progress=progress, what="reading", threads=threads
+        classify_chunk, len(splats), 4 * _CHUNK, progress=progress, what="reading", threads=threads
     )  # fmt: skip
     return good, opaque
 
 
-def near(
+def near_scene(
     splats: Splats, opaque: NDArray[np.bool_], scene: Scene
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the rows of opaque splats that are not too far away, (M,), and their places, (M, 3).
@@ -237,7 +242,7 @@ def reaching(
     Depths are along the view's axis, in scene sizes.
     """
     if not _computable(scene, view):
-        return _together([])
+        return _joined([])
     planes = clip_planes(scene, view)
     rotation = _rotation6(view.rotation @ scene.axes.T)
     pieces = []
@@ -253,9 +258,9 @@ def reaching(
             index = touching + start
             alphas = gaussians.alphas.take(index)
             centers, major, minor, sigmas = _ellipses(local, shape, view)
-            found = Footprints(index, centers, major, minor, sigmas, inside, alphas)
-            pieces.append((found, local[2]))
-    return _together(pieces)
+            footprints = Footprints(index, centers, major, minor, sigmas, inside, alphas)
+            pieces.append((footprints, local[2]))
+    return _joined(pieces)
 
 
 def front_to_back(pieces: Sequence[tuple[Footprints, NDArray[np.float32]]]) -> Footprints:
@@ -266,23 +271,23 @@ def front_to_back(pieces: Sequence[tuple[Footprints, NDArray[np.float32]]]) -> F
     pieces : sequence of Footprints, (n,) float32
         As `reaching` returns them.
     """
-    found, depth = _together(pieces)
+    footprints, depth = _joined(pieces)
     checkpoint()
-    return found.take(_by_depth(depth))
+    return footprints.take(_by_depth(depth))
 
 
-def _together(
+def _joined(
     pieces: Sequence[tuple[Footprints, NDArray[np.float32]]],
 ) -> tuple[Footprints, NDArray[np.float32]]:
     """Return the footprints of all pieces as one, and their depths."""
     if len(pieces) == 1:
         return pieces[0]
-    every = [_NOTHING, *(found for found, _ in pieces)]
-    joined = (
-        np.concatenate([getattr(found, item.name) for found in every], axis=-1)
+    every = [_NOTHING, *(footprints for footprints, _ in pieces)]
+    arrays = (
+        np.concatenate([getattr(footprints, item.name) for footprints in every], axis=-1)
         for item in fields(Footprints)
     )
-    return Footprints(*joined), np.concatenate([_NONE[0], *(depth for _, depth in pieces)])
+    return Footprints(*arrays), np.concatenate([_NONE[0], *(depth for _, depth in pieces)])
 
 
 def in_camera(
@@ -304,8 +309,7 @@ def _computable(scene: Scene, view: View) -> bool:
 def clip_planes(scene: Scene, view: View) -> tuple[float, float]:
     """Return near and far plane in scene sizes."""
     near, far = frustum.clip_planes(view, NEAR_RELATIVE * scene.size)
-    # Footprints of splats nearer than 1e-5 could overflow float32; no renderer draws them.
-    return min(max(near / scene.size, 1e-5), 1e30), min(far / scene.size, 1e30)
+    return min(max(near / scene.size, _NEAREST), _NO_END), min(far / scene.size, _NO_END)
 
 
 def _local(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.float32]:
@@ -353,8 +357,7 @@ def boxes_touch(boxes: NDArray[np.float32], scene: Scene, view: View) -> NDArray
     corners = np.stack([boxes[:, place] for place in places], axis=-1)  # (B, 3, 8)
     local = _local(np.moveaxis(corners, 1, 0).reshape(3, -1), scene, view)
     x, y, z = local.reshape(3, len(boxes), 8).astype(np.float64)
-    # Rounding moves a mean by far less than this.
-    slack = 1e-4 * (1.0 + np.abs(local).max(axis=0).reshape(len(boxes), 8).max(axis=1))
+    slack = _SLACK * (1.0 + np.abs(local).max(axis=0).reshape(len(boxes), 8).max(axis=1))
     touching: NDArray[np.bool_] = (z.max(axis=1) + slack >= near) & (z.min(axis=1) - slack <= far)
     for coordinate, side in zip((x, y), frustum.image_sides(view), strict=True):
         reach = _reach(side) * (boxes[:, 6].astype(np.float64) + slack)

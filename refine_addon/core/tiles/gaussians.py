@@ -122,9 +122,9 @@ class ActivateSplats:
         self, context: SceneContext, progress: Progress, threads: int | None
     ) -> NDArray[np.int64]:
         splats, scene = self.source.splats(), context.scene
-        good, opaque = projection.judge(splats, threads=threads)
+        good, opaque = projection.classify(splats, threads=threads)
         with np.errstate(under="ignore"):
-            rows, place = projection.near(splats, opaque, scene)
+            rows, place = projection.near_scene(splats, opaque, scene)
             activated = projection.activate(splats, rows, place, scene, progress, threads)
             code = spatial_code(place)
         table = np.empty((len(rows), 14), np.float32)

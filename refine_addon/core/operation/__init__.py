@@ -1,0 +1,1 @@
+"""One way through for every operation on splats: refuse, read, decide, write, report (`run`)."""

@@ -1,0 +1,204 @@
+"""Operations from a file to a file."""
+
+from __future__ import annotations
+
+import contextlib
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from ..formats.registry import as_written, format_named, read_splats
+from ..report import Files, held
+from ..volumes import forced
+from ..whole_file import expanded, refuse_existing, refuse_mapped
+from ..work import Progress, report, silent
+from .loaded import Loaded, RowSizes
+from .prune import DECIDED
+from .run import Written, run
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from ..absorbing.absorb import Absorbed
+    from ..formats.format import Format
+    from ..task import Result
+    from ..volumes import Zone
+    from .prune import PruneRequest
+    from .run import Runtime
+
+
+def prune_file(
+    source: Path | str,
+    output: Path | str | None,
+    request: PruneRequest,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Result:
+    """Prune a file of splats, and write the result to another file.
+
+    Parameters
+    ----------
+    source : path-like
+        The file to read, of any format (`read_splats`).
+    output : path-like or None
+        The file to write, in the format that its suffix names; None decides without writing, as for
+        a plain PLY.
+    request : PruneRequest
+        What is asked.
+    progress, threads
+        See `run`.
+
+    Returns
+    -------
+    Result
+        Its report also has the names and sizes of the files.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `run`, `FileSource`, `FileSink` and `PruneRequest`. Nothing is written then, unless the
+        message says so.
+
+    Examples
+    --------
+    To leave half of the splats, with what they absorbed::
+
+        prune_file("in.ply", "out.ply", PruneRequest(views, Budget(ratio=0.5), absorb=True))
+    """
+    sink = FileSink(
+        None if output is None else expanded(output),
+        source=expanded(source),
+        overwrite=request.overwrite,
+        dry_run=request.dry_run,
+    )
+    return run(FileSource(source, request.zones), request, sink, progress=progress, threads=threads)
+
+
+@dataclass(frozen=True)
+class FileSource:
+    """Splats of a file.
+
+    Attributes
+    ----------
+    path : path-like
+    zones : sequence of Zone
+        Volumes that say which splats must stay and which must go.
+    """
+
+    path: Path | str
+    zones: Sequence[Zone] = ()
+
+    def read(self, form: Format | None) -> Loaded:
+        """Read the file; its frame is that of the views.
+
+        Raises
+        ------
+        RefineError
+            See `read_splats` and `volumes.forced`.
+        """
+        file = read_splats(self.path)
+        splats = file.splats()
+        return Loaded(
+            name=str(file.path),
+            bytes=file.stored_bytes,
+            splats=splats,
+            forced=forced(self.zones, splats.means),
+            sizes=RowSizes.of(file, form),
+            stored=file.rows,
+            file=lambda: file,
+            matrix=np.eye(4),
+        )
+
+
+class Choice(Protocol):
+    """Which splats stay, and as what."""
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """What the report says of it."""
+        ...
+
+    @property
+    def keep(self) -> NDArray[np.bool_]:
+        """Which splats stay, (N,)."""
+        ...
+
+    @property
+    def absorbed(self) -> Absorbed | None:
+        """What survivors became, where they absorbed others."""
+        ...
+
+
+@dataclass(frozen=True)
+class FileSink:
+    """A file to be made of what stays.
+
+    Attributes
+    ----------
+    path : Path or None
+        Its suffix names the format. None writes nothing.
+    source : Path or None
+        The file that is read meanwhile, if it is one.
+    overwrite : bool
+        Whether a file may be replaced.
+    dry_run : bool
+        Whether to tell sizes and counts as of the file, and write nothing.
+    """
+
+    path: Path | None
+    source: Path | None = None
+    overwrite: bool = False
+    dry_run: bool = False
+    timing: str = "write_s"
+
+    @property
+    def form(self) -> Format | None:
+        """Its format; None is plain PLY."""
+        return None if self.path is None else format_named(self.path)
+
+    @property
+    def written(self) -> Path | None:
+        """The file that is made, if one is."""
+        return None if self.dry_run else self.path
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[None]:
+        """Refuse a file that cannot be written, before the work.
+
+        Raises
+        ------
+        RefineError
+            See `refuse_existing` and `refuse_mapped`.
+        """
+        if self.written is not None:
+            refuse_existing(self.written, overwrite=self.overwrite)
+            if self.source is not None:
+                refuse_mapped(self.written, self.source)
+        yield
+
+    def write(self, loaded: Loaded, choice: Choice, runtime: Runtime) -> Written:
+        """Write what stays: all of it, or nothing.
+
+        Raises
+        ------
+        RefineError, Cancelled
+            See `SplatFile.write`.
+        """
+        report(runtime.progress, DECIDED, "writing")
+        made = as_written(loaded.file(), self.path)
+        columns = loaded.columns(choice.absorbed)
+        path, size = self.written, made.size(choice.keep, columns)
+        if path is not None:
+            made.write(path, choice.keep, columns=columns, overwrite=self.overwrite)
+            size = path.stat().st_size
+        return Written(
+            files=asdict(Files(loaded.name, str(path) if path else None, loaded.bytes, size)),
+            path=path,
+            splats=held(made, choice.keep, written=path is not None),
+            notes=made.notes(choice.keep),
+        )

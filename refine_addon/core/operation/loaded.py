@@ -1,0 +1,128 @@
+"""The splats of a source in memory, with what they are rows of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..formats.registry import Packed
+from ..survivors import survivor_columns
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from ..absorbing.absorb import Absorbed
+    from ..formats.format import Format
+    from ..formats.ply import SplatFile
+    from ..selection import Budget, RowBytes
+    from ..splats import Splats
+    from ..survivors import Columns
+    from ..volumes import Forced
+
+
+@dataclass(frozen=True, eq=False)
+class RowSizes:
+    """How many bytes splats take in a file.
+
+    Attributes
+    ----------
+    row : float or (N,) int64
+        Of one splat, or of each of them where rows are text.
+    changed : float
+        Most bytes of one splat whose numbers absorbing may have changed.
+    fixed : int
+        Of everything else in the file.
+    """
+
+    row: RowBytes
+    changed: float
+    fixed: int
+
+    @classmethod
+    def of(cls, file: SplatFile, form: Format | None) -> RowSizes:
+        """Return those of a file's splats in a format; None is plain PLY."""
+        writer = file if form is None else Packed(file, form)
+        return cls(writer.row_bytes, writer.changed_row_bytes, writer.fixed_bytes)
+
+    def take(self, rows: NDArray[np.bool_]) -> RowSizes:
+        """Return those of some of the splats, (N,) bool."""
+        return replace(self, row=self.row[rows]) if isinstance(self.row, np.ndarray) else self
+
+
+@dataclass(frozen=True, eq=False)
+class Loaded:
+    """Splats of a source.
+
+    Attributes
+    ----------
+    name : str
+        What the report calls the source.
+    bytes : int
+        Its size.
+    splats : Splats
+        The N splats, in the frame of the views.
+    forced : Forced
+        Which of them must stay, and which must go.
+    sizes : RowSizes
+        In the format of the output.
+    stored : mapping of str to (N,), or structured array
+        The properties of the splats, in the frame of the source.
+    file : callable
+        Returns the source as the file that is written, in the frame of the source.
+    matrix : (4, 4) float64
+        From that frame to that of the views.
+    remarks : tuple of str
+        What the user should know about the source, in sentences.
+    reusable : bool
+        Whether the scores are kept for other budgets; see `Task`.
+    """
+
+    name: str
+    bytes: int
+    splats: Splats
+    forced: Forced
+    sizes: RowSizes
+    stored: Columns | NDArray[Any]
+    file: Callable[[], SplatFile]
+    matrix: NDArray[np.float64]
+    remarks: tuple[str, ...] = ()
+    reusable: bool = False
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the report says of what must stay and go."""
+        return {"volumes": list(self.forced.facts)}
+
+    def notes(self) -> list[str]:
+        """Return the remarks."""
+        return [*self.remarks]
+
+    def take(self, rows: NDArray[np.bool_]) -> Loaded:
+        """Return what decides on some of the splats, (N,) bool; `stored` and `file` stay whole."""
+        return replace(
+            self,
+            splats=self.splats.take(rows),
+            forced=self.forced.of(rows),
+            sizes=self.sizes.take(rows),
+        )
+
+    def counted(self, budget: Budget, *, absorb: bool) -> Loaded:
+        """Return this with the bytes of each splat as they count for a budget.
+
+        If survivors absorb others, each may become as long as the longest row of text can.
+        """
+        removed, sizes = self.forced.removed, self.sizes
+        rest = np.ones(len(self.splats), np.bool_) if removed is None else ~removed
+        count = int(np.count_nonzero(rest))
+        if not absorb or budget.removals(count, sizes.take(rest).row, sizes.fixed) == 0:
+            return self
+        return replace(self, sizes=replace(sizes, row=sizes.changed))
+
+    def columns(self, absorbed: Absorbed | None) -> dict[str, NDArray[Any]]:
+        """Return the stored properties with what survivors became; none if nothing was absorbed."""
+        if absorbed is None:
+            return {}
+        return survivor_columns(self.stored, absorbed, np.linalg.inv(self.matrix))

@@ -1,0 +1,194 @@
+"""The way of every operation on splats: refuse, read, decide, write, report.
+
+A request says what is to be done, a source where the splats are, a sink where they go:
+
+| | source | request | sink | in |
+|---|---|---|---|---|
+| `prune_file` | `FileSource` | `PruneRequest` | `FileSink` | `core/operation/files.py` |
+| `lod_file` | `FileSource` | `LevelsRequest` | `LevelSink` | `core/levels/files.py` |
+| `prune_object` | `ObjectSource` | `PruneRequest` | `ObjectSink` | `objects/prune_object.py` |
+| `prune_tiles` | `TileSource` | `TilesRequest` | `TileSink` | `core/tiles/prune.py` |
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from ..report import Clock
+from ..work import Progress, part, silent
+
+if TYPE_CHECKING:
+    from contextlib import AbstractContextManager
+    from pathlib import Path
+
+    from ..formats.format import Format
+
+
+@dataclass(frozen=True, eq=False)
+class Runtime:
+    """What every step of one run is given besides its data.
+
+    Attributes
+    ----------
+    clock : Clock
+        Gets the time of each step.
+    progress : callable
+        ``progress(fraction, what)``; returning ``False`` cancels.
+    threads : int or None
+    """
+
+    clock: Clock
+    progress: Progress = silent
+    threads: int | None = None
+
+    def part(self, start: float, end: float) -> Runtime:
+        """Return this for a step whose progress is `start`..`end` of the whole."""
+        return replace(self, progress=part(self.progress, start, end))
+
+
+@dataclass(frozen=True, eq=False)
+class Written:
+    """What a sink made, for the report.
+
+    Attributes
+    ----------
+    files : dict
+        Names and sizes of what was read and written: ``files`` of the report.
+    path : Path or None
+        The file that holds the splats, if a single one was written.
+    splats : dict of str to int or None
+        Counts to add to ``splats``: how many the files hold.
+    notes : list of str
+        What the user should know about the files.
+    facts : dict
+        Anything else.
+    """
+
+    files: dict[str, Any]
+    path: Path | None = None
+    splats: dict[str, Any] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+class Input(Protocol):
+    """What a source gives."""
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the report says of it."""
+        ...
+
+    def notes(self) -> list[str]:
+        """Return what the user should know about it, in sentences."""
+        ...
+
+
+class Decision(Protocol):
+    """What a request decided of an input; `run` completes its report."""
+
+    @property
+    def report(self) -> dict[str, Any]:
+        """Plain JSON values, with ``splats`` and ``notes``."""
+        ...
+
+
+InputT = TypeVar("InputT", bound=Input)
+InputT_co = TypeVar("InputT_co", bound=Input, covariant=True)
+InputT_contra = TypeVar("InputT_contra", bound=Input, contravariant=True)
+DecisionT = TypeVar("DecisionT", bound=Decision)
+DecisionT_contra = TypeVar("DecisionT_contra", bound=Decision, contravariant=True)
+
+
+class Source(Protocol[InputT_co]):
+    """Where splats are."""
+
+    def read(self, form: Format | None) -> InputT_co:
+        """Return them, with the bytes that each takes in a format; None is plain PLY."""
+        ...
+
+
+class Request(Protocol[InputT_contra, DecisionT]):
+    """What is to be done."""
+
+    def opened(self, form: Format | None) -> AbstractContextManager[None]:
+        """Refuse what can be had of no splats, before any are read."""
+        ...
+
+    def decide(self, read: InputT_contra, runtime: Runtime) -> DecisionT:
+        """Decide; nothing is changed or written."""
+        ...
+
+    def compare(
+        self, read: InputT_contra, decision: DecisionT, path: Path | None, runtime: Runtime
+    ) -> dict[str, Any]:
+        """Return what the report says of the pictures of the file that was written."""
+        ...
+
+
+class Sink(Protocol[InputT_contra, DecisionT_contra]):
+    """Where splats go."""
+
+    @property
+    def timing(self) -> str:
+        """What the report calls the time that writing took."""
+        ...
+
+    @property
+    def form(self) -> Format | None:
+        """The format in which a budget counts bytes; None is plain PLY."""
+        ...
+
+    def opened(self) -> AbstractContextManager[None]:
+        """Refuse what could not be written; if the block fails, remove what was made for it."""
+        ...
+
+    def write(self, read: InputT_contra, decision: DecisionT_contra, runtime: Runtime) -> Written:
+        """Write all of what was decided, or nothing."""
+        ...
+
+
+def run(
+    source: Source[InputT],
+    request: Request[InputT, DecisionT],
+    sink: Sink[InputT, DecisionT],
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> DecisionT:
+    """Do what is requested with the splats of a source, and write the outcome to a sink.
+
+    Parameters
+    ----------
+    source : Source
+    request : Request
+    sink : Sink
+    progress : callable, optional
+        ``progress(fraction, what)``; returning ``False`` cancels.
+    threads : int, optional
+
+    Returns
+    -------
+    Decision
+        With the whole report.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See the steps. Nothing is written then, unless the message says so.
+    """
+    runtime = Runtime(Clock(), progress, threads)
+    with request.opened(sink.form), sink.opened():
+        read = source.read(sink.form)
+        runtime.clock.lap("read_s")
+        decision = request.decide(read, runtime)
+        written = sink.write(read, decision, runtime)
+        runtime.clock.lap(sink.timing)
+        compared = request.compare(read, decision, written.path, runtime)
+    runtime.clock.stop()
+    report = decision.report
+    report |= written.facts | compared | read.facts()
+    report["splats"] |= written.splats
+    report["notes"] += [*written.notes, *read.notes()]
+    report |= {"files": written.files, "timings": runtime.clock.timings}
+    return decision

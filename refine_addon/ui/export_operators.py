@@ -1,0 +1,132 @@
+"""The operator that writes splats to a file."""
+
+# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, EnumProperty, StringProperty
+from bpy_extras.io_utils import ExportHelper
+
+from ..core.formats.registry import FORMATS, Packed, without_suffix
+from ..core.work import report
+from ..mesh import scores as mesh_scores
+from ..objects import splat_object
+from .import_operators import FILE_NAMES
+from .on_thread import AskedFirst
+from .operator_bases import Answer, OnSplats
+
+if TYPE_CHECKING:
+    from ..core.formats.ply import SplatFile
+    from ..core.work import Progress
+    from ..mesh.layout import SplatObject
+
+_FORMATS = (
+    (".ply", ".ply", "In the layout that was imported"),
+    *((form.suffix, form.suffix, f"It {form.loss}") for form in FORMATS),
+)
+"""The formats of an export as Blender lists them, with tooltips."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Export:
+    """What is to be written where."""
+
+    file: SplatFile
+    target: Path
+    overwrite: bool
+
+
+class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelper):
+    """Write the active object's splats to a file, in the format that its suffix names"""
+
+    bl_idname = "refine.export_ply"
+    bl_label = "Export Splats"
+    bl_options = {"REGISTER", "PRESET"}
+    doing = "Writing splats"
+
+    filename_ext = ".ply"
+    filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
+    suffix: EnumProperty(
+        name="Format",
+        description="Of the file that is picked here; a suffix that is typed chooses it",
+        items=_FORMATS,
+        options={"SKIP_SAVE"},
+    )
+    settled: StringProperty(default=_FORMATS[0][0], options={"HIDDEN", "SKIP_SAVE"})
+    apply_transform: BoolProperty(
+        name="Apply Transform",
+        description="Write the splats as they stand in the world: positions, rotations, scales "
+        "and view-dependent colour follow the object",
+    )
+    overwrite: BoolProperty(
+        name="Overwrite",
+        description="Replace the file if it exists",
+        options={"SKIP_SAVE"},
+    )
+
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+        """Ask for the file; whoever picks an existing one in the browser means to replace it."""
+        if not self.filepath:
+            self.filepath = _new_name(context.object)
+        self.overwrite = True
+        return ExportHelper.invoke(self, context, event)
+
+    def check(self, _context: bpy.types.Context) -> bool:
+        """Bring name and format together, whichever was changed; return whether either changed."""
+        before = self.filepath, self.suffix
+        name = without_suffix(self.filepath)
+        typed = self.filepath[len(name) :].lower()
+        if typed and self.suffix == self.settled:
+            self.suffix = typed
+        self.filepath = name + self.suffix
+        self.settled = self.suffix
+        return before != (self.filepath, self.suffix)
+
+    def written(
+        self, _context: bpy.types.Context, _checked: SplatObject | None
+    ) -> list[SplatObject]:
+        """Return none: the object is only read."""
+        return []
+
+    def prepare(self, _context: bpy.types.Context, checked: SplatObject) -> _Export:
+        """Refuse what cannot be written, and gather what is."""
+        target = splat_object.export_target(
+            bpy.path.abspath(self.filepath), overwrite=self.overwrite
+        )
+        file = splat_object.export_source(checked, apply_transform=self.apply_transform)
+        return _Export(file, target, self.overwrite)
+
+    @staticmethod
+    def work(job: _Export, progress: Progress) -> SplatFile | Packed:
+        """Write the file."""
+        report(progress, 0.0, job.target.name)
+        return splat_object.write_export(job.file, job.target, overwrite=job.overwrite)
+
+    def finish(
+        self,
+        _context: bpy.types.Context,
+        _checked: SplatObject | None,
+        _job: _Export,
+        file: SplatFile | Packed,
+    ) -> Answer:
+        """Say what was written."""
+        if isinstance(file, Packed):
+            self.report({"INFO"}, "; ".join(file.notes(np.ones(len(file.file), np.bool_))))
+        self.report({"INFO"}, f"Wrote the splats to {self.filepath}")
+        return {"FINISHED"}
+
+
+def _new_name(obj: bpy.types.Object) -> str:
+    """Return a name for an export that no file beside the .blend has yet."""
+    mesh = obj.data
+    pruned = mesh_scores.RANK in mesh.attributes and mesh_scores.record(mesh) is None
+    name = f"{obj.name}_{'pruned' if pruned else 'copy'}"
+    names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
+    folder = Path(bpy.path.abspath("//"))  # where the file browser starts
+    return next(f"{new}.ply" for new in names if not (folder / f"{new}.ply").exists())
