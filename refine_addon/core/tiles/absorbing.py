@@ -129,8 +129,8 @@ def absorb(tiles: MeasuredTiles, goal: int, settings: Settings, runner: Runner) 
     factor = patience(1.0 - goal / len(rows))
     counts = stages(len(rows), goal, STAGE)
     for number, count in enumerate(counts):
-        ahead = runner.part(number / len(counts), (number + 1) / len(counts))
-        regions, left = _stage(tiles.context, number, left, count, factor, ahead)
+        stage_runner = runner.part(number / len(counts), (number + 1) / len(counts))
+        regions, left = _stage(tiles.context, number, left, count, factor, stage_runner)
     origin, members = (_of_all(regions, name) for name in ("origin", "members"))
     merged = int(members.sum()) - goal
     return Survivors(regions, origin, members > 1, merged, total - goal - merged)
@@ -229,8 +229,8 @@ def _measured_again(scene: SceneContext, left: _Left, turn: int, runner: Runner)
     gaussians, good = store_gaussians(scene, left.sources, runner.part(0.0, 0.2))
     measuring = TileMeasuring(scene, runner)
     groups = measuring.groups_of_part(turn, PARTS)
-    ahead = runner.part(0.2, 1.0).progress
-    sums = measuring.measure(gaussians, groups, ahead)  # type: ignore[arg-type]
+    progress = runner.part(0.2, 1.0).progress
+    sums = measuring.measure(gaussians, groups, progress)  # type: ignore[arg-type]
     measured = Measured.sum(sums.values()).for_all(gaussians.index, len(good))
     others = 1.0 - measuring.weight_share(groups)
     measured.contribution[:] += others * left.measured.contribution

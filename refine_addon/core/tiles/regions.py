@@ -106,17 +106,17 @@ class StageContext:
         starts = np.cumsum([0, *map(len, self.sources)])
         edges = np.searchsorted(rows, starts)
         for number, source in enumerate(self.sources):
-            mine = rows[edges[number] : edges[number + 1]] - starts[number]
-            if not len(mine):
+            places = rows[edges[number] : edges[number + 1]] - starts[number]
+            if not len(places):
                 continue
-            tables.append(source.splats().take(mine))
+            tables.append(source.splats().take(places))
             if isinstance(source, Region):
                 arrays = source.folder.load(source.index, ("origin", "members"))
-                origins.append(arrays["origin"][mine])
-                members.append(arrays["members"][mine])
+                origins.append(arrays["origin"][places])
+                members.append(arrays["members"][places])
             else:
-                origins.append(mine + starts[number])
-                members.append(np.ones(len(mine), np.int64))
+                origins.append(places + starts[number])
+                members.append(np.ones(len(places), np.int64))
         return packed(joined(tables)), np.concatenate(origins), np.concatenate(members)
 
 
@@ -164,14 +164,14 @@ class GatherRegion:
         table, origin, members = context.gathered(rows)
         splats = unpacked(table)
         places = mergeable(splats, context.scene, np.zeros(len(rows), np.bool_))
-        found = merge_field.unallowed(
+        unallowed = merge_field.unallowed(
             splats, places, context.views, context.scene, ViewSums(*sums),
             progress=progress, threads=threads,
         )  # fmt: skip
         arrays = dict(zip(_GATHERED, (table, origin, members, places), strict=True))
-        arrays |= {"mass": found.mass, "seen_by": found.seen}
-        context.folder.save(self.index, arrays | vars(found.field))
-        return found.seen_and_whole()
+        arrays |= {"mass": unallowed.mass, "seen_by": unallowed.seen}
+        context.folder.save(self.index, arrays | vars(unallowed.field))
+        return unallowed.seen_and_whole()
 
 
 @dataclass(frozen=True)
@@ -349,11 +349,12 @@ class SettleUnit:
         origin, place, changed = (folder.mapped(name) for name in SURVIVORS)
         end = self.begin + len(self.unit)
         here = slice(*np.searchsorted(origin, (self.begin, end)).tolist())
-        rows, mine = origin[here] - self.begin, changed[here]
+        rows, changed_here = origin[here] - self.begin, changed[here]
         keep = np.zeros(len(self.unit), np.bool_)
         keep[rows] = True
         folder.save(
-            self.unit.index, {"changed": rows[mine], "became": self._table(place[here][mine])}
+            self.unit.index,
+            {"changed": rows[changed_here], "became": self._table(place[here][changed_here])},
         )
         return save_kept(self.unit, folder, keep)
 
