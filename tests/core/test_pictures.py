@@ -252,9 +252,11 @@ def test_a_picture_that_exists_is_refused_before_the_work(tmp_path):
     views = ViewSet((replace(view_of(10, 10), name="a"),))
     (tmp_path / "in-a-after.png").write_bytes(b"precious")
 
-    with pytest.raises(RefineError, match=r"in-a-after\.png: exists already"):
-        PictureFiles(tmp_path, "in").refuse_existing(views)
-    PictureFiles(tmp_path, "in", overwrite=True).refuse_existing(views)
+    refused = pytest.raises(RefineError, match=r"in-a-after\.png: exists already")
+    with refused, PictureFiles(tmp_path, "in").opened(views):
+        pass
+    with PictureFiles(tmp_path, "in", overwrite=True).opened(views):
+        pass
 
 
 def test_what_absorbs_is_drawn_as_it_became():
