@@ -48,7 +48,7 @@ the mean, the logarithms of the scales and a turn, the last three by its own axe
 
 COUNT = 13
 
-_LEAST_WEIGHT = 1e-4  # hits that make up less of their pixel are left out
+_LEAST_WEIGHT = 1e-3  # hits that make up less of their pixel are left out
 
 
 @dataclass(frozen=True, eq=False)

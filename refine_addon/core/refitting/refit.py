@@ -12,7 +12,8 @@ are hit, for each kind of parameter. So what few rays tell of a splat moves it l
 made small by a few steps of conjugate gradients, preconditioned by the diagonal.
 
 The rays of a round, before anything is learned from them, are a measurement that nothing was fitted
-to: rounds end where it no longer rises, and a round after which it falls is undone.
+to: on them, survivors before and after the round before are compared. Rounds end where little is
+gained, and a round that loses is undone.
 """
 
 from __future__ import annotations
@@ -47,8 +48,9 @@ RAYS_OF_SPLAT = 4.0
 MIN_RAYS = 1 << 16
 """Rays of a round where that would be fewer."""
 
-MAX_HITS = 1 << 23
-"""About how many hits the rays of a round may have; each takes 80 bytes."""
+MAX_HITS = 1 << 25
+"""About how many hits the rays of a round may have on the unpruned splats. Survivors have fewer,
+and those that hardly show are left out: some 80 bytes are taken for every third."""
 
 MAX_RAYS_OF_VIEW = 60_000
 """See `ray_sample.MAX_RAYS_OF_VIEW`."""
@@ -56,7 +58,7 @@ MAX_RAYS_OF_VIEW = 60_000
 STEPS = 4
 """Steps of conjugate gradients in a round."""
 
-DAMPING, PRIOR = 0.5, 0.5
+DAMPING, PRIOR = 1.0, 1.0
 """Of the diagonal, and of its median over splats; see the top of this file."""
 
 LEAST_GAIN = 0.05
@@ -110,7 +112,8 @@ class Refitted:
     rounds : int
         How many rounds made them so.
     psnr_before, psnr : float
-        On rays that nothing was fitted to, dB: of the survivors as given, and as they are now.
+        Of the survivors as given, and as they are now, dB: each round's gain is measured on rays
+        that nothing was fitted to, and added.
     """
 
     splats: Splats
@@ -195,14 +198,17 @@ def refit_rounds(  # noqa: PLR0913 - as `refit`
         share = 0.7 / (settings.rounds + 1)
         begin = 0.3 + share * number
         linear = rays.linear(trial, number, part(progress, begin, begin + share / 2))
-        psnr = rays.psnr(linear, number)
-        if number and psnr <= best.psnr:
-            return
-        gained = psnr - best.psnr
-        changed = best.changed | ~_same(survivors, trial)
-        best = Refitted(trial, changed, number, best.psnr_before if number else psnr, psnr)
+        psnr = rays.psnr([view.colors for view in linear], number)
+        if not number:
+            best = replace(best, psnr_before=psnr, psnr=psnr)
+        else:
+            gain = psnr - rays.psnr(rays.colors(best.splats, number), number)
+            if gain <= 0.0:
+                return
+            changed = ~_same(survivors, trial)
+            best = Refitted(trial, changed, number, best.psnr_before, best.psnr + gain)
         yield best
-        if number == settings.rounds or (number and gained < LEAST_GAIN):
+        if number == settings.rounds or (number and gain < LEAST_GAIN):
             return
         change = rays.solve(
             linear, number, movable, part(progress, begin + share / 2, begin + share)
@@ -295,11 +301,26 @@ class _Rounds:
 
         return self._each(linear_of, part(progress, 0.1, 1.0))
 
-    def psnr(self, linear: list[LinearView], round_: int) -> float:
+    def colors(self, splats: Splats, round_: int) -> list[NDArray[np.float64]]:
+        """Return what the rays of each view see of survivors, (3, P)."""
+        gaussians, _, _ = projection.prepare(
+            splats, self._chosen, self.scene, threads=self._threads
+        )
+
+        def colors_of(piece: slice) -> NDArray[np.float64]:
+            view, truth = self._views[piece.start][0], self._truths[piece.start][round_]
+            with np.errstate(under="ignore"):
+                footprints = projection.project(gaussians, self.scene, view)
+                rays = cast(footprints, truth.columns, truth.rows)
+                return rays.colors(colors_from(splats, gaussians.index[rays.hit], view))
+
+        return self._each(colors_of, silent)
+
+    def psnr(self, colors: list[NDArray[np.float64]], round_: int) -> float:
         """Return the mean PSNR of what the rays of each view see, weighted as the views are, dB."""
         errors = [
-            max(float(np.mean(np.square(truths[round_].colors - view.colors))), _CAP)
-            for truths, view in zip(self._truths, linear, strict=True)
+            max(float(np.mean(np.square(truths[round_].colors - seen))), _CAP)
+            for truths, seen in zip(self._truths, colors, strict=True)
         ]
         weights = [weight for _, weight in self._views]
         return float(np.average(-10.0 * np.log10(errors), weights=weights))
