@@ -57,6 +57,12 @@ def core(addon):
     return addon.core
 
 
+def export(addon, checked, path, **options):
+    """Write an object to a file, as *Export* does; see `exported_file` for the options."""
+    file = addon.objects.splat_object.exported_file(checked, **options)
+    addon.core.formats.registry.as_written(file, path).write(path)
+
+
 def keep_mask(addon, obj, budget, protect=""):
     """Return which splats of a scored object stay, as *Apply* decides it; `protect` names some."""
     checked = addon.mesh.layout.check(obj)

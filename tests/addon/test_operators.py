@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 import pytest
 
-from .conftest import keep_mask
+from .conftest import export, keep_mask
 
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 
@@ -540,7 +540,7 @@ def test_linked_objects_are_refused(addon, room, room_cameras, score, tmp_path):
 
     with pytest.raises(addon.core.RefineError, match="is linked from"):
         score(room, views)
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
+    export(addon, addon.mesh.layout.check(room), tmp_path / "out.ply")
     assert _bytes(tmp_path / "out.ply") == _bytes(ROOM / "point_cloud.ply")
 
 
@@ -566,7 +566,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
         ("core.pipeline", "decide", "apply", {}),
         ("ui.import_operators", "read_splats", "import_ply", {"filepath": "in.ply"}),
         ("ui.import_operators", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),
-        ("objects.splat_object", "write_export", "export_ply", {"filepath": "out.ply"}),
+        ("ui.export_operators", "as_written", "export_ply", {"filepath": "out.ply"}),
         ("ui.preview", "show", "preview", {}),
     ],
 )

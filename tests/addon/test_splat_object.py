@@ -12,6 +12,8 @@ import pytest
 
 from tests.strategies import ply_of
 
+from .conftest import export
+
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 PLY = ROOM / "point_cloud.ply"
 
@@ -136,9 +138,7 @@ def test_an_unevenly_scaled_object_is_scored_as_it_stands_in_the_world(addon, co
         np.sort(splats.log_scales, axis=1), [-3.0, -3.0, math.log(2) - 3.0], atol=1e-5
     )
     with pytest.raises(core.RefineError, match="make the object's scale uniform"):
-        addon.objects.splat_object.export_object(
-            addon.mesh.layout.check(obj), tmp_path / "out.ply", apply_transform=True
-        )
+        export(addon, addon.mesh.layout.check(obj), tmp_path / "out.ply", apply_transform=True)
     assert not (tmp_path / "out.ply").exists()
 
 
@@ -150,10 +150,8 @@ def test_an_export_with_the_transform_is_the_moved_splats(addon, core, room, tmp
         @ mathutils.Matrix.Scale(2.0, 4)
     )
     bpy.context.view_layer.update()
-    addon.objects.splat_object.export_object(
-        addon.mesh.layout.check(room), tmp_path / "moved.ply", apply_transform=True
-    )
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "kept.ply")
+    export(addon, addon.mesh.layout.check(room), tmp_path / "moved.ply", apply_transform=True)
+    export(addon, addon.mesh.layout.check(room), tmp_path / "kept.ply")
     file = core.read_ply(PLY)
     expected = core.affine.transformed(
         file.splats(), np.array(room.matrix_world, np.float64), rotate_sh=True
@@ -177,9 +175,7 @@ def test_normals_turn_with_the_transform(addon, core, make_splats, tmp_path):
     obj = bpy.data.objects.new("turned", mesh)
     obj.rotation_euler.z = math.pi / 2
     bpy.context.scene.collection.objects.link(obj)
-    addon.objects.splat_object.export_object(
-        addon.mesh.layout.check(obj), tmp_path / "out.ply", apply_transform=True
-    )
+    export(addon, addon.mesh.layout.check(obj), tmp_path / "out.ply", apply_transform=True)
     rows = core.read_ply(tmp_path / "out.ply").rows
 
     assert [(row["nx"], row["ny"], row["nz"]) for row in rows] == [(0, 1, 0), (0, 0, 0)]
@@ -223,7 +219,7 @@ def test_a_pruned_object_is_imported_and_pruned_again(addon, room, room_cameras,
     for _ in range(2):
         bpy.ops.refine.score()
         bpy.ops.refine.apply()
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
+    export(addon, addon.mesh.layout.check(room), tmp_path / "out.ply")
 
     assert len(addon.core.read_ply(tmp_path / "out.ply")) == 39755 - 19877 - 9939
 
