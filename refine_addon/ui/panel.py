@@ -230,23 +230,9 @@ class REFINE_PT_preview(_InSidebar, bpy.types.Panel):
         obj = context.object
         splats = mesh_layout.looks_like_splats(obj)
         _draw_modes(layout, obj if splats else None)
-        mode, hidden = preview.shown(obj) if splats else ("", False)
-        row = layout.row(align=True)
-        row.label(text="Points")
-        for choice, text in (("HEAT", "Heat Map"), ("COLOR", "Colour")):
-            cell = row.row(align=True)
-            cell.enabled = choice == "COLOR" or (splats and preview.has_heat(obj))
-            button = cell.operator("refine.preview", text=text, depress=mode == choice)
-            button.mode = "OFF" if mode == choice else choice
-            button.hide_removed = hidden
-        row = layout.row()
-        row.enabled = bool(mode)
-        icon = "HIDE_ON" if hidden else "HIDE_OFF"
-        button = row.operator("refine.preview", text="Hide What Goes", depress=hidden, icon=icon)
-        button.mode = mode or "HEAT"
-        button.hide_removed = not hidden
-        button = layout.operator("refine.preview", text="Show in Renders", icon="RENDER_STILL")
-        button.mode, button.style, button.hide_removed = "COLOR", "SPLATS", hidden
+        mode = preview.shown(obj) if splats else ""
+        button = layout.operator("refine.preview", icon="RENDER_STILL", depress=bool(mode))
+        button.mode = "OFF" if mode else "COLOR"
 
 
 class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
