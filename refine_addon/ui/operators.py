@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from ..cameras.sets import Choice
+from ..cameras.sets import CameraChoice
 from ..core import pipeline
 from ..core.estimate.quality import in_words
 from ..core.levels.lod import Level, Levels, lod
@@ -60,7 +60,7 @@ _SCORED = 0.97
 
 def chosen_views(context: bpy.types.Context) -> ViewSet:
     """Return the views of the cameras that the panel names."""
-    return Choice.of_scene(context.scene).views(context, context.object)
+    return CameraChoice.of_scene(context.scene).views(context, context.object)
 
 
 def apply_task(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from ..cameras.sets import chosen_cameras
+from ..cameras.sets import CameraChoice
 from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
@@ -325,8 +325,7 @@ def _has(obj: bpy.types.Object | None, attribute: str) -> bool:
 
 
 def _cameras(context: bpy.types.Context) -> list[bpy.types.Object]:
-    settings = context.scene.refine
-    return chosen_cameras(context, settings.source, settings.collection)
+    return CameraChoice.of_scene(context.scene).cameras(context)
 
 
 def _changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:

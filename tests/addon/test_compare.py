@@ -34,7 +34,7 @@ def test_the_pictures_are_those_of_what_apply_leaves(addon, room, room_cameras, 
     bpy.ops.refine.apply()
     after = gather(check(room), whole=True)
     assert len(after) == 39_755 - 27_828
-    views = addon.cameras.sets.Choice("ACTIVE").views(bpy.context, room)
+    views = addon.cameras.sets.CameraChoice("ACTIVE").views(bpy.context, room)
     (expected,) = addon.core.pictures.compare(before, after, views)
     assert (expected.view.width, expected.view.height) == (240, 160)
     for name, wanted in zip(NAMES, ("before", "after", "difference"), strict=True):

@@ -56,7 +56,7 @@ def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):  # n
     report = addon.objects.prune_object.prune_object(
         "room",
         addon.core.PruneRequest(
-            addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None),
+            addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context),
             addon.core.Budget(keep=1000),
             addon.core.Settings("closed-form"),
             dry_run=True,
@@ -73,7 +73,7 @@ def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):  # n
 @pytest.mark.parametrize("options", [{}, {"save": True}])
 def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_file, options):  # noqa: ARG001
     """The message lists the splat objects of the scene."""
-    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
+    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     with pytest.raises(addon.core.RefineError, match=r"no object 'rooom'.*splat objects: room"):
         addon.objects.prune_object.prune_object(
             "rooom",
@@ -84,7 +84,7 @@ def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_f
 
 def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_cameras):  # noqa: ARG001
     """There is no file to save to."""
-    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
+    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     with pytest.raises(addon.core.RefineError, match="not saved in a"):
         addon.objects.prune_object.prune_object(
             "room",
@@ -95,7 +95,7 @@ def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_ca
 
 
 def _ranked(addon, obj, score):
-    score(obj, addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None))
+    score(obj, addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context))
     return addon.mesh.attributes.read_attribute(obj.data, "refine_rank")
 
 
@@ -183,7 +183,7 @@ def test_normals_turn_with_the_transform(addon, core, make_splats, tmp_path):
 
 def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):  # noqa: ARG001
     """Someone deleted a vertex while the scoring ran."""
-    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
+    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     scores = addon.core.score(
         addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         views,
