@@ -18,7 +18,7 @@ from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject, check
-from ..mesh.scores import store
+from ..mesh.scores import Provenance, store
 from .demands import NONE, Demands
 from .splat_object import find, gather, modifier_notes, reduce_object
 
@@ -183,7 +183,7 @@ class ObjectSink:
         if self.save:
             columns = loaded.columns(result.absorbed)
             with mesh_edit.all_or_nothing(self.checked.obj):
-                store(self.checked, result.scores, self.request.settings)
+                store(self.checked, result.scores, Provenance(self.request.settings))
                 reduce_object(self.checked, result.keep, columns)
                 _save(written.path)
         return written

@@ -120,7 +120,9 @@ def score(addon):
         scores = addon.core.score(
             addon.objects.splat_object.gather(addon.mesh.layout.check(obj)), views, settings
         )
-        addon.mesh.scores.store(addon.mesh.layout.check(obj), scores, settings)
+        addon.mesh.scores.store(
+            addon.mesh.layout.check(obj), scores, addon.mesh.scores.Provenance(settings)
+        )
 
     return score
 

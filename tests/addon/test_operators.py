@@ -281,7 +281,7 @@ def test_a_budget_that_means_nothing_to_the_scores_is_refused(  # noqa: PLR0917
     checked = addon.mesh.layout.check(room)
     asked = core.Settings(method, 4, core.ClosedForm(frustum=False))
     scores = core.score(addon.objects.splat_object.gather(checked), room_views, asked)
-    addon.mesh.scores.store(checked, scores, asked)
+    addon.mesh.scores.store(checked, scores, addon.mesh.scores.Provenance(asked))
     settings.budget = kind
     addon.ui.plans.refresh(bpy.context)
     unchanged.start()

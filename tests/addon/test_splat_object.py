@@ -194,7 +194,11 @@ def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):  # no
     addon.mesh.edit.delete_vertices(room, ~keep)
 
     with pytest.raises(addon.core.RefineError, match="39754 splats, was scored with 39755"):
-        addon.mesh.scores.store(addon.mesh.layout.check(room), scores, addon.core.Settings())
+        addon.mesh.scores.store(
+            addon.mesh.layout.check(room),
+            scores,
+            addon.mesh.scores.Provenance(addon.core.Settings()),
+        )
 
 
 def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, room, room_views):
