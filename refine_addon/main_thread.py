@@ -8,8 +8,7 @@ import threading
 from concurrent.futures import Future, wait
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from .core.errors import Cancelled
-from .core.work import checkpoint
+from .core.work import Cancelled, checkpoint
 
 if TYPE_CHECKING:
     from collections.abc import Callable

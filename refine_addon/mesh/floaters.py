@@ -47,9 +47,9 @@ def store(checked: SplatObject, cleaned: Cleaned) -> None:
         raise RefineError(msg)
     reasons = np.zeros(len(cleaned.keep), np.int32)
     for number, name in enumerate(REASONS, start=1):
-        reasons[cleaned.found[name]] = number
+        reasons[cleaned.by_reason[name]] = number
     mesh_attributes.write_attribute(checked.mesh, REASON, "INT", reasons)
-    counts = {name: int(np.count_nonzero(mask)) for name, mask in cleaned.found.items()}
+    counts = {name: int(np.count_nonzero(mask)) for name, mask in cleaned.by_reason.items()}
     checked.mesh[FOUND] = json.dumps({"splats": len(reasons), "counts": counts})
     mesh_attributes.updated(checked.mesh)
 

@@ -15,21 +15,17 @@ import bpy
 import numpy as np
 
 from ..cameras.objects import world_matrix
-from ..core import pipeline
 from ..core.affine import is_uniform, transformed
 from ..core.errors import RefineError
 from ..core.formats.ply import columns_from_splats
 from ..core.survivors import survivor_columns
 from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.volumes import FREE, Forced
-from ..core.work import Progress, silent
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
 from ..mesh import layout as mesh_layout
-from ..mesh.layout import SplatObject, check
 from ..mesh.scores import RECORD, stored_scores
-from .demands import NONE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,11 +35,10 @@ if TYPE_CHECKING:
     from ..core.absorbing.absorb import Absorbed
     from ..core.formats.ply import SplatFile
     from ..core.levels.lod import Level
-    from ..core.scores import Scores
     from ..core.selection import Budget
     from ..core.splats import Splats
     from ..core.views import ViewSet
-    from .demands import Demands
+    from ..mesh.layout import SplatObject
 
 
 @dataclass(frozen=True)
@@ -270,51 +265,6 @@ def exported_file(checked: SplatObject, *, apply_transform: bool = False) -> Spl
     """
     columns = _world_columns(checked) if apply_transform else None
     return mesh_attributes.file_from_object(checked, columns)
-
-
-def score_object(
-    name: str,
-    views: ViewSet,
-    settings: Settings,
-    demands: Demands = NONE,
-    *,
-    progress: Progress = silent,
-) -> tuple[SplatFile, Scores, Forced, list[str]]:
-    """Score an object of the open scene; nothing in the scene changes.
-
-    Parameters
-    ----------
-    name : str
-        Of the object.
-    views, settings, progress
-        See `refine_addon.core.pipeline.score`.
-    demands : Demands
-        What must stay and what must go; the latter scores 0.
-
-    Returns
-    -------
-    SplatFile
-        The file that the object would be.
-    Scores
-        Of its splats.
-    Forced
-        What must stay and what must go.
-    list of str
-        See `modifier_notes`.
-
-    Raises
-    ------
-    RefineError
-        See `gather`, `Demands.forced` and `refine_addon.core.pipeline.score`; also if there is no
-        such object.
-    """
-    checked = check(find(name))
-    forced = demands.forced(checked)
-    scores = pipeline.score(
-        gather(checked), views, settings,
-        protected=forced.protected, removed=forced.removed, progress=progress,
-    )  # fmt: skip
-    return mesh_attributes.file_from_object(checked), scores, forced, modifier_notes(checked.obj)
 
 
 def _outcome(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:

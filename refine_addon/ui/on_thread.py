@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 
 from .. import main_thread
-from ..core.errors import Cancelled
-from ..core.work import silent
+from ..core.work import Cancelled, silent
 from ..mesh import layout as mesh_layout
 from . import running as at_work
 from .operator_bases import FAILURES, Answer, fail
