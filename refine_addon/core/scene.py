@@ -77,7 +77,7 @@ def median_size(squared: NDArray[np.float64], drawable: NDArray[np.bool_]) -> fl
     Parameters
     ----------
     squared : (N,) float64
-        Squared distance of each splat to the scene's origin, plus the median over views of theirs.
+        Squared distance of each splat to the scene's origin, plus the median of the views'.
     drawable : (N,) bool
         Which splats count.
     """
@@ -202,7 +202,7 @@ def spatial_order(
     place: NDArray[np.float64],
     ties: Callable[[NDArray[np.int64]], NDArray[np.uint64]] | None = None,
 ) -> NDArray[np.int64]:
-    """Return the order of positions along a Z-shaped curve, near ones together (Morton, 1966).
+    """Return the order of positions along a Z-shaped curve: neighbours follow (Morton, 1966).
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ class Solid:
 
     A point on its surface belongs to the side towards which x, y and z grow, but for rounding, so
     that solids that share a face share no point. Parts that overlap are joined; where one turns its
-    faces the other way, their overlap is outside, as the hollow of a sphere in a sphere is.
+    faces the other way, their overlap is outside, like the hollow of a hollow sphere.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ class Solid:
         return self._holds(turns)
 
     def _holds(self, turns: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which winding numbers are those of the inside."""
+        """Return which winding numbers mean inside."""
         return np.asarray(turns != 0.0 if self.turned else turns % 2.0 == 1.0)
 
     def _grid(
@@ -273,7 +273,7 @@ def _touched(vertices: NDArray[np.float64], triangles: Index, cells: int) -> NDA
     """Return which cells of a grid triangles touch, (G * G * G,), and some beside them.
 
     Triangles wider than a cell are halved until they are not; of the eight cells in which the
-    others may lie, those count that their plane meets.
+    others may lie, those that the triangle's plane crosses are touched.
 
     Parameters
     ----------

@@ -71,7 +71,7 @@ _MOST_PIXELS = 16383
 """Of a side of a WebP image."""
 
 _SPARE_PIXELS = 1 << 16
-"""An image may have so many pixels more than four times those needed, as images are padded."""
+"""An image has at most four times the pixels that are needed, and these: writers pad images."""
 
 _BROKEN = (
     zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError,
@@ -265,7 +265,7 @@ def _palette(bundle: _Bundle, count: int) -> tuple[NDArray[np.float32], NDArray[
 
 
 def write(stream: BinaryIO, splats: Splats) -> None:
-    """Write splats as a SOG file, near ones together.
+    """Write splats as a SOG file, sorted so that neighbours in space are neighbours in images.
 
     Raises
     ------
@@ -312,7 +312,7 @@ def write(stream: BinaryIO, splats: Splats) -> None:
 
 
 def _image_size(count: int) -> tuple[int, int]:
-    """Return height and width of images of so many pixels: about a square, the width in fours."""
+    """Return height and width of images for `count` pixels: nearly square, width divisible by 4."""
     width = 4 * (-(-math.isqrt(max(count - 1, 0)) // 4) + 1)
     if width > _MOST_PIXELS:
         msg = f"{count} splats: {NAME} holds {(_MOST_PIXELS // 4 * 4) ** 2}"
@@ -339,13 +339,13 @@ def _image(size: tuple[int, int], values: NDArray[np.uint8]) -> NDArray[np.uint8
 def _coordinates(
     means: NDArray[Any],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the range of the logarithms of positions (N, 3), and their places in it.
+    """Return the range of the logarithms of positions (N, 3), and their codes within it.
 
     Returns
     -------
     low, high : (3,) float64
     lower, upper : (N, 3) uint8
-        The two bytes of the places.
+        The two bytes of the codes.
     """
     means = np.asarray(means, np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))
@@ -384,21 +384,21 @@ def _grouped_harmonics(
 def _tabulated(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return a table of 256 values and the place of the nearest for each of `values`.
 
-    Half of the table are even steps from the least to the largest, so that no value is off by more
-    than half of one; the other half are where the values are, as many between any two.
+    Half of the table are equal steps from the least to the largest value, so that no value is off
+    by more than half a step; the other half are quantiles of the values.
     """
     flat = np.sort(values, axis=None)
     half = _TABLE // 2
-    spots = np.linspace(0.0, 1.0, half)
-    even = flat[0] + (float(flat[-1]) - float(flat[0])) * spots
-    often = flat[np.rint(spots * (len(flat) - 1)).astype(np.intp)]
-    table = np.sort(np.concatenate([even, often])).astype(np.float32)
+    shares = np.linspace(0.0, 1.0, half)
+    even = flat[0] + (float(flat[-1]) - float(flat[0])) * shares
+    quantiles = flat[np.rint(shares * (len(flat) - 1)).astype(np.intp)]
+    table = np.sort(np.concatenate([even, quantiles])).astype(np.float32)
     bounds = (table[1:].astype(np.float64) + table[:-1]) / 2.0
     return table, np.searchsorted(bounds, values).astype(np.uint8)
 
 
 def _grouped(rows: NDArray[Any]) -> NDArray[np.int64]:
-    """Return a group for each of N rows (N, D), near ones in one; groups are numbered from 0.
+    """Return a group for each of N rows (N, D): similar rows share one. Numbers start at 0.
 
     All rows are one group first; every group is halved at its mean along the axis in which it
     varies most, again and again, until there are 65,536 or as many as half of the rows.

@@ -52,6 +52,9 @@ _SCALE_STEPS, _LOWEST_SCALE = 16.0, -10.0
 _BUCKETS = (8, 16)
 """Harmonics are rounded to multiples of these, in 1/128: of degree 1, and of all others."""
 
+_USUAL_FRACTION, _LEAST_STEPS = 12, 18
+"""Bits of a position behind the point in most files, and of the largest coordinate at least."""
+
 _LARGEST_CODE = (1 << 23) - 1
 """Of a position: of its 24 bits, one is the sign."""
 
@@ -146,7 +149,7 @@ def _parsed(path: Path, head: bytes) -> _Header:
 
 
 def _refuse_many(path: Path, header: _Header, size: int) -> None:
-    """Raise `RefineError` if a file of `size` bytes cannot hold as many splats as it announces."""
+    """Raise `RefineError` if a file of `size` bytes cannot hold the splats that it announces."""
     needed, most = sum(header.blocks().values()), _INFLATION * size
     if needed > most:
         msg = (
@@ -339,8 +342,8 @@ def write(stream: BinaryIO, splats: Splats) -> None:
 def _fraction(splats: Splats) -> int:
     """Return how many bits a position has behind the point.
 
-    12, as other writers have it, gives 4096 steps a unit. Scenes that are too large for it get
-    fewer, small ones as many as divide them into a quarter of a million steps.
+    Usually 12, as other writers have it: 4096 steps a unit. Fewer where coordinates are too large
+    for that, more where the largest is below 32, so that it is still some 2^17 steps.
     """
     farthest = float(np.abs(splats.means).max())
     _, bits = math.frexp(farthest)  # before the point
@@ -350,7 +353,7 @@ def _fraction(splats: Splats) -> int:
     if most < 0:
         msg = f"a coordinate is {farthest:.10g}: {NAME} holds coordinates up to {_LARGEST_CODE}"
         raise RefineError(msg)
-    return min(max(12, 18 - bits), most, _LARGEST_CODE.bit_length())
+    return min(max(_USUAL_FRACTION, _LEAST_STEPS - bits), most, _LARGEST_CODE.bit_length())
 
 
 def _packed_rotations(quaternions: NDArray[Any]) -> NDArray[np.uint32]:
@@ -364,7 +367,7 @@ def _packed_rotations(quaternions: NDArray[Any]) -> NDArray[np.uint32]:
 
 
 def _harmonic_codes(sh_rest: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the codes of harmonics (n, K, 3): the middles of their buckets, 128 being 0."""
+    """Return the codes of harmonics (n, K, 3), where 128 is 0, rounded to `_BUCKETS`."""
     steps = np.rint(np.clip(sh_rest, -1.0, 1.0) * np.float32(128.0)).astype(np.int16) + 128
     for bucket, band in zip(_BUCKETS, (slice(3), slice(3, None)), strict=True):
         steps[:, band] = (steps[:, band] + bucket // 2) // bucket * bucket
