@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RefineError
-from ..foreign_files import foreign_kind
+from ..foreign_files import is_sog
 from ..place import Place, described
 from ..splats import above_constant, opacity, opacity_logits, unit_quaternions
 from .format import (
@@ -82,7 +82,7 @@ _BROKEN = (
 
 def matches(path: Path, head: bytes) -> bool:
     """Return whether a file is one: an archive that lists images and ``meta.json``."""
-    return foreign_kind(path, head).startswith("a SOG file")
+    return is_sog(path, head)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RefineError
-from ..foreign_files import GZIP, unpacked_beginning
+from ..foreign_files import GZIP, SPZ, is_spz
 from ..splats import above_constant, opacity, opacity_logits, unit_quaternions
 from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
 from .ply import Origin, SplatFile
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from ..splats import Splats
 
 NAME = "SPZ"
-MAGIC = b"NGSP"
 
 _HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, splats, degree, fractional bits, flags; then 0, or in version 4 how many streams
@@ -92,9 +91,7 @@ def matches(path: Path, head: bytes) -> bool:
 
     A gzip stream of its name is one that may be damaged at its beginning.
     """
-    if head.startswith(MAGIC) or unpacked_beginning(head).startswith(MAGIC):
-        return True
-    return path.suffix.lower() == FORMAT.suffix and head.startswith(GZIP)
+    return is_spz(head) or (path.suffix.lower() == FORMAT.suffix and head.startswith(GZIP))
 
 
 def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
@@ -106,7 +103,7 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         If it is truncated or damaged, of another version, or of version 4 and there is no module
         for zstd.
     """
-    packed = not data[: len(MAGIC)].tobytes().startswith(MAGIC)
+    packed = not data[: len(SPZ)].tobytes().startswith(SPZ)
     if packed:
         header, blocks = _unpacked(path, data)
     else:
@@ -133,8 +130,8 @@ def _parsed(path: Path, head: bytes) -> _Header:
     """Return what the first bytes say, or refuse them."""
     refuse_short(path, _HEADER.size, len(head), "the first bytes of an SPZ file")
     magic, version, count, degree, fraction, _, streams = _HEADER.unpack(head)
-    if magic != MAGIC:
-        msg = f"{path}: no SPZ file: its gzip stream begins with {magic!r}, expected {MAGIC!r}"
+    if magic != SPZ:
+        msg = f"{path}: no SPZ file: its gzip stream begins with {magic!r}, expected {SPZ!r}"
         raise RefineError(msg)
     if version not in _VERSIONS:
         msg = f"{path}: SPZ version {version}, expected {', '.join(map(str, _VERSIONS))}"
@@ -334,7 +331,7 @@ def write(stream: BinaryIO, splats: Splats) -> None:
         if rest:
             blocks["rest"][piece] = _harmonic_codes(batch.sh_rest).reshape(-1, rest)
     engine = zlib.compressobj(wbits=16 + zlib.MAX_WBITS)
-    stream.write(engine.compress(_HEADER.pack(MAGIC, 3, count, header.degree, fraction, 0, 0)))
+    stream.write(engine.compress(_HEADER.pack(SPZ, 3, count, header.degree, fraction, 0, 0)))
     stream.writelines(engine.compress(block.data) for block in blocks.values())
     stream.write(engine.flush())
 
