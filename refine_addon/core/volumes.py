@@ -272,13 +272,6 @@ def forced(
     return Forced(protected, removed, tuple(facts))
 
 
-def among_all(values: NDArray[Any], rest: NDArray[np.bool_]) -> NDArray[Any]:
-    """Return values of the splats in `rest`, (N,) bool, as values of all N: 0 for the others."""
-    of_all = np.zeros(len(rest), values.dtype)
-    of_all[rest] = values
-    return of_all
-
-
 def refuse_all(removed: NDArray[np.bool_]) -> None:
     """Raise `RefineError` if all splats must go."""
     if len(removed) and removed.all():
