@@ -106,6 +106,10 @@ class _Bundle:
         section, place = self.section(name)
         return np.array(place.at(key).numbers(section.get(key), count))
 
+    def table(self, name: str) -> NDArray[np.float64]:
+        """Return the values that the pixels of an attribute are places of, (256,)."""
+        return self.numbers(name, "codebook", _TABLE)
+
     def pixels(self, name: str, index: int, count: int, width: int = 0) -> NDArray[np.uint8]:
         """Return an image of at least `count` pixels, (height, width, 4).
 
@@ -198,47 +202,51 @@ def _bundle(path: Path, archive: zipfile.ZipFile, size: int) -> _Bundle:
 
 def _splats(bundle: _Bundle, count: int) -> SplatFile:
     """Return the splats of an archive."""
-    low, high = (bundle.numbers("means", key, 3) for key in ("mins", "maxs"))
-    lower, upper = bundle.rows("means", 0, count), bundle.rows("means", 1, count)
-    turns = bundle.rows("quats", 0, count)
-    scales, scale_table = bundle.rows("scales", 0, count), bundle.numbers("scales", *_CODEBOOK)
-    colors, color_table = bundle.rows("sh0", 0, count), bundle.numbers("sh0", *_CODEBOOK)
-    _check_rotations(bundle, turns)
     palette, labels = _palette(bundle, count)
     degree = math.isqrt(palette.shape[1] + 1) - 1
-    path = bundle.place.path
-    file, splats = new_file(path, Origin(f"{NAME} version 2", bundle.size), count, degree)
+    origin = Origin(f"{NAME} version 2", bundle.size)
+    file, splats = new_file(bundle.place.path, origin, count, degree)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in meta.json
+        _fill_means(bundle, splats)
+        _fill_rotations(bundle, splats)
+        _fill_from_tables(bundle, splats)
         for piece in pieces(count):
-            code = lower[piece, :3] + upper[piece, :3] * 256.0
-            logs = low + (high - low) * (code / _COORDINATE)
-            splats.means[piece] = np.sign(logs) * np.expm1(np.abs(logs))
-            splats.quaternions[piece] = _quaternions(turns[piece])
-            splats.log_scales[piece] = scale_table[scales[piece, :3]]
-            splats.sh_dc[piece] = color_table[colors[piece, :3]]
-            splats.opacity_logits[piece] = opacity_logits(colors[piece, 3] / 255.0)
             splats.sh_rest[piece] = palette[labels[piece]]
     return file
 
 
-_CODEBOOK = ("codebook", _TABLE)
-"""In ``meta.json``: the key of a table, and how many numbers it has."""
+def _fill_means(bundle: _Bundle, splats: Splats) -> None:
+    low, high = (bundle.numbers("means", key, 3) for key in ("mins", "maxs"))
+    lower, upper = (bundle.rows("means", index, len(splats)) for index in (0, 1))
+    for piece in pieces(len(splats)):
+        code = lower[piece, :3] + upper[piece, :3] * 256.0
+        logs = low + (high - low) * (code / _COORDINATE)
+        splats.means[piece] = np.sign(logs) * np.expm1(np.abs(logs))
 
 
-def _check_rotations(bundle: _Bundle, turns: NDArray[np.uint8]) -> None:
-    """Refuse pixels of rotations that do not say which component is the largest."""
-    wrong = turns[:, 3] < _ROTATIONS
+def _fill_rotations(bundle: _Bundle, splats: Splats) -> None:
+    """Set quaternions from pixels; see `_rotation_pixels`."""
+    pixels = bundle.rows("quats", 0, len(splats))
+    wrong = pixels[:, 3] < _ROTATIONS
     if wrong.any():
         index = int(np.argmax(wrong))
         Place(bundle.place.path, f"rotation of splat {index}").fail(
-            f"alpha {turns[index, 3]}, expected {_ROTATIONS} to 255"
+            f"alpha {pixels[index, 3]}, expected {_ROTATIONS} to 255"
         )
+    for piece in pieces(len(splats)):
+        others = (pixels[piece, :3] / 127.5 - 1.0) / math.sqrt(2.0)
+        largest = (pixels[piece, 3] - _ROTATIONS).astype(np.intp)
+        splats.quaternions[piece] = join_largest(largest, others)
 
 
-def _quaternions(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return quaternions w x y z, (n, 4), of pixels; see `_rotation_pixels`."""
-    others = (pixels[:, :3] / 127.5 - 1.0) / math.sqrt(2.0)
-    return join_largest((pixels[:, 3] - _ROTATIONS).astype(np.intp), others)
+def _fill_from_tables(bundle: _Bundle, splats: Splats) -> None:
+    """Set scales, colours and, from the alpha of the colours' image, opacities."""
+    scales, scale_table = bundle.rows("scales", 0, len(splats)), bundle.table("scales")
+    colors, color_table = bundle.rows("sh0", 0, len(splats)), bundle.table("sh0")
+    for piece in pieces(len(splats)):
+        splats.log_scales[piece] = scale_table[scales[piece, :3]]
+        splats.sh_dc[piece] = color_table[colors[piece, :3]]
+        splats.opacity_logits[piece] = opacity_logits(colors[piece, 3] / 255.0)
 
 
 def _palette(bundle: _Bundle, count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
@@ -248,7 +256,7 @@ def _palette(bundle: _Bundle, count: int) -> tuple[NDArray[np.float32], NDArray[
     held, place = bundle.section("shN")
     bands = place.at("bands").whole(held.get("bands"), 1, _DEGREES)
     entries = place.at("count").whole(held.get("count"), 1, 1 << _LABEL_BITS)
-    table = bundle.numbers("shN", *_CODEBOOK)
+    table = bundle.table("shN")
     coefficients = above_constant(bands)
     width, height = _ACROSS * coefficients, -(-entries // _ACROSS)
     image = bundle.pixels("shN", 0, width * height, width)
