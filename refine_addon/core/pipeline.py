@@ -16,7 +16,7 @@ import numpy as np
 
 from . import selection
 from .absorbing import absorb as absorbing
-from .absorbing.merging import ViewSums
+from .absorbing.merge_field import ViewSums
 from .estimate.alignment import alignment
 from .estimate.psnr import psnr_against, psnr_kept, quality_curve
 from .estimate.quality import FEWEST, left_to_lose, needed, out_of_reach

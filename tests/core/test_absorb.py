@@ -8,8 +8,8 @@ import pytest
 
 from refine_addon.core.absorbing import merge_field, merge_graph, merging
 from refine_addon.core.absorbing.absorb import absorb, patience
+from refine_addon.core.absorbing.merge_field import Field, ViewSums
 from refine_addon.core.absorbing.merge_graph import MergeGraph
-from refine_addon.core.absorbing.merging import Field, ViewSums
 from refine_addon.core.affine import transformed
 from refine_addon.core.errors import Cancelled
 from refine_addon.core.rendering import ALPHA_MAX
@@ -49,7 +49,8 @@ def viewing(means, views):
 
 def field_of(splats, views, seen):
     scene = scene_of(splats.means, drawable(splats), views)
-    return merge_field.field(splats, np.arange(len(splats)), views, scene, seen)
+    bare = merge_field.unallowed(splats, np.arange(len(splats)), views, scene, seen)
+    return bare.with_allowance(bare.seen_and_whole())
 
 
 def merged_of(field, first=0, second=1):

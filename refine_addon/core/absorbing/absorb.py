@@ -57,15 +57,7 @@ _CHUNK = 1 << 14  # covariances turned into axes at a time: some MB of temporari
 
 
 class Counts:
-    """How many splats absorbing changed, merged and deleted.
-
-    Attributes
-    ----------
-    changed : (K,) bool
-        Which survivors absorbed others.
-    merged, deleted : int
-        How many splats were absorbed by a survivor, and how many were deleted.
-    """
+    """How many splats absorbing changed, merged and deleted; see `Absorbed`."""
 
     changed: NDArray[np.bool_]
     merged: int
@@ -281,9 +273,10 @@ def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     report(progress, 0.0, "absorbing")
 
     def make_graph() -> MergeGraph:
-        field = merge_field.field(
+        bare = merge_field.unallowed(
             splats, rows, views, scene, sums, progress=part(progress, 0.0, 0.1), threads=threads
         )
+        field = bare.with_allowance(bare.seen_and_whole())
         return MergeGraph(field, scene, factor, threads=threads)
 
     return reduced(
@@ -349,17 +342,8 @@ def _with_merged(
 ) -> Stage:
     """Return what a stage makes of splats, with the merged splats in place of survivors.
 
-    Parameters
-    ----------
-    splats, sums : Splats, ViewSums
-        The N splats of the stage, and what the views see of them.
-    keep : (N,) bool
-        Which of them survive.
-    rows : (M,) int64
-        Rows of the splats that the graph holds.
-    graph : MergeGraph
-        Reduced; its field shrinks to the changed survivors.
-    progress : callable
+    `keep`, (N,) bool, says which of them survive; the reduced graph's field shrinks to the changed
+    survivors. The rest as `reduced`.
     """
     owner, share = _owners(graph.merges, len(rows))  # (M,) each
     changed = np.zeros(len(rows), np.bool_)  # (M,), survivors that absorbed others
@@ -385,15 +369,9 @@ def _with_merged(
 
 
 def _owners(merges: Sequence[tuple[Index, Index, Array]], count: int) -> tuple[Index, Array]:
-    """Return the splat that each of `count` went into, and its share of that one's colour.
+    """Return the splat that each of `count` went into, or is, and its share of that one's colour.
 
-    A splat that went into none is its own.
-
-    Parameters
-    ----------
-    merges : sequence of (survivor, absorbed, share)
-        See `MergeGraph.merges`.
-    count : int
+    `merges`: see `MergeGraph.merges`.
     """
     owner, share = np.arange(count), np.ones(count)
     # From the last round to the first: a survivor of one round may be absorbed in a later one.

@@ -164,16 +164,9 @@ def viewing(
 
 
 def _viewing(points: Array, views: list[tuple[View, float]], closest: float) -> Viewing:
-    """Return from where views see M points.
+    """Return from where views, with their weights, see M points, (3, M).
 
-    Parameters
-    ----------
-    points : (3, M) float64
-        World units.
-    views : list of (View, float)
-        Views and their weights.
-    closest : float
-        Least distance of a camera.
+    A camera counts as at least `closest` away.
     """
     rows, columns = np.triu_indices(3)
     # Sums over views: of the weights, of pixels per squared world unit, of views; (M,) each.
@@ -227,7 +220,7 @@ def _deviation(direction: Array, second: Array) -> Array:
     return deviation.T
 
 
-def field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
+def unallowed(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
     splats: Splats,
     rows: Index,
     views: ViewSet,
@@ -236,11 +229,8 @@ def field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
     *,
     progress: Progress = silent,
     threads: int | None = None,
-) -> Field:
-    """Return some splats as merging needs them.
-
-    A splat that these views do not show may be visible from elsewhere, so each splat gets an
-    allowance for what one more view may see of it (`Unallowed`).
+) -> Unallowed:
+    """Return some splats as merging needs them, but for the allowance.
 
     Parameters
     ----------
@@ -262,21 +252,6 @@ def field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
     Cancelled
         If `progress` answers ``False``.
     """
-    bare = unallowed(splats, rows, views, scene, sums, progress=progress, threads=threads)
-    return bare.with_allowance(bare.seen_and_whole())
-
-
-def unallowed(  # noqa: PLR0913 - as `field`
-    splats: Splats,
-    rows: Index,
-    views: ViewSet,
-    scene: Scene,
-    sums: ViewSums,
-    *,
-    progress: Progress = silent,
-    threads: int | None = None,
-) -> Unallowed:
-    """Return some splats as merging needs them, but for the allowance; parameters as `field`."""
     viewed = viewing(
         splats.means[rows], views, scene, progress=part(progress, 0.0, 0.5), threads=threads
     )
