@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from refine_addon.core.absorbing import merge_field, merge_graph, merging
-from refine_addon.core.absorbing.absorb import absorb, patience
+from refine_addon.core.absorbing.absorb import ALONE, STAGE, absorb, patience, stages
 from refine_addon.core.absorbing.merge_field import Field, ViewSums
 from refine_addon.core.absorbing.merge_graph import MergeGraph
 from refine_addon.core.affine import transformed
@@ -862,3 +864,11 @@ def test_what_absorbed_in_any_stage_is_said_to_have_changed():
     for name in FIELDS:
         found = getattr(result.splats, name)[same]
         np.testing.assert_array_equal(found, getattr(splats, name)[rows])
+
+
+@given(st.integers(1, 10**9), st.floats(0.0, 1.0), st.sampled_from([ALONE, STAGE]))
+def test_no_stage_removes_more_than_half(count, share, alone):
+    """Tiles count a merge as half a splat, and have no more to remove than that of a region."""
+    left = [count, *stages(count, max(int(share * count), 1), alone)]
+
+    assert all(after >= before // 2 for before, after in itertools.pairwise(left))
