@@ -154,10 +154,6 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
         See `refine_addon.core.work.Progress`.
     threads : int, optional
 
-    Returns
-    -------
-    Absorbed
-
     Raises
     ------
     Cancelled
@@ -189,7 +185,7 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
 
 
 def _in_float64(splats: Splats, progress: Progress) -> Splats:
-    """Return splats in float64: merged ones merge again, and rounding depends on the frame."""
+    """Return splats in float64: merged ones merge again, and rounding would depend on the frame."""
     columns = {}
     for name, values in vars(splats).items():
         report(progress, 0.0, "absorbing")
