@@ -109,6 +109,7 @@ def test_a_dome_behind_all_stays():
     assert clean(splats, cameras()).keep.all()
 
 
+@pytest.mark.slow
 def test_what_changes_no_pixel_is_nearly_transparent_and_stays():
     """Opacity .015 against white changes a pixel by at most 3 of 255."""
     splats = joined(wall(), made([[0.1, 0.0, 2.0]], 0.06, 0.015, 0.1))
@@ -118,6 +119,7 @@ def test_what_changes_no_pixel_is_nearly_transparent_and_stays():
     assert np.flatnonzero(~asked.keep).tolist() == [SIDE**2]
 
 
+@pytest.mark.slow
 def test_switches_and_protection_spare():
     """A reason that is off takes nothing, and a protected splat has no reason."""
     splats = joined(wall(), FLOATER)
@@ -136,6 +138,7 @@ def test_one_view_is_enough_where_no_other_sees_it():
     assert cleaned.in_words() == "1 in front of surfaces in all of the 1 or 2 views that see them"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 def test_neither_order_nor_unit_nor_frame_decides(unit):
     """The scene reversed, turned by a quarter about x and in another unit loses the same splats."""
@@ -207,6 +210,7 @@ def test_cameras_that_see_nothing_are_refused():
         clean(wall(), away)
 
 
+@pytest.mark.slow
 def test_a_faint_splat_that_covers_much_must_show_less():
     """At .225 of the picture's side .9 of 255 is enough where .05 and less must change it by 4."""
     wide = made([[0.0, 0.0, 2.0]], 0.6, 0.01, 0.1)

@@ -15,6 +15,8 @@ from refine_addon.core.levels import files as levels_files
 
 from .test_command_clean import call, files  # noqa: F401 - a fixture
 
+pytestmark = pytest.mark.slow
+
 QUICK = ["--nested", "--method", "closed-form", "--views", "2"]
 
 

@@ -20,13 +20,14 @@ from refine_addon.core import (
     Splats,
     View,
     ViewSet,
+    absorb_splats,
     lod,
     lod_file,
-    pipeline,
     prune,
     read_cameras,
     read_ply,
     read_splats,
+    score,
 )
 from refine_addon.core.absorbing import absorb as absorbing
 from refine_addon.core.estimate.psnr import psnr_against
@@ -136,7 +137,7 @@ def test_what_absorbed_before_is_not_thinned_by_a_tenth_again(monkeypatch):
     """
     given, shares, whole, plain = [], [], absorbing.absorb, absorbing.patience
     monkeypatch.setattr(
-        pipeline.absorbing,
+        absorb_splats.absorbing,
         "absorb",
         lambda splats, *rest, **named: given.append(len(splats)) or whole(splats, *rest, **named),
     )
@@ -185,7 +186,7 @@ def test_the_psnr_of_a_level_is_against_the_original():
     """The estimate of the second level is that of its splats against all, not against the first."""
     splats, views = colourful(), cameras()
     levels = lod(splats, views, Levels((0.5, 0.2)))
-    sample = pipeline.score(splats, views, Settings("occlusion")).ray_sample
+    sample = score(splats, views, Settings("occlusion")).ray_sample
 
     assert levels[1].psnr == pytest.approx(psnr_against(sample, levels[1].splats, views), abs=0.01)
 
@@ -372,6 +373,7 @@ def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, monkeypat
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
+@pytest.mark.slow
 def test_no_manifest_lists_levels_of_two_runs(tmp_path, monkeypatch):
     """Where replacing fails at the second level, the first is replaced and the manifest is gone."""
     source = file_of(colourful(), tmp_path / "a.ply")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..scene import MIX
+from ..seeing.scene import MIX
 from ..work import Progress, for_chunks, part, report, silent
 from . import merging
 from .neighbours import nearest
@@ -14,7 +14,7 @@ from .neighbours import nearest
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..scene import Scene
+    from ..seeing.scene import Scene
     from .merge_field import Array, Field, Index
 
     Rows = NDArray[np.int32]

@@ -19,8 +19,8 @@ import numpy as np
 from ..errors import RefineError
 from ..seeing import projection
 from ..seeing.measuring import VIEW_GROUPS
-from ..splats import refuse_undrawable
-from ..volumes import among_all, refuse_all
+from ..splats import among_all, refuse_undrawable
+from ..volumes import refuse_all
 from ..work import Progress, for_chunks, part, silent
 from .clusters import cluster_sizes
 from .support import Evidence, Support, hits_of_view
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
     from ..seeing.projection import Footprints, Gaussians
+    from ..seeing.scene import Scene
     from ..splats import Splats
     from ..views import ViewSet
     from .support import Hits

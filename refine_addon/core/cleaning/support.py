@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
     from ..seeing.projection import Footprints, Gaussians
     from ..seeing.rays import Rays
+    from ..seeing.scene import Scene
     from ..views import View
 
 RAYS = 2500

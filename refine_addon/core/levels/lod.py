@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import RefineError
 from ..estimate.quality import PSNR_CAP
-from ..pipeline import decide, score
+from ..pipeline import decide
+from ..score_splats import score
 from ..selection import Budget
+from ..splats import among_all
 from ..task import DEFAULTS, Origin, Task
-from ..volumes import among_all
 from ..work import Progress, part, silent
 from .distance import OriginalPictures
 
@@ -242,7 +243,7 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     Raises
     ------
     RefineError, Cancelled
-        See `pipeline.score`; also if no level would have fewer splats than the original.
+        See `score_splats.score`; also if no level would have fewer splats than the original.
 
     Examples
     --------
