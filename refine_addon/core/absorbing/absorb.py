@@ -395,16 +395,10 @@ def _put_shapes(
 
 
 class _Blend:
-    """Weighted means of rows in groups; the shares of a group sum to 1.
+    """Weighted means of rows in groups.
 
-    Parameters
-    ----------
-    members : (m,) int64
-        Rows to take means of.
-    targets : (m,) int64
-        The row that the mean of a member's group is written to.
-    share : (m,) float64
-        Weight of each member.
+    `members`, (m,), are the rows; `targets`, (m,), the row that the mean of a member's group is
+    written to; `share`, (m,), their weights, which sum to 1 in a group.
     """
 
     def __init__(self, members: Index, targets: Index, share: Array) -> None:

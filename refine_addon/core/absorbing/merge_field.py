@@ -203,13 +203,8 @@ def _seen_from(view: View, points: Array, closest: float) -> tuple[NDArray[np.bo
 def _deviation(direction: Array, second: Array) -> Array:
     """Return the largest standard deviation of viewing directions as a vector, (M, 3).
 
-    Parameters
-    ----------
-    direction : (M, 3) float64
-        Mean viewing direction, length 1.
-    second : (M, 6) float64
-        Mean products xx, xy, xz, yy, yz, zz of the directions. In the plane at right angles to the
-        mean direction these are variances.
+    Given their mean, (M, 3), and their mean products xx, xy, xz, yy, yz, zz, (M, 6). In the plane
+    at right angles to the mean these are variances.
     """
     u, v = across(direction)
     xx, xy, yy = footprint(second, (u, v), np.zeros(len(direction)))
@@ -367,12 +362,7 @@ def across(normal: Array) -> tuple[Array, Array]:
 def footprint(covariances: Array, plane: tuple[Array, Array], blur: Array) -> Footprint:
     """Return xx, xy, yy of ``(u, v)' C (u, v) + blur I``, (M,) each: C projected to a plane.
 
-    Parameters
-    ----------
-    covariances : (M, 6) float64
-    plane : (u, v)
-        Unit vectors, (3, M).
-    blur : (M,) float64
+    `plane` holds the unit vectors u and v, (3, M) each.
     """
     u, v = plane
     xx, xy, xz, yy, yz, zz = covariances.T

@@ -134,11 +134,9 @@ def hits_of_view(
 
     Parameters
     ----------
-    gaussians : Gaussians
-    footprints : Footprints
-        Of these in the view.
-    scene : Scene
-    view : View
+    gaussians, footprints
+        The latter are those of the former in the view.
+    scene, view
     number : int
         Of the view: each has its rays in other pixels.
     absent : (M,) bool
@@ -197,14 +195,7 @@ def _depths(
     from its centre. That is the sum of ``(c.a / s^2) (d.a / s^2)`` over the footprint's axes a, of
     length s.
 
-    Parameters
-    ----------
-    gaussians, footprints : Gaussians, Footprints
-        The u that are hit.
-    scene, view
-    rays : Rays
-    reached : (h,) int64
-        Which of their hits.
+    `gaussians` and `footprints` are the u that are hit; `reached`, (h,), says which hits count.
     """
     means, covariances = (
         values.astype(np.float64) for values in projection.in_camera(gaussians, scene, view)
@@ -326,12 +317,7 @@ class Evidence(_Sums):
     def add(self, hits: Hits, suspects: NDArray[np.bool_], colors: NDArray[np.float32]) -> None:
         """Add what one view sees.
 
-        Parameters
-        ----------
-        hits : Hits
-            With the suspects absent.
-        suspects : (M,) bool
-        colors : (M, 3) float32
+        The hits are those with the suspects, (M,) bool, absent; colours are (M, 3).
         """
         rows = np.flatnonzero(suspects[hits.hit].take(hits.owner))
         around = hits.around(rows)
