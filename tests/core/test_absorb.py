@@ -51,8 +51,8 @@ def viewing(means, views):
 
 def field_of(splats, views, seen):
     scene = scene_of(splats.means, drawable(splats), views)
-    bare = merge_field.unallowed(splats, np.arange(len(splats)), views, scene, seen)
-    return bare.with_allowance(bare.seen_and_whole())
+    measured = merge_field.measured_field(splats, np.arange(len(splats)), views, scene, seen)
+    return measured.with_allowance(measured.seen_and_whole())
 
 
 def merged_of(field, first=0, second=1):

@@ -269,10 +269,10 @@ def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     report(progress, 0.0, "absorbing")
 
     def make_graph() -> MergeGraph:
-        bare = merge_field.unallowed(
+        measured = merge_field.measured_field(
             splats, rows, views, scene, sums, progress=part(progress, 0.0, 0.1), threads=threads
         )
-        field = bare.with_allowance(bare.seen_and_whole())
+        field = measured.with_allowance(measured.seen_and_whole())
         return MergeGraph(field, scene, factor, threads=threads)
 
     return reduced(

@@ -215,7 +215,7 @@ def _deviation(direction: Array, second: Array) -> Array:
     return deviation.T
 
 
-def unallowed(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
+def measured_field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
     splats: Splats,
     rows: Index,
     views: ViewSet,
@@ -224,7 +224,7 @@ def unallowed(  # noqa: PLR0913 - which splats, seen by what, in which scene, ho
     *,
     progress: Progress = silent,
     threads: int | None = None,
-) -> Unallowed:
+) -> MeasuredField:
     """Return some splats as merging needs them, but for the allowance.
 
     Parameters
@@ -278,7 +278,7 @@ def unallowed(  # noqa: PLR0913 - which splats, seen by what, in which scene, ho
         xx, xy, yy = footprint(covariances, across(field.direction), field.blur)  # (M,) each
         # In pixels of a view, over 2 pi; a constant factor does not matter here.
         mass = field.opacity * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / viewed.pixel
-    return Unallowed(field, mass, viewed.seen)
+    return MeasuredField(field, mass, viewed.seen)
 
 
 def _covariances(splats: Splats) -> Array:
@@ -290,7 +290,7 @@ def _covariances(splats: Splats) -> Array:
     return full[:, rows, columns]
 
 
-class Unallowed(NamedTuple):
+class MeasuredField(NamedTuple):
     """Splats as merging needs them, but without the allowance for views that were not given.
 
     If nothing were hidden, each view would see the whole mass of every splat whose centre lies in
