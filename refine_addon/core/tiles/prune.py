@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..formats.format import Format
-    from ..operation.prune import PruneRequest
+    from ..operation.requests import PruneRequest
     from ..operation.run import Runtime
     from ..scores import Scores
     from ..selection import Budget
@@ -124,13 +124,11 @@ class TileScene:
     tiles : list of Tile
     workers : Workers
         Who does the steps.
-    notes : tuple of str
     """
 
     folder: Folder
     tiles: list[Tile]
     workers: Workers
-    notes: tuple[str, ...] = ()
 
     @functools.cached_property
     def units(self) -> list[Unit]:
