@@ -6,7 +6,7 @@
 
 Of 2,000 floaters, 1,100 stand in front of a camera, each by itself; 800 form blobs of 5 to 59 in
 free space; 100 are huge veils. Size, opacity, colour and place vary. Free space is what lies in
-front of the depth at which half of a line of sight's light is gone. The train views place floaters
+front of the depth at which half of a ray's light is gone. The train views place floaters
 and decide; the test views only compare with renders of the unpolluted scene and real pictures.
 """
 

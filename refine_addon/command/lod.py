@@ -58,5 +58,4 @@ def _in_words(entry: dict[str, Any], goal: float) -> str:
     far = entry["distance_psnr"]
     if far is not None:
         parts.append(f"{goal:g} dB at a distance of {far:.3g} or more")
-    parts.append(f"no change wider than a pixel at {entry['distance_pixel']:.3g} or more")
     return f"{entry['file']}: {', '.join(parts)}"

@@ -9,7 +9,7 @@ In short::
 
 from .cameras.read import read_cameras
 from .cleaning.clean import REASONS, Cleaned, Cleaning, clean
-from .errors import Cancelled, RefineError
+from .errors import RefineError
 from .formats.ply import SplatFile, read_ply
 from .formats.registry import as_written, read_splats
 from .levels.files import LevelsRequest, lod_file
@@ -29,6 +29,7 @@ from .task import METHODS, Result, Settings
 from .tiles.prune import prune_tiles
 from .views import View, ViewSet
 from .volumes import Box, MovedVolume, Sphere, Zone, forced
+from .work import Cancelled
 
 __all__ = [
     "METHODS",

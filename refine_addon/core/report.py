@@ -12,6 +12,7 @@ import numpy as np
 from .estimate.quality import FEWEST, out_of_reach
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
     from numpy.typing import NDArray
 
     from .absorbing.absorb import Counts
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from .formats.registry import Packed
     from .scores import Scores
     from .selection import Budget
-    from .task import Settings
 
 
 SEES_TOO_LITTLE = "the views see too little for an estimate of the pictures' quality"
@@ -153,7 +153,11 @@ def held(
 
 
 def make_report(
-    scores: Scores, keep: NDArray[np.bool_], budget: Budget, settings: Settings, clock: Clock
+    scores: Scores,
+    keep: NDArray[np.bool_],
+    budget: Budget,
+    settings: DataclassInstance,
+    clock: Clock,
 ) -> dict[str, Any]:
     """Return the report of a prune, as plain JSON values.
 

@@ -1,8 +1,8 @@
 """What the panel and the command do to an object: score, apply, export.
 
-An operation begins with `mesh.layout.check`, which finds out that an object holds splats, and hands
-what it found to all functions here. Each either does all it says, or raises `RefineError` and
-leaves the scene as it was.
+An operation begins with `mesh.layout.check`, which makes sure that an object holds splats; its
+`SplatObject` is what the functions here take. Each either does all it says, or raises `RefineError`
+and leaves the scene as it was.
 """
 
 from __future__ import annotations
@@ -237,7 +237,7 @@ def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
 def reduce_object(
     checked: SplatObject, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
 ) -> None:
-    """Delete what does not stay, store what the others became, and drop the note of the scores."""
+    """Delete what does not stay, store what the others became, and drop the scores' record."""
     mesh_edit.delete_vertices(checked.obj, ~keep)
     columns = {name: values[keep] for name, values in columns.items()}
     mesh_attributes.write_columns(checked, columns)
@@ -320,10 +320,10 @@ def write_export(
     keep: NDArray[np.bool_] | None = None,
     overwrite: bool = False,
 ) -> SplatFile | Packed:
-    """Do what is left of `export_object`, which takes arrays alone; see there."""
-    made = as_written(file, target)
-    made.write(target, keep, overwrite=overwrite)
-    return made
+    """Write what `export_source` returned, as `export_object` does; without Blender's data."""
+    written = as_written(file, target)
+    written.write(target, keep, overwrite=overwrite)
+    return written
 
 
 def _outcome(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
@@ -351,7 +351,7 @@ def find(name: str) -> bpy.types.Object:
     obj = bpy.context.scene.objects.get(name)
     if obj is None:
         names = [o.name for o in bpy.context.scene.objects if mesh_layout.looks_like_splats(o)]
-        there = ", ".join(names[:8]) or "none"
-        msg = f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {there})"
+        listed = ", ".join(names[:8]) or "none"
+        msg = f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {listed})"
         raise RefineError(msg)
     return obj

@@ -88,6 +88,22 @@ def room(addon, empty_scene):
 
 
 @pytest.fixture
+def quarter(addon, room):
+    """Keep every fourth splat of the room: 9,939."""
+    addon.mesh.edit.delete_vertices(room, np.arange(len(room.data.vertices)) % 4 != 0)
+    return room
+
+
+@pytest.fixture(scope="session")
+def quarter_file(addon, tmp_path_factory):
+    """Write every fourth splat of the room to a file."""
+    path = tmp_path_factory.mktemp("quarter") / "room.ply"
+    file = addon.core.read_ply(ROOM / "point_cloud.ply")
+    file.write(path, np.arange(len(file)) % 4 == 0)
+    return path
+
+
+@pytest.fixture
 def room_views(addon):
     """Read the room's camera file."""
     return addon.core.read_cameras(ROOM / "cameras.json")

@@ -201,10 +201,10 @@ def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):  # no
         addon.mesh.scores.store(addon.mesh.layout.check(room), scores, addon.core.Settings())
 
 
-def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, room, room_views):
+def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, quarter, room_views):
     """The thread of the window: same scores; after `cancel` its result raises `Cancelled`."""
     core = addon.core
-    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(room))
+    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(quarter))
     worker = addon.ui.worker.Worker(
         lambda progress: core.score(splats, room_views, progress=progress)
     )

@@ -281,6 +281,7 @@ def test_one_splat_and_one_view_score_one(settings):
     assert scored(splats, ViewSet((view(),)), settings).values == pytest.approx([1.0])
 
 
+@pytest.mark.slow
 def test_ten_thousand_views_are_one_mean():
     """Copies of one view change nothing."""
     splats = cloud()

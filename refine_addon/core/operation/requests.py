@@ -10,13 +10,13 @@ import numpy as np
 
 from ..affine import is_uniform, transformed
 from ..cleaning.clean import Cleaning, clean
-from ..estimate.written import written_facts
 from ..formats.registry import read_written, refuse_unknown_size
 from ..pipeline import decide
 from ..report import kept_and_removed, scoring_notes, seen_by, what_was_seen
 from ..score_splats import score
 from ..task import DEFAULTS, Settings, Task
 from .run import DECIDED, Request
+from .written import written_facts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

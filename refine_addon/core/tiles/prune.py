@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...version import VERSION
-from ..errors import Cancelled, RefineError
+from ..errors import RefineError
 from ..estimate.psnr import psnr_kept
 from ..estimate.quality import needed
 from ..formats.ply_header import with_count
@@ -22,7 +22,7 @@ from ..report import MEASURES, Files, conclude, make_report, remark
 from ..scoring.closed_form_block import ROWS
 from ..selection import refuse_none_left
 from ..urls import Url
-from ..work import Progress, silent
+from ..work import Cancelled, Progress, silent
 from . import absorbing
 from .closed_form import ClosedFormContext, by_closed_form
 from .folder import Folder, Interrupted
