@@ -16,8 +16,7 @@ from .levels.files import LevelsRequest, lod_file
 from .levels.lod import Level, Levels, lod
 from .operation.files import file_to_file, prune_file
 from .operation.requests import CleanRequest, ConvertRequest, PruneRequest, ScoreRequest
-from .pipeline import prune
-from .score_splats import score
+from .pipeline import prune, score
 from .scores import Scores
 from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion

@@ -11,9 +11,8 @@ import numpy as np
 from ..affine import is_uniform, transformed
 from ..cleaning.clean import Cleaning, clean
 from ..formats.registry import read_written, refuse_unknown_size
-from ..pipeline import decide
+from ..pipeline import decide, score
 from ..report import kept_and_removed, scoring_notes, seen_by, what_was_seen
-from ..score_splats import score
 from ..task import DEFAULTS, Settings, Task
 from .run import DECIDED, Request
 from .written import written_facts
@@ -282,7 +281,7 @@ class ScoreRequest(Request["Loaded", Kept]):
         Raises
         ------
         RefineError, Cancelled
-            See `score_splats.score`.
+            See `pipeline.score`.
         """
         forced = loaded.forced
         scores = score(
