@@ -135,19 +135,19 @@ def kept_and_removed(keep: NDArray[np.bool_]) -> dict[str, int]:
 
 
 def held(
-    made: SplatFile | Packed, keep: NDArray[np.bool_], *, written: bool = True
+    writer: SplatFile | Packed, keep: NDArray[np.bool_], *, written: bool = True
 ) -> dict[str, int | None]:
     """Return how many splats a file of the kept rows holds, and how many its format leaves out.
 
     Parameters
     ----------
-    made : SplatFile or Packed
+    writer : SplatFile or Packed
         What writes the file.
     keep : (N,) bool
     written : bool
         Whether there is a file; without one, ``written`` is None.
     """
-    missing = made.left_out(keep)
+    missing = writer.left_out(keep)
     count = int(np.count_nonzero(keep)) - missing
     return {"written": count if written else None, "left_out": missing}
 
