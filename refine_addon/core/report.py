@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,25 +54,11 @@ class Clock:
         self.timings["total_s"] = time.perf_counter() - self._start
 
 
-@dataclass(frozen=True)
-class Files:
-    """The files of a prune, under their names in the report.
-
-    Attributes
-    ----------
-    input : str
-        A file, or a .blend file and the object in it.
-    output : str or None
-        The file that was written, if any.
-    input_bytes : int
-    output_bytes : int or None
-        Sizes; None for a file that is not written and whose size only writing tells.
-    """
-
-    input: str
-    output: str | None
-    input_bytes: int
-    output_bytes: int | None
+def files_facts(
+    source: str, output: str | None, before: int, after: int | None
+) -> dict[str, str | int | None]:
+    """Return what a report says of files: their names, and bytes; see docs/report.md."""
+    return {"input": source, "output": output, "input_bytes": before, "output_bytes": after}
 
 
 def size_in_words(count: int) -> str:

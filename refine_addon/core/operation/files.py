@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from ..formats.registry import as_written, format_named, read_splats
-from ..report import Files, held
+from ..report import files_facts, held
 from ..volumes import forced
 from ..whole_file import expanded, refuse_existing, refuse_mapped
 from ..work import Progress, report, silent
@@ -191,7 +191,7 @@ class FileSink:
             writer.write(path, choice.keep, columns=columns, overwrite=self.overwrite)
             size = path.stat().st_size
         return Written(
-            files=asdict(Files(loaded.name, str(path) if path else None, loaded.bytes, size)),
+            files=files_facts(loaded.name, str(path) if path else None, loaded.bytes, size),
             path=path,
             splats=held(writer, choice.keep, written=path is not None),
             notes=[*writer.notes(choice.keep), *loaded.notes],
