@@ -1,4 +1,4 @@
-"""Calls that other threads ask Blender's main thread to make: its data is not safe elsewhere."""
+"""Calls that other threads leave to Blender's main thread: only there its data may be touched."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ import threading
 from concurrent.futures import Future, wait
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from .core.errors import Cancelled
-from .core.work import checkpoint
+from .core.work import Cancelled, checkpoint
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,12 +22,14 @@ _asked: queue.SimpleQueue[tuple[Callable[[], Any], Future[Any]]] = queue.SimpleQ
 
 
 def call(function: Callable[[], Answer]) -> Answer:
-    """Return what a function returns that the main thread calls: at once there, else by `serve`.
+    """Have the main thread call a function, and return what it returns.
+
+    Called on the main thread, it does so at once; on another, it waits until `serve` has done it.
 
     Raises
     ------
     Cancelled
-        See `work.checkpoint`; the function may not be called then.
+        See `work.checkpoint`. The function may have been called or not.
     Exception
         What the function raises.
     """

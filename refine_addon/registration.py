@@ -8,7 +8,7 @@ from bpy.props import PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
-from .ui import camera_list, demand_changes, kept, plans, price, running
+from .ui import camera_list, demand_changes, panel_cache, plans, price, running
 from .ui.camera_list import REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
 from .ui.export_operators import REFINE_OT_export_ply
@@ -104,7 +104,7 @@ def register() -> None:
     bpy.types.TOPBAR_MT_file_import.append(_draw_import)
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
     camera_list.register()
-    kept.register()
+    panel_cache.register()
     demand_changes.register()
     price.register()
     running.register()
@@ -121,7 +121,7 @@ def unregister() -> None:
     plans.unregister()
     price.unregister()
     demand_changes.unregister()
-    kept.unregister()
+    panel_cache.unregister()
     camera_list.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)
     bpy.types.TOPBAR_MT_file_import.remove(_draw_import)

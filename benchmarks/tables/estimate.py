@@ -22,8 +22,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from refine_addon.core import Settings, prune
 from refine_addon.core.errors import RefineError
-from refine_addon.core.pipeline import Settings, prune, with_quality
+from refine_addon.core.score_splats import with_quality
 from refine_addon.core.selection import Budget
 
 from .evaluate import Evaluator, read_scene

@@ -33,10 +33,10 @@ import numpy as np
 from PIL import Image
 from skimage.metrics import structural_similarity
 
+from refine_addon.core import Settings, score
 from refine_addon.core.cameras.read import read_cameras
 from refine_addon.core.errors import RefineError
 from refine_addon.core.formats.ply import read_ply
-from refine_addon.core.pipeline import Settings, score
 from refine_addon.core.scores import Scores
 from refine_addon.core.selection import Budget, select
 

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
 import numpy as np
 
-from refine_addon.core import pipeline
+from refine_addon import core
+from refine_addon.core import Settings
 from refine_addon.core.formats.ply import read_ply
-from refine_addon.core.pipeline import Settings
 from refine_addon.core.scores import Scores
 from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.selection import Budget
@@ -204,14 +204,14 @@ def _absorb(task: Task, keep_count: int, ratio: float) -> Splats:
     del ratio
     budget = Budget(keep=keep_count)
     settings = Settings(views=0, method="occlusion")
-    result = pipeline.prune(task.splats, task.views, budget, settings, absorb=True)
+    result = core.prune(task.splats, task.views, budget, settings, absorb=True)
     return task.splats.take(result.keep) if result.absorbed is None else result.absorbed.splats
 
 
 def _scoring(name: str, group: str, about: str, settings: Settings) -> Method:
     def score(task: Task, statistics: Statistics | None) -> Scores:
         del statistics
-        return pipeline.score(task.splats, task.views, settings)
+        return core.score(task.splats, task.views, settings)
 
     return Method(name, group, about, score=score)
 

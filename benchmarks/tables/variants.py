@@ -6,8 +6,7 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from refine_addon.core import pipeline
-from refine_addon.core.pipeline import Settings
+from refine_addon.core import Settings, score
 from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.scoring.occlusion import Occlusion
 
@@ -80,7 +79,7 @@ def measure(
     lines = []
     for name, settings in variants.items():
         start = time.perf_counter()
-        scores = pipeline.score(task.splats, task.views, settings)
+        scores = score(task.splats, task.views, settings)
         seconds = time.perf_counter() - start
         psnr = evaluator.psnr(task.splats, scores, ratios)
         lines.append(Line(name, seconds, psnr))

@@ -182,7 +182,8 @@ def _turn(
 ) -> int | None:
     """Return by how many quarters about x cameras are to be turned; see `ViewSet`.
 
-    It is known where splats and at least half of the cameras were imported, and stand alike.
+    None where that is not known: unless splats and at least half of the cameras were imported, and
+    all of these cameras are turned alike.
     """
     data = None if splats is None else splats.data
     if splats is None or data is None or not (LAYOUT in data or is_native(data)):
@@ -192,8 +193,8 @@ def _turn(
     axes = linear / scale if scale else linear
     if np.abs(axes @ axes.T - np.eye(3)).max() > SHEAR:
         return None
-    found = [quarter_turn(camera, view, axes) for camera, view in zip(cameras, views, strict=True)]
-    turns = [turn for turn in found if turn is not None]
+    pairs = zip(cameras, views, strict=True)
+    turns = [t for camera, view in pairs if (t := quarter_turn(camera, view, axes)) is not None]
     alike = len(set(turns)) == 1 and 2 * len(turns) >= len(cameras)
     return turns[0] if alike else None
 

@@ -1,4 +1,4 @@
-"""What ``info`` says of a file."""
+"""What ``info`` does and says."""
 
 from __future__ import annotations
 
@@ -6,10 +6,28 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..core import read_splats
 from ..core.splats import drawable
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from ..core import SplatFile
+    from .run import Run
+
+
+def info(run: Run) -> None:
+    """Describe each input."""
+    for source in run.options.inputs:
+        run.attempt(str(source), lambda source=source: _info(run, source))
+
+
+def _info(run: Run, source: Path) -> dict[str, Any]:
+    facts = describe(read_splats(source))
+    run.terminal.say(f"{source}")
+    for name, value in facts.items():
+        run.terminal.say(f"  {name.replace('_', ' '):18} {value}")
+    return {"input": str(source), **facts}
 
 
 def describe(file: SplatFile) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What ``lod`` does, and what it says of the levels."""
+"""What ``lod`` does and says."""
 
 from __future__ import annotations
 
@@ -8,26 +8,24 @@ from ..core.estimate.quality import in_words
 from ..core.levels.files import LevelsRequest, lod_file
 from ..core.report import size_in_words
 from .options import levels, settings
-from .words import by, left_unseen
-from .zones import of_files, words
+from .words import by
+from .zones import of_files
 
 if TYPE_CHECKING:
-    import argparse
     from pathlib import Path
 
     from ..core import ViewSet
-    from ..core.work import Progress
-    from .terminal import Terminal
+    from .run import Run
 
 
-def make_levels(
-    options: argparse.Namespace,
-    terminal: Terminal,
-    source: Path,
-    views: ViewSet,
-    progress: Progress,
-) -> dict[str, Any]:
-    """Make the levels of a file and say what each costs; return the report."""
+def lod(run: Run) -> None:
+    """Make levels of detail of the input."""
+    views, source = run.views(), run.options.inputs[0]
+    run.attempt(str(source), lambda: _make_levels(run, source, views))
+
+
+def _make_levels(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
+    options, terminal = run.options, run.terminal
     request = LevelsRequest(
         views,
         levels(options),
@@ -37,18 +35,15 @@ def make_levels(
         goal=options.distance_psnr,
         overwrite=options.overwrite,
     )
-    done = lod_file(source, options.output_dir, request, progress=progress)
+    done = lod_file(source, options.output_dir, request, progress=run.progress(source.name))
     terminal.clear()
     count, made = done["splats"]["before"], len(done["levels"])
     terminal.say(
         f"{source}: {made} level{'s' if made > 1 else ''} of {count:,} splats, "
         f"{by(done['views'])}, {done['timings']['total_s']:.2f} s -> {options.output_dir}"
     )
-    if said := words(done):
-        terminal.say(f"  {said}")
-    if done["splats"]["unseen"]:
-        scored = count - done["splats"]["forced"]
-        terminal.say(f"  {left_unseen(done['splats']['unseen'], scored)}")
+    run.say_demanded(done)
+    run.say_unseen(done["splats"]["unseen"], count - done["splats"]["forced"])
     for entry in done["levels"]:
         terminal.say(f"  {_in_words(entry, done['goal_psnr'])}")
     terminal.notes(done["notes"])
@@ -63,5 +58,4 @@ def _in_words(entry: dict[str, Any], goal: float) -> str:
     far = entry["distance_psnr"]
     if far is not None:
         parts.append(f"{goal:g} dB at a distance of {far:.3g} or more")
-    parts.append(f"no change wider than a pixel at {entry['distance_pixel']:.3g} or more")
     return f"{entry['file']}: {', '.join(parts)}"

@@ -9,14 +9,17 @@ In short::
 
 from .cameras.read import read_cameras
 from .cleaning.clean import REASONS, Cleaned, Cleaning, clean
-from .errors import Cancelled, RefineError
+from .errors import RefineError
 from .formats.ply import SplatFile, read_ply
 from .formats.registry import as_written, read_splats
 from .levels.files import LevelsRequest, lod_file
 from .levels.lod import Level, Levels, lod
-from .operation.files import prune_file
-from .operation.prune import PruneRequest
-from .pipeline import prune, score
+from .operation.clean import CleanRequest, clean_file
+from .operation.convert import convert_file
+from .operation.prune import PruneRequest, prune_file
+from .operation.score import ScoreRequest, score_file
+from .pipeline import prune
+from .score_splats import score
 from .scores import Scores
 from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
@@ -28,6 +31,7 @@ from .task import METHODS, Result, Settings
 from .tiles.prune import prune_tiles
 from .views import View, ViewSet
 from .volumes import Box, MovedVolume, Sphere, Zone, forced
+from .work import Cancelled
 
 __all__ = [
     "METHODS",
@@ -35,6 +39,7 @@ __all__ = [
     "Box",
     "Budget",
     "Cancelled",
+    "CleanRequest",
     "Cleaned",
     "Cleaning",
     "ClosedForm",
@@ -46,6 +51,7 @@ __all__ = [
     "PruneRequest",
     "RefineError",
     "Result",
+    "ScoreRequest",
     "Scores",
     "Settings",
     "Solid",
@@ -57,6 +63,8 @@ __all__ = [
     "Zone",
     "as_written",
     "clean",
+    "clean_file",
+    "convert_file",
     "forced",
     "lod",
     "lod_file",
@@ -68,6 +76,7 @@ __all__ = [
     "read_ply",
     "read_splats",
     "score",
+    "score_file",
     "select",
     "survivor_columns",
 ]

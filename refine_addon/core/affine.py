@@ -21,21 +21,36 @@ QUARTER = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 QUARTERS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T}
 """No turn, a quarter turn about x and one back, by how many quarters they are."""
 
-UNIFORM_TOLERANCE = 1e-4
+_UNIFORM = 1e-4
 """Relative difference between the scales of a matrix that still counts as uniform scaling."""
 
-SMALLEST_SCALE, LARGEST_SCALE = 1e-30, 1e30
-"""Of a matrix that is applied: its determinant is in the range of float64, and usual splats stay in
-that of float32."""
+_FLAT = 1e-9
+"""Least over largest scale of a matrix that cannot be inverted in practice."""
+
+_SMALLEST, _LARGEST = 1e-30, 1e30
+"""Scales of a matrix that is applied: its determinant is in the range of float64, and usual splats
+stay in that of float32."""
 
 _CHUNK = 1 << 16
 """Splats whose covariances are computed together, which limits temporary memory."""
 
 
+def scales_of(matrix: NDArray[Any]) -> NDArray[np.float64]:
+    """Return by how much a (4, 4) or (3, 3) matrix scales along its three axes, largest first."""
+    linear = np.asarray(matrix, np.float64)[:3, :3]
+    return np.asarray(np.linalg.svd(linear, compute_uv=False))
+
+
 def is_uniform(matrix: NDArray[Any]) -> bool:
     """Return whether a (4, 4) or (3, 3) matrix scales all directions alike; it may mirror."""
-    scales = np.linalg.svd(np.asarray(matrix, np.float64)[:3, :3], compute_uv=False)
-    return bool(scales[0] - scales[2] <= UNIFORM_TOLERANCE * scales[0])
+    scales = scales_of(matrix)
+    return bool(scales[0] - scales[2] <= _UNIFORM * scales[0])
+
+
+def is_flat(matrix: NDArray[Any]) -> bool:
+    """Return whether a (4, 4) or (3, 3) matrix maps space to a plane, a line or a point."""
+    scales = scales_of(matrix)
+    return not scales[2] > _FLAT * scales[0]
 
 
 def moved(means: NDArray[Any], matrix: NDArray[Any]) -> NDArray[np.float64]:
@@ -67,31 +82,13 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
     ------
     RefineError
         If the matrix is not finite, not invertible or not affine, or scales by less than 1e-30 or
-        more than 1e30; or if, with `rotate_sh`, it
-        scales directions differently, which harmonics cannot express.
+        more than 1e30; or if, with `rotate_sh`, it scales directions differently, which harmonics
+        cannot express.
     """
     matrix = np.asarray(matrix, np.float64)
-    linear = matrix[:3, :3]
-    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
-        msg = f"expected a finite (4, 4) matrix, got {matrix.tolist()}"
-        raise RefineError(msg)
-    scales = np.linalg.svd(linear, compute_uv=False)
-    if scales[2] <= 1e-9 * scales[0] or not np.array_equal(matrix[3], [0, 0, 0, 1]):
-        msg = (
-            f"the transform is flat or not affine (scales {scales.tolist()}): it cannot be applied"
-        )
-        raise RefineError(msg)
-    if not SMALLEST_SCALE <= scales[2] <= scales[0] <= LARGEST_SCALE:
-        msg = f"the transform scales by {scales[0]:g}, expected 1e-30 to 1e30"
-        raise RefineError(msg)
-    means = moved(splats.means, matrix)
+    _check(matrix, with_sh=rotate_sh)
+    means, linear = moved(splats.means, matrix), matrix[:3, :3]
     if not is_uniform(matrix):
-        if rotate_sh:
-            msg = (
-                f"the transform scales directions differently ({scales.round(6).tolist()}); splat "
-                "colours cannot follow that: make the object's scale uniform first"
-            )
-            raise RefineError(msg)
         return _stretched(splats, means, linear)
     factor = np.cbrt(abs(np.linalg.det(linear)))
     rotation = linear / factor
@@ -111,6 +108,28 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
             else splats.sh_rest
         ),
     )
+
+
+def _check(matrix: NDArray[np.float64], *, with_sh: bool) -> None:
+    """Refuse a matrix that splats, or with `with_sh` their harmonics, cannot follow."""
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        msg = f"expected a finite (4, 4) matrix, got {matrix.tolist()}"
+        raise RefineError(msg)
+    scales = scales_of(matrix)
+    if is_flat(matrix) or not np.array_equal(matrix[3], [0, 0, 0, 1]):
+        msg = (
+            f"the transform is flat or not affine (scales {scales.tolist()}): it cannot be applied"
+        )
+        raise RefineError(msg)
+    if not _SMALLEST <= scales[2] <= scales[0] <= _LARGEST:
+        msg = f"the transform scales by {scales[0]:g}, expected {_SMALLEST:g} to {_LARGEST:g}"
+        raise RefineError(msg)
+    if with_sh and not is_uniform(matrix):
+        msg = (
+            f"the transform scales directions differently ({scales.round(6).tolist()}); splat "
+            "colours cannot follow that: make the object's scale uniform first"
+        )
+        raise RefineError(msg)
 
 
 def _rotated(quaternions: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:

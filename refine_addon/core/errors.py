@@ -33,7 +33,3 @@ class RefineError(Exception):
     def __str__(self) -> str:
         """Return the message, made `printable`, since it may hold names out of files."""
         return printable(super().__str__())
-
-
-class Cancelled(Exception):  # noqa: N818 - not an error: the user asked to stop
-    """Raised between two pieces of work when the progress callback returns ``False``."""

@@ -24,8 +24,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeVar
 
-from .whole_file import REPLACES_MAPPED
-from .work import Progress, default_threads, each_chunk, for_chunks, part, silent
+from .work import REPLACES_MAPPED, Progress, default_threads, each_chunk, for_chunks, part, silent
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator

@@ -9,14 +9,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .estimate.quality import FEWEST, out_of_reach
+
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
     from numpy.typing import NDArray
 
+    from .absorbing.absorb import Counts
     from .formats.ply import SplatFile
     from .formats.registry import Packed
     from .scores import Scores
     from .selection import Budget
-    from .task import Settings
+
+
+SEES_TOO_LITTLE = "the views see too little for an estimate of the pictures' quality"
+NOT_ESTIMATED = "the closed form estimates the pictures' quality only if a PSNR is the budget"
+NOT_FORETOLD = f"what absorbing reaches is not foretold for fewer than {FEWEST:,} splats"
+"""Why there is no estimate: notes of the report."""
+
+MEASURES = "absorbing measures by occlusion: closed-form was not used"
+"""A note of the report."""
 
 
 class Clock:
@@ -141,7 +153,11 @@ def held(
 
 
 def make_report(
-    scores: Scores, keep: NDArray[np.bool_], budget: Budget, settings: Settings, clock: Clock
+    scores: Scores,
+    keep: NDArray[np.bool_],
+    budget: Budget,
+    settings: DataclassInstance,
+    clock: Clock,
 ) -> dict[str, Any]:
     """Return the report of a prune, as plain JSON values.
 
@@ -173,3 +189,78 @@ def complete_report(report: dict[str, Any], clock: Clock, files: Files) -> None:
     """Add the names and sizes of the files and the total time to a report."""
     clock.stop()
     report["files"] = asdict(files)
+
+
+def remark(budget: Budget, gone: int, total: int, psnr: float | None, size: int) -> str:
+    """Return why a budget is out of reach or removes nothing, or "".
+
+    Parameters
+    ----------
+    budget : Budget
+    gone, total : int
+        How many splats go, of how many.
+    psnr : float or None
+        The estimate for the result, dB.
+    size : int
+        Bytes of the file before.
+    """
+    if budget.psnr is not None:
+        return out_of_reach(budget.psnr, gone, total, psnr)
+    if budget.max_mb is not None and not gone:
+        return f"already {size_in_words(size)}: the budget removes nothing"
+    return ""
+
+
+def conclude(
+    facts: dict[str, Any],
+    scores: Scores,
+    keep: NDArray[np.bool_],
+    psnr: float | None,
+    absorbed: Counts | None,
+    why: str,
+) -> None:
+    """Add to a report what it says about the quality of the pictures and about absorbing.
+
+    Parameters
+    ----------
+    facts : dict
+        The report; changed.
+    scores : Scores
+    keep : (N,) bool
+    psnr : float or None
+        The estimate for the result, dB.
+    absorbed : Counts or None
+        What survivors absorbed, if they did.
+    why : str
+        See `remark`.
+    """
+    facts |= _quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
+    if psnr is None and scores.ray_sample is not None:
+        facts["notes"].append(SEES_TOO_LITTLE)
+    facts["budget_remark"] = why
+    if why:
+        facts["notes"].append(why)
+    if absorbed is not None:
+        facts["absorbed"] = absorbed.facts()
+        facts["notes"].append(absorbed.note())
+
+
+def _quality_facts(
+    scores: Scores, keep: NDArray[np.bool_], psnr: float | None, *, absorbed: bool
+) -> dict[str, Any]:
+    """Return what a report says about the quality of the pictures; see `conclude`."""
+    curve, other = scores.quality, psnr if absorbed else None
+    if curve is not None and curve.foretold and not absorbed:
+        other = curve.at(1.0 - float(np.mean(keep)), absorb=True)
+    why = why_other = None
+    if psnr is None:
+        why = NOT_ESTIMATED if scores.ray_sample is None else SEES_TOO_LITTLE
+    if other is None:
+        why_other = NOT_FORETOLD if psnr is not None else why
+    return {
+        "estimated_psnr": None if psnr is None else round(psnr, 2),
+        "estimated_psnr_absorbed": None if other is None else round(other, 2),
+        "estimated_psnr_note": why,
+        "estimated_psnr_absorbed_note": why_other,
+        "quality": curve.facts() if curve is not None else None,
+    }

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .errors import RefineError
-from .volumes import among_all
+from .splats import among_all
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -1,11 +1,11 @@
 """Which points lie inside a closed mesh.
 
-A line upward from a point counts the triangles that it crosses: those that turn their outer side
-up count 1, the others -1. The sum is the winding number of the mesh about the point, 0 outside.
-Where neighbours do not turn the same way, the number of crossings decides, odd inside.
+A ray upward from a point counts the triangles that it crosses: those that turn their outer side up
+count 1, the others -1. The sum is the winding number of the mesh about the point, 0 outside. Where
+neighbours do not turn the same way, the number of crossings decides, odd inside.
 
 Points are sorted into a grid. A cell that no triangle touches lies inside or outside as a whole, so
-that lines are drawn from the points of the others alone.
+that rays are cast only from the points of the others.
 """
 
 from __future__ import annotations
@@ -100,24 +100,23 @@ class Solid:
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which points, (N, 3) floating, lie inside, (N,); none that is not finite."""
-        found = np.zeros(len(points), np.bool_)
+        inside = np.zeros(len(points), np.bool_)
         low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
         rows = np.flatnonzero(((points >= low) & (points < high)).all(axis=1))
         near = np.asarray(points[rows], np.float64)
-        doubted = slice(None)
         if len(rows) >= _FEW:
             cells = min(int(np.cbrt(4 * len(rows))), _GRID)
             scale = cells / (high - low)
             place = np.minimum(((near - low) * scale).astype(np.int64), cells - 1)
             flat = np.ravel_multi_index(tuple(place.T), (cells,) * 3)
-            found[rows] = self._grid(low, scale, cells).reshape(-1)[flat]
-            doubted = _touched((self.vertices - low) * scale, self.triangles, cells)[flat]
-            rows, near = rows[doubted], near[doubted]
-        found[rows] = self._crossed(near)
-        return found
+            inside[rows] = self._grid(low, scale, cells).reshape(-1)[flat]
+            mixed = _touched((self.vertices - low) * scale, self.triangles, cells)[flat]
+            rows, near = rows[mixed], near[mixed]
+        inside[rows] = self._crossed(near)
+        return inside
 
     def _crossed(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which points, (N, 3), lie inside, each by its own line."""
+        """Return which points, (N, 3), lie inside, each by its own ray."""
         turns = np.zeros(len(points))
         for rows, heights, signs in self._crossings(points[:, :2]):
             above = heights > points[rows, 2]
@@ -131,7 +130,7 @@ class Solid:
     def _grid(
         self, low: NDArray[np.float64], scale: NDArray[np.float64], cells: int
     ) -> NDArray[np.bool_]:
-        """Return which cells of a grid lie inside, (G, G, G); without meaning where one is touched.
+        """Return which cells of a grid lie inside, (G, G, G); meaningless where one is touched.
 
         Parameters
         ----------
@@ -153,11 +152,11 @@ class Solid:
     def _crossings(
         self, places: NDArray[np.float64]
     ) -> Iterator[tuple[Index, NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield where lines along z cross triangles.
+        """Yield where rays along z cross triangles.
 
-        An edge is crossed on the same side of a line for both of its triangles, since its vertices
-        are taken in the same order for both, and lines through a vertex count the edges that begin
-        there: so no line slips between two triangles or meets both.
+        An edge is crossed on the same side of a ray for both of its triangles, since its vertices
+        are taken in the same order for both, and rays through a vertex count the edges that begin
+        there: so no ray slips between two triangles or hits both.
 
         Parameters
         ----------
@@ -166,7 +165,7 @@ class Solid:
         Yields
         ------
         rows : (C,) int64
-            Which lines.
+            Which rays.
         heights : (C,) float64
         signs : (C,) float64
             1 or -1 by the way that the triangle turns, or 1 throughout if not all are `turned`.
@@ -176,19 +175,20 @@ class Solid:
             px, py = places[rows].T
             corners = self.triangles[triangles]  # (C, 3)
             below = y[corners] <= py[:, None]
-            one = below.sum(axis=1) == 1
-            # The corner that the line along x has on its own side; two edges meet in it.
-            own = np.where(one, below.argmax(axis=1), below.argmin(axis=1))
+            one_below = below.sum(axis=1) == 1
+            # A line along x through the ray has one corner on one side, and the two edges that end
+            # in this corner cross it.
+            alone = np.where(one_below, below.argmax(axis=1), below.argmin(axis=1))
             every = np.arange(len(rows))
-            apex = corners[every, own]
-            x1, z1 = self._cut(apex, corners[every, (own + 1) % 3], py)
-            x2, z2 = self._cut(corners[every, (own + 2) % 3], apex, py)
+            apex = corners[every, alone]
+            x1, z1 = self._cut(apex, corners[every, (alone + 1) % 3], py)
+            x2, z2 = self._cut(corners[every, (alone + 2) % 3], apex, py)
             crossed = (x1 > px) != (x2 > px)
             x1, x2, z1, z2, px = (values[crossed] for values in (x1, x2, z1, z2, px))
             heights = z1 + (px - x1) / (x2 - x1) * (z2 - z1)
             signs = np.ones(len(px))
             if self.turned:
-                signs[(x1 > px) != one[crossed]] = -1.0
+                signs[(x1 > px) != one_below[crossed]] = -1.0
             yield rows[crossed], heights, signs
 
     def _cut(
@@ -225,36 +225,48 @@ def _pairs(
     places : (N, 2) float64
     corners : (T, 3, 2) float64
     """
+    batch: list[tuple[Index, Index]] = []
+    total = 0
+    for pairs in _pairs_of_groups(places, corners):
+        batch.append(pairs)
+        total += len(pairs[0])
+        if total > _AT_ONCE:
+            yield _joined(batch)
+            batch, total = [], 0
+    if total:
+        yield _joined(batch)
+
+
+def _joined(batch: list[tuple[Index, Index]]) -> tuple[Index, Index]:
+    rows, triangles = zip(*batch, strict=True)
+    return np.concatenate(rows), np.concatenate(triangles)
+
+
+def _pairs_of_groups(
+    places: NDArray[np.float64], corners: NDArray[np.float64]
+) -> Iterator[tuple[Index, Index]]:
+    """Yield the pairs of `_pairs` for groups of places near each other.
+
+    A group is halved along its longer side until few triangles may hold one of its places.
+    """
     low, high = corners.min(axis=1).T.copy(), corners.max(axis=1).T.copy()  # (2, T) each
     waiting = [(np.arange(len(places)), np.arange(len(corners)))] if len(places) else []
-    found: list[tuple[Index, Index]] = []
-    total = 0
     while waiting:
         rows, triangles = waiting.pop()
-        here = places[rows]
-        first, last = here.min(axis=0), here.max(axis=0)
+        group = places[rows]
+        first, last = group.min(axis=0), group.max(axis=0)
         (left, bottom), (right, top) = low[:, triangles], high[:, triangles]
-        triangles = triangles[
-            (left <= last[0]) & (right > first[0]) & (bottom <= last[1]) & (top > first[1])
-        ]
+        near = (left <= last[0]) & (right > first[0]) & (bottom <= last[1]) & (top > first[1])
+        triangles = triangles[near]
         if len(rows) * len(triangles) > _LEAF and len(rows) > 1:
             half, axis = len(rows) // 2, int(np.argmax(last - first))
-            order = np.argpartition(here[:, axis], half)
+            order = np.argpartition(group[:, axis], half)
             waiting += [(rows[order[:half]], triangles), (rows[order[half:]], triangles)]
-            continue
-        if not len(triangles):
-            continue
-        x, y = here.T[:, :, None]
-        (left, bottom), (right, top) = low[:, triangles], high[:, triangles]
-        there = (x >= left) & (x < right) & (y >= bottom) & (y < top)
-        which, met = np.nonzero(there)
-        found.append((rows[which], triangles[met]))
-        total += len(which)
-        if total > _AT_ONCE:
-            yield np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
-            found, total = [], 0
-    if total:
-        yield np.concatenate([f[0] for f in found]), np.concatenate([f[1] for f in found])
+        elif len(triangles):
+            x, y = group.T[:, :, None]
+            (left, bottom), (right, top) = low[:, triangles], high[:, triangles]
+            held = np.nonzero((x >= left) & (x < right) & (y >= bottom) & (y < top))
+            yield rows[held[0]], triangles[held[1]]
 
 
 def _touched(vertices: NDArray[np.float64], triangles: Index, cells: int) -> NDArray[np.bool_]:

@@ -335,3 +335,10 @@ _UNIT_TOLERANCE = 5e-7  # of the squared length: four squares, each rounded to f
 _LARGEST = np.finfo(np.float32).max
 _LOG_LARGEST = float(np.log(np.float64(_LARGEST)))
 _LOG_SMALLEST = float(np.log(np.float64(np.finfo(np.float32).smallest_subnormal)))
+
+
+def among_all(values: NDArray[Any], rest: NDArray[np.bool_]) -> NDArray[Any]:
+    """Return values of the splats in `rest`, (N,) bool, as values of all N: 0 for the others."""
+    of_all = np.zeros(len(rest), values.dtype)
+    of_all[rest] = values
+    return of_all

@@ -11,7 +11,8 @@ import numpy as np
 from .errors import RefineError
 from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
-from .volumes import among_all, refuse_all
+from .splats import among_all
+from .volumes import refuse_all
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

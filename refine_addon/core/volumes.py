@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 
-from .affine import moved
+from .affine import is_flat, moved, scales_of
 from .errors import RefineError
 
 if TYPE_CHECKING:
@@ -123,9 +123,9 @@ class MovedVolume:
         RefineError
             If it is flat.
         """
-        scales = np.linalg.svd(self.matrix[:3, :3], compute_uv=False)
-        if not scales[2] > 1e-9 * scales[0]:
-            msg = f"is flat (scales {scales.round(9).tolist()}), expected a volume"
+        if is_flat(self.matrix):
+            scales = scales_of(self.matrix).round(9).tolist()
+            msg = f"is flat (scales {scales}), expected a volume"
             raise RefineError(msg)
 
     def inside(self, points: NDArray[Any]) -> NDArray[np.bool_]:
@@ -270,13 +270,6 @@ def forced(
             removed = removed & ~protected
         refuse_all(removed)
     return Forced(protected, removed, tuple(facts))
-
-
-def among_all(values: NDArray[Any], rest: NDArray[np.bool_]) -> NDArray[Any]:
-    """Return values of the splats in `rest`, (N,) bool, as values of all N: 0 for the others."""
-    of_all = np.zeros(len(rest), values.dtype)
-    of_all[rest] = values
-    return of_all
 
 
 def refuse_all(removed: NDArray[np.bool_]) -> None:

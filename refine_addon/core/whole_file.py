@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from .errors import RefineError, reason_of
 from .urls import refuse_url
-from .work import checkpoint
+from .work import REPLACES_MAPPED, checkpoint
 
 try:
     import fcntl
@@ -25,9 +25,6 @@ except ImportError:  # Windows
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-
-REPLACES_MAPPED = os.name != "nt"
-"""Whether the system can replace a file that a program has mapped; Windows cannot."""
 
 
 def expanded(path: Path | str) -> Path:

@@ -13,16 +13,21 @@ from typing import TypeVar
 
 import numpy as np
 
-from .errors import Cancelled
-
 Progress = Callable[[float, str], "bool | None"]
 """Called as ``progress(fraction, what)``; returning ``False`` cancels."""
 
 Result = TypeVar("Result")
 
+REPLACES_MAPPED = os.name != "nt"
+"""Whether a file that is mapped into memory can be replaced; Windows refuses."""
+
 _HELD = 30_000_000  # bytes; above 32 MB, freeing a block does not raise glibc's threshold
 _REPORT_INTERVAL = 0.1  # seconds between two reports while chunks take long
 _own = threading.local()  # `checkpoint` calls the `check` of its own thread
+
+
+class Cancelled(Exception):  # noqa: N818 - not an error: the user asked to stop
+    """Raised between two pieces of work when the progress callback returns ``False``."""
 
 
 def silent(_fraction: float, _what: str) -> None:

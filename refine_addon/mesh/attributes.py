@@ -26,8 +26,11 @@ if TYPE_CHECKING:
 
     from ..core.survivors import Columns
 
-_GROUP = 16  # float32 columns in a cache line
-_ROWS = 4096  # of 16 columns: what stays in the first-level caches while it is turned
+_GROUP = 16
+"""Columns that are transposed together: float32 numbers in a cache line of 64 bytes."""
+
+_ROWS = 4096
+"""Rows of so many columns that are transposed at a time: 256 kB, which caches hold."""
 
 
 def file_size(checked: SplatObject) -> tuple[int, int]:
@@ -138,14 +141,10 @@ def file_from_object(
     rows = np.empty(len(checked), layout.row_dtype)
     read = _Reader(checked)
     for names in _groups([column.name for column in layout.columns], rows.dtype):
-        given = [columns.get(name) for name in names]
-        planes = [
-            read.stored(name) if plane is None else plane
-            for name, plane in zip(names, given, strict=True)
-        ]
+        planes = [columns[name] if name in columns else read.stored(name) for name in names]
         _interleave(rows, names, planes)
-    nothing = np.empty(0, np.uint8)
-    return SplatFile(Path(checked.obj.name), rows, layout.header, nothing, nothing)
+    no_elements = np.empty(0, np.uint8)
+    return SplatFile(Path(checked.obj.name), rows, layout.header, no_elements, no_elements)
 
 
 def stored_columns(checked: SplatObject) -> Columns:
@@ -168,14 +167,14 @@ def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> 
     for name, values in columns.items():
         place = places[name].place
         attribute = mesh.attributes[place.attribute]
-        held = place.coding.to_attribute(values) if place.coding else values
+        coded = place.coding.to_attribute(values) if place.coding else values
         if KINDS[attribute.data_type].width == 1:
-            write_attribute(mesh, place.attribute, attribute.data_type, held)
+            write_attribute(mesh, place.attribute, attribute.data_type, coded)
             continue
         if place.attribute not in vectors:
             vectors[place.attribute] = read_attribute(mesh, place.attribute)
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
-            vectors[place.attribute][:, place.component] = held
+            vectors[place.attribute][:, place.component] = coded
     for name, values in vectors.items():
         kind = mesh.attributes[name].data_type
         write_attribute(
@@ -220,15 +219,12 @@ def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDA
 
 
 def digest(checked: SplatObject) -> int:
-    """Return a number that tells an object's splats from others.
-
-    Neither view-dependent colour is looked at, nor what does not draw, such as a painted mask.
-    """
+    """Return a checksum of what makes an object's splats, but for view-dependent colour."""
     columns = (column for column in checked.layout.columns if column.name in REQUIRED)
-    found = 0
+    checksum = 0
     for name in dict.fromkeys(column.attribute for column in columns):
-        found = zlib.crc32(read_attribute(checked.mesh, name).data, found)
-    return found
+        checksum = zlib.crc32(read_attribute(checked.mesh, name).data, checksum)
+    return checksum
 
 
 def remove_attribute(mesh: bpy.types.Mesh, name: str) -> None:
@@ -239,7 +235,7 @@ def remove_attribute(mesh: bpy.types.Mesh, name: str) -> None:
 
 
 class _Reader:
-    """Reads the columns of one mesh; keeps a vector attribute while its components are asked."""
+    """Reads the columns of one mesh; keeps the last vector attribute for its other components."""
 
     def __init__(self, checked: SplatObject) -> None:
         self.mesh = checked.mesh
@@ -298,9 +294,9 @@ def _fill(mesh: bpy.types.Mesh, rows: NDArray[Any], columns: Iterable[Column]) -
 
 
 def _groups(names: list[str], dtype: np.dtype[Any]) -> list[list[str]]:
-    """Split columns into runs of one type that are turned together.
+    """Split columns into runs of one type that are transposed together.
 
-    Rows are too far apart for columns to be taken one by one: each would fetch the whole file.
+    A row fills several cache lines: columns read one by one would each fetch the whole file.
     """
     groups: list[list[str]] = []
     for name in names:

@@ -81,10 +81,10 @@ def _left(old: bpy.types.Object) -> list[str]:
         notes.append(f"its modifiers ({', '.join(modifiers)}) were left behind")
     if getattr(data, "edges", ()):
         notes.append(f"its {len(data.edges)} edges and {len(data.polygons)} faces were left behind")
-    strange = [a.name for a in data.attributes if a.domain == "POINT" and not _copied(a)]
-    strange = [name for name in strange if name[0] != "."]
-    if strange:
-        notes.append(f"its attributes {', '.join(strange)} were left behind")
+    uncopied = [a.name for a in data.attributes if a.domain == "POINT" and not _copied(a)]
+    uncopied = [name for name in uncopied if name[0] != "."]
+    if uncopied:
+        notes.append(f"its attributes {', '.join(uncopied)} were left behind")
     return [f"object '{old.name}': {note}" for note in notes]
 
 
@@ -148,34 +148,52 @@ def _moved(checked: SplatObject) -> list[Column]:
 
 def _fill(checked: SplatObject, obj: bpy.types.Object) -> None:
     """Give a new object what the old one holds."""
-    old, data = checked.obj, obj.data
-    columns = _moved(checked)
-    held = {column.attribute for column in columns} | {heat_map.COLOR}  # that of a preview
-    needed = set(data.attributes.keys())
-    for attribute in list(checked.mesh.attributes):
-        if _copied(attribute) and attribute.name not in held and attribute.name[0] != ".":
-            if attribute.name in needed:
-                msg = (
-                    f"object '{old.name}': has an attribute '{attribute.name}', a name that the "
-                    f"splats of a {other_form(checked.mesh).lower()} need; rename it first"
-                )
-                raise RefineError(msg)
-            values = mesh_attributes.read_attribute(checked.mesh, attribute.name)
-            mesh_attributes.write_attribute(data, attribute.name, attribute.data_type, values)
-    for group in old.vertex_groups:
-        if group.name not in data.attributes:
-            values = group_weights(old, group.name)
-            mesh_attributes.write_attribute(data, group.name, "FLOAT", values)
-    for source, target in ((checked.mesh, data), (old, obj)):
+    _copy_attributes(checked, obj.data)
+    for group in checked.obj.vertex_groups:
+        if group.name not in obj.data.attributes:
+            weights = group_weights(checked.obj, group.name)
+            mesh_attributes.write_attribute(obj.data, group.name, "FLOAT", weights)
+    for source, target in ((checked.mesh, obj.data), (checked.obj, obj)):
         for key, value in source.items():
             target[key] = value.to_dict() if hasattr(value, "to_dict") else value
     for material in checked.mesh.materials:
-        data.materials.append(material)
-    stored, target = mesh_attributes.stored_columns(checked), check(obj)
-    places = {column.name: column.attribute for column in target.layout.columns}
-    for attribute in dict.fromkeys(places[column.name] for column in columns):
-        some = [column.name for column in columns if places[column.name] == attribute]
-        mesh_attributes.write_columns(target, {name: stored[name] for name in some})
+        obj.data.materials.append(material)
+    _copy_columns(checked, check(obj))
+
+
+def _copy_attributes(checked: SplatObject, data: bpy.types.ID) -> None:
+    """Copy the point attributes that both forms hold alike.
+
+    Raises
+    ------
+    RefineError
+        If one has a name that the new form needs for another.
+    """
+    moved = {column.attribute for column in _moved(checked)} | {heat_map.COLOR}  # of a preview
+    needed = set(data.attributes.keys())
+    for attribute in list(checked.mesh.attributes):
+        name = attribute.name
+        if not _copied(attribute) or name in moved or name[0] == ".":
+            continue
+        if name in needed:
+            msg = (
+                f"object '{checked.obj.name}': has an attribute '{name}', a name that the splats "
+                f"of a {other_form(checked.mesh).lower()} need; rename it first"
+            )
+            raise RefineError(msg)
+        values = mesh_attributes.read_attribute(checked.mesh, name)
+        mesh_attributes.write_attribute(data, name, attribute.data_type, values)
+
+
+def _copy_columns(source: SplatObject, target: SplatObject) -> None:
+    """Copy what makes the splats, attribute by attribute of the target."""
+    stored = mesh_attributes.stored_columns(source)
+    attributes = {column.name: column.attribute for column in target.layout.columns}
+    names: dict[str, list[str]] = {}
+    for column in _moved(source):
+        names.setdefault(attributes[column.name], []).append(column.name)
+    for columns in names.values():
+        mesh_attributes.write_columns(target, {name: stored[name] for name in columns})
 
 
 def _take_place(old: bpy.types.Object, new: bpy.types.Object) -> None:
@@ -188,9 +206,9 @@ def _take_place(old: bpy.types.Object, new: bpy.types.Object) -> None:
         _animate(old.animation_data, new.animation_data_create())
     name, data = old.name, old.data
     layer = bpy.context.view_layer
-    there = old.name in layer.objects
-    active, selected = layer.objects.active == old, there and old.select_get()
-    hidden = there and old.hide_get()
+    in_layer = old.name in layer.objects
+    active, selected = layer.objects.active == old, in_layer and old.select_get()
+    hidden = in_layer and old.hide_get()
     old.user_remap(new)
     bpy.data.objects.remove(old)
     if not data.users:
@@ -199,7 +217,7 @@ def _take_place(old: bpy.types.Object, new: bpy.types.Object) -> None:
         new.data.name = name_of_data
     new.name = name
     layer.update()
-    if there:
+    if in_layer:
         new.select_set(selected)
         new.hide_set(hidden)
         if active:

@@ -157,9 +157,9 @@ def mark_removed(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
 def mark_forced(
     obj: bpy.types.Object,
     protected: NDArray[np.bool_] | None,
-    removed: NDArray[np.bool_] | None,
+    forced_out: NDArray[np.bool_] | None,
 ) -> None:
-    """Mark, for the views, what stays and what goes in any case: (N,) each, or None.
+    """Mark, for the 3D views, what stays and what goes in any case: (N,) each, or None.
 
     Raises
     ------
@@ -168,7 +168,7 @@ def mark_forced(
     """
     check_writable(obj)
     force = np.zeros(splat_count(obj.data), np.int32)
-    for number, mask in ((2, removed), (1, protected)):
+    for number, mask in ((2, forced_out), (1, protected)):
         if mask is not None:
             force[mask] = number
     if force.any():
@@ -221,13 +221,13 @@ def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
         return mesh_attributes.read_attribute(obj.data, name) > 0
     if name in obj.vertex_groups:
         return group_weights(obj, name) > 0.0
-    found = f" ('{name}' is {attribute.data_type} on {attribute.domain})" if attribute else ""
+    what = f" ('{name}' is {attribute.data_type} on {attribute.domain})" if attribute else ""
     expected = "a boolean or float attribute on points"
     if obj.type == "POINTCLOUD":
         expected += " (a point cloud has no vertex groups)"
     else:
         expected = f"a vertex group, or {expected}"
-    msg = f"object '{obj.name}': nothing to protect is named '{name}'{found}; expected {expected}"
+    msg = f"object '{obj.name}': nothing to protect is named '{name}'{what}; expected {expected}"
     raise RefineError(msg)
 
 

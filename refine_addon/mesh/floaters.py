@@ -12,7 +12,7 @@ from ..core.errors import RefineError
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
 from .layout import splat_count
-from .notes import parsed
+from .records import parsed
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -47,9 +47,9 @@ def store(checked: SplatObject, cleaned: Cleaned) -> None:
         raise RefineError(msg)
     reasons = np.zeros(len(cleaned.keep), np.int32)
     for number, name in enumerate(REASONS, start=1):
-        reasons[cleaned.found[name]] = number
+        reasons[cleaned.by_reason[name]] = number
     mesh_attributes.write_attribute(checked.mesh, REASON, "INT", reasons)
-    counts = {name: int(np.count_nonzero(mask)) for name, mask in cleaned.found.items()}
+    counts = {name: int(np.count_nonzero(mask)) for name, mask in cleaned.by_reason.items()}
     checked.mesh[FOUND] = json.dumps({"splats": len(reasons), "counts": counts})
     mesh_attributes.updated(checked.mesh)
 
@@ -58,15 +58,15 @@ def counts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, int] | None
     """Return how many floaters were found for each reason; None if nobody looked since a change."""
     try:
         noted = parsed(mesh[FOUND])
-        found = {name: int(noted["counts"][name]) for name in REASONS}
-        holds = noted["splats"] == splat_count(mesh) and REASON in mesh.attributes
+        counted = {name: int(noted["counts"][name]) for name in REASONS}
+        current = noted["splats"] == splat_count(mesh) and REASON in mesh.attributes
     except (KeyError, TypeError, ValueError):
         return None
-    return found if holds else None
+    return counted if current else None
 
 
 def mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.bool_]:
-    """Return which splats float for one of some reasons, (N,).
+    """Return which splats float for one of these reasons, (N,).
 
     Raises
     ------
@@ -81,7 +81,7 @@ def mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.bool_]:
 
 
 def mark(checked: SplatObject, reasons: Collection[str]) -> None:
-    """Mark the floaters of some reasons as what goes, for the preview.
+    """Mark the floaters of these reasons as what goes, for the preview.
 
     Raises
     ------

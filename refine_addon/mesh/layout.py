@@ -74,6 +74,13 @@ NORMAL_PLACES = {
 """Where Blender's own PLY importer puts a file's normals."""
 
 _COUNT = rb"([\r\n]element[ \t]+vertex[ \t]+)[0-9]+"
+
+_LONGEST_NAME = 63
+"""Bytes of the longest name that Blender gives an attribute."""
+
+_MOST_NAMES = 8
+"""Names of attributes that an error lists at most."""
+
 _TAKEN = {
     *("position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"),
     *("refine_score", "refine_rank", "refine_seen", "refine_scored"),
@@ -132,9 +139,10 @@ class Layout:
 
 @dataclass(frozen=True)
 class SplatObject:
-    """An object that holds splats, as `check` found it; what works on splats is handed one.
+    """An object that holds splats, and in which attributes: what `check` returns.
 
-    It is made once, where an operation begins, and holds until splats or attributes come or go.
+    An operation makes it once, where it begins. It is out of date as soon as splats or attributes
+    come or go.
 
     Attributes
     ----------
@@ -248,7 +256,7 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
         layout = Layout(columns, header, native.is_native(mesh))
         described = layout.row_dtype.itemsize > 0
     except (AttributeError, KeyError, TypeError, ValueError):
-        # Somebody else may have written there: what does not describe a file is no layout.
+        # Another program may have written there: what does not describe a file is no layout.
         return None
     return layout if described else None
 
@@ -269,44 +277,56 @@ def _standard(obj: bpy.types.Object) -> Layout:
     attributes = obj.data.attributes
     rest = [f"f_rest_{index}" for index in range(rest_count(obj.data))]
     if len(rest) not in REST_COUNTS:
-        each, of = (native.HARMONIC, 3) if native.is_native(obj.data) else ("f_rest_", 1)
-        *counts, most = (count // of for count in REST_COUNTS)
-        msg = (
-            f"object '{obj.name}': has {len(rest) // of} attributes {each}*, expected "
-            f"{', '.join(map(str, counts))} or {most} of them (degree 0 to 4)"
-        )
-        raise RefineError(msg)
-    normals: dict[str, Any] = dict.fromkeys(("nx", "ny", "nz")) if "nx" in attributes else {}
+        raise _wrong_rest_count(obj, len(rest))
+    normals: tuple[str, ...] = ("nx", "ny", "nz") if "nx" in attributes else ()
     places = PLACES | _native_places(obj.data)
     if not normals and _is(attributes.get("normal"), ("FLOAT_VECTOR",)):
-        normals = NORMAL_PLACES
+        normals = tuple(NORMAL_PLACES)
         places.update(NORMAL_PLACES)
     names = [*PLACES, *normals, *REQUIRED[3:6], *rest, *REQUIRED[6:]]
     columns = [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in names]
-    held = {*names, *(column.attribute for column in columns)}
-    dtypes = {"FLOAT": "<f4", "INT": "<i4", "INT8": "<i1"}
-    for attribute in attributes:
-        kind = dtypes.get(attribute.data_type)
-        plain = re.fullmatch(r"(?!refine_|KIRI)[!-~]+", attribute.name) and attribute.name[0] != "."
-        if kind and plain and attribute.domain == "POINT" and attribute.name not in held:
-            columns.append(Column(attribute.name, kind, _plain(kind, attribute.name)))
+    columns += _further_columns(obj.data, {*names, *(column.attribute for column in columns)})
     header = _new_header(columns, splat_count(obj.data))
     return Layout(tuple(columns), header, native.is_native(obj.data))
 
 
+def _wrong_rest_count(obj: bpy.types.Object, count: int) -> RefineError:
+    """Return the error for so many ``f_rest_*``, which are those of no degree."""
+    name, width = (native.HARMONIC, 3) if native.is_native(obj.data) else ("f_rest_", 1)
+    *counts, most = (each // width for each in REST_COUNTS)
+    msg = (
+        f"object '{obj.name}': has {count // width} attributes {name}*, expected "
+        f"{', '.join(map(str, counts))} or {most} of them (degree 0 to 4)"
+    )
+    return RefineError(msg)
+
+
+def _further_columns(mesh: bpy.types.Mesh, taken: set[str]) -> list[Column]:
+    """Return columns of the plain point attributes that are neither taken nor ours."""
+    dtypes = {"FLOAT": "<f4", "INT": "<i4", "INT8": "<i1"}
+    return [
+        Column(attribute.name, dtype, _plain(dtype, attribute.name))
+        for attribute in mesh.attributes
+        if (dtype := dtypes.get(attribute.data_type))
+        and attribute.domain == "POINT"
+        and attribute.name not in taken
+        and re.fullmatch(r"(?!refine_|KIRI|\.)[!-~]+", attribute.name)
+    ]
+
+
 def _check_attributes(obj: bpy.types.Object, layout: Layout) -> None:
     attributes = obj.data.attributes
-    present = {column.name for column in layout.columns}
-    absent = [name for name in REQUIRED if name not in present]
+    properties = {column.name for column in layout.columns}
+    absent = [name for name in REQUIRED if name not in properties]
     absent += [column.attribute for column in layout.columns if column.attribute not in attributes]
     if absent:
-        there = [a.name for a in attributes if a.domain == "POINT" and a.name[0] != "."]
-        more = ", ..." if len(there) > 8 else ""  # noqa: PLR2004 - a line of names
-        own = f" or Blender's own {native.NAMES}" if obj.type == "POINTCLOUD" else ""
+        present = [a.name for a in attributes if a.domain == "POINT" and a.name[0] != "."]
+        more = ", ..." if len(present) > _MOST_NAMES else ""
+        or_native = f" or Blender's own {native.NAMES}" if obj.type == "POINTCLOUD" else ""
         msg = (
             f"object '{obj.name}': has no attribute {', '.join(dict.fromkeys(absent))}; expected "
-            f"the properties of a 3DGS file{own} on its points "
-            f"(it has {', '.join(there[:8])}{more})"
+            f"the properties of a 3DGS file{or_native} on its points "
+            f"(it has {', '.join(present[:_MOST_NAMES])}{more})"
         )
         raise RefineError(msg)
     for column in layout.columns:
@@ -345,8 +365,8 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
         if name in PLACES:
             columns.append(Column(name, kind, PLACES[name]))
             continue
-        # Blender keeps some names for itself, we others, and none has more than 63 bytes.
-        plain = name not in _TAKEN and len(name.encode()) < 64 and name[0] != "."  # noqa: PLR2004
+        # Blender keeps some names for itself, we others.
+        plain = name not in _TAKEN and len(name.encode()) <= _LONGEST_NAME and name[0] != "."
         place = name if plain else f"ply_{index}"
         attribute = mesh.attributes.new(place, STORAGE[kind[1:]], "POINT")
         attribute = attribute or mesh.attributes.new(f"ply_{index}", STORAGE[kind[1:]], "POINT")

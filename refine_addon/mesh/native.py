@@ -84,17 +84,17 @@ def places(count: int) -> dict[str, Place]:
     The number in the name of a harmonic counts as in the file, without the constant: ``sh_10``
     comes after ``sh_9``. Each holds red, green and blue, where a file has all of red first.
     """
-    found = {f"f_dc_{channel}": Place(BASE, channel, FOUR_FLOATS) for channel in range(3)}
+    by_name = {f"f_dc_{channel}": Place(BASE, channel, FOUR_FLOATS) for channel in range(3)}
     for channel in range(3):
         for index in range(count):
             place = Place(f"{HARMONIC}{index}", channel, ("FLOAT_VECTOR",))
-            found[f"f_rest_{channel * count + index}"] = place
-    found["opacity"] = Place(BASE, 3, FOUR_FLOATS, LOGIT)
+            by_name[f"f_rest_{channel * count + index}"] = place
+    by_name["opacity"] = Place(BASE, 3, FOUR_FLOATS, LOGIT)
     for axis in range(3):
-        found[f"scale_{axis}"] = Place(SCALE, axis, ("FLOAT_VECTOR",), LOG)
+        by_name[f"scale_{axis}"] = Place(SCALE, axis, ("FLOAT_VECTOR",), LOG)
     for index in range(4):
-        found[f"rot_{index}"] = Place(ROTATION, index, ("QUATERNION",))
-    return found
+        by_name[f"rot_{index}"] = Place(ROTATION, index, ("QUATERNION",))
+    return by_name
 
 
 def lost_base(obj: bpy.types.Object) -> bool:

@@ -1,4 +1,4 @@
-"""Scores on a mesh: attributes to look at and select by, and a note of how they came to be."""
+"""Scores on a mesh: attributes to look at and select by, and a record of how they came to be."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..core.selection import rank
 from . import attributes as mesh_attributes
 from . import edit as mesh_edit
 from . import heat_map
-from .notes import parsed
+from .records import parsed
 
 if TYPE_CHECKING:
     import bpy
@@ -29,8 +29,8 @@ SCORE, RANK, SEEN = "refine_score", "refine_rank", "refine_seen"
 """Point attributes: the score, its place from 0 (goes first) to 1, in how many views it lies."""
 
 SCORED = "refine_scored"
-"""Boolean point attribute: which splats have a score; not those that were forced out, and not those
-that were joined or added since, for which Blender writes False."""
+"""Boolean point attribute: which splats have a score. Neither those that were forced out have one,
+nor those that were joined or added since, for which Blender writes False."""
 
 RECORD = "refine_scores"
 """Custom property of the mesh: how its scores came to be, as JSON."""
@@ -54,7 +54,7 @@ class Together(NamedTuple):
     ranks: NDArray[np.float64]
 
 
-def store(  # noqa: PLR0913 - all that a note holds
+def store(  # noqa: PLR0913 - all that a record holds
     checked: SplatObject,
     scores: Scores,
     settings: Settings,
@@ -65,13 +65,13 @@ def store(  # noqa: PLR0913 - all that a note holds
     asked: Settings | None = None,
     together: Together | None = None,
 ) -> None:
-    """Write scores to the attributes of an object's mesh, and note how they came to be.
+    """Write scores to the attributes of an object's mesh, and record how they came to be.
 
     Parameters
     ----------
     checked : SplatObject
     scores, settings
-        What `core.pipeline.score` gave, and was given.
+        What `core.score` gave, and was given.
     origin : dict, optional
         See `staleness.origin`.
     cameras : list of (str, int), optional
@@ -97,7 +97,7 @@ def store(  # noqa: PLR0913 - all that a note holds
         )
         raise RefineError(msg)
     ranks = together.ranks if together else rank(scores.values)
-    note = json.dumps(
+    new_record = json.dumps(
         {
             "splats": len(scores.values),
             "settings": asdict(settings),
@@ -117,14 +117,14 @@ def store(  # noqa: PLR0913 - all that a note holds
             "together": together and {"id": together.id, "splats": together.splats},
         }
     )
-    # What can fail comes first: scores and note are to belong together.
+    # The heat map may fail for want of memory, and comes first: scores and record belong together.
     heat_map.write(mesh, ranks)
     mesh_attributes.write_attribute(mesh, SCORE, "FLOAT", scores.values)
     mesh_attributes.write_attribute(mesh, RANK, "FLOAT", ranks)
     mesh_attributes.write_attribute(mesh, SEEN, "INT", scores.seen)
     scored = np.ones(len(checked), np.bool_) if scores.scored is None else scores.scored
     mesh_attributes.write_attribute(mesh, SCORED, "BOOLEAN", scored)
-    mesh[RECORD] = note
+    mesh[RECORD] = new_record
     mesh_attributes.updated(mesh)
 
 
@@ -138,25 +138,25 @@ def digest(mask: NDArray[np.bool_] | None) -> list[int]:
 def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
     """Return how a mesh was scored, None if it was not."""
     try:
-        noted: dict[str, Any] = parsed(mesh[RECORD])
-        complete = noted.keys() >= {"splats", "settings", "views_given", "views_used"}
+        recorded: dict[str, Any] = parsed(mesh[RECORD])
+        complete = recorded.keys() >= {"splats", "settings", "views_given", "views_used"}
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
-    return noted if complete else None
+    return recorded if complete else None
 
 
 def unrefined(record: dict[str, Any]) -> bool:
-    """Tell whether the scores of a note are a sketch of those that were asked for."""
+    """Tell whether a record is of a first version of the scores that were asked for."""
     return bool(record.get("asked"))
 
 
-def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None) -> Scores:
+def stored_scores(checked: SplatObject, forced_out: NDArray[np.bool_] | None = None) -> Scores:
     """Return the scores that an object's mesh holds.
 
     Parameters
     ----------
     checked : SplatObject
-    removed : (N,) bool, optional
+    forced_out : (N,) bool, optional
         Splats that have to go, and need no score.
 
     Raises
@@ -165,36 +165,40 @@ def stored_scores(checked: SplatObject, removed: NDArray[np.bool_] | None = None
         If it was not scored, or has splats that were not.
     """
     mesh, label = checked.mesh, f"object '{checked.obj.name}'"
-    noted = record(mesh)
-    kinds = {SCORE: "FLOAT", SEEN: "INT", SCORED: "BOOLEAN"}
-    for name, kind in kinds.items():
-        attribute = mesh.attributes.get(name)
-        if noted is None or not attribute or attribute.data_type != kind:
-            msg = f"{label}: has no scores; score it first"
-            raise RefineError(msg)
+    recorded = record(mesh)
+    if recorded is None or not _has_scores(mesh):
+        msg = f"{label}: has no scores; score it first"
+        raise RefineError(msg)
     values = mesh_attributes.read_attribute(mesh, SCORE)
     scored = mesh_attributes.read_attribute(mesh, SCORED)
-    unscored = ~scored if removed is None else ~scored & ~removed
-    if len(values) > noted["splats"] or unscored.any():
+    forced_out = np.zeros_like(scored) if forced_out is None else forced_out
+    unscored = int(np.count_nonzero(~scored & ~forced_out))
+    if len(values) > recorded["splats"] or unscored:
         msg = (
-            f"{label}: scored with {noted['splats']} splats, has {len(values)} now, "
-            f"{np.count_nonzero(unscored)} of them without a score; score it again"
+            f"{label}: scored with {recorded['splats']} splats, has {len(values)} now, "
+            f"{unscored} of them without a score; score it again"
         )
         raise RefineError(msg)
     # The curve is that of all splats that were scored: of one object, with the same forced out.
-    forced_out = np.zeros_like(scored) if removed is None else removed
-    whole = len(values) == noted["splats"] and not noted.get("together")
+    whole = len(values) == recorded["splats"] and not recorded.get("together")
     whole = whole and np.array_equal(forced_out, ~scored)
     return Scores(
         values=values,
         seen=mesh_attributes.read_attribute(mesh, SEEN),
-        views_used=noted["views_used"],
-        undrawable=noted.get("undrawable", 0),
-        facts=noted.get("weights", {}),
-        notes=tuple(noted.get("notes", ())),
-        method=noted.get("method", ""),
-        frustum=noted.get("frustum", True),
-        views_given=noted["views_given"],
-        quality=Quality.from_facts(noted.get("quality")) if whole else None,
+        views_used=recorded["views_used"],
+        undrawable=recorded.get("undrawable", 0),
+        facts=recorded.get("weights", {}),
+        notes=tuple(recorded.get("notes", ())),
+        method=recorded.get("method", ""),
+        frustum=recorded.get("frustum", True),
+        views_given=recorded["views_given"],
+        quality=Quality.from_facts(recorded.get("quality")) if whole else None,
         scored=None if scored.all() else scored,
     )
+
+
+def _has_scores(mesh: bpy.types.Mesh) -> bool:
+    """Tell whether a mesh has the attributes that `stored_scores` reads."""
+    kinds = {SCORE: "FLOAT", SEEN: "INT", SCORED: "BOOLEAN"}
+    attributes = ((mesh.attributes.get(name), kind) for name, kind in kinds.items())
+    return all(attribute and attribute.data_type == kind for attribute, kind in attributes)

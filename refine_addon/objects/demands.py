@@ -22,7 +22,7 @@ from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import splat_count
-from ..mesh.notes import parsed
+from ..mesh.records import parsed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -177,7 +177,7 @@ def _mesh_volume(
 
 
 def mark(checked: SplatObject, forced: Forced) -> None:
-    """Mark for the previews what must stay and what must go, and note how many splats that is.
+    """Mark for the previews what must stay and what must go, and record how many splats that is.
 
     What must go is also marked as what goes, unless scores or floaters tell that.
 
@@ -196,7 +196,7 @@ def mark(checked: SplatObject, forced: Forced) -> None:
         mesh_attributes.remove_attribute(mesh, mesh_edit.REMOVE)
     if forced.facts or forced.protected is not None:
         volumes = [[fact["name"], fact["splats"]] for fact in forced.facts]
-        _note(mesh, {**forced.counts(), "volumes": volumes})
+        _record(mesh, {**forced.counts(), "volumes": volumes})
     elif FACTS in mesh:
         del mesh[FACTS]
 
@@ -207,19 +207,19 @@ def refresh(scene: bpy.types.Scene, checked: SplatObject) -> Forced:
     Raises
     ------
     RefineError
-        See `Demands`; it is noted as well.
+        See `Demands`; it is recorded as well.
     """
     try:
         forced = Demands.of_scene(scene).forced(checked)
         mark(checked, forced)
     except RefineError as error:
-        _note(checked.mesh, {"error": str(error)})
+        _record(checked.mesh, {"error": str(error)})
         raise
     return forced
 
 
 def facts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
-    """Return what is noted of a mesh; empty where it is not known of all its splats.
+    """Return what `mark` recorded of a mesh; nothing if splats came or went since.
 
     Returns
     -------
@@ -228,18 +228,18 @@ def facts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, Any]:
         ``error``, why that is not known.
     """
     try:
-        noted = parsed(mesh[FACTS])
-        if noted["splats"] != splat_count(mesh):
+        recorded = parsed(mesh[FACTS])
+        if recorded["splats"] != splat_count(mesh):
             return {}
-        if "error" in noted:
-            return {"error": str(noted["error"])}
-        counts = {name: int(noted[name]) for name in ("protected", "forced")}
-        return {**counts, "volumes": dict(noted["volumes"])}
+        if "error" in recorded:
+            return {"error": str(recorded["error"])}
+        counts = {name: int(recorded[name]) for name in ("protected", "forced")}
+        return {**counts, "volumes": dict(recorded["volumes"])}
     except (KeyError, TypeError, ValueError):
         return {}
 
 
-def _note(mesh: bpy.types.Mesh, facts: dict[str, Any]) -> None:
+def _record(mesh: bpy.types.Mesh, facts: dict[str, Any]) -> None:
     mesh[FACTS] = json.dumps({"splats": splat_count(mesh), **facts})
 
 

@@ -55,7 +55,7 @@ def chosen(layer: bpy.types.ViewLayer, active: bpy.types.Object) -> list[bpy.typ
 
 
 def members(layer: bpy.types.ViewLayer, active: SplatObject) -> Members:
-    """Return the objects of `chosen`, found to hold splats.
+    """Return the objects of `chosen`, all of which hold splats.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def gather(group: Members, *, whole: bool | None = False) -> Splats:
 
 
 @dataclass(frozen=True, eq=False)
-class Noted:
+class Provenance:
     """How scores came to be; see `mesh.scores.store`.
 
     Attributes
@@ -195,7 +195,7 @@ class Noted:
     asked: Settings | None = None
 
 
-def store(group: Members, scores: Scores, noted: Noted) -> None:
+def store(group: Members, scores: Scores, provenance: Provenance) -> None:
     """Write scores of all objects' splats to their meshes; see `mesh.scores.store`.
 
     Parameters
@@ -203,21 +203,21 @@ def store(group: Members, scores: Scores, noted: Noted) -> None:
     group : list of SplatObject
     scores : Scores
         Of the splats of `gather`.
-    noted : Noted
+    provenance : Provenance
     """
     _check_counts(group, len(scores.values))
     ranks, scoring = rank(scores.values), uuid.uuid4().hex
-    stay = parts_of(noted.forced.protected, group)
+    stay = parts_of(provenance.forced.protected, group)
     for member, origin, rows, protected in zip(
-        group, noted.origins, _rows(group), stay, strict=True
+        group, provenance.origins, _rows(group), stay, strict=True
     ):
         scores_of_member, together = scores, None
         if len(group) > 1:
             scores_of_member = _scores_of_rows(scores, rows)
             together = mesh_scores.Together(scoring, len(scores.values), ranks[rows])
         mesh_scores.store(
-            member, scores_of_member, noted.settings, origin, noted.cameras,
-            protected=protected, asked=noted.asked, together=together,
+            member, scores_of_member, provenance.settings, origin, provenance.cameras,
+            protected=protected, asked=provenance.asked, together=together,
         )  # fmt: skip
 
 
@@ -344,20 +344,20 @@ def _check_scored_together(group: Members) -> None:
 
 def _scores(group: Members, parts: list[Scores], masks: dict[str, Any]) -> Scores:
     """Return the scores of all objects as one; their curve, if all that were scored are there."""
-    noted, removed = mesh_scores.record(group[0].mesh) or {}, masks.get("removed")
+    record, removed = mesh_scores.record(group[0].mesh) or {}, masks.get("removed")
     values = np.concatenate([part.values for part in parts])
     scored = ~_joined_masks(
         [None if part.scored is None else ~part.scored for part in parts],
         [len(part.values) for part in parts],
     )
     forced_out = np.zeros_like(scored) if removed is None else removed
-    whole = noted["together"]["splats"] == len(values) and np.array_equal(forced_out, ~scored)
+    whole = record["together"]["splats"] == len(values) and np.array_equal(forced_out, ~scored)
     return replace(
         parts[0],
         values=values,
         seen=np.concatenate([part.seen for part in parts]),
         undrawable=sum(part.undrawable for part in parts),
-        quality=Quality.from_facts(noted.get("quality")) if whole else None,
+        quality=Quality.from_facts(record.get("quality")) if whole else None,
         scored=scored,
     )
 

@@ -1,8 +1,8 @@
 """What the panel and the command do to an object: score, apply, export.
 
-An operation begins with `mesh.layout.check`, which finds out that an object holds splats, and hands
-what it found to all functions here. Each either does all it says, or raises `RefineError` and
-leaves the scene as it was.
+An operation begins with `mesh.layout.check`, which makes sure that an object holds splats; its
+`SplatObject` is what the functions here take. Each either does all it says, or raises `RefineError`
+and leaves the scene as it was.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import bpy
 import numpy as np
 
 from ..cameras.objects import world_matrix
-from ..core import pipeline
 from ..core.affine import is_uniform, transformed
 from ..core.errors import RefineError
 from ..core.formats.ply import columns_from_splats
@@ -24,14 +23,11 @@ from ..core.survivors import survivor_columns
 from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.volumes import FREE, Forced
 from ..core.whole_file import expanded, refuse_existing
-from ..core.work import Progress, silent
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
 from ..mesh import layout as mesh_layout
-from ..mesh.layout import SplatObject, check
 from ..mesh.scores import RECORD, stored_scores
-from .demands import NONE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,11 +39,10 @@ if TYPE_CHECKING:
     from ..core.formats.ply import SplatFile
     from ..core.formats.registry import Packed
     from ..core.levels.lod import Level
-    from ..core.scores import Scores
     from ..core.selection import Budget
     from ..core.splats import Splats
     from ..core.views import ViewSet
-    from .demands import Demands
+    from ..mesh.layout import SplatObject
 
 
 @dataclass(frozen=True)
@@ -242,7 +237,7 @@ def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
 def reduce_object(
     checked: SplatObject, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
 ) -> None:
-    """Delete what does not stay, store what the others became, and drop the note of the scores."""
+    """Delete what does not stay, store what the others became, and drop the scores' record."""
     mesh_edit.delete_vertices(checked.obj, ~keep)
     columns = {name: values[keep] for name, values in columns.items()}
     mesh_attributes.write_columns(checked, columns)
@@ -325,55 +320,10 @@ def write_export(
     keep: NDArray[np.bool_] | None = None,
     overwrite: bool = False,
 ) -> SplatFile | Packed:
-    """Do what is left of `export_object`, which takes arrays alone; see there."""
-    made = as_written(file, target)
-    made.write(target, keep, overwrite=overwrite)
-    return made
-
-
-def score_object(
-    name: str,
-    views: ViewSet,
-    settings: Settings,
-    demands: Demands = NONE,
-    *,
-    progress: Progress = silent,
-) -> tuple[SplatFile, Scores, Forced, list[str]]:
-    """Score an object of the open scene; nothing in the scene changes.
-
-    Parameters
-    ----------
-    name : str
-        Of the object.
-    views, settings, progress
-        See `refine_addon.core.pipeline.score`.
-    demands : Demands
-        What must stay and what must go; the latter scores 0.
-
-    Returns
-    -------
-    SplatFile
-        The file that the object would be.
-    Scores
-        Of its splats.
-    Forced
-        What must stay and what must go.
-    list of str
-        See `modifier_notes`.
-
-    Raises
-    ------
-    RefineError
-        See `gather`, `Demands.forced` and `refine_addon.core.pipeline.score`; also if there is no
-        such object.
-    """
-    checked = check(find(name))
-    forced = demands.forced(checked)
-    scores = pipeline.score(
-        gather(checked), views, settings,
-        protected=forced.protected, removed=forced.removed, progress=progress,
-    )  # fmt: skip
-    return mesh_attributes.file_from_object(checked), scores, forced, modifier_notes(checked.obj)
+    """Write what `export_source` returned, as `export_object` does; without Blender's data."""
+    written = as_written(file, target)
+    written.write(target, keep, overwrite=overwrite)
+    return written
 
 
 def _outcome(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
@@ -401,7 +351,7 @@ def find(name: str) -> bpy.types.Object:
     obj = bpy.context.scene.objects.get(name)
     if obj is None:
         names = [o.name for o in bpy.context.scene.objects if mesh_layout.looks_like_splats(o)]
-        there = ", ".join(names[:8]) or "none"
-        msg = f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {there})"
+        listed = ", ".join(names[:8]) or "none"
+        msg = f"no object '{name}' in scene '{bpy.context.scene.name}' (splat objects: {listed})"
         raise RefineError(msg)
     return obj

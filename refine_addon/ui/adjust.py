@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class Adjustable:
     """An operator that works by the budget of the panel, and can be done again by another one.
 
-    To adjust it Blender undoes it and calls it again with the other values. These go into the
-    panel, which then says what was done. Nothing is remembered for the next click.
+    To adjust it Blender undoes it and calls it again with other values. They are written to the
+    panel, so that the panel says what was done, and they are not kept for the next click.
     """
 
     budget: EnumProperty(**AMOUNTS["budget"], options={"SKIP_SAVE"})
@@ -37,9 +37,10 @@ class Adjustable:
         layout: Any
 
     def adjusted(self, context: bpy.types.Context, call: Callable[[], set[str]]) -> set[str]:
-        """Return what a call answers by the values that were given, which go into the panel.
+        """Write the values that the operator was given to the panel, call, and return its answer.
 
-        All others come from there. Where nothing is done, the panel is left as it was.
+        The operator takes all other values from the panel. If the call does nothing, the panel is
+        put back as it was.
         """
         settings = context.scene.refine
         before = {name: getattr(settings, name) for name in AMOUNTS}
@@ -55,13 +56,12 @@ class Adjustable:
         return answer
 
     def _adjust(self, settings: RefineSettings) -> None:
-        given = self.properties.is_property_set
         for name in AMOUNTS:
-            here, there = getattr(self, name), getattr(settings, name)
-            if not given(name):
-                setattr(self, name, there)
-            elif here != there:
-                setattr(settings, name, here)
+            asked, in_panel = getattr(self, name), getattr(settings, name)
+            if not self.properties.is_property_set(name):
+                setattr(self, name, in_panel)
+            elif asked != in_panel:
+                setattr(settings, name, asked)
 
     def draw(self, _context: bpy.types.Context) -> None:
         """Draw the budget, as the panel does."""

@@ -45,7 +45,7 @@ def unregister() -> None:
 
 
 def fill(record: dict[str, Any]) -> None:
-    """List the cameras of the note of a scoring, those that see least first."""
+    """List the cameras of the record of a scoring, those that see least first."""
     listed = bpy.context.window_manager.refine_cameras
     listed.clear()
     far = set((record.get("alignment") or {}).get("far", ()))

@@ -21,10 +21,10 @@ def mark_again(context: bpy.types.Context) -> None:
 
 
 def _splats(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Return the objects whose splats are marked, or are to be: the one looked at comes first.
+    """Return the objects whose splats are to be marked, the one that the panel shows first.
 
-    That is the active one, or else the first there is; also all that are selected, and all that
-    bear marks or scores.
+    That is the active one, or else the first that is visible. The others are those that are
+    selected, or have marks or scores.
     """
     active = getattr(context, "object", None)
     objects = [o for o in context.scene.objects if mesh_layout.looks_like_splats(o)]
@@ -58,14 +58,14 @@ def _updated(scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = Non
         return
     if not scene.refine.volumes:
         return
-    there = {item.object for item in demands.listed(scene)}
-    there |= {obj.data for obj in there if obj.data is not None}
+    volumes = {item.object for item in demands.listed(scene)}
+    volumes |= {obj.data for obj in volumes if obj.data is not None}
     for update in depsgraph.updates:
         original = update.id.original
         moved = update.is_updated_transform and mesh_layout.looks_like_splats(
             original if isinstance(original, bpy.types.Object) else None
         )
-        if moved or original in there:
+        if moved or original in volumes:
             mark_again(bpy.context)
             return
 

@@ -39,7 +39,7 @@ class _Searching:
 
 
 class REFINE_OT_find_floaters(OnThread, OnSplats, bpy.types.Operator):
-    """Find splats that stand where the cameras see that nothing is; nothing is deleted (Esc cancels)"""  # noqa: E501 - a tooltip is one line
+    """Find splats that float where the cameras see empty space; nothing is deleted (Esc cancels)"""
 
     bl_idname = "refine.find_floaters"
     bl_label = "Find Floaters"

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ..core.work import Progress
 
 _ROWS = 1 << 16
-"""Rows that are read between two looks at whether to go on."""
+"""Rows that are read before the next look at whether the import was cancelled."""
 
 FILE_NAMES = ";".join(f"*{suffix}" for suffix in SUFFIXES)
 """What a file browser shows."""
@@ -89,9 +89,9 @@ class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper
         """Read the files; one that cannot be read does not stop the others."""
         read = _Read([], [])
         for index, path in enumerate(paths):
-            ahead = part(progress, index / len(paths), (index + 1) / len(paths))
+            progress_of_file = part(progress, index / len(paths), (index + 1) / len(paths))
             try:
-                read.files.append(_read(path, ahead))
+                read.files.append(_read(path, progress_of_file))
             except FAILURES as error:
                 read.errors.append(error)
         return read
@@ -213,10 +213,10 @@ def _capture_folder(obj: bpy.types.Object | None) -> Path | None:
     Trained scenes have their splats some folders below their cameras, in
     ``point_cloud/iteration_30000``.
     """
-    noted = obj.get(FOLDER) if obj is not None else None
-    if not isinstance(noted, str) or not noted or not os.path.isdir(noted):  # noqa: PTH112
+    stored = obj.get(FOLDER) if obj is not None else None
+    if not isinstance(stored, str) or not stored or not os.path.isdir(stored):  # noqa: PTH112
         return None
-    folder = Path(noted)
+    folder = Path(stored)
     for place in (folder, *folder.parents[:_ABOVE]):
         if any((place / name).exists() for name in _CAMERAS):
             return place

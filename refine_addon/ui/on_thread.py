@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 
 from .. import main_thread
-from ..core.errors import Cancelled
-from ..core.work import silent
+from ..core.work import Cancelled, silent
 from ..mesh import layout as mesh_layout
 from . import running as at_work
 from .operator_bases import FAILURES, Answer, fail
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from .running import Sketch
 
 _STEP = 0.05
-"""Seconds between two looks at the thread."""
+"""Seconds between two events of the timer, at each of which the thread is looked at."""
 
 
 class OnThread:
@@ -32,11 +31,11 @@ class OnThread:
     needed of it. `work` runs on the thread and touches the job's arrays alone. `finish` writes what
     came of it. The operator itself keeps neither.
 
-    Where `sketch` names other work, that is done first; `show` writes what came of it while `work`
-    goes on, and it stays if that is cancelled or fails.
+    Where `sketch` returns other, quicker work, that is done first. `show` writes its result while
+    `work` goes on; it stays if `work` is cancelled or fails.
 
-    Meanwhile events go on to the rest of the window, but for undo and save. What was done to the
-    object is looked for before anything is written to it (`Target`).
+    Meanwhile events go on to the rest of the window, but for undo and save. Before anything is
+    written to an object, it is compared with what it was when it was read (`Target`).
     """
 
     doing = ""
@@ -141,16 +140,16 @@ class OnThread:
     def _sketched(self, context: bpy.types.Context, running: Running) -> Answer:
         """Go on to the main work, and show what the sketch came to."""
         try:
-            found = running.worker.result()
+            result = running.worker.result()
         except Cancelled:
             return self._stopped(context, running)
         except FAILURES:
-            found = None  # the main work says what is wrong, in the words that fit it
+            result = None  # the main work fails too, and its message fits what was asked for
         running.stage = "work"
         running.next(Worker(partial(self.work, running.job)))
-        if found is not None and not running.waits:
+        if result is not None and not running.waits:
             try:
-                self.show(context, running.found(), running.job, found)
+                self.show(context, running.target(), running.job, result)
             except FAILURES as error:
                 running.worker.cancel()
                 self._over(context, running)
@@ -169,7 +168,7 @@ class OnThread:
             return self._stopped(context, running, error)
         self._over(context, running)
         try:
-            return self.finish(context, running.found(), running.job, result)
+            return self.finish(context, running.target(), running.job, result)
         except FAILURES as error:
             return self._stopped(context, running, error)
 

@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 
 from ..cameras.sets import Choice
-from ..core import pipeline
+from ..core import pipeline, score_splats
 from ..core.estimate.quality import in_words
 from ..core.levels.lod import Level, Levels, lod
 from ..core.report import scoring_notes, sizes_in_words
@@ -52,6 +52,10 @@ if TYPE_CHECKING:
     from ..core.volumes import Forced
     from ..core.work import Progress
     from ..mesh.layout import SplatObject
+
+
+_SCORED = 0.97
+"""Share of the time of a scoring after which only the splats in each view are to be counted."""
 
 
 def chosen_views(context: bpy.types.Context) -> ViewSet:
@@ -133,23 +137,23 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     ) -> None:
         """Store the closed form's scores, to be looked at until those asked for are there."""
         group = splat_group.by_uids(job.uids, checked)
-        noted = splat_group.Noted(
+        provenance = splat_group.Provenance(
             _by_closed_form(job), job.origins, forced=job.forced, asked=job.settings
         )
-        splat_group.store(group, scores, noted)
+        splat_group.store(group, scores, provenance)
         plans.refresh(context)
 
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
         """Score, and count how many splats lie in each view."""
         forced_out, means = job.forced.removed, job.splats.means
-        scores = pipeline.score(
+        scores = score_splats.score(
             job.splats, job.views, job.settings,
             protected=job.forced.protected, removed=forced_out,
-            quality=job.quality, progress=part(progress, 0.0, 0.97),
+            quality=job.quality, progress=part(progress, 0.0, _SCORED),
         )  # fmt: skip
         means = means if forced_out is None else means[~forced_out]
-        return scores, frustum.census(means, job.views, progress=part(progress, 0.97, 1.0))
+        return scores, frustum.census(means, job.views, progress=part(progress, _SCORED, 1.0))
 
     def finish(
         self,
@@ -163,8 +167,8 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         pairs = zip(job.views, counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
         group = splat_group.by_uids(job.uids, checked)
-        noted = splat_group.Noted(job.settings, job.origins, cameras, job.forced)
-        splat_group.store(group, scores, noted)
+        provenance = splat_group.Provenance(job.settings, job.origins, cameras, job.forced)
+        splat_group.store(group, scores, provenance)
         plans.refresh(context)
         self.report({"INFO"}, _scored_in_words(group, scores, job.forced.counts()["forced"]))
         modifiers = [note for each in group for note in splat_object.modifier_notes(each.obj)]
@@ -188,7 +192,7 @@ def _by_closed_form(job: _Scoring) -> Settings:
 
 
 def _sketch(job: _Scoring, progress: Progress) -> Scores:
-    return pipeline.score(
+    return score_splats.score(
         job.splats, job.views, _by_closed_form(job), removed=job.forced.removed, progress=progress
     )
 
@@ -225,7 +229,7 @@ def _scored_or_applied(context: bpy.types.Context) -> str:
 
 
 class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
-    """Delete the splats that the budget does not keep; with Absorb, survivors take them over"""
+    """Delete the splats that the budget does not keep; with Absorb, the others make up for them"""
 
     bl_idname = "refine.apply"
     bl_label = "Apply"
@@ -319,7 +323,7 @@ class _MakingLevels:
 
 
 class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
-    """Make objects with ever fewer of the splats, by the cameras, in a collection of their own"""
+    """Make objects with fewer and fewer splats, by what the cameras see, in a new collection"""
 
     bl_idname = "refine.levels"
     bl_label = "Make Levels"

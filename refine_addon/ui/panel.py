@@ -16,7 +16,8 @@ from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
 from ..objects import demands, splat_group
 from ..viewport import draw as viewport_draw
-from . import camera_list, kept, plans, preview, price, running, staleness, wrapped
+from . import camera_list, plans, preview, price, running, staleness, wrapped
+from .panel_cache import cached
 from .properties import FLOATERS
 from .view_operators import MODES
 from .volumes import ROLES
@@ -70,7 +71,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         if several:
             wrapped.label(layout, context, "Scored and pruned as one scene", icon="INFO")
             return
-        size = kept.answer("bytes", context, lambda: mesh_layout.export_bytes(obj))
+        size = cached("bytes", context, lambda: mesh_layout.export_bytes(obj))
         if size is not None:
             layout.label(text=size_in_words(size))
         layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
@@ -93,7 +94,7 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
         if settings.source == "FRAMES":
             _draw_frames(layout, settings, context.scene)
         elif settings.source != "ACTIVE":
-            count = kept.answer("cameras", context, lambda: len(_cameras(context)))
+            count = cached("cameras", context, lambda: len(_cameras(context)))
             layout.label(text=counted(count, "camera"), icon="CAMERA_DATA")
 
 
@@ -130,13 +131,13 @@ class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
         settings = context.scene.refine
         layout.operator("refine.find_floaters", icon="VIEWZOOM")
         obj = context.object
-        found = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        counts = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
         column = layout.column(align=True)
         for name, text, _ in FLOATERS:
-            shown = text if found is None else f"{text}: {found[name]:,}"
+            shown = text if counts is None else f"{text}: {counts[name]:,}"
             column.prop_enum(settings, "reasons", name, text=shown)
-        if found is not None:
-            total = sum(found[name] for name in settings.reasons)
+        if counts is not None:
+            total = sum(counts[name] for name in settings.reasons)
             layout.label(
                 text=f"Go: {total:,} of {mesh_layout.splat_count(obj.data):,}", icon="TRASH"
             )
@@ -329,7 +330,7 @@ def _draw_modes(layout: bpy.types.UILayout, obj: bpy.types.Object | None) -> Non
 
 
 def _record(obj: bpy.types.Object | None) -> dict[str, Any] | None:
-    """Return the note of the scores of an object, None without."""
+    """Return the record of an object's scoring, None without."""
     return mesh_scores.record(obj.data) if mesh_layout.looks_like_splats(obj) else None
 
 
@@ -347,7 +348,7 @@ def _changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
     objects = splat_group.chosen(context.view_layer, obj)
     question = ("changes", tuple(each.data.get(mesh_scores.RECORD) for each in objects))
     marked = dict.fromkeys(objects)  # what is protected of them is marked
-    return kept.answer(question, context, lambda: staleness.changes_of(context, marked))
+    return cached(question, context, lambda: staleness.changes_of(context, marked))
 
 
 def _draw_price(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:

@@ -74,9 +74,9 @@ def drawn(text: str) -> NDArray[np.bool_]:
 @cache
 def _letters() -> dict[str, NDArray[np.bool_]]:
     """Return each character's pixels, (HEIGHT, its own width)."""
-    found = {" ": np.zeros((HEIGHT, _SPACE), np.bool_)}
+    letters = {" ": np.zeros((HEIGHT, _SPACE), np.bool_)}
     for band in _SHAPES:
         names, *rows = (line.split() for line in band.strip().splitlines())
         for name, cells in zip(names, zip(*rows, strict=True), strict=True):
-            found[name] = np.array([[mark == "#" for mark in cell] for cell in cells])
-    return found
+            letters[name] = np.array([[mark == "#" for mark in cell] for cell in cells])
+    return letters

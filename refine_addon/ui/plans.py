@@ -24,7 +24,7 @@ from ..core.report import sizes_in_words
 from ..core.selection import Tally, quality_of
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..mesh.notes import parsed
+from ..mesh.records import parsed
 from ..objects import demands, splat_group
 from ..objects.splat_object import Outcome
 from . import camera_list, price
@@ -184,13 +184,13 @@ def wait(scene: bpy.types.Scene, objects: Sequence[bpy.types.Object], seconds: f
 def stored(obj: bpy.types.Object, settings: Any) -> dict[str, Any] | None:  # noqa: ANN401
     """Return the stored plan if it is that of the current budget and mesh, else None."""
     try:
-        noted: dict[str, Any] = parsed(obj.data[PLAN])
+        plan: dict[str, Any] = parsed(obj.data[PLAN])
         objects = _objects(obj)
         count = sum(mesh_layout.splat_count(each.data) for each in objects)
-        current = noted["key"] == _key(settings, objects) and noted["splats"] == count
+        current = plan["key"] == _key(settings, objects) and plan["splats"] == count
     except (KeyError, TypeError, ValueError):
         return None
-    return noted if current else None
+    return plan if current else None
 
 
 def forget(mesh: bpy.types.Mesh) -> None:
@@ -230,7 +230,7 @@ def sentence(plan: dict[str, Any], *, absorb: bool) -> str:
 
 
 def remark(plan: dict[str, Any], record: dict[str, Any]) -> str:
-    """Return what else there is to say of a plan and of the note of the scoring, or ""."""
+    """Return what else there is to say of a plan and of the scoring, or ""."""
     if "psnr" in plan:
         return str(plan.get("remark", ""))
     if mesh_scores.unrefined(record):
@@ -267,7 +267,7 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[Warned]:
     plan : dict
         See `stored`.
     record : dict
-        The note of the scoring.
+        The record of the scoring.
     """
     warned = []
     alignment = Alignment.from_facts(record.get("alignment"))
@@ -292,7 +292,7 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[Warned]:
 
 
 def _sentence(note: str) -> str:
-    """Return a note of the core as a sentence of the panel."""
+    """Return what core says as a sentence of the panel."""
     return note[:1].upper() + note[1:]
 
 

@@ -39,7 +39,7 @@ MODES = {"COLOR": heat_map.COLOR, "HEAT": heat_map.HEAT}
 """What can be shown -> the colour attribute that holds it."""
 
 STYLES = ("POINTS", "SPLATS", "CLOUD", "NATIVE")
-"""The last two are what points are for point clouds: with a file's values, with Blender's own."""
+"""CLOUD and NATIVE are POINTS of a point cloud: with the values of a file, with Blender's own."""
 
 MADE_BY = "refine_version"
 """Custom property of our node groups and materials: the version of the add-on that made them. Those

@@ -35,8 +35,12 @@ if TYPE_CHECKING:
 
 METHODS = (
     ("auto", "Auto", "Occlusion with no more views than the pictures need"),
-    ("occlusion", "Occlusion", "Knows what hides what; uses all views"),
-    ("closed-form", "Closed Form", "Takes nothing as hidden: far faster, and worse"),
+    ("occlusion", "Occlusion", "Knows which splats hide others; uses all views"),
+    (
+        "closed-form",
+        "Closed Form",
+        "Ignores that splats hide others: far faster, and worse",
+    ),
 )
 """Methods of scoring, by the names that core gives them."""
 
@@ -65,7 +69,7 @@ VIEWS: dict[str, Any] = {
 AMOUNTS: dict[str, dict[str, Any]] = {
     "budget": {
         "name": "Budget",
-        "description": "What says how much is removed",
+        "description": "How the number of splats that go is given",
         "items": BUDGETS,
     },
     "percent": {
@@ -106,7 +110,7 @@ AMOUNTS: dict[str, dict[str, Any]] = {
     "psnr": {
         "name": "PSNR",
         "description": "How close the pictures of the cameras stay to those of all splats, in dB: "
-        "40 is hard to tell apart, 30 is seen",
+        "40 is hard to tell apart, 30 is visible",
         "default": 40.0,
         "min": 1.0,
         "max": 99.0,
@@ -117,14 +121,14 @@ AMOUNTS: dict[str, dict[str, Any]] = {
         "better when much is removed, and slower; the survivors change",
     },
 }
-"""What says how much is removed, and how: properties of the panel and of *Apply*."""
+"""How much is removed, and how: properties of the panel and of *Apply*."""
 
 FLOATERS = (
-    ("front", "In Front", "Stands in front of surfaces, seen by itself"),
+    ("front", "In Front", "Stands in front of a surface, and cameras see past it"),
     ("isolated", "Isolated", "Is in a small cluster that touches nothing else"),
     ("giant", "Giant", "Is a huge veil across the pictures"),
     ("needle", "Needle", "Is long and thin, and crosses the pictures"),
-    ("transparent", "Transparent", "Floats, but changes no picture that anyone would see"),
+    ("transparent", "Transparent", "Floats, but no picture changes visibly without it"),
 )
 """Reasons why a splat floats, by the names that core gives them."""
 
@@ -168,9 +172,9 @@ def _protectable(
     if mesh_layout.looks_like_splats(obj):
         yield from (group.name for group in obj.vertex_groups)
         for attribute in obj.data.attributes:
-            own = attribute.name.startswith((".", "refine_", "f_rest_"))
-            own = own or attribute.name in {*REQUIRED, "radius"}
-            if attribute.data_type in MARKING and attribute.domain == "POINT" and not own:
+            ours = attribute.name.startswith((".", "refine_", "f_rest_"))
+            ours = ours or attribute.name in {*REQUIRED, "radius"}
+            if attribute.data_type in MARKING and attribute.domain == "POINT" and not ours:
                 yield attribute.name
 
 
@@ -242,7 +246,7 @@ class RefineSettings(bpy.types.PropertyGroup):
         update=_plan_again,
     )
     volumes: CollectionProperty(
-        name="Volumes", description="Objects that say what must stay and go", type=RefineVolume
+        name="Volumes", description="Objects that mark what must stay and go", type=RefineVolume
     )
 
     levels: StringProperty(

@@ -1,4 +1,4 @@
-"""Operators that put right what the warnings beside Apply tell, each in one click."""
+"""Operators beside the warnings at Apply: each mends in one click what its warning tells."""
 
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
@@ -31,9 +31,14 @@ if TYPE_CHECKING:
     from ..core.volumes import Forced
     from ..mesh.layout import SplatObject
 
-_INNER = (5.0, 95.0)  # percentiles of the splats' positions that a ring frames
-_ELEVATIONS = (15.0, 40.0)  # degrees, by turns
-_MARGIN = 1.1  # how much farther away than would just do
+_INNER = (5.0, 95.0)
+"""Percentiles of the splats' positions that a ring frames: floaters far away do not count."""
+
+_ELEVATIONS = (15.0, 40.0)
+"""Degrees above the horizon of the cameras of a ring, by turns."""
+
+_MARGIN = 1.1
+"""How many times as far away a camera stands as would just do."""
 
 
 class _Bounds(NamedTuple):
@@ -79,7 +84,7 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_add_ring(AtOnce, OnSplats, bpy.types.Operator):
-    """Add cameras around the splats that see all of them; they decide with those there are"""
+    """Add cameras around the splats that see all of them; they decide together with the others"""
 
     bl_idname = "refine.add_ring"
     bl_label = "Add a Ring of Cameras"
@@ -125,7 +130,7 @@ class REFINE_OT_leave_out(AtOnce, OnSplats, bpy.types.Operator):
 
 
 class REFINE_OT_keep_unseen(AtOnce, OnSplats, bpy.types.Operator):
-    """Mark the splats that lie in no view to stay, with those that are marked"""
+    """Mark the splats that lie in no view to stay, beside those that are marked already"""
 
     bl_idname = "refine.keep_unseen"
     bl_label = "Keep What Is Unseen"
@@ -134,8 +139,8 @@ class REFINE_OT_keep_unseen(AtOnce, OnSplats, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> Answer:
         """Mark them."""
         group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
-        found = splat_group.forced_of_each(context.scene, group)
-        masks = [_unseen(*pair) for pair in zip(group, found, strict=True)]
+        forced = splat_group.forced_of_each(context.scene, group)
+        masks = [_unseen(*pair) for pair in zip(group, forced, strict=True)]
         for member in group:
             mesh_edit.check_writable(member.obj)
         for member, unseen in zip(group, masks, strict=True):
@@ -147,10 +152,10 @@ class REFINE_OT_keep_unseen(AtOnce, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _unseen(checked: SplatObject, found: Forced) -> NDArray[np.bool_]:
+def _unseen(checked: SplatObject, forced: Forced) -> NDArray[np.bool_]:
     """Return which splats lie in no view, (N,), and need not go for another reason."""
-    unseen = mesh_scores.stored_scores(checked, found.removed).seen == 0
-    return unseen if found.removed is None else unseen & ~found.removed
+    unseen = mesh_scores.stored_scores(checked, forced.removed).seen == 0
+    return unseen if forced.removed is None else unseen & ~forced.removed
 
 
 def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:
@@ -187,13 +192,13 @@ def _roots(cameras: Sequence[bpy.types.Object], splats: bpy.types.Object) -> lis
     RefineError
         If that cannot be.
     """
-    own = [splats]
-    while own[-1].parent:
-        own.append(own[-1].parent)
+    ancestors = [splats]  # of the splats, with themselves
+    while ancestors[-1].parent:
+        ancestors.append(ancestors[-1].parent)
     roots = []
     for camera in cameras:
         root = camera
-        while root.parent and root.parent not in own:
+        while root.parent and root.parent not in ancestors:
             root = root.parent
         if root.parent:
             msg = f"camera '{camera.name}' turns with the splats, being parented to them or theirs"

@@ -38,16 +38,16 @@ def _begun() -> Pace:
 
 @dataclass(frozen=True)
 class Sketch:
-    """Work whose result is shown while the main work goes on.
+    """Quick work whose result is shown while the main work goes on.
 
     Attributes
     ----------
     work : callable
         ``work(progress)``.
     doing, escape : str
-        See `Running`: from then on.
+        Those of `Running` once the result is shown.
     left : str
-        What is so if the main work comes to nothing.
+        A sentence on what the user has if the main work is cancelled or fails.
     """
 
     work: Callable[[Progress], Any]
@@ -64,7 +64,7 @@ _LONG = 5.0
 class Running:
     """An operation while it runs: all that an operator holds of it, dropped when it is over.
 
-    Blender keeps an operator in its history long after; splats and results are not to stay there.
+    Blender keeps operators in its history, which must not keep splats in memory.
 
     Attributes
     ----------
@@ -83,7 +83,7 @@ class Running:
     sketch : Sketch or None
         What is done first.
     stage : {"sketch", "work", "shown"}
-        What is being done; "shown" is the work too, with the sketch written.
+        What is being done; "shown" is the main work with the sketch's result written.
     waits : str
         What has to happen before the result can be written, "" if nothing.
     """
@@ -102,15 +102,15 @@ class Running:
     _pace: Pace = field(default_factory=_begun)
     _told: str = ""
 
-    def found(self) -> SplatObject | None:
-        """Return the first object that is to be written to, if all are as they were read.
+    def target(self) -> SplatObject | None:
+        """Return the first object that is to be written to, None if none is.
 
         Raises
         ------
         RefineError
-            See `Target.found`.
+            If one is no longer as it was read; see `Target.unchanged`.
         """
-        return next(iter([target.found() for target in self.targets]), None)
+        return next(iter([target.unchanged() for target in self.targets]), None)
 
     def next(self, worker: Worker[Any]) -> None:
         """Go on with other work, at a pace of its own."""

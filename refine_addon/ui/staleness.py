@@ -53,14 +53,14 @@ def changes(
     context : bpy.types.Context
         Evaluated: matrices are read as they stand.
     obj : bpy.types.Object
-        Without scores, or scored by a script that noted no origin, it has no changes.
+        Without scores, or scored by a script that recorded no origin, it has no changes.
     protected : (N,) bool, optional
         Which of its splats stay in any case; by default those that are marked so for the views.
     """
     record = mesh_scores.record(obj.data) or {}
     try:
         then, settings = record["origin"], record.get("asked") or record["settings"]
-        found = {
+        changed = {
             "object moved": _moved(then, context.scene, obj),
             "cameras changed": _other_cameras(then, _cameras(context)),
             "volumes changed": _other_volumes(then, context.scene),
@@ -71,7 +71,7 @@ def changes(
         }
     except (KeyError, TypeError, ValueError):  # whoever wrote there, these are no scores of ours
         return []
-    return [words for words, so in found.items() if so]
+    return [words for words, so in changed.items() if so]
 
 
 def changes_of(
@@ -85,8 +85,8 @@ def changes_of(
     objects : dict of bpy.types.Object to (N,) bool or None
         With what is protected of each.
     """
-    found = (words for obj, mask in objects.items() for words in changes(context, obj, mask))
-    return list(dict.fromkeys(found))
+    every = (words for obj, mask in objects.items() for words in changes(context, obj, mask))
+    return list(dict.fromkeys(every))
 
 
 def _protected(obj: bpy.types.Object, mask: NDArray[np.bool_] | None) -> list[int]:
@@ -100,15 +100,15 @@ def _volumes(scene: bpy.types.Scene) -> list[Any]:
     listed = demands.listed(scene)
     if all(item.role == "PROTECT" for item in listed):
         return []  # what is protected is scored like the rest; see `_protected`
-    found, depsgraph = [], bpy.context.evaluated_depsgraph_get()
+    volumes, depsgraph = [], bpy.context.evaluated_depsgraph_get()
     for item in listed:
         obj = item.object
         kind = obj.empty_display_type if obj.type == "EMPTY" else obj.type
         size = [obj.empty_display_size] * 3 if obj.type == "EMPTY" else list(obj.dimensions)
         shape = _shape(obj, depsgraph) if obj.type == "MESH" else []
         numbers = [*np.array(obj.matrix_world).ravel().tolist(), *size, *shape]
-        found.append([item.role, kind, numbers])
-    return found
+        volumes.append([item.role, kind, numbers])
+    return volumes
 
 
 def _shape(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> list[float]:
@@ -149,7 +149,7 @@ def _deciding(settings: dict[str, Any]) -> dict[str, Any]:
 
 
 def _cameras(context: bpy.types.Context) -> dict[str, Any]:
-    """Return a note of the cameras that decide; of a shot, which frames of which camera."""
+    """Return numbers that tell the cameras that decide from others; of a shot, its frames."""
     scene, settings = context.scene, context.scene.refine
     if settings.source == "FRAMES":
         frames = settings.to_frames(scene)

@@ -52,13 +52,13 @@ class Target:
             return ""
         return f"go back to {self.mode.replace('_', ' ').lower()} mode for the result"
 
-    def found(self) -> SplatObject:
-        """Return the object as it is now.
+    def unchanged(self) -> SplatObject:
+        """Return the object, whose splats are still those that were read.
 
         Raises
         ------
         RefineError
-            If its splats are no longer those that were read.
+            If they are not.
         """
         obj, label = self._object(), f"object '{self.name}'"
         if obj is None:
@@ -78,5 +78,5 @@ class Target:
 
     def _object(self) -> bpy.types.Object | None:
         """Return the object if it is still in a scene."""
-        found = (obj for obj in bpy.data.objects if obj.session_uid == self.obj)
-        return next((obj for obj in found if obj.users_scene), None)
+        same = (obj for obj in bpy.data.objects if obj.session_uid == self.obj)
+        return next((obj for obj in same if obj.users_scene), None)

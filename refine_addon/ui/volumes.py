@@ -26,6 +26,13 @@ ROLES = (
 )
 """What becomes of the splats in a volume, by the names that core gives it in small letters."""
 
+_OUTSIDE, _OUTSIDE_KEPT = 0.25, 0.02
+"""Share of the splats that lie beyond each face of a new volume: it holds their middle half, or
+nearly all of them where it keeps what is inside."""
+
+_LEAST_HALF = 1e-3
+"""Half the least width of a new volume, world units: flat splats make no flat one."""
+
 SHAPES = (
     ("BOX", "Box", "A new box around the middle of the splats"),
     ("SPHERE", "Sphere", "A new sphere around the middle of the splats"),
@@ -118,16 +125,16 @@ def _new_empty(
     if not len(means):
         msg = f"object '{checked.obj.name}': no splat has a finite centre"
         raise RefineError(msg)
-    share = 0.02 if role == "KEEP" else 0.25
+    share = _OUTSIDE_KEPT if role == "KEEP" else _OUTSIDE
     low, high = np.quantile(means, (share, 1.0 - share), axis=0)
-    half = np.maximum((high - low) / 2.0, 1e-3)
+    half = np.maximum((high - low) / 2.0, _LEAST_HALF)
     obj = bpy.data.objects.new(f"{checked.obj.name} {role.lower()}", None)
     obj.empty_display_type = "CUBE" if shape == "BOX" else "SPHERE"
     obj.location = (low + high) / 2.0
     obj.scale = half
     if shape == "SPHERE":
         away = np.linalg.norm(means - (low + high) / 2.0, axis=1)
-        obj.scale = (max(float(np.quantile(away, 1.0 - 2.0 * share)), 1e-3),) * 3
+        obj.scale = (max(float(np.quantile(away, 1.0 - 2.0 * share)), _LEAST_HALF),) * 3
     obj.show_in_front = True
     context.collection.objects.link(obj)
     for other in context.selected_objects:

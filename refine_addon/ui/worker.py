@@ -6,8 +6,7 @@ import threading
 import time
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-from ..core.errors import Cancelled
-from ..core.work import checked_by
+from ..core.work import Cancelled, checked_by
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -50,11 +50,11 @@ def counted(number: int, what: str) -> str:
 def lines(text: str, width: int, points: float) -> tuple[str, ...]:
     """Return a text in lines that are at most so many pixels wide; a word is never broken."""
     blf.size(0, points)
-    found: list[str] = []
+    broken: list[str] = []
     for word in text.split():
-        longer = f"{found[-1]} {word}" if found else word
-        if found and blf.dimensions(0, longer)[0] <= width:
-            found[-1] = longer
+        longer = f"{broken[-1]} {word}" if broken else word
+        if broken and blf.dimensions(0, longer)[0] <= width:
+            broken[-1] = longer
         else:
-            found.append(word)
-    return tuple(found)
+            broken.append(word)
+    return tuple(broken)

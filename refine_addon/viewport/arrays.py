@@ -36,8 +36,11 @@ MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (1.0, 1.0, 1.0)}
 SHARES = {"SCENE": 0.35, "HEAT": 0.55, "STAYS": 0.35, "GOES": 0.75}
 """How much of a colour that tint is, by mode of the view."""
 
-_KEYS = 65535.0
+_LARGEST_KEY = 65535.0
+"""Of 16 bits."""
+
 _LARGEST_HALF = 65504.0
+"""Of float16."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +89,7 @@ class Eye(NamedTuple):
 
 
 def pack(splats: Splats) -> Packed:
-    """Return what is drawn of splats; with the harmonics that are to be seen."""
+    """Return what is drawn of splats."""
     opacities = opacity(splats.opacity_logits).astype(np.float32)  # (N,)
     shown = drawable(splats) & (opacities >= ALPHA_CUT)
     vertices = np.flatnonzero(shown).astype(np.int32)
@@ -94,13 +97,13 @@ def pack(splats: Splats) -> Packed:
     harmonics = np.empty((len(vertices), splats.sh_rest.shape[1] + 1, 3), np.float16)
     rows, columns = np.triu_indices(3)
     for chunk in pieces(len(vertices)):
-        some = splats.take(vertices[chunk])
+        part = splats.take(vertices[chunk])
         with np.errstate(under="ignore", over="ignore"):
-            axes = rotation_matrices(some.quaternions)
-            axes *= scales(some.log_scales)[:, None, :]
+            axes = rotation_matrices(part.quaternions)
+            axes *= scales(part.log_scales)[:, None, :]
             matrices = axes @ axes.transpose(0, 2, 1)
             covariances[chunk] = matrices[:, rows, columns]
-        harmonics[chunk, 0], harmonics[chunk, 1:] = _half(some.sh_dc), _half(some.sh_rest)
+        harmonics[chunk, 0], harmonics[chunk, 1:] = _half(part.sh_dc), _half(part.sh_rest)
     means = np.ascontiguousarray(splats.means[vertices], np.float32)
     return Packed(vertices, means, covariances, opacities[vertices], harmonics)
 
@@ -132,8 +135,8 @@ def colors(packed: Packed, eye: Eye | None = None) -> NDArray[np.float32]:
     eye : Eye, optional
         From where they are seen; without it, the constant colour.
     """
-    found = np.empty((len(packed), 4), np.float32)
-    found[:, 3] = packed.opacities
+    rgba = np.empty((len(packed), 4), np.float32)
+    rgba[:, 3] = packed.opacities
     for chunk in pieces(len(packed)):
         coefficients = packed.harmonics[chunk].astype(np.float32)
         if eye is None:
@@ -141,8 +144,8 @@ def colors(packed: Packed, eye: Eye | None = None) -> NDArray[np.float32]:
         else:
             directions = _directions(packed.means[chunk], eye)
             rgb = colors_along(directions, coefficients[:, 0], coefficients[:, 1:])
-        found[chunk, :3] = np.clip(rgb, 0.0, _LARGEST_HALF)
-    return found
+        rgba[chunk, :3] = np.clip(rgb, 0.0, _LARGEST_HALF)
+    return rgba
 
 
 def heat(packed: Packed, ranks: NDArray[Any], ramp: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -157,36 +160,36 @@ def heat(packed: Packed, ranks: NDArray[Any], ramp: NDArray[np.float64]) -> NDAr
         Colours from rank 0 to 1.
     """
     index = np.nan_to_num(ranks[packed.vertices]) * (len(ramp) - 1) + 0.5
-    found = np.empty((len(packed), 4), np.float32)
-    found[:, :3] = ramp[np.clip(index, 0, len(ramp) - 1).astype(np.int64)]
-    found[:, 3] = packed.opacities
-    return found
+    rgba = np.empty((len(packed), 4), np.float32)
+    rgba[:, :3] = ramp[np.clip(index, 0, len(ramp) - 1).astype(np.int64)]
+    rgba[:, 3] = packed.opacities
+    return rgba
 
 
 def tinted(
     rgba: NDArray[np.float32], tint: tuple[float, float, float], share: float
 ) -> NDArray[np.float32]:
     """Return colours, (M, 4), of which a share is the tint."""
-    found = rgba.copy()
-    found[:, :3] = (1.0 - share) * np.clip(rgba[:, :3], 0.0, 1.0) + share * np.array(tint)
-    return found
+    mixed = rgba.copy()
+    mixed[:, :3] = (1.0 - share) * np.clip(rgba[:, :3], 0.0, 1.0) + share * np.array(tint)
+    return mixed
 
 
 def marked(rgba: NDArray[np.float32], force: NDArray[Any] | None, mode: str) -> NDArray[np.float32]:
     """Return colours, (M, 4), with those of what stays and goes in any case, (M,), tinted."""
     if force is None or mode not in SHARES:
         return rgba
-    found = rgba.copy()
+    mixed = rgba.copy()
     for mark, tint in MARKS.items():
         rows = force == mark
-        found[rows] = tinted(found[rows], tint, SHARES[mode])
-    return found
+        mixed[rows] = tinted(mixed[rows], tint, SHARES[mode])
+    return mixed
 
 
 def in_front(
     means: NDArray[np.float32], eye: Eye, near: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return which means, (M, 3), are deeper than the near plane of a view, and how deep: (V,)."""
+    """Return which means, (M, 3), lie behind the near plane of a view, (V,), and their depths."""
     with np.errstate(over="ignore", invalid="ignore"):
         depths = means @ eye.row[:3].astype(np.float32) + np.float32(eye.row[3])
     shown = np.flatnonzero((depths > near) & (depths < np.inf))
@@ -194,11 +197,10 @@ def in_front(
 
 
 def farthest_first(depths: NDArray[np.float32], *, perspective: bool) -> NDArray[np.int64]:
-    """Return the order of depths, the largest first; those that all but agree, as they come.
+    """Return the order of depths, the largest first; nearly equal ones keep their order.
 
-    Depths are sorted by 16 bits, for which NumPy has a radix sort, 8 times as fast as that of
-    float32: by their logarithms in perspective, where a step is then some 1e-4 of the depth, and
-    evenly without.
+    Depths are rounded to 16 bits, for which NumPy has a radix sort, 8 times as fast as its sort of
+    float32. In perspective their logarithms are rounded, to steps of some 1e-4 of the depth.
 
     Parameters
     ----------
@@ -215,7 +217,7 @@ def farthest_first(depths: NDArray[np.float32], *, perspective: bool) -> NDArray
     values = np.log(depths) if perspective else depths
     low, high = values.min(), values.max()
     extent = high - low
-    scale = np.float32(_KEYS / extent if extent > 0.0 else 0.0)
+    scale = np.float32(_LARGEST_KEY / extent if extent > 0.0 else 0.0)
     keys = ((high - values) * scale).astype(np.uint16)
     return np.argsort(keys, kind="stable")
 

@@ -225,19 +225,18 @@ class Content:
         keys = sorted(wanted | (slots.keys() & existing()))
         keys = [key for key in keys if self._held[key[1]].packed is not None]
         meshes = {mesh for _, mesh in keys}
-        self._held = {m: h for m, h in self._held.items() if m in meshes or h.future}
+        self._held = {
+            mesh: held for mesh, held in self._held.items() if mesh in meshes or held.future
+        }
         self.atlas = _atlas(keys, self._held)
 
 
 def _atlas(keys: list[tuple[int, int]], held: dict[int, Held]) -> Atlas:
-    packs = [packed for _, mesh in keys if (packed := held[mesh].packed) is not None]
-    counts = first_of_each([len(packed) for packed in packs], MOST)
-    slots, start = {}, 0
-    for number, (key, packed, count) in enumerate(zip(keys, packs, counts, strict=True)):
-        slots[key] = Slot(held[key[1]], packed, number, start, count)
-        start += count
-    means = np.empty((start, 4), np.float32)
-    covariances = np.empty((start, 6), np.float32)
+    """Make the textures of some objects, by the identities of objects and meshes."""
+    slots = _slots(keys, held)
+    total = sum(slot.count for slot in slots.values())
+    means = np.empty((total, 4), np.float32)
+    covariances = np.empty((total, 6), np.float32)
     for slot in slots.values():
         rows = slice(slot.start, slot.start + slot.count)
         means[rows, :3] = slot.packed.means[: slot.count]
@@ -249,6 +248,17 @@ def _atlas(keys: list[tuple[int, int]], held: dict[int, Held]) -> Atlas:
         shader.texture(as_texture(covariances[:, :4]), 4, "RGBA32F"),
         shader.texture(as_texture(covariances[:, 4:]), 2, "RG32F"),
     )
+
+
+def _slots(keys: list[tuple[int, int]], held: dict[int, Held]) -> dict[tuple[int, int], Slot]:
+    """Place objects one after another, with at most `MOST` splats in all."""
+    packs = [packed for _, mesh in keys if (packed := held[mesh].packed) is not None]
+    counts = first_of_each([len(packed) for packed in packs], MOST)
+    slots, start = {}, 0
+    for number, (key, packed, count) in enumerate(zip(keys, packs, counts, strict=True)):
+        slots[key] = Slot(held[key[1]], packed, number, start, count)
+        start += count
+    return slots
 
 
 def _attribute(mesh: bpy.types.Mesh, name: str, kind: str) -> NDArray[Any] | None:

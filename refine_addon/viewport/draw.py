@@ -21,12 +21,15 @@ if TYPE_CHECKING:
 MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
 """What can be drawn: nothing, all as it is, coloured by rank, what Apply leaves, what it takes."""
 
-_TICK = 0.03  # seconds
-_VIEWS = 16  # regions remembered
+_TICK = 0.03
+"""Seconds between two looks at whether the thread has sorted more splats."""
+
+_VIEWS = 16
+"""Regions whose pictures are kept on the graphics card."""
 
 
 class _State:
-    """All that is there while splats are drawn; nothing of it is stored anywhere."""
+    """What is kept while splats are drawn, in memory alone."""
 
     def __init__(self) -> None:
         self.mode = "OFF"
@@ -123,7 +126,7 @@ def _unhook() -> None:
 
 
 def _guarded(work: Callable[[], None]) -> None:
-    """Draw; what fails fails once, and the points are shown again."""
+    """Draw; after the first failure splats are drawn no more, and their points are shown again."""
     if _state.mode == "OFF" or _state.failure:
         return
     try:

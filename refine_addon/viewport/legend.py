@@ -17,17 +17,20 @@ if TYPE_CHECKING:
 
     import bpy
 
-WORDS = {
-    "HEAT": "goes first                    goes last",
-    "STAYS": "What stays",
-    "GOES": "What goes",
-}
-"""What is written in a view, by mode."""
+WORDS = {"HEAT": ("goes first", "goes last"), "STAYS": ("What stays",), "GOES": ("What goes",)}
+"""What is written in a view, by mode; of the heat map at both ends of its bar."""
 
 MARKED = {STAYS: "Protected", GOES: "Goes by a volume"}
 """What is written beside the tint of what stays and goes in any case."""
 
+_REDUNDANT = {(STAYS, "GOES"), (GOES, "STAYS")}
+"""Marks that no splat has in a mode."""
+
 _WIDE, _HIGH, _EDGE, _FONT = 220, 10, 16, 12  # pixels at scale 1
+_GAP = 6  # between the bar and the words above it
+
+_WHITE, _BLACK = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 1.0)
+_BLUR = 5  # of the shadow: 0, 3 or 5
 
 
 def draw(context: bpy.types.Context, mode: str, marks: Collection[int] = ()) -> None:
@@ -35,30 +38,39 @@ def draw(context: bpy.types.Context, mode: str, marks: Collection[int] = ()) -> 
     if mode not in WORDS and not marks:
         return
     scale = context.preferences.system.ui_scale
-    tools = sum(
-        r.width for r in context.area.regions if r.type == "TOOLS" and r.x <= context.region.x
-    )
-    x, y = tools + _EDGE * scale, _EDGE * scale
+    x, y = _beside_tools(context) + _EDGE * scale, _EDGE * scale
     blf.size(0, _FONT * scale)
-    blf.color(0, 1.0, 1.0, 1.0, 1.0)
+    blf.color(0, *_WHITE)
     blf.enable(0, blf.SHADOW)
-    blf.shadow(0, 5, 0.0, 0.0, 0.0, 1.0)
-    words = ("goes first", "goes last") if mode == "HEAT" else (WORDS.get(mode, ""),)
-    above = y + (_HIGH + 6) * scale if mode == "HEAT" else y
-    for place, text in enumerate(words):
-        wide = blf.dimensions(0, text)[0]
-        blf.position(0, x + place * (_WIDE * scale - wide), above, 0.0)
-        blf.draw(0, text)
-    shown = [mark for mark in MARKED if mark in marks]
-    shown = [mark for mark in shown if (mark, mode) not in {(STAYS, "GOES"), (GOES, "STAYS")}]
-    for place, mark in enumerate(shown, start=1 if mode in WORDS else 0):
-        line = (above if mode in WORDS else y) + place * 2 * _HIGH * scale
-        blf.position(0, x + 2 * _HIGH * scale, line, 0.0)
-        blf.draw(0, MARKED[mark])
-        _swatch(x, line, scale, MARKS[mark])
-    blf.disable(0, blf.SHADOW)
+    blf.shadow(0, _BLUR, *_BLACK)
+    line = y
     if mode == "HEAT":
         _bar(x, y, scale)
+        line += (_HIGH + _GAP) * scale
+    if mode in WORDS:
+        _words(WORDS[mode], x, line, scale)
+        line += 2 * _HIGH * scale
+    for mark, text in MARKED.items():
+        if mark in marks and (mark, mode) not in _REDUNDANT:
+            blf.position(0, x + 2 * _HIGH * scale, line, 0.0)
+            blf.draw(0, text)
+            _swatch(x, line, scale, MARKS[mark])
+            line += 2 * _HIGH * scale
+    blf.disable(0, blf.SHADOW)
+
+
+def _beside_tools(context: bpy.types.Context) -> int:
+    """Return how many pixels the toolbar covers of a view."""
+    regions = (region for region in context.area.regions if region.type == "TOOLS")
+    return sum(region.width for region in regions if region.x <= context.region.x)
+
+
+def _words(words: tuple[str, ...], x: float, y: float, scale: float) -> None:
+    """Write the first words to the left, and the last, if there are two, to the end of the bar."""
+    for index, text in enumerate(words):
+        width = blf.dimensions(0, text)[0]
+        blf.position(0, x + index * (_WIDE * scale - width), y, 0.0)
+        blf.draw(0, text)
 
 
 def _swatch(x: float, y: float, scale: float, color: tuple[float, float, float]) -> None:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def hide(depsgraph: bpy.types.Depsgraph, refused: Container[int] = ()) -> None:
-    """Show the splat objects of a view layer as their bounding boxes, save some meshes'."""
+    """Show the splat objects of a view layer as their bounding boxes, but for refused meshes."""
     for obj, evaluated in _copies(depsgraph):
         drawn = not is_edited(obj) and obj.data.session_uid not in refused
         wanted = "BOUNDS" if drawn else obj.display_type

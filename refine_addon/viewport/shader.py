@@ -142,13 +142,13 @@ void main()
   ivec2 low = ivec2(at);
   ivec2 high = min(low + 1, size - 1);
   vec2 share = at - vec2(low);
-  vec4 found = mix(
+  vec4 mixed = mix(
       mix(texelFetch(picture, low, 0), texelFetch(picture, ivec2(high.x, low.y), 0), share.x),
       mix(texelFetch(picture, ivec2(low.x, high.y), 0), texelFetch(picture, high, 0), share.x),
       share.y);
-  vec3 shown = clamp(found.rgb, 0.0, 1.0);
+  vec3 shown = clamp(mixed.rgb, 0.0, 1.0);
   vec3 curved = pow((shown + 0.055) / 1.055, vec3(2.4));
-  color = vec4(mix(shown / 12.92, curved, step(vec3(0.04045), shown)), found.a);
+  color = vec4(mix(shown / 12.92, curved, step(vec3(0.04045), shown)), mixed.a);
 }
 """
 
@@ -165,7 +165,7 @@ def splats() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
     between = gpu.types.GPUStageInterfaceInfo("refine_splat")
     between.smooth("VEC2", "place")
     between.flat("VEC4", "paint")
-    return _made(info, between, _SPLAT_VERTEX, _SPLAT_FRAGMENT)
+    return _program(info, between, _SPLAT_VERTEX, _SPLAT_FRAGMENT)
 
 
 @cache
@@ -175,7 +175,7 @@ def picture() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
     info.sampler(0, "FLOAT_2D", "picture")
     between = gpu.types.GPUStageInterfaceInfo("refine_picture")
     between.smooth("VEC2", "uv")
-    return _made(info, between, _PICTURE_VERTEX, _PICTURE_FRAGMENT)
+    return _program(info, between, _PICTURE_VERTEX, _PICTURE_FRAGMENT)
 
 
 def forget() -> None:
@@ -199,7 +199,7 @@ def texture(values: NDArray[np.float32], channels: int, kind: str) -> gpu.types.
     return gpu.types.GPUTexture(size, format=kind, data=gpu.types.Buffer("FLOAT", len(flat), flat))
 
 
-def _made(
+def _program(
     info: gpu.types.GPUShaderCreateInfo,
     between: gpu.types.GPUStageInterfaceInfo,
     vertex: str,
@@ -210,6 +210,6 @@ def _made(
     info.fragment_out(0, "VEC4", "color")
     info.vertex_source(vertex)
     info.fragment_source(fragment)
-    made = gpu.shader.create_from_info(info)
+    program = gpu.shader.create_from_info(info)
     corners = [(-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0), (1.0, 1.0)]
-    return made, batch_for_shader(made, "TRI_STRIP", {"corner": corners})
+    return program, batch_for_shader(program, "TRI_STRIP", {"corner": corners})

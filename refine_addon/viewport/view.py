@@ -105,8 +105,18 @@ class _Part(NamedTuple):
     eye: Eye
 
 
-class _Found(NamedTuple):
-    """What the thread found."""
+class _Sorted(NamedTuple):
+    """What the thread computed.
+
+    Attributes
+    ----------
+    order : (R, WIDTH) float32
+        Rows of the textures that are drawn, the farthest first, as a texture.
+    drawn : int
+        How many these are.
+    colors : (R, WIDTH * 4) float32 or None
+        Of all rows, as a texture; None where they are as before.
+    """
 
     order: NDArray[np.float32]
     drawn: int
@@ -133,7 +143,7 @@ class View:
         self._colors: gpu.types.GPUTexture | None = None
         self._colors_key: object = None
         self._colored: Atlas | None = None
-        self._job: tuple[object, object, Future[_Found]] | None = None
+        self._job: tuple[object, object, Future[_Sorted]] | None = None
         self._camera_key = b""
         self._changed = 0.0
         self.complete = False
@@ -206,15 +216,15 @@ class View:
         return now - self._changed < REST
 
     def _take(self) -> None:
-        """Take what the thread has found."""
+        """Take what the thread has computed."""
         if self._job is None or not self._job[2].done():
             return
         order_key, colors_key, future = self._job
         self._job = None
-        found = future.result()
-        self._order = _Order(shader.texture(found.order, 1, "R32F"), found.drawn, order_key)
-        if found.colors is not None:
-            self._colors = shader.texture(found.colors, 4, "RGBA16F")
+        result = future.result()
+        self._order = _Order(shader.texture(result.order, 1, "R32F"), result.drawn, order_key)
+        if result.colors is not None:
+            self._colors = shader.texture(result.colors, 4, "RGBA16F")
             self._colors_key, self._colored = colors_key, order_key[0]
 
     def _start(
@@ -233,10 +243,10 @@ class View:
             colors_key += tuple(p.eye.place.tobytes() for p in parts if p.slot.held.degree)
         rows = None if colors_key == self._colors_key else key[0].rows
         if self._colors is None and key[0].rows > few:
-            first = background.start(_find, parts, camera.near, mode, rows, few)
+            first = background.start(_sort_and_color, parts, camera.near, mode, rows, few)
             self._job = ((*key, few), None, first)
         else:
-            work = background.start(_find, parts, camera.near, mode, rows)
+            work = background.start(_sort_and_color, parts, camera.near, mode, rows)
             self._job = (key, colors_key, work)
 
     def _sort(
@@ -253,42 +263,54 @@ class View:
     ) -> None:
         """Draw the splats into the picture, unless it shows them already."""
         depths = _depths(camera.size) if solid else None
-        size = tuple(max(1, length // pixels) for length in camera.size)
+        size = (max(1, camera.size[0] // pixels), max(1, camera.size[1] // pixels))
         wanted = (self._order.key, self._colors_key, self._camera_key, size)
         if self._picture and wanted == self._drawn and same(depths, self._depths):
             return
         self._drawn, self._depths = wanted, depths
         if not self._picture or (self._picture.width, self._picture.height) != size:
             self._picture = gpu.types.GPUTexture(size, format="RGBA16F")
-        flat = np.ones((1, 1), np.float32) if depths is None else depths
-        rows = np.zeros((1 + max(s.slot.number for s in shown), 12), np.float32)
-        for s in shown:
-            rows[s.slot.number] = s.matrix[:3].reshape(-1)
-        # Held until they are drawn: the shader does not keep what it is given.
-        matrices, occluders = shader.texture(rows, 4, "RGBA32F"), shader.texture(flat, 1, "R32F")
-        program, quad = shader.splats()
-        numbers = np.zeros(24, np.float32)
-        numbers[:16] = camera.projection.T.reshape(-1)
-        numbers[16:20] = (*size, camera.near, camera.size[0] / size[0])
-        numbers[20:22] = (camera.perspective, solid)
-        block = gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", 24, numbers))
+        occluders = np.ones((1, 1), np.float32) if depths is None else depths
+        textures = {
+            "order": self._order.texture,
+            "means": atlas.means,
+            "covariances": atlas.covariances,
+            "more_covariances": atlas.more_covariances,
+            "colors": self._colors,
+            "matrices": shader.texture(_matrix_rows(shown), 4, "RGBA32F"),
+            "depths": shader.texture(occluders, 1, "R32F"),
+        }  # held until they are drawn: the shader does not keep what it is given
+        block = _view_data(camera, size, solid=solid)
         frame = gpu.types.GPUFrameBuffer(color_slots=self._picture)
         with frame.bind():
             frame.clear(color=(0.0, 0.0, 0.0, 0.0))
             if self._order.count:
+                program, quad = shader.splats()
                 gpu.state.blend_set("ALPHA_PREMULT")
                 gpu.state.depth_test_set("NONE")
                 program.bind()
                 program.uniform_block("view_data", block)
-                program.uniform_sampler("order", self._order.texture)
-                program.uniform_sampler("means", atlas.means)
-                program.uniform_sampler("covariances", atlas.covariances)
-                program.uniform_sampler("more_covariances", atlas.more_covariances)
-                program.uniform_sampler("colors", self._colors)
-                program.uniform_sampler("matrices", matrices)
-                program.uniform_sampler("depths", occluders)
+                for name, texture in textures.items():
+                    program.uniform_sampler(name, texture)
                 quad.draw_instanced(program, instance_count=self._order.count)
                 gpu.state.blend_set("NONE")
+
+
+def _matrix_rows(shown: list[Shown]) -> NDArray[np.float32]:
+    """Return the upper three rows of each object's matrix, by the number of its slot, (S, 12)."""
+    rows = np.zeros((1 + max(each.slot.number for each in shown), 12), np.float32)
+    for each in shown:
+        rows[each.slot.number] = each.matrix[:3].reshape(-1)
+    return rows
+
+
+def _view_data(camera: Camera, size: tuple[int, int], *, solid: bool) -> gpu.types.GPUUniformBuf:
+    """Return what the shader knows of a view as ``ViewData``, for a picture of this size."""
+    numbers = np.zeros(24, np.float32)
+    numbers[:16] = camera.projection.T.reshape(-1)
+    numbers[16:20] = (*size, camera.near, camera.size[0] / size[0])
+    numbers[20:22] = (camera.perspective, solid)
+    return gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", len(numbers), numbers))
 
 
 def _parts(shown: Iterable[Shown], camera: Camera) -> list[_Part]:
@@ -304,49 +326,63 @@ def _parts(shown: Iterable[Shown], camera: Camera) -> list[_Part]:
     return parts
 
 
-def _find(
+def _sort_and_color(
     parts: list[_Part], near: float, mode: str, rows: int | None, few: int | None = None
-) -> _Found:
+) -> _Sorted:
     """Sort splats and, in textures of so many rows, colour them; on the thread.
 
     With `few`, only so many are sorted, and colours are constant.
     """
     order = _order(parts, near, mode, few)
     if rows is None:
-        return _Found(as_texture(order), len(order), None)
+        return _Sorted(as_texture(order), len(order), None)
     painted = np.zeros((rows, 4), np.float32)
-    for slot, _, ranks, forced, _, eye in parts:
-        place = slice(slot.start, slot.start + slot.count)
-        if mode == "HEAT" and ranks is not None:
-            rgba = heat(slot.packed, ranks, ramp())
-        else:
-            rgba = colors(slot.packed, eye if few is None else None)
-        if mode == "GOES":
-            goes = tinted(rgba, TINT, TINT_SHARE)
-            rgba = goes if forced is None else np.where((forced == GOES)[:, None], rgba, goes)
-        painted[place] = marked(rgba, forced, mode)[: slot.count]
-    return _Found(as_texture(order), len(order), as_texture(painted))
+    for part in parts:
+        slot = part.slot
+        rgba = _colored(part, mode, constant=few is not None)
+        painted[slot.start : slot.start + slot.count] = rgba[: slot.count]
+    return _Sorted(as_texture(order), len(order), as_texture(painted))
+
+
+def _colored(part: _Part, mode: str, *, constant: bool) -> NDArray[np.float32]:
+    """Return the colours of an object's splats in a mode, (M, 4)."""
+    packed, forced = part.slot.packed, part.forced
+    if mode == "HEAT" and part.ranks is not None:
+        rgba = heat(packed, part.ranks, ramp())
+    else:
+        rgba = colors(packed, None if constant else part.eye)
+    if mode == "GOES":
+        goes = tinted(rgba, TINT, TINT_SHARE)
+        rgba = goes if forced is None else np.where((forced == GOES)[:, None], rgba, goes)
+    return marked(rgba, forced, mode)
 
 
 def _order(parts: list[_Part], near: float, mode: str, most: int | None = None) -> NDArray[Any]:
     """Return the rows of the textures that are drawn, the farthest first."""
     counts = [part.slot.count for part in parts]
     counts = counts if most is None else first_of_each(counts, most)
-    rows, depths = [], []
-    for (slot, going, _, _, important, eye), count in zip(parts, counts, strict=True):
-        if count == slot.count or important is None:
-            before, deep = in_front(slot.packed.means[:count], eye, near)
-        else:
-            some = important[important < slot.count][:count]
-            nearer, deep = in_front(slot.packed.means[some], eye, near)
-            before = some[nearer].astype(np.int64)
-        if mode in {"STAYS", "GOES"}:
-            wanted = _wanted(going, mode, before)
-            before, deep = before[wanted], deep[wanted]
-        rows.append(before + slot.start)
-        depths.append(deep)
+    rows, depths = zip(
+        *(_in_view(*pair, near, mode) for pair in zip(parts, counts, strict=True)), strict=True
+    )
     perspective = parts[0].eye.perspective
     return np.concatenate(rows)[farthest_first(np.concatenate(depths), perspective=perspective)]
+
+
+def _in_view(
+    part: _Part, count: int, near: float, mode: str
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return the rows of an object's most important splats that a view draws, and their depths."""
+    slot, important = part.slot, part.important
+    if count == slot.count or important is None:
+        shown, depths = in_front(slot.packed.means[:count], part.eye, near)
+    else:
+        chosen = important[important < slot.count][:count]
+        places, depths = in_front(slot.packed.means[chosen], part.eye, near)
+        shown = chosen[places].astype(np.int64)
+    if mode in {"STAYS", "GOES"}:
+        wanted = _wanted(part.going, mode, shown)
+        shown, depths = shown[wanted], depths[wanted]
+    return shown + slot.start, depths
 
 
 def _wanted(

@@ -47,7 +47,7 @@ def addon(extension):
     for path in (ROOT / "refine_addon").glob("*.py"):
         if not path.stem.startswith("__"):
             importlib.import_module(f"{MODULE}.{path.stem}")
-    importlib.import_module(f"{MODULE}.objects.prune_object")  # which the command alone loads
+    importlib.import_module(f"{MODULE}.objects.operation")  # which the command alone loads
     return extension
 
 
@@ -85,6 +85,22 @@ def room(addon, empty_scene):
     bpy.context.view_layer.objects.active = obj
     obj.select_set(True)
     return obj
+
+
+@pytest.fixture
+def quarter(addon, room):
+    """Keep every fourth splat of the room: 9,939."""
+    addon.mesh.edit.delete_vertices(room, np.arange(len(room.data.vertices)) % 4 != 0)
+    return room
+
+
+@pytest.fixture(scope="session")
+def quarter_file(addon, tmp_path_factory):
+    """Write every fourth splat of the room to a file."""
+    path = tmp_path_factory.mktemp("quarter") / "room.ply"
+    file = addon.core.read_ply(ROOM / "point_cloud.ply")
+    file.write(path, np.arange(len(file)) % 4 == 0)
+    return path
 
 
 @pytest.fixture

@@ -85,7 +85,7 @@ def test_the_command_on_an_object_writes_the_same_survivors(addon, few, room_vie
     count = len(room.data.vertices)
     out = tmp_path / "out.ply"
 
-    report = addon.objects.prune_object.prune_object(
+    report = addon.objects.operation.prune_object(
         room.name,
         addon.core.PruneRequest(room_views, budget, addon.core.Settings(), absorb=True),
         output=out,
@@ -104,7 +104,7 @@ def test_saving_leaves_in_the_blend_what_apply_leaves(addon, few, room_views, tm
     expected = absorbed_in_core(addon, room, room_views, budget).absorbed
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
 
-    addon.objects.prune_object.prune_object(
+    addon.objects.operation.prune_object(
         room.name,
         addon.core.PruneRequest(room_views, budget, addon.core.Settings(), absorb=True),
         save=True,

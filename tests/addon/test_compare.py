@@ -19,22 +19,22 @@ def pixels(name):
 
 
 @pytest.mark.parametrize("absorb", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_the_pictures_are_those_of_what_apply_leaves(addon, room, room_cameras, absorb):
-    """Before: the room as it is; after: the object once *Apply* was clicked, by the same camera."""
+def test_the_pictures_are_those_of_what_apply_leaves(addon, quarter, room_cameras, absorb):
+    """Before: the splats as they are; after: once *Apply* was clicked; by the same camera."""
     scene = bpy.context.scene
     scene.camera = room_cameras.objects[24]
     scene.refine.ratio, scene.refine.absorb, scene.refine.views = 0.7, absorb, 16
     bpy.ops.refine.score()
     gather, check = addon.objects.splat_object.gather, addon.mesh.layout.check
-    before = gather(check(room), whole=True)
+    before = gather(check(quarter), whole=True)
 
     assert bpy.ops.refine.compare() == {"FINISHED"}
 
-    assert len(room.data.vertices) == 39_755
+    assert len(quarter.data.vertices) == 9_939
     bpy.ops.refine.apply()
-    after = gather(check(room), whole=True)
-    assert len(after) == 39_755 - 27_828
-    views = addon.cameras.sets.Choice("ACTIVE").views(bpy.context, room)
+    after = gather(check(quarter), whole=True)
+    assert len(after) == 9_939 - 6_957  # floor(.7 * 9939)
+    views = addon.cameras.sets.Choice("ACTIVE").views(bpy.context, quarter)
     (expected,) = addon.core.pictures.compare(before, after, views)
     assert (expected.view.width, expected.view.height) == (240, 160)
     for name, wanted in zip(NAMES, ("before", "after", "difference"), strict=True):

@@ -40,19 +40,21 @@ def test_import_score_apply_export_writes_the_file_that_core_writes(addon, room_
 
 
 @pytest.mark.parametrize(("method", "absorb"), [("occlusion", False), ("closed-form", True)])
-def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(addon, method, absorb):
+def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(
+    addon, quarter_file, method, absorb
+):
     """A quarter turn of splats and cameras: the command without Blender never sees it."""
-    bpy.ops.refine.import_ply(filepath=str(ROOM / "point_cloud.ply"), upright=True)
+    bpy.ops.refine.import_ply(filepath=str(quarter_file), upright=True)
     obj = bpy.context.object
     obj.data.attributes.new("row", "INT", "POINT")
-    obj.data.attributes["row"].data.foreach_set("value", np.arange(39755))
+    obj.data.attributes["row"].data.foreach_set("value", np.arange(9939))
     bpy.ops.refine.import_cameras(filepath=str(ROOM / "cameras.json"), upright=True)
     settings = bpy.context.scene.refine
     settings.method, settings.absorb, settings.views, settings.ratio = method, absorb, 24, 0.9
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     core = addon.core
-    splats = core.read_ply(ROOM / "point_cloud.ply").splats()
+    splats = core.read_ply(quarter_file).splats()
     expected = core.prune(
         splats,
         core.read_cameras(ROOM / "cameras.json"),
@@ -552,7 +554,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
     core = addon.core
     views = core.read_cameras(ROOM / "cameras.json")
     with pytest.raises(core.RefineError, match=r"^~nouser/x\.ply: cannot be found"):
-        addon.objects.prune_object.prune_object(
+        addon.objects.operation.prune_object(
             "room",
             addon.core.PruneRequest(views, core.Budget(ratio=0.5), core.Settings()),
             output=Path("~nouser/x.ply"),
@@ -562,7 +564,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
 @pytest.mark.parametrize(
     ("module", "function", "operator", "arguments"),
     [
-        ("core.pipeline", "score", "score", {}),
+        ("core.score_splats", "score", "score", {}),
         ("core.pipeline", "decide", "apply", {}),
         ("ui.import_operators", "read_splats", "import_ply", {"filepath": "in.ply"}),
         ("ui.import_operators", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),

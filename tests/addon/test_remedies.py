@@ -125,7 +125,7 @@ def test_the_command_notes_what_the_panel_warns_of(addon, imported):
     """On an object of the scene, by the cameras that the panel chooses."""
     obj = imported(splats=True, cameras=False)
     views = addon.cameras.sets.Choice.of_scene(bpy.context.scene).views(bpy.context, obj)
-    report = addon.objects.prune_object.prune_object(
+    report = addon.objects.operation.prune_object(
         obj.name,
         addon.core.PruneRequest(
             views, addon.core.Budget(ratio=0.5), addon.core.Settings("closed-form"), dry_run=True

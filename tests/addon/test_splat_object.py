@@ -51,7 +51,7 @@ def test_save_prunes_the_object_in_the_blend(addon, scene_file):
 def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):  # noqa: ARG001
     """Nor does it write."""
     unchanged.start()
-    report = addon.objects.prune_object.prune_object(
+    report = addon.objects.operation.prune_object(
         "room",
         addon.core.PruneRequest(
             addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None),
@@ -73,7 +73,7 @@ def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_f
     """The message lists the splat objects of the scene."""
     views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
     with pytest.raises(addon.core.RefineError, match=r"no object 'rooom'.*splat objects: room"):
-        addon.objects.prune_object.prune_object(
+        addon.objects.operation.prune_object(
             "rooom",
             addon.core.PruneRequest(views, addon.core.Budget(ratio=0.5)),
             **options,
@@ -84,7 +84,7 @@ def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_ca
     """There is no file to save to."""
     views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
     with pytest.raises(addon.core.RefineError, match="not saved in a"):
-        addon.objects.prune_object.prune_object(
+        addon.objects.operation.prune_object(
             "room",
             addon.core.PruneRequest(views, addon.core.Budget(ratio=0.5), addon.core.Settings()),
             save=True,
@@ -201,12 +201,12 @@ def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):  # no
         addon.mesh.scores.store(addon.mesh.layout.check(room), scores, addon.core.Settings())
 
 
-def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, room, room_views):
+def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, quarter, room_views):
     """The thread of the window: same scores; after `cancel` its result raises `Cancelled`."""
     core = addon.core
-    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(room))
+    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(quarter))
     worker = addon.ui.worker.Worker(
-        lambda progress: core.pipeline.score(splats, room_views, progress=progress)
+        lambda progress: core.score(splats, room_views, progress=progress)
     )
     scores = worker.result()
     cancelled = addon.ui.worker.Worker.__new__(addon.ui.worker.Worker)

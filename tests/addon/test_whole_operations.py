@@ -84,7 +84,7 @@ def test_an_apply_that_fails_leaves_the_mesh_as_it_was(few, fail_at, stage):
 
 def pruned(addon, room_views, tmp_path, **options):
     """Prune the object as the command does, to a file and in the .blend."""
-    return addon.objects.prune_object.prune_object(
+    return addon.objects.operation.prune_object(
         "room",
         addon.core.PruneRequest(
             room_views, addon.core.Budget(ratio=0.6), addon.core.Settings(views=4), **options
@@ -176,8 +176,8 @@ def noted(addon, monkeypatch):
         monkeypatch.setattr(module, name, noting)
 
     note(addon.objects.splat_object, "gather")
-    note(addon.core.pipeline, "score")
-    note(addon.core.pipeline, "absorb_removed")
+    note(addon.core.score_splats, "score")
+    note(addon.core.absorb_splats, "absorb_removed")
     return references
 
 
@@ -216,9 +216,11 @@ def work(addon, monkeypatch):
                 time.sleep(0.01)
             raise addon.core.Cancelled if how == "wait" else addon.core.RefineError("failed")
 
-        monkeypatch.setattr(
-            addon.core.pipeline, {"score": "score", "apply": "decide"}[name], instead
-        )
+        core = addon.core
+        module, function = {
+            "score": (core.score_splats, "score"), "apply": (core.pipeline, "decide"),
+        }[name]  # fmt: skip
+        monkeypatch.setattr(module, function, instead)
 
     return work
 

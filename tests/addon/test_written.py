@@ -20,7 +20,7 @@ def test_the_file_of_a_moved_object_is_compared_where_the_object_stands(
     bpy.context.view_layer.update()
     views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None).take(range(0, 72, 6))
 
-    report = addon.objects.prune_object.prune_object(
+    report = addon.objects.operation.prune_object(
         "room",
         addon.core.PruneRequest(views, core.Budget(ratio=0.3), core.Settings("occlusion")),
         output=tmp_path / "a.glb",
@@ -38,7 +38,7 @@ def test_the_report_of_an_object_counts_what_the_file_holds(
     for vertex in room.data.vertices[:3]:
         vertex.co.x = np.nan
 
-    report = addon.objects.prune_object.prune_object(
+    report = addon.objects.operation.prune_object(
         "room",
         addon.core.PruneRequest(
             room_views.take(range(4)),

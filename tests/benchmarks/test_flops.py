@@ -11,7 +11,7 @@ pytest.importorskip("numba")
 
 from benchmarks.tables import flops
 from benchmarks.tables.flops import ANALYTIC, READINGS, Counting
-from refine_addon.core.pipeline import Settings
+from refine_addon.core import Settings
 from refine_addon.core.scoring import closed_form
 from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.splats import Splats

@@ -11,11 +11,11 @@ from refine_addon.core.absorbing.absorb import absorb, patience
 from refine_addon.core.absorbing.merge_graph import MergeGraph
 from refine_addon.core.absorbing.merging import Field, ViewSums
 from refine_addon.core.affine import transformed
-from refine_addon.core.errors import Cancelled
 from refine_addon.core.rendering import ALPHA_MAX
-from refine_addon.core.scene import Scene, scene_of
+from refine_addon.core.seeing.scene import Scene, scene_of
 from refine_addon.core.splats import Splats, drawable, opacity, rotation_matrices
 from refine_addon.core.views import View, ViewSet
+from refine_addon.core.work import Cancelled
 
 SCENE = Scene(np.zeros(3), 1.0, np.eye(3))
 

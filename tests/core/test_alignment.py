@@ -89,6 +89,7 @@ def test_the_note_says_how_much_finer_and_reaches_the_report(room):
     assert words not in " ".join(plain["notes"])
 
 
+@pytest.mark.slow
 def test_what_is_known_of_the_views_is_not_measured():
     """Views that know their turn say so, whatever the pictures look like."""
     for turn, sentences in ((0, 0), (1, 1), (-1, 1)):

@@ -10,7 +10,7 @@ import pytest
 from refine_addon.core import Cleaning, RefineError, Splats, View, ViewSet, clean
 from refine_addon.core.cleaning.clean import agreed
 from refine_addon.core.cleaning.clusters import connected
-from refine_addon.core.cleaning.sight import Evidence
+from refine_addon.core.cleaning.support import Evidence
 
 SIDE = 24
 """Splats along each side of the wall."""
@@ -57,19 +57,19 @@ def test_what_views_see_past_goes_as_being_in_front():
     """All six views see the dark splat at half the depth of the white wall; nothing is near it."""
     splats = joined(wall(), FLOATER)
 
-    found = clean(splats, cameras())
+    cleaned = clean(splats, cameras())
 
-    assert np.flatnonzero(~found.keep).tolist() == [SIDE**2]
-    assert found.counts() == {"front": 1, "isolated": 0, "giant": 0, "needle": 0}
-    assert found.in_words() == "1 in front of surfaces in 3+ views"
+    assert np.flatnonzero(~cleaned.keep).tolist() == [SIDE**2]
+    assert cleaned.counts() == {"front": 1, "isolated": 0, "giant": 0, "needle": 0}
+    assert cleaned.in_words() == "1 in front of surfaces in 3+ views"
 
 
 def test_a_wall_stays_whole():
     """Each splat of the wall has others beside it, and nothing lies behind them."""
-    found = clean(wall(), cameras())
+    cleaned = clean(wall(), cameras())
 
-    assert found.keep.all()
-    assert found.in_words() == "nothing to clean away"
+    assert cleaned.keep.all()
+    assert cleaned.in_words() == "nothing to clean away"
 
 
 def test_a_clump_in_front_of_the_wall_is_isolated():
@@ -77,11 +77,11 @@ def test_a_clump_in_front_of_the_wall_is_isolated():
     places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (12, 3))
     splats = joined(wall(), made(places, 0.06, 0.95, 0.1))
 
-    found = clean(splats, cameras())
+    cleaned = clean(splats, cameras())
 
-    assert found.keep[: SIDE**2].all()
-    assert not found.keep[SIDE**2 :].any()
-    assert found.found["isolated"].sum() >= 6
+    assert cleaned.keep[: SIDE**2].all()
+    assert not cleaned.keep[SIDE**2 :].any()
+    assert cleaned.by_reason["isolated"].sum() >= 6
 
 
 def test_a_clump_of_many_splats_is_a_thing():
@@ -96,10 +96,10 @@ def test_a_veil_before_the_wall_is_giant():
     """Its standard deviation reaches across 60 x 1.5 / 2 = 45 of 80 pixels."""
     splats = joined(wall(), made([[0.0, 0.0, 2.0]], 1.5, 0.2, 0.1))
 
-    found = clean(splats, cameras())
+    cleaned = clean(splats, cameras())
 
-    assert found.counts() == {"front": 0, "isolated": 0, "giant": 1, "needle": 0}
-    assert found.keep[: SIDE**2].all()
+    assert cleaned.counts() == {"front": 0, "isolated": 0, "giant": 1, "needle": 0}
+    assert cleaned.keep[: SIDE**2].all()
 
 
 def test_a_dome_behind_all_stays():
@@ -109,6 +109,7 @@ def test_a_dome_behind_all_stays():
     assert clean(splats, cameras()).keep.all()
 
 
+@pytest.mark.slow
 def test_what_changes_no_pixel_is_nearly_transparent_and_stays():
     """Opacity .015 against white changes a pixel by at most 3 of 255."""
     splats = joined(wall(), made([[0.1, 0.0, 2.0]], 0.06, 0.015, 0.1))
@@ -118,6 +119,7 @@ def test_what_changes_no_pixel_is_nearly_transparent_and_stays():
     assert np.flatnonzero(~asked.keep).tolist() == [SIDE**2]
 
 
+@pytest.mark.slow
 def test_switches_and_protection_spare():
     """A reason that is off takes nothing, and a protected splat has no reason."""
     splats = joined(wall(), FLOATER)
@@ -126,16 +128,17 @@ def test_switches_and_protection_spare():
     assert clean(splats, cameras(), Cleaning(("giant",))).keep.all()
     spared = clean(splats, cameras(), protected=protected)
     assert spared.keep.all()
-    assert not spared.found["front"].any()
+    assert not spared.by_reason["front"].any()
 
 
 def test_one_view_is_enough_where_no_other_sees_it():
     """A splat close to the one camera there is; the words say so."""
-    found = clean(joined(wall(), FLOATER), cameras(1))
+    cleaned = clean(joined(wall(), FLOATER), cameras(1))
 
-    assert found.in_words() == "1 in front of surfaces in all of the 1 or 2 views that see them"
+    assert cleaned.in_words() == "1 in front of surfaces in all of the 1 or 2 views that see them"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 def test_neither_order_nor_unit_nor_frame_decides(unit):
     """The scene reversed, turned by a quarter about x and in another unit loses the same splats."""
@@ -163,10 +166,10 @@ def test_extreme_and_undrawable_splats_are_survived():
     odd.log_scales[3:] = [[80, 80, 80], [-np.inf, -np.inf, -np.inf], [-90, 3, -90]]
     odd.opacity_logits[2] = np.inf
 
-    found = clean(joined(wall(), odd), cameras())
+    cleaned = clean(joined(wall(), odd), cameras())
 
-    assert found.keep[: SIDE**2].all()
-    assert found.keep[SIDE**2 : SIDE**2 + 2].all()
+    assert cleaned.keep[: SIDE**2].all()
+    assert cleaned.keep[SIDE**2 : SIDE**2 + 2].all()
 
 
 @pytest.mark.parametrize("count", [0, 1])
@@ -207,6 +210,7 @@ def test_cameras_that_see_nothing_are_refused():
         clean(wall(), away)
 
 
+@pytest.mark.slow
 def test_a_faint_splat_that_covers_much_must_show_less():
     """At .225 of the picture's side .9 of 255 is enough where .05 and less must change it by 4."""
     wide = made([[0.0, 0.0, 2.0]], 0.6, 0.01, 0.1)

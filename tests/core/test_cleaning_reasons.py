@@ -9,10 +9,9 @@ import pytest
 
 from refine_addon.core import Cleaning, View, ViewSet, clean
 from refine_addon.core.cleaning import clean as cleaning
-from refine_addon.core.cleaning import sight
+from refine_addon.core.cleaning import support
 from refine_addon.core.cleaning.clean import REASONS
 from refine_addon.core.seeing import projection
-from refine_addon.core.seeing.ray_sample import RaySample
 
 from .test_cleaning import FLOATER, SIDE, cameras, joined, made, wall
 
@@ -28,12 +27,12 @@ def stretched(place, scales, opacity=0.8, color=0.1):
 
 def reasons(*parts, count=1):
     """Return the reasons of the last splats before the wall, each once; the rest has none."""
-    found = clean(joined(wall(), *parts), cameras(), ALL).found
-    told = np.stack([found[name] for name in REASONS])  # (5, N)
+    by_reason = clean(joined(wall(), *parts), cameras(), ALL).by_reason
+    told = np.stack([by_reason[name] for name in REASONS])  # (5, N)
 
     assert told.sum(axis=0).max() <= 1
     assert not told[:, : SIDE**2].any()
-    return {name: int(found[name][-count:].sum()) for name in REASONS if found[name].any()}
+    return {name: int(by_reason[name][-count:].sum()) for name in REASONS if by_reason[name].any()}
 
 
 @pytest.mark.parametrize(
@@ -88,22 +87,22 @@ def test_fog_holds_no_cluster_together():
     depth = np.arange(2.0, 4.01, 0.1)
     fog = made(np.stack([0 * depth, 0 * depth, depth], axis=1), 0.06, 0.05, 0.1)
 
-    found = clean(joined(wall(), fog, clump()), cameras()).found
+    by_reason = clean(joined(wall(), fog, clump()), cameras()).by_reason
 
-    assert found["isolated"][-40:].all()
+    assert by_reason["isolated"][-40:].all()
 
 
 def seen_as(monkeypatch, near, behind, contrast, views, past):
     """Let the views have seen that of every suspect, whatever they see."""
 
-    def judge(self, _suspects, _progress):
+    def find(self, _suspects, _progress):
         for name, value in (
             ("near", near), ("behind", behind), ("contrast", contrast * behind),
             ("views", views), ("past", past),
         ):  # fmt: skip
             getattr(self.evidence, name)[-1] = value
 
-    monkeypatch.setattr(cleaning._Run, "_judge", judge)
+    monkeypatch.setattr(cleaning._Search, "_find_evidence", find)
     # The splat put in last is the last Gaussian, too.
     monkeypatch.setattr(
         projection, "spatial_order", lambda place, _ties=None: np.arange(len(place))
@@ -163,15 +162,15 @@ def test_evidence_decides_of_giants(monkeypatch, opacity, evidence, expected):
 
 
 def hits(keys, alphas, *, absent=()):
-    """Return hits of one line, each splat once; those absent take no light."""
+    """Return hits of one ray, each splat once; those absent take no light."""
     alpha = np.array(alphas)
-    there = np.array([place not in absent for place in range(len(alpha))], float)
-    dark = np.cumprod(np.append(1.0, 1.0 - alpha * there))[:-1]
-    every = np.arange(len(alpha))
-    window = np.full(len(alpha), 0.05)
-    return sight.Hits(
-        every, every, alpha, dark, dark * alpha * there, np.array(keys), window, 0.0 * alpha
-    )
+    present = np.array([place not in absent for place in range(len(alpha))], float)
+    transmittance = np.cumprod(np.append(1.0, 1.0 - alpha * present))[:-1]
+    every, width = np.arange(len(alpha)), np.zeros(len(alpha), np.float32)
+    return support.Hits(
+        every, width, every, alpha, transmittance, transmittance * alpha * present,
+        0.0 * alpha, np.array(keys), np.full(len(alpha), 0.05),
+    )  # fmt: skip
 
 
 def test_support_is_what_others_would_stop_if_the_splat_were_gone():
@@ -180,7 +179,7 @@ def test_support_is_what_others_would_stop_if_the_splat_were_gone():
     Without the first, twice as much reaches the others: .5 near it and .25 behind, a support of
     2/3. Without the second, the first takes .5 and the third .25: 2/3. Nothing is behind the third.
     """
-    light, held = sight.own_support(hits([0.1, 0.12, 0.5], [0.5, 0.5, 0.5]))
+    light, held = support.own_support(hits([0.1, 0.12, 0.5], [0.5, 0.5, 0.5]))
 
     np.testing.assert_allclose(light, [0.5, 0.25, 0.125])
     np.testing.assert_allclose(held / light, [2 / 3, 2 / 3, 1.0])
@@ -201,21 +200,21 @@ def test_a_view_sees_past_what_little_light_stops_near(alphas, near, views, past
     .1 and .9 of the rest: .1 / .91. .2 and .9: .2 / .92. Of .05 and .04 only .088 stops at all, and
     from .1 on a view sees what is there.
     """
-    seen = hits([0.1, 0.12, 0.5], alphas, absent=(0,))
-    found, suspects = sight.Evidence.zero(3), np.array([True, False, False])
+    evidence, suspects = support.Evidence.zero(3), np.array([True, False, False])
     colors = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [0.3, 0.6, 0.9]], np.float32)
 
-    found.add(seen, suspects, colors)
+    evidence.add(hits([0.1, 0.12, 0.5], alphas, absent=(0,)), suspects, colors)
 
     behind = (1.0 - near) * alphas[2]
-    assert found.near[0] == pytest.approx(0.5 * near)
-    assert found.behind[0] == pytest.approx(0.5 * behind)
-    assert found.contrast[0] == pytest.approx(0.5 * behind * np.sqrt((0.09 + 0.36 + 0.81) / 3))
-    assert (found.views[0], found.past[0]) == (views, past)
+    assert evidence.near[0] == pytest.approx(0.5 * near)
+    assert evidence.behind[0] == pytest.approx(0.5 * behind)
+    contrast = 0.5 * behind * np.sqrt((0.09 + 0.36 + 0.81) / 3)
+    assert evidence.contrast[0] == pytest.approx(contrast)
+    assert (evidence.views[0], evidence.past[0]) == (views, past)
 
 
-def test_a_splat_lies_where_it_is_densest_on_a_line(monkeypatch):
-    """A large flat splat turned by 45 degrees: z = 4 + x, so 4 (1 + u) on the line x = u z.
+def test_a_splat_lies_where_it_is_densest_on_a_ray(monkeypatch):
+    """A large flat splat turned by 45 degrees: z = 4 + x, so 4 (1 + u) on the ray x = u z.
 
     To first order in u; at 7.5 px from the centre and f = 60, u = .125 and the next order 1.6 %.
     """
@@ -224,16 +223,17 @@ def test_a_splat_lies_where_it_is_densest_on_a_line(monkeypatch):
     views = ViewSet((View(np.eye(3), np.zeros(3), 60, 60, 8, 8, 16, 16, name="a"),))
     gaussians, scene, _ = projection.prepare(splats, views)
     footprints = projection.project(gaussians, scene, views.views[0])
-    sample, told, depths = RaySample(views.by_distance(), gaussians, splats), [], sight._depths
+    told, depths = [], support._depths
 
-    def noted(camera, view, own, rays, there):
-        told.append((rays.columns[rays.ray[there] % len(rays.columns)], camera[0][2]))
-        told.append(depths(camera, view, own, rays, there))
+    def noted(gaussians, footprints, scene, view, rays, reached):
+        told.append(rays.columns[rays.ray[reached] % len(rays.columns)])
+        told.append(depths(gaussians, footprints, scene, view, rays, reached))
         return told[-1]
 
-    monkeypatch.setattr(sight, "_depths", noted)
-    sight.look(gaussians, footprints, scene, sample, 0, np.zeros(1, np.bool_))
+    monkeypatch.setattr(support, "_depths", noted)
+    support.hits_of_view(gaussians, footprints, scene, views.views[0], 0, np.zeros(1, np.bool_))
 
-    (columns, center), found = told
-    np.testing.assert_allclose(found / center[0], 1.0 + (columns + 0.5 - 8.0) / 60.0, rtol=0.001)
+    columns, measured = told
+    expected = 4.0 / scene.size * (1.0 + (columns + 0.5 - 8.0) / 60.0)
+    np.testing.assert_allclose(measured, expected, rtol=0.001)
     assert np.ptp(columns) == 15

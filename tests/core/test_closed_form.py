@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from refine_addon.core import ClosedForm, RefineError, Splats, View, ViewSet
-from refine_addon.core.scene import principal_axes
 from refine_addon.core.scoring import closed_form, closed_form_block
 from refine_addon.core.seeing.frustum import Frustums
+from refine_addon.core.seeing.scene import principal_axes
 
 READINGS = [
     ClosedForm(),

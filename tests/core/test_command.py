@@ -49,10 +49,10 @@ def folder(tmp_path, monkeypatch):
         {
             "position": [offset, 0.1 * offset * offset, 0.0],
             "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-            "fx": 1800.0,
-            "fy": 1800.0,
-            "width": 400,
-            "height": 300,
+            "fx": 450.0,
+            "fy": 450.0,
+            "width": 100,
+            "height": 75,
             "img_name": str(offset),
         }
         for offset in (-0.4, -0.2, 0.0, 0.2, 0.4)
@@ -337,9 +337,10 @@ def test_the_report_of_scores_is_plain_too(folder):
     assert command.main([*SCORE, "-o", "out.ply", "--report", "report.json"]) == 0
 
     (entry,) = json.loads((folder / "report.json").read_text())["results"]
-    assert entry["files"] == {"input": "in.ply", "output": "out.ply"}
+    sizes = [(folder / name).stat().st_size for name in ("in.ply", "out.ply")]
+    assert [*entry["files"].values()] == ["in.ply", "out.ply", *sizes]
     counts = {"before": COUNT, "undrawable": 0, "unseen": unseen, "forced": 0}
-    assert entry["splats"] == counts
+    assert entry["splats"] == counts | {"written": COUNT, "left_out": 0}
     assert all(map(math.isfinite, numbers(entry)))
 
 
@@ -419,7 +420,7 @@ def test_a_dry_run_says_the_same_and_writes_nothing(folder, capsys):
     ids=["dry run", "written", "absorbed, rounded"],
 )
 def test_pictures_show_what_was_and_what_is_written(folder, capsys, options):
-    """Of five cameras along a line three are drawn: both ends and the middle; 400 x 300 px each."""
+    """Of five cameras along a line three are drawn: both ends and the middle; 100 x 75 px each."""
     shown = [*PRUNE, *options, "--pictures", "shown", "--report", "report.json"]
 
     assert command.main(shown) == 0

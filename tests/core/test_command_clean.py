@@ -76,6 +76,7 @@ def test_an_unknown_reason_is_wrong_usage(files, capsys):
     assert "transparent" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absorb", [[], ["--absorb"]])
 def test_prune_cleans_before_the_budget_counts(files, capsys, absorb):
     """Of 577, one floats; half of the other 576 stay, and none of them is dark like the floater."""
@@ -86,6 +87,7 @@ def test_prune_cleans_before_the_budget_counts(files, capsys, absorb):
     assert (read_ply(out).splats().means[:, 2] > 3.0).all()
 
 
+@pytest.mark.slow
 def test_unseen_splats_are_counted_of_those_that_cleaning_left(files, capsys):
     """Of 577, one floats; of the other 576, those count that land outside of all six images.
 
@@ -113,6 +115,7 @@ def test_clean_says_what_a_lossy_format_does_to_what_stays(files, capsys):
     assert "  note: .splat " in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_reasons_are_named_with_commas_before_or_behind_the_input(files):
     """With blanks between them the file behind them was taken for a reason."""
     scene, out = str(files / "scene.ply"), files / "out.ply"
@@ -124,6 +127,7 @@ def test_reasons_are_named_with_commas_before_or_behind_the_input(files):
     assert len(read_ply(out)) == SIDE**2 + 1
 
 
+@pytest.mark.slow
 def test_clean_takes_many_files_and_one_that_fails_does_not_stop_the_others(files, capsys):
     """As `prune` does: the second is no PLY."""
     (files / "broken.ply").write_bytes(b"no")

@@ -58,6 +58,7 @@ def test_a_report_counts_what_the_written_file_holds(broken, capsys, command, su
     assert (f", {stay - missing} written" in capsys.readouterr().out) == bool(missing)
 
 
+@pytest.mark.slow
 def test_a_manifest_counts_what_the_files_of_levels_hold(broken):
     """Of 577, .997 are 576 (575.3): the first that cannot be drawn goes, two are left out."""
     options = ["--nested", "--levels", ".997", "--format", ".SPLAT", "-o", str(broken / "out")]
@@ -80,6 +81,7 @@ def test_nothing_is_said_to_be_written_where_nothing_is(broken):
     assert splats["left_out"] == BROKEN
 
 
+@pytest.mark.slow
 def test_every_report_says_what_was_seen_by_how_many_views(broken):
     """Of six views two are used. A splat at depth z lies in one up to 2/3 z beside, 1/2 z above.
 
@@ -107,6 +109,7 @@ def test_every_report_says_what_was_seen_by_how_many_views(broken):
     assert manifest["splats"] == entries[-1]["splats"]
 
 
+@pytest.mark.slow
 def test_clean_and_lod_say_what_lies_in_no_view(files, capsys):  # noqa: F811
     """In the words of `prune`, and by how many views."""
     assert call(files, "clean", "--views", "2") == 0

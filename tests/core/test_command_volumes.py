@@ -93,6 +93,7 @@ def test_score_leaves_out_what_must_go(scene):
     assert call(folder, "score", "--protect", HALF, "-o", str(out)) == 2
 
 
+@pytest.mark.slow
 def test_levels_leave_out_what_must_go(scene):
     """Both levels lie in the right half; the report counts what went."""
     folder, x, _ = scene

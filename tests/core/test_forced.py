@@ -32,6 +32,8 @@ from tests.core.test_levels import cameras as level_cameras
 from tests.core.test_levels import colourful
 from tests.strategies import ply_of
 
+pytestmark = pytest.mark.slow
+
 COUNT = 576
 
 BUDGETS = [
@@ -40,9 +42,7 @@ BUDGETS = [
 ]  # fmt: skip
 
 
-WAYS = pytest.mark.parametrize(
-    "absorb", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["delete", "absorb"]
-)
+WAYS = pytest.mark.parametrize("absorb", [False, True], ids=["delete", "absorb"])
 
 
 @pytest.fixture(scope="module")

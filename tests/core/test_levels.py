@@ -20,21 +20,22 @@ from refine_addon.core import (
     Splats,
     View,
     ViewSet,
+    absorb_splats,
     lod,
     lod_file,
-    pipeline,
     prune,
     read_cameras,
     read_ply,
     read_splats,
+    score,
 )
 from refine_addon.core.absorbing import absorb as absorbing
 from refine_addon.core.estimate.psnr import psnr_against
 from refine_addon.core.formats.ply import SplatFile
 from refine_addon.core.levels import distance
-from refine_addon.core.levels.distance import Lookout, Reach
+from refine_addon.core.levels.distance import OriginalPictures
 
-from .test_cleaning import cameras, joined, made, wall
+from .test_cleaning import cameras, wall
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 DELETED = Levels((0.5, 0.25), absorb=False)
@@ -136,7 +137,7 @@ def test_what_absorbed_before_is_not_thinned_by_a_tenth_again(monkeypatch):
     """
     given, shares, whole, plain = [], [], absorbing.absorb, absorbing.patience
     monkeypatch.setattr(
-        pipeline.absorbing,
+        absorb_splats.absorbing,
         "absorb",
         lambda splats, *rest, **named: given.append(len(splats)) or whole(splats, *rest, **named),
     )
@@ -185,7 +186,7 @@ def test_the_psnr_of_a_level_is_against_the_original():
     """The estimate of the second level is that of its splats against all, not against the first."""
     splats, views = colourful(), cameras()
     levels = lod(splats, views, Levels((0.5, 0.2)))
-    sample = pipeline.score(splats, views, Settings("occlusion")).ray_sample
+    sample = score(splats, views, Settings("occlusion")).ray_sample
 
     assert levels[1].psnr == pytest.approx(psnr_against(sample, levels[1].splats, views), abs=0.01)
 
@@ -230,55 +231,16 @@ def test_progress_only_rises_and_can_cancel(absorb):
         lod(colourful(), cameras(), levels, progress=lambda f, _: f < 0.5)
 
 
-def looking(splats, size=96, focal=400.0):
-    """Return a lookout of one view straight at the wall, 4 away."""
+def pictures_of(splats, size=96, focal=400.0):
+    """Return the picture of one view straight at the wall, 4 away."""
     half = size / 2
     view = View(np.eye(3), np.zeros(3), focal, focal, half, half, size, size, name="a")
-    return Lookout(splats, ViewSet((view,)))
+    return OriginalPictures(splats, ViewSet((view,)))
 
 
 def test_the_distance_is_that_of_what_is_seen():
     """The image of 96 px at f = 400 shows .96 of the wall at z = 4: 4 to 4.06 away."""
-    assert looking(colourful()).distance == pytest.approx(4.03, abs=0.03)
-
-
-def test_the_geometric_error_is_the_width_of_what_changed():
-    """A veil of standard deviation .5 before the wall: 1 wide, so under a pixel from 400 on."""
-    splats = joined(colourful(), made([[0.0, 0.0, 3.0]], 0.5, 0.5, 0.2))
-    lookout, keep = looking(splats), np.arange(577) < 576
-
-    reach = lookout.reach(splats.take(keep), keep)
-
-    assert reach.error == pytest.approx(1.0, rel=1e-6)
-    assert reach.pixel == pytest.approx(400.0, rel=1e-6)
-
-
-def test_no_level_has_a_smaller_geometric_error_than_one_before(monkeypatch):
-    """A viewer that goes by 3D Tiles' rule would never choose the one before."""
-    errors = iter((3.0, 1.0, 4.0))
-    monkeypatch.setattr(Lookout, "reach", lambda *_, **__: Reach(next(errors), (), 1.0))
-
-    levels = lod(colourful(), cameras(), Levels((0.5, 0.3, 0.1), absorb=False))
-
-    assert [level.reach.error for level in levels] == [3.0, 3.0, 4.0]
-
-
-def test_a_survivor_that_grew_counts_as_wide_as_it_is():
-    """The veil stays, but became twice as wide: 2."""
-    splats = joined(colourful(), made([[0.0, 0.0, 3.0]], 0.5, 0.5, 0.2))
-    level = joined(colourful(), made([[0.0, 0.0, 3.0]], 1.0, 0.5, 0.2))
-
-    reach = looking(splats).reach(level, np.ones(577, np.bool_), np.arange(577) == 576)
-
-    assert reach.error == pytest.approx(2.0, rel=1e-6)
-
-
-def test_what_makes_up_a_hundredth_is_overlooked():
-    """The same veil with opacity .005 makes up less than a hundredth of any pixel."""
-    splats = joined(colourful(), made([[0.0, 0.0, 3.0]], 0.5, 0.005, 0.2))
-    keep = np.arange(577) < 576
-
-    assert looking(splats).reach(splats.take(keep), keep).error == 0.0
+    assert pictures_of(colourful()).distance == pytest.approx(4.03, abs=0.03)
 
 
 def test_an_even_change_is_seen_from_any_distance():
@@ -289,7 +251,7 @@ def test_an_even_change_is_seen_from_any_distance():
     splats = wall()
     darker = replace(splats, sh_dc=splats.sh_dc - np.float32(0.1 / 0.28209479))
 
-    reach = looking(splats).reach(darker, np.ones(576, np.bool_))
+    reach = pictures_of(splats).reach(darker)
 
     psnr = [value for _, value in reach.psnr]
     assert psnr == pytest.approx([psnr[0]] * 5, abs=0.001)
@@ -307,7 +269,7 @@ def test_a_change_that_evens_out_fades_with_the_distance():
     assert found == pytest.approx([20.0, 100.0, 100.0, 100.0, 100.0])
 
 
-def test_small_pictures_are_looked_at_whole():
+def test_small_pictures_are_compared_whole():
     """15 columns are fewer than one square of 16; 200 hold four, evenly spread."""
     assert distance._patches(15).tolist() == list(range(15))
     columns = distance._patches(200)
@@ -317,8 +279,8 @@ def test_small_pictures_are_looked_at_whole():
 
 
 def test_where_the_views_see_too_little_no_distance_is_said():
-    """An image of 10 x 10 has 100 lines, fewer than the 256 that an estimate needs."""
-    reach = looking(colourful(), size=10).reach(colourful(), np.ones(576, np.bool_))
+    """An image of 10 x 10 has 100 rays, fewer than the 256 that an estimate needs."""
+    reach = pictures_of(colourful(), size=10).reach(colourful())
 
     assert reach.psnr == ()
     assert reach.within(10.0) is None
@@ -411,6 +373,7 @@ def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, monkeypat
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
+@pytest.mark.slow
 def test_no_manifest_lists_levels_of_two_runs(tmp_path, monkeypatch):
     """Where replacing fails at the second level, the first is replaced and the manifest is gone."""
     source = file_of(colourful(), tmp_path / "a.ply")

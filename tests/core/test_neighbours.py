@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core.absorbing.neighbours import nearest
-from refine_addon.core.errors import Cancelled
+from refine_addon.core.work import Cancelled
 
 
 def brute_force(points, count):

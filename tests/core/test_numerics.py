@@ -25,8 +25,8 @@ from refine_addon.core import (
     score,
     select,
 )
+from refine_addon.core.absorb_splats import absorb_removed
 from refine_addon.core.absorbing import merge_field, merge_graph
-from refine_addon.core.pipeline import absorb_removed
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
 from refine_addon.core.seeing import points, projection
 from refine_addon.core.splats import drawable, opacity
@@ -281,6 +281,7 @@ def test_one_splat_and_one_view_score_one(settings):
     assert scored(splats, ViewSet((view(),)), settings).values == pytest.approx([1.0])
 
 
+@pytest.mark.slow
 def test_ten_thousand_views_are_one_mean():
     """Copies of one view change nothing."""
     splats = cloud()

@@ -485,6 +485,7 @@ def test_parts_of_the_views_take_turns_and_make_up_the_whole():
     assert occlusion.measure_part(splats, ring(1), ONCE, 5, 3)[1] == 1.0
 
 
+@pytest.mark.slow
 def test_views_are_measured_once_and_scoring_rays_tell_the_rest(monkeypatch):
     """All rounds after the first ask the rays that were cast then."""
     asked = []
@@ -513,6 +514,7 @@ def test_a_round_orders_what_it_removes_and_the_next_one_the_rest_anew():
     assert set(two) == set(three) == set(range(300))
 
 
+@pytest.mark.slow
 def test_a_budget_ends_the_rounds_and_changes_no_place_up_to_it():
     """Of three rounds two are done for .7 removed, one for half, each with all of its order."""
     splats, views = cloud(), ring()
@@ -695,6 +697,7 @@ def test_a_rigid_motion_does_not_matter():
     np.testing.assert_allclose(found, expected, atol=0.1)
 
 
+@pytest.mark.slow
 def test_threads_change_nothing_at_all():
     splats, views = cloud(), ring(11)
 
@@ -846,6 +849,7 @@ def test_scoring_is_cancelled_while_the_floor_is_weighed(monkeypatch, last):
     assert len(calls) == last
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("large", "steps"), [(0.05, 0), (0.1, 1), (0.3, 3)])
 def test_cells_stop_growing_where_each_footprint_needs_a_point_of_its_own(large, steps):
     """4.3 million footprints are more than the 2^22 points of a view: 1.25 a footprint are allowed.

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from refine_addon.core import Budget, RefineError, Splats, prune
-from refine_addon.core.errors import Cancelled
 from refine_addon.core.picture_files import KINDS, PictureFiles, chosen, in_words
 from refine_addon.core.pictures import AMPLIFIED, Comparison, compare, fitted
 from refine_addon.core.png import png
@@ -20,6 +19,7 @@ from refine_addon.core.seeing import projection
 from refine_addon.core.seeing.cast import cast
 from refine_addon.core.seeing.ray_sample import colors_from
 from refine_addon.core.views import View, ViewSet
+from refine_addon.core.work import Cancelled
 
 C0 = 0.28209479177387814
 
@@ -88,6 +88,7 @@ def test_what_is_nearer_covers_what_is_farther_whatever_the_order():
     assert np.abs(pictures[0][4, 4] - np.array([204.0, 25.5, 0.0])).max() <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(64, 48), (700, 90)], ids=["one strip", "two strips"])
 def test_a_picture_is_what_the_lines_of_sight_through_all_its_pixels_see(size):
     """`meet` finds the same by another way: all pairs first, then one sort for each pixel."""
@@ -106,6 +107,7 @@ def test_a_picture_is_what_the_lines_of_sight_through_all_its_pixels_see(size):
     assert apart.max() <= 0.5 / 255.0 + 1e-5
 
 
+@pytest.mark.slow
 def test_pictures_do_not_depend_on_threads_or_on_how_many_pairs_are_drawn_at_a_time(monkeypatch):
     """Blocks of footprints end anywhere; only sums of float64 may differ, by less than 1e-9 dB."""
     splats, views = crowd(), ViewSet((view_of(400, 300, 300.0),))
@@ -252,9 +254,11 @@ def test_a_picture_that_exists_is_refused_before_the_work(tmp_path):
     views = ViewSet((replace(view_of(10, 10), name="a"),))
     (tmp_path / "in-a-after.png").write_bytes(b"precious")
 
-    with pytest.raises(RefineError, match=r"in-a-after\.png: exists already"):
-        PictureFiles(tmp_path, "in").refuse_existing(views)
-    PictureFiles(tmp_path, "in", overwrite=True).refuse_existing(views)
+    refused = pytest.raises(RefineError, match=r"in-a-after\.png: exists already")
+    with refused, PictureFiles(tmp_path, "in").opened(views):
+        pass
+    with PictureFiles(tmp_path, "in", overwrite=True).opened(views):
+        pass
 
 
 def test_what_absorbs_is_drawn_as_it_became():

@@ -24,7 +24,7 @@ from refine_addon.core import (
     Splats,
     View,
     ViewSet,
-    pipeline,
+    absorb_splats,
     prune,
     prune_file,
     read_cameras,
@@ -33,11 +33,11 @@ from refine_addon.core import (
     select,
 )
 from refine_addon.core.pipeline import decide
-from refine_addon.core.scene import principal_axes
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
 from refine_addon.core.scoring.closed_form_block import LUMA
 from refine_addon.core.seeing import froxels, lattices, points, projection, ray_sums
 from refine_addon.core.seeing.measuring import Measured
+from refine_addon.core.seeing.scene import principal_axes
 from refine_addon.core.selection import rank
 from refine_addon.core.task import Task
 from tests.strategies import plain_header, ply_of, splat_names
@@ -76,6 +76,7 @@ def test_a_ratio_removes_exactly_its_floor(file, views, ratio):
     assert result.report["splats"]["removed"] == expected
 
 
+@pytest.mark.slow
 def test_what_survives_half_survives_a_third(file, views):
     """Budgets are nested, since all select from one ranking."""
     masks = [
@@ -297,6 +298,7 @@ def test_occlusion_in_floats_keeps_the_splats_that_doubles_keep(
     assert min(agreement(scores, expected)) >= 0.999
 
 
+@pytest.mark.slow
 def test_core_imports_where_there_is_no_blender():
     """`sys.modules["bpy"] = None` makes any import of it fail."""
     code = (
@@ -436,6 +438,7 @@ def uneven(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absorb", [False, True])
 def test_a_text_file_that_fits_loses_nothing(uneven, front, tmp_path, absorb):
     """However long its longest row is: its limit is its own size, byte by byte."""
@@ -448,6 +451,7 @@ def test_a_text_file_that_fits_loses_nothing(uneven, front, tmp_path, absorb):
     assert (tmp_path / "out.ply").read_bytes() == uneven.read_bytes()
 
 
+@pytest.mark.slow
 def test_a_text_file_is_cut_to_its_limit_by_no_more_than_one_row(uneven, front, tmp_path):
     """The next splat in the order of removal would not have fit any more."""
     file, limit = read_ply(uneven), 3000
@@ -549,6 +553,7 @@ def test_protected_splats_stay_as_they_are_while_others_absorb(small, views):
     assert not result.absorbed.changed[protected[result.keep]].any()
 
 
+@pytest.mark.slow
 def test_nothing_to_remove_leaves_absorbing_nothing_to_do(small, views):
     """All stay, none changes."""
     result = prune(read_ply(small).splats(), views, Budget(ratio=0.0), absorb=True)
@@ -557,6 +562,7 @@ def test_nothing_to_remove_leaves_absorbing_nothing_to_do(small, views):
     assert not result.absorbed.changed.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.03, 0.1])
 def test_the_first_tenth_goes_as_occlusion_says_and_nothing_absorbs_it(ratio):
     """What the views would miss least is next to nothing: any merge would change more."""
@@ -574,6 +580,7 @@ def test_the_first_tenth_goes_as_occlusion_says_and_nothing_absorbs_it(ratio):
     }
 
 
+@pytest.mark.slow
 def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, views, monkeypatch):
     """What was expected counts by the share of the views that were not measured.
 
@@ -587,7 +594,7 @@ def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, vi
         ones = np.ones(len(splats))
         return Measured(ones, 2.0 * ones, np.zeros(len(splats), np.int32)), 0.25
 
-    def listening(splats, used, measure, count, original=pipeline.absorbing.absorb, **changes):
+    def listening(splats, used, measure, count, original=absorb_splats.absorbing.absorb, **changes):
         def tell(now, expected, progress):
             sums = measure(now, expected, progress)
             if expected is not None:
@@ -596,8 +603,8 @@ def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, vi
 
         return original(splats, used, tell, count, **changes)
 
-    monkeypatch.setattr(pipeline.occlusion, "measure_part", quarter)
-    monkeypatch.setattr(pipeline.absorbing, "absorb", listening)
+    monkeypatch.setattr(absorb_splats.occlusion, "measure_part", quarter)
+    monkeypatch.setattr(absorb_splats.absorbing, "absorb", listening)
     prune(read_ply(small).splats(), views, Budget(ratio=0.7), absorb=True)
 
     assert asked == [(turn, 2) for turn in range(len(asked))]
@@ -623,6 +630,7 @@ def scored_for_all(request, small, views):
     return task, replace(task, scores=decide(replace(task, reusable=True)).scores), zoned
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.05, 0.55, 0.93])
 def test_scoring_for_one_budget_decides_what_scores_for_all_would(scored_for_all, ratio):
     """Scoring ends with the round that removes the last of its splats: the same report, too."""

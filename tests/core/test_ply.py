@@ -666,6 +666,7 @@ def test_a_file_that_claims_the_other_byte_order_is_no_crash(tmp_path, form):
     assert expected == opened(tmp_path, data).rows["x"][0]
 
 
+@pytest.mark.slow
 @given(case=ply_files(least=1, forms=("binary_little_endian", "binary_big_endian")))
 def test_a_binary_file_cut_anywhere_in_its_splats_is_refused(folder, case):
     """Cut at every byte up to the end of the last vertex row."""

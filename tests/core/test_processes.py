@@ -16,12 +16,15 @@ import pytest
 # Of modules, not of the package: a process that runs `row` imports these too, from the same places.
 from refine_addon.core import processes
 from refine_addon.core.cameras.read import read_cameras
-from refine_addon.core.errors import Cancelled, RefineError
+from refine_addon.core.errors import RefineError
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.pipeline import prune
 from refine_addon.core.processes import for_each
 from refine_addon.core.selection import Budget
 from refine_addon.core.task import Settings
+from refine_addon.core.work import Cancelled
+
+pytestmark = pytest.mark.slow
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 LONG = 600.0  # seconds; a tenth of it is more than any machine needs to notice

@@ -220,6 +220,7 @@ def gaussians_of(splats):
     return projection.prepare(splats, ring())[0]
 
 
+@pytest.mark.slow
 def test_the_curve_is_what_each_share_reaches():
     """Each point is the estimate for the lowest scores removed, as `select` removes them."""
     splats, views = cloud(), ring()
@@ -233,6 +234,7 @@ def test_the_curve_is_what_each_share_reaches():
         assert psnr_kept(scores.ray_sample, keep) == pytest.approx(value, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_curve_is_the_mean_of_those_of_single_views():
     """Weighted as the views are: one counts three times as much as each of the others.
 
@@ -270,6 +272,7 @@ def test_a_view_whose_splats_stay_is_not_changed():
     assert curve.of_views(0.5)["a"] < 30.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["closed-form", "occlusion", "auto"])
 def test_the_estimate_depends_on_nothing_but_the_scene(method):
     """Order of splats and of views, frame, and threads: only the last digits may differ."""
@@ -409,6 +412,7 @@ def test_scores_without_an_estimate_cannot_keep_a_psnr():
         select(scores, Budget(psnr=40.0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["closed-form", "occlusion", "auto"])
 @pytest.mark.parametrize("goal", [20.0, 35.0])
 def test_every_method_reaches_a_psnr(method, goal):
@@ -432,7 +436,7 @@ def test_published_scores_reach_it_too():
 @pytest.mark.slow
 @pytest.mark.parametrize("goal", [25.0, 40.0])
 def test_absorbing_reaches_a_psnr_with_fewer(goal):
-    """By its own estimate, to `pipeline.CLOSE` or as near as three tries come."""
+    """By its own estimate, to `absorb_splats.CLOSE` or as near as three tries come."""
     splats, views = cloud(1500), ring()
     plain = prune(splats, views, Budget(psnr=goal), Settings("occlusion"))
     merged = prune(splats, views, Budget(psnr=goal), absorb=True)
@@ -465,6 +469,7 @@ def test_the_report_has_the_estimate_and_the_curve():
     json.dumps(done, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_what_absorbing_would_reach_is_told_of_many_splats_alone():
     """With few it was off by up to 7 dB. What it did reach is always told."""
     few = prune(cloud(), ring(), Budget(ratio=0.5), Settings("occlusion"))
@@ -496,6 +501,7 @@ def test_the_closed_form_says_that_it_made_no_estimate():
     assert done["notes"] == []
 
 
+@pytest.mark.slow
 def test_absorbing_casts_rays_of_no_more_views_than_validate_it():
     """Of 60 views every third validates, at most 24: the same estimate as with the rays of all."""
     splats, views = cloud(), ring(60)
@@ -538,6 +544,7 @@ def test_estimating_can_be_cancelled():
         psnr_against(found, splats, views, progress=stop)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 def test_extreme_splats_make_no_warning():
     """Opaque, invisible, vast, tiny, far, behind, brighter than white."""

@@ -12,6 +12,8 @@ from refine_addon.command import main
 
 from .test_command_clean import files  # noqa: F401 - a fixture
 
+pytestmark = pytest.mark.slow
+
 SECTIONS = (Path(__file__).parents[2] / "docs/report.md").read_text("utf-8").split("\n## ")
 CAMERAS = ["--cameras", "."]
 ABSORBING = ["--absorb", "--clean", "--ratio", ".3"]

@@ -196,6 +196,7 @@ def test_an_archive_without_meta_json_is_refused(sog):
         read_splats(sog)
 
 
+@pytest.mark.slow
 def test_a_bomb_in_the_archive_is_refused(sog):
     """100 MB of zeros in 100 KB, as an image."""
     files = content(sog)

@@ -75,6 +75,7 @@ def here(folder, views, settings=CLOSED, **options):
     return [(folder / "here" / name).read_bytes() for name in NAMES]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("absorb", [False, True])
 def test_behind_urls_the_same_bytes_are_written(folder, memory, views, absorb):
     """Tiles and folder are in memory; nothing else is left there, nor here."""
@@ -366,6 +367,7 @@ def server(fsspec):
         fsspec.asyn.reset_lock()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("default")
 def test_a_server_sends_ranges(folder, server, views):
     """The same bytes as from the disk; nobody can write there."""

@@ -99,6 +99,7 @@ def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budg
     assert told["notes"] == whole.report["notes"]
 
 
+@pytest.mark.slow
 def test_views_of_nothing_are_refused_as_of_one_file(tmp_path, tiles, views):
     """Near planes behind all splats: the message is that of one file, and nothing is left."""
     away = ViewSet(tuple(replace(view, near=1e6) for view in views))

@@ -49,6 +49,7 @@ def angles(vertices, triangles, point):
     return np.arctan2(top, below).sum() / (2.0 * np.pi)
 
 
+@pytest.mark.slow
 def test_the_inside_is_where_the_winding_number_is_not_0():
     """Of a bent, turned globe, by the sum of solid angles; with the grid and without it."""
     vertices, triangles = globe(14, 9)

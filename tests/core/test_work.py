@@ -7,8 +7,7 @@ import time
 
 import pytest
 
-from refine_addon.core.errors import Cancelled
-from refine_addon.core.work import checkpoint, for_chunks
+from refine_addon.core.work import Cancelled, checkpoint, for_chunks
 
 LONG = 600.0  # seconds; a tenth of it is more than any machine needs to notice
 

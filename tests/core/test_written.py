@@ -12,7 +12,7 @@ from refine_addon.command import main
 from refine_addon.core import Budget, PruneRequest, Settings, prune_file, read_splats
 from refine_addon.core.affine import transformed
 from refine_addon.core.estimate.psnr import psnr_against
-from refine_addon.core.estimate.written import written_facts
+from refine_addon.core.operation.written import written_facts
 
 from .test_cleaning import cameras, wall
 from .test_command_clean import files  # noqa: F401 - a fixture

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..scene import scene_of, spatial_order, splat_fingerprint
+from ..seeing.scene import scene_of, spatial_order, splat_fingerprint
 from ..splats import Splats, drawable
 from ..work import Progress, for_chunks, part, report, silent
 from . import merge_field, merging
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
+    from ..seeing.scene import Scene
     from ..views import ViewSet
     from .merge_field import Array, Field, Index
 

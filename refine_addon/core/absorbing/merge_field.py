@@ -16,7 +16,7 @@ from ..work import Progress, for_chunks, part, silent
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..scene import Scene
+    from ..seeing.scene import Scene
     from ..splats import Splats
     from ..views import View, ViewSet
 

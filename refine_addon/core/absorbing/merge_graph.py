@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..scene import MIX
+from ..seeing.scene import MIX
 from ..work import Progress, for_chunks, part, report, silent
 from . import merging
 from .neighbours import nearest
@@ -14,7 +14,7 @@ from .neighbours import nearest
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from ..scene import Scene
+    from ..seeing.scene import Scene
     from .merge_field import Array, Field, Index
 
     Rows = NDArray[np.int32]
@@ -52,7 +52,7 @@ class MergeGraph:
     cost : (E,) float64
         Of merging each pair; infinite where it is not less than that of deleting one of the two.
     connected : int
-        How many splats were alive when pairs were found last; 0 before.
+        How many splats were alive when neighbours were last searched; 0 before.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class MergeGraph:
         field : Field
             Changed in place.
         scene : Scene
-            Neighbours are found in its frame.
+            Neighbours are searched in its frame.
         patience : float
             Factor on the cost of merging.
         threads : int, optional
@@ -90,7 +90,7 @@ class MergeGraph:
         *,
         threads: int | None = None,
     ) -> MergeGraph:
-        """Return a graph as it is when its pairs have been found: `first`, `second` and `cost`."""
+        """Return a graph that has its pairs already: `first`, `second` and `cost`."""
         graph = cls(field, scene, patience, threads=threads)
         graph.first, graph.second, graph.cost = pairs
         graph.connected = len(graph.alive)

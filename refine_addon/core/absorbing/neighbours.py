@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..scene import spatial_order
+from ..seeing.scene import spatial_order
 from ..splats import rotation_matrices
 from ..work import Progress, for_chunks, part, silent
 

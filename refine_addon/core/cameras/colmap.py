@@ -145,11 +145,10 @@ def _lens(
     )
     numbers = [place.at(f"parameter {index}").number(item) for index, item in enumerate(values)]
     fx, fy = (place.at("focal length").focal(numbers[index]) for index in (0, model.focals - 1))
-    cx, cy = numbers[model.focals : model.focals + 2]
-    extra = numbers[model.focals + 2 :]
+    cx, cy, *distortion = numbers[model.focals :]
     if model.name == "EUCM":
-        extra = extra[:1]  # with alpha = 0 it is a pinhole for every beta
-    distorted = model.fisheye or any(extra)
+        distortion = distortion[:1]  # with alpha = 0 it is a pinhole for every beta
+    distorted = model.fisheye or any(distortion)
     return Lens(model, (fx, fy), (cx, cy), (width, height), distorted)
 
 

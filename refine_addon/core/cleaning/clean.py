@@ -1,10 +1,10 @@
 """Which splats float: they stand where the cameras see that nothing is.
 
-1. Suspects are found: splats whose light has little support by others (`sight.own_support`), small
+1. Suspects are found: splats that have little support by others (`support.own_support`), small
    clusters that touch nothing else, giants and needles.
-2. All suspects are taken away, and the views judge each of them by what is left: how much of the
-   light that reaches its place stops near it, and how much goes on to a surface behind. So floaters
-   cannot vouch for each other, and a surface vouches for all that belongs to it.
+2. All suspects are taken away, and it is measured what the views see at the place of each: how much
+   of the light that reaches it stops near it, and how much goes on to a surface behind. So floaters
+   are no support for each other, and a surface supports all that belongs to it.
 
 Only the second step decides. A splat with nothing behind it, such as one of a sky, stays.
 """
@@ -19,24 +19,24 @@ import numpy as np
 from ..errors import RefineError
 from ..seeing import projection
 from ..seeing.measuring import VIEW_GROUPS
-from ..seeing.ray_sample import RaySample
-from ..splats import refuse_undrawable
-from ..volumes import among_all, refuse_all
+from ..splats import among_all, refuse_undrawable
+from ..volumes import refuse_all
 from ..work import Progress, for_chunks, part, silent
-from . import sight
 from .clusters import cluster_sizes
+from .support import Evidence, Support, hits_of_view
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
     from ..seeing.projection import Footprints, Gaussians
+    from ..seeing.scene import Scene
     from ..splats import Splats
     from ..views import ViewSet
+    from .support import Hits
 
-Result = TypeVar("Result")
+Sums = TypeVar("Sums")
 
 REASONS = {
     "front": "in front of surfaces",
@@ -51,7 +51,7 @@ DEFAULT_REASONS = ("front", "isolated", "giant", "needle")
 """All but the nearly transparent, which no picture shows."""
 
 DOUBTED = 0.3
-"""A splat is suspect, and may be found to be in front of surfaces, if others support less than this
+"""A splat is suspect, and may turn out to be in front of surfaces, if others support less than this
 share of its light."""
 
 SMALL = 100
@@ -69,21 +69,21 @@ SLENDER, LONG = 10.0, 0.05
 of a picture's longer side."""
 
 SUPPORT, GIANT_SUPPORT, VEIL_SUPPORT = 0.2, 0.3, 0.5
-"""What less of the light stops near than this share has no surface. Giants cross surfaces; of a
-giant that is a veil, half may lie at one."""
+"""A suspect floats if less than this share of the light stops near it. Giants cross surfaces, so
+they may have more near them, and giants that are veils up to a half."""
 
 VEIL = 0.15
 """A giant of lower opacity is a veil."""
 
 VIEWS = 3
-"""So many views must see past a splat; all of them where fewer see it."""
+"""At least so many views must see past a splat; all of them where fewer see it."""
 
 AGREE = 0.6
-"""Share of the views that must see past it."""
+"""At least this share of the views that see it must see past it."""
 
 LOUD, LOUD_VIEWS, LOUD_AGREE = 10 / 255, 6, 0.3
-"""Of a splat that changes a pixel by as much, so many views that see past it are enough, if they
-are this share: the others may see it against a surface just behind."""
+"""Where a splat changes a pixel by at least this much, so many views that see past it are enough,
+if they are this share of all: the others may see it against a surface just behind."""
 
 VISIBLE, WIDE = 4 / 255, 0.05
 """By how much a splat must change a pixel, as its opacity times its contrast to what lies behind.
@@ -128,13 +128,13 @@ class Cleaning:
 
 @dataclass(frozen=True, eq=False)
 class Cleaned:
-    """What `clean` found.
+    """Which splats `clean` would remove, and why.
 
     Attributes
     ----------
     keep : (N,) bool
         Which splats stay.
-    found : dict of str to (N,) bool
+    by_reason : dict of str to (N,) bool
         For each of `REASONS`, switched on or not, the splats that it is true of; a splat has one
         reason. Protected splats have none.
     past : (N,) int32
@@ -149,7 +149,7 @@ class Cleaned:
     """
 
     keep: NDArray[np.bool_]
-    found: dict[str, NDArray[np.bool_]]
+    by_reason: dict[str, NDArray[np.bool_]]
     past: NDArray[np.int32]
     seen: NDArray[np.int32]
     undrawable: int
@@ -159,13 +159,17 @@ class Cleaned:
 
     def counts(self) -> dict[str, int]:
         """Return how many splats go for each reason that is switched on."""
-        return {name: int(np.count_nonzero(self.found[name])) for name in self.settings.reasons}
+        return {name: int(np.count_nonzero(self.by_reason[name])) for name in self.settings.reasons}
 
     def for_all(self, rest: NDArray[np.bool_]) -> Cleaned:
         """Return this of what was left of N splats, (N,) bool, for them all: the others go too."""
-        found = {name: among_all(mask, rest) for name, mask in self.found.items()}
-        keep, past, seen = (among_all(some, rest) for some in (self.keep, self.past, self.seen))
-        return replace(self, keep=keep, found=found, past=past, seen=seen)
+        return replace(
+            self,
+            keep=among_all(self.keep, rest),
+            by_reason={name: among_all(mask, rest) for name, mask in self.by_reason.items()},
+            past=among_all(self.past, rest),
+            seen=among_all(self.seen, rest),
+        )
 
     def facts(self) -> dict[str, Any]:
         """Return what a report says of it."""
@@ -182,17 +186,17 @@ class Cleaned:
                 continue
             many = self.past >= VIEWS if name == "front" else np.ones(len(self.keep), np.bool_)
             views = f" in {VIEWS}+ views" if name == "front" else ""
-            words.append((int(np.count_nonzero(self.found[name] & many)), f"{text}{views}"))
-            few = int(np.count_nonzero(self.found[name] & ~many))
+            words.append((int(np.count_nonzero(self.by_reason[name] & many)), f"{text}{views}"))
+            few = int(np.count_nonzero(self.by_reason[name] & ~many))
             words.append((few, f"{text} in all of the 1 or 2 views that see them"))
-        found = [f"{count:,} {text}" for count, text in words if count]
-        return ", ".join(found) or "nothing to clean away"
+        counted = [f"{count:,} {text}" for count, text in words if count]
+        return ", ".join(counted) or "nothing to clean away"
 
     def notes(self) -> list[str]:
         """Return what else the user should know, in sentences."""
         if not self.undrawable:
             return []
-        return [f"{self.undrawable} splats cannot be drawn: no camera judges them, and they stay"]
+        return [f"{self.undrawable} splats cannot be drawn: no view shows them, and they stay"]
 
 
 def clean(  # noqa: PLR0913 - as `pipeline.prune`
@@ -236,41 +240,34 @@ def clean(  # noqa: PLR0913 - as `pipeline.prune`
     if removed is not None and removed.any():
         rest = ~removed if protected is None else ~removed | protected
         refuse_all(~rest)
-        found = clean(
+        cleaned = clean(
             splats.take(rest), views, settings,
             protected=None if protected is None else protected[rest],
             progress=progress, threads=threads,
         )  # fmt: skip
-        return found.for_all(rest)
+        return cleaned.for_all(rest)
     with np.errstate(under="ignore"):
         gaussians, scene, good = projection.prepare(
             splats, views, progress=part(progress, 0.0, 0.05), threads=threads
         )
         if len(splats):
             refuse_undrawable(int(np.count_nonzero(good)), len(good))
-        run = _Run(gaussians, scene, splats, views.spread(settings.views), threads)
-        reasons = run.reasons(part(progress, 0.05, 1.0))
-    count = len(splats)
-    masks = {name: np.zeros(count, np.bool_) for name in REASONS}
-    keep = np.ones(count, np.bool_)
-    for name, rows in reasons.items():
-        masks[name][gaussians.index[rows]] = True
-        if protected is not None:
-            masks[name] &= ~protected
-        if name in settings.reasons:
-            keep &= ~masks[name]
-    if count and not keep.any():
-        msg = f"cleaning would remove all {count} splats; nothing was removed"
+        search = _Search(gaussians, scene, splats, views.spread(settings.views), threads)
+        reasons = search.reasons(part(progress, 0.05, 1.0))
+    may_go = np.ones(len(splats), np.bool_) if protected is None else ~protected
+    by_reason = {name: search.of_all(mask) & may_go for name, mask in reasons.items()}
+    keep = ~np.any([by_reason[name] for name in settings.reasons], axis=0)
+    if len(splats) and not keep.any():
+        msg = f"cleaning would remove all {len(splats)} splats; nothing was removed"
         raise RefineError(msg)
-    past, seen = np.zeros((2, count), np.int32)
-    past[gaussians.index], seen[gaussians.index] = run.evidence.past, run.seen
-    undrawable = count - int(np.count_nonzero(good))
     return Cleaned(
-        keep, masks, past, seen, undrawable, len(views), len(run.ray_sample.views), settings
-    )
+        keep, by_reason, search.of_all(search.evidence.past.astype(np.int32)),
+        search.of_all(search.support.views.astype(np.int32)), int(np.count_nonzero(~good)),
+        len(views), len(search.views), settings,
+    )  # fmt: skip
 
 
-class _Run:
+class _Search:
     """The work of one `clean`, on M Gaussians."""
 
     def __init__(
@@ -282,25 +279,30 @@ class _Run:
         threads: int | None,
     ) -> None:
         self.gaussians, self.scene, self.threads = gaussians, scene, threads
-        self.ray_sample = RaySample(views.by_distance(), gaussians, splats)
-        self.evidence = sight.Evidence.zero(len(gaussians))
-        self.seen = np.zeros(len(gaussians), np.int32)
+        self.views, self.count = views.by_distance(), len(splats)
+        self.support, self.evidence = Support.zero(len(gaussians)), Evidence.zero(len(gaussians))
         with np.errstate(invalid="ignore"):
             scales = np.sort(splats.log_scales[gaussians.index].astype(np.float64), axis=1)
         self.slender = scales[:, 2] - scales[:, 1] >= np.log(SLENDER)
 
+    def of_all(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return values of the M Gaussians, (M,), for all N splats, (N,); 0 for the others."""
+        whole = np.zeros(self.count, values.dtype)
+        whole[self.gaussians.index] = values
+        return whole
+
     def reasons(self, progress: Progress) -> dict[str, NDArray[np.bool_]]:
         """Return for each reason which Gaussians it is true of, (M,) each; one each at most."""
-        support, widest = self._support(part(progress, 0.0, 0.5))
-        giant = (self.gaussians.largest >= HUGE) & (widest >= GIANT)
-        needle = self.slender & (widest >= LONG) & ~giant
-        doubted = support < DOUBTED
+        self._measure_support(part(progress, 0.0, 0.5))
+        doubted, width = self.support.shares() < DOUBTED, self.support.width
+        giant = (self.gaussians.largest >= HUGE) & (width >= GIANT)
+        needle = self.slender & (width >= LONG) & ~giant
         small = self._clusters(~doubted & ~giant, part(progress, 0.5, 0.6))
-        self._judge(doubted | giant | needle | small, part(progress, 0.6, 1.0))
+        self._find_evidence(doubted | giant | needle | small, part(progress, 0.6, 1.0))
         effect = self._effect()
         floats = ~giant & self._floats(SUPPORT) & agreed(self.evidence, effect)
         most = np.where(self.gaussians.alphas < VEIL, VEIL_SUPPORT, GIANT_SUPPORT)
-        shows = effect >= VISIBLE * (WIDE / np.maximum(widest, WIDE))
+        shows = effect >= VISIBLE * (WIDE / np.maximum(width, WIDE))
         visible = floats & shows
         return {
             "front": visible & doubted & ~needle,
@@ -310,44 +312,26 @@ class _Run:
             "transparent": floats & doubted & ~visible,
         }
 
-    def _support(self, progress: Progress) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the support of each Gaussian by the others, and its widest footprint, (M,) each.
-
-        The latter is the longer standard deviation as a share of a picture's longer side. What no
-        view sees is fully supported.
-        """
+    def _measure_support(self, progress: Progress) -> None:
+        """Let all views see all Gaussians."""
         count = len(self.gaussians)
-        none = np.zeros(count, np.bool_)
+        nobody = np.zeros(count, np.bool_)
 
-        def block(numbers: range) -> tuple[NDArray[np.float64], ...]:
-            light, supported, widest, inside = np.zeros((4, count))
+        def of_group(numbers: range) -> Support:
+            total = Support.zero(count)
             for number in numbers:
-                footprints, looked = self._look(number, none)
-                inside[footprints.index[footprints.inside]] += 1.0
-                if looked is not None:
-                    hits, wide = looked
-                    taken, held = sight.own_support(hits)
-                    light[hits.hit] += taken
-                    supported[hits.hit] += held
-                    widest[hits.hit] = np.maximum(widest[hits.hit], wide)
-            return light, supported, widest, inside
+                total.add(*self._seen(number, nobody))
+            return total
 
-        blocks = self._blocks(block, progress, "looking")
-        lights, supports, widths, insides = (
-            np.array(arrays) for arrays in zip(*blocks, strict=True)
-        )
-        self.seen = insides.sum(axis=0).astype(np.int32)
-        light = lights.sum(axis=0)
-        lit = light > 0.0
-        if len(self.ray_sample.splats) and not lit.any():
+        for support in self._in_groups(of_group, progress, "casting rays"):
+            self.support.merge(support)
+        if self.count and not self.support.weight.any():
             msg = (
                 f"no camera sees the splats: none of {count} that show is hit by a ray of "
-                f"any of {len(self.ray_sample.views)} views; check that cameras and splats share "
+                f"any of {len(self.views)} views; check that cameras and splats share "
                 "their frame and unit"
             )
             raise RefineError(msg)
-        support = supports.sum(axis=0) / np.where(lit, light, 1.0)
-        return np.where(lit, support, 1.0), widths.max(axis=0)
 
     def _clusters(self, solid: NDArray[np.bool_], progress: Progress) -> NDArray[np.bool_]:
         """Return which Gaussians are of a small cluster, (M,), of those that are solid."""
@@ -357,43 +341,42 @@ class _Run:
         small[rows] = sizes < SMALL
         return small
 
-    def _judge(self, suspects: NDArray[np.bool_], progress: Progress) -> None:
+    def _find_evidence(self, suspects: NDArray[np.bool_], progress: Progress) -> None:
         """Let all views see what is left without the suspects, (M,)."""
 
-        def block(numbers: range) -> sight.Evidence:
-            total = sight.Evidence.zero(len(suspects))
+        def of_group(numbers: range) -> Evidence:
+            total = Evidence.zero(len(suspects))
             for number in numbers:
-                _, looked = self._look(number, suspects)
-                if looked is not None:
-                    total.add(looked[0], suspects, self.gaussians.colors)
+                _, hits = self._seen(number, suspects)
+                if hits is not None:
+                    total.add(hits, suspects, self.gaussians.colors)
             return total
 
-        for found in self._blocks(block, progress, "judging"):
-            self.evidence.merge(found)
+        for evidence in self._in_groups(of_group, progress, "casting rays"):
+            self.evidence.merge(evidence)
 
-    def _look(
-        self, number: int, absent: NDArray[np.bool_]
-    ) -> tuple[Footprints, tuple[sight.Hits, NDArray[np.float32]] | None]:
-        """Return the footprints of all Gaussians in a view, and `sight.look`."""
-        view = self.ray_sample.views[number][0]
+    def _seen(self, number: int, absent: NDArray[np.bool_]) -> tuple[Footprints, Hits | None]:
+        """Return the footprints of all Gaussians in a view, and what its rays hit."""
+        view = self.views[number][0]
         footprints = projection.project(self.gaussians, self.scene, view)
-        looked = sight.look(self.gaussians, footprints, self.scene, self.ray_sample, number, absent)
-        return footprints, looked
+        return footprints, hits_of_view(
+            self.gaussians, footprints, self.scene, view, number, absent
+        )
 
-    def _blocks(
-        self, work: Callable[[range], Result], progress: Progress, what: str
-    ) -> list[Result]:
-        """Return what `work` makes of the numbers of the views in each of some blocks."""
-        count = min(VIEW_GROUPS, len(self.ray_sample.views))
+    def _in_groups(
+        self, work: Callable[[range], Sums], progress: Progress, what: str
+    ) -> list[Sums]:
+        """Return what `work` makes of the numbers of the views in each of some groups."""
+        count = min(VIEW_GROUPS, len(self.views))
         return for_chunks(
-            lambda piece: work(range(piece.start, len(self.ray_sample.views), count)),
+            lambda piece: work(range(piece.start, len(self.views), count)),
             count, 1, progress=progress, what=what, threads=self.threads,
         )  # fmt: skip
 
     def _floats(self, most: float | NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which suspects have a surface behind them and less than `most` support, (M,)."""
-        seen = self.evidence
-        return (seen.views > 0) & (seen.near < most * (seen.near + seen.behind))
+        views, near, behind = self.evidence.views, self.evidence.near, self.evidence.behind
+        return (views > 0) & (near < most * (near + behind))
 
     def _effect(self) -> NDArray[np.float64]:
         """Return by how much each suspect changes a pixel that it covers, (M,)."""
@@ -402,8 +385,9 @@ class _Run:
         return np.asarray(self.gaussians.alphas * contrast, np.float64)
 
 
-def agreed(seen: sight.Evidence, effect: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which suspects, of some effects on a pixel, enough views see past, (M,)."""
-    most = (seen.past >= np.minimum(VIEWS, seen.views)) & (seen.past >= AGREE * seen.views)
-    some = (seen.past >= LOUD_VIEWS) & (seen.past >= LOUD_AGREE * seen.views)
-    return most | (some & (effect >= LOUD))
+def agreed(evidence: Evidence, effect: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return past which suspects enough views see, given by how much each changes a pixel, (M,)."""
+    views, past = evidence.views, evidence.past
+    most = (past >= np.minimum(VIEWS, views)) & (past >= AGREE * views)
+    fewer = (past >= LOUD_VIEWS) & (past >= LOUD_AGREE * views)
+    return most | (fewer & (effect >= LOUD))

@@ -1,4 +1,4 @@
-"""Clusters of splats that touch, found by near neighbours."""
+"""Clusters of splats that touch, each searched among its near neighbours."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ if TYPE_CHECKING:
     from ..seeing.projection import Gaussians
 
 NEIGHBOURS = 8
-"""With how many near neighbours a splat may touch."""
+"""How many near neighbours of a splat are tested for whether they touch it."""
 
 REACH = 2.0
 """Two splats touch within this many standard deviations of both, along the step between them."""
 
 APART = 0.01
-"""They touch as well within this distance: of the scene's size plus the distance to its middle."""
+"""They touch as well if they are this close: a share of the scene's size plus the distance to its
+middle."""
 
 
 def cluster_sizes(

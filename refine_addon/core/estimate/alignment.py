@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
     from ..seeing.projection import Gaussians
+    from ..seeing.scene import Scene
     from ..splats import Splats
     from ..views import View, ViewSet
 

@@ -97,15 +97,15 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     colored = _COLOR[0] in (chunks.dtype.names or ())
     if colored:
         _expect(path, "chunk", chunks, _COLOR, "f4")
-    count, needed = len(packed), -(-len(packed) // SPLATS)
+    needed = -(-len(packed) // SPLATS)
     if len(chunks) < needed:
-        msg = f"{path}: {len(chunks)} chunks, expected {needed} for {count} splats"
+        msg = f"{path}: {len(chunks)} chunks, expected {needed} for {len(packed)} splats"
         raise RefineError(msg)
-    rest = _rest(path, elements, count)
+    rest = _rest(path, elements, len(packed))
     degree = REST_COUNTS[rest.shape[1]]
-    file, splats = new_file(path, Origin(NAME, len(data)), count, degree)
+    file, splats = new_file(path, Origin(NAME, len(data)), len(packed), degree)
     with np.errstate(invalid="ignore", over="ignore"):  # ranges that are not finite
-        for piece in pieces(count):
+        for piece in pieces(len(packed)):
             rows, ranges = packed[piece], chunks[_chunks_of(piece)]
             splats.means[piece] = _between(rows["packed_position"], ranges, _POSITION)
             splats.log_scales[piece] = _between(rows["packed_scale"], ranges, _SCALE)
@@ -254,11 +254,19 @@ def write(stream: BinaryIO, splats: Splats) -> None:
         with np.errstate(under="ignore"):
             shares[:, 3] = opacity(batch.opacity_logits)
         packed[piece, 3] = _packed(shares, _CHANNELS)
-        planes = np.asarray(batch.sh_rest, np.float64).transpose(0, 2, 1).reshape(len(batch), rest)
-        # Each code stands for the middle of its step, so that it is the whole part, not rounded.
-        steps = np.clip((planes / REST_RANGE + 0.5) * 256.0, 0.0, 255.0)
-        harmonics[piece] = steps.astype(np.uint8)
+        harmonics[piece] = _harmonic_codes(batch.sh_rest)
     stream.writelines(part.data for part in (ranges, packed, harmonics))
+
+
+def _harmonic_codes(sh_rest: NDArray[Any]) -> NDArray[np.uint8]:
+    """Return codes (n, 3 K) of coefficients (n, K, 3), the reverse of `_harmonics`."""
+    planes = (
+        np.asarray(sh_rest, np.float64)
+        .transpose(0, 2, 1)
+        .reshape(len(sh_rest), 3 * sh_rest.shape[1])
+    )
+    # Each code stands for the middle of its step, so that it is the whole part, not rounded.
+    return np.clip((planes / REST_RANGE + 0.5) * 256.0, 0.0, 255.0).astype(np.uint8)
 
 
 def _places(values: NDArray[Any], ranges: NDArray[np.float32]) -> NDArray[np.float64]:

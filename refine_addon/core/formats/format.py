@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RefineError
-from ..scene import spatial_order
+from ..seeing.scene import spatial_order
 from ..work import chunks
 from .ply import Origin, SplatFile
 from .ply_columns import empty_rows

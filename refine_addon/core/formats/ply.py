@@ -241,17 +241,7 @@ def read_ply(path: Path | str) -> SplatFile:
         names the file, the place, what was found and what was expected.
     """
     path = expanded(path)
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):  # opening a pipe would wait for a writer
-            msg = f"{path}: is a {'folder' if path.is_dir() else 'device'}, expected a PLY file"
-            raise RefineError(msg)
-        with path.open("rb") as stream:
-            header, vertex = splat_header(path, stream)
-            whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-    except (OSError, ValueError) as error:
-        msg = f"{path}: cannot be read ({reason_of(error)})"
-        raise RefineError(msg) from error
-    body = np.frombuffer(whole, np.uint8)[len(header.raw) :]
+    header, vertex, body = _mapped(path)
     check_counts(header, len(body))
     filled = [e.name for e, count in zip(header.elements, header.counts, strict=True) if count]
     indexing = tuple(name for name in filled if name in INDEXING)
@@ -262,6 +252,21 @@ def read_ply(path: Path | str) -> SplatFile:
     start, end = vertex_range(header, vertex, body)
     rows = body[start:end].view(header.elements[vertex].dtype(header.order))
     return SplatFile(path, rows, header.raw, body[:start], body[end:], indexing=indexing)
+
+
+def _mapped(path: Path) -> tuple[Header, int, NDArray[np.uint8]]:
+    """Return a file's header, which of its elements are splats, and its body, mapped."""
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):  # opening a pipe would wait for a writer
+            msg = f"{path}: is a {'folder' if path.is_dir() else 'device'}, expected a PLY file"
+            raise RefineError(msg)
+        with path.open("rb") as stream:
+            header, vertex = splat_header(path, stream)
+            whole = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+    except (OSError, ValueError) as error:
+        msg = f"{path}: cannot be read ({reason_of(error)})"
+        raise RefineError(msg) from error
+    return header, vertex, np.frombuffer(whole, np.uint8)[len(header.raw) :]
 
 
 def splat_header(path: Path | Url, stream: BinaryIO) -> tuple[Header, int]:

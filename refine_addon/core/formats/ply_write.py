@@ -106,21 +106,22 @@ def text_lines(
     names = rows.dtype.names or ()
     cells = {n: _cast(v, _stored(rows.dtype, n, v.dtype)) for n, v in columns.items()}
     added = [values for name, values in cells.items() if name not in names]
-    replaced = [
+    # Of each property that is set: its place in a row, its values, and which of them are new.
+    changed = [
         (names.index(name), values, _differs(values, rows[name]))
         for name, values in cells.items()
         if name in names
     ]
     kept: Iterable[int] = range(len(lines)) if keep is None else np.flatnonzero(keep).tolist()
     for index in kept:
-        # str of a NumPy number is the shortest text that reads back as that number.
-        words = {
-            place: str(values[index]).encode()
-            for place, values, differs in replaced
-            if differs[index]
-        }
-        more = [str(values[index]).encode() for values in added]
+        words = {place: _word(values[index]) for place, values, new in changed if new[index]}
+        more = [_word(values[index]) for values in added]
         yield _edited(lines[index], words, more) if words or more else lines[index]
+
+
+def _word(value: Any) -> bytes:  # noqa: ANN401 - a number of NumPy's
+    """Return the shortest text that reads back as a number, which `str` makes of NumPy's."""
+    return str(value).encode()
 
 
 def longest_line(dtype: np.dtype[Any], lines: Sequence[bytes], names: Collection[str]) -> int:

@@ -12,7 +12,7 @@ from ..errors import RefineError
 from ..estimate.quality import PSNR_CAP
 from ..formats.registry import SUFFIXES, as_written, without_suffix
 from ..operation.files import FileSource
-from ..operation.run import Written, run
+from ..operation.run import Request, Written, run
 from ..report import held, scoring_notes, seen_by
 from ..selection import Budget
 from ..task import DEFAULTS, Task
@@ -79,7 +79,7 @@ def check_goal(goal: float) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class LevelsRequest:
+class LevelsRequest(Request["Loaded", "LevelSeries"]):
     """What is asked of levels of detail as files.
 
     Attributes
@@ -117,13 +117,8 @@ class LevelsRequest:
             protected=loaded.forced.protected, removed=loaded.forced.removed,
         )  # fmt: skip
         levels = each_level(scene, self.levels, progress=runtime.progress, threads=runtime.threads)
-        return LevelSeries(levels, {"settings": asdict(self.settings), "notes": []})
-
-    def compare(
-        self, _loaded: Loaded, _series: LevelSeries, _path: Path | None, _runtime: Runtime
-    ) -> dict[str, Any]:
-        """Return nothing: what a lossy format costs is not measured of levels."""
-        return {}
+        facts = {"settings": asdict(self.settings), "volumes": loaded.volumes, "notes": []}
+        return LevelSeries(levels, facts)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,16 +11,17 @@ import math
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import RefineError
 from ..estimate.quality import PSNR_CAP
-from ..pipeline import decide, score
+from ..pipeline import decide
+from ..score_splats import score
 from ..selection import Budget
+from ..splats import among_all
 from ..task import DEFAULTS, Origin, Task
-from ..volumes import among_all
 from ..work import Progress, part, silent
-from .distance import Lookout
+from .distance import OriginalPictures
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -36,10 +37,11 @@ if TYPE_CHECKING:
     from ..views import ViewSet
     from .distance import Reach
 
-    _Made = tuple[NDArray[np.bool_], Splats, Result, Absorbed | None]
-
-MANY = 16
+MAX_LEVELS = 16
 """No more levels than this: the last of so many halvings would hold .0015 % of the splats."""
+
+COMPARING = 0.05
+"""Share of the work that taking pictures of the original is, for a progress bar."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +92,8 @@ class Levels:
         if rising:
             msg = f"level {rising[1]} comes after {rising[0]}, expected less: the finest first"
             raise RefineError(msg)
-        if len(values) > MANY:
-            msg = f"got {len(values)} levels, expected at most {MANY}"
+        if len(values) > MAX_LEVELS:
+            msg = f"got {len(values)} levels, expected at most {MAX_LEVELS}"
             raise RefineError(msg)
 
     def __len__(self) -> int:
@@ -192,8 +194,6 @@ class Level:
             "asked": self.asked,
             "splats": len(self.splats),
             "psnr": self.psnr,
-            "geometricError": short(self.reach.error),
-            "distance_pixel": short(self.reach.pixel),
             "distance_psnr": None if within is None else short(within),
             "psnr_from_distances": [round(psnr, 2) for _, psnr in self.reach.psnr],
         }
@@ -243,7 +243,7 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     Raises
     ------
     RefineError, Cancelled
-        See `pipeline.score`; also if no level would have fewer splats than the original.
+        See `score_splats.score`; also if no level would have fewer splats than the original.
 
     Examples
     --------
@@ -270,34 +270,39 @@ def each_level(
     """
     total, forced = len(scene.scene()[0]), scene.forced()
     scene = replace(scene, removed=None) if forced is None else scene.without(forced)
-    splats, views = scene.scene()
-    lookout = Lookout(splats, views, progress=part(progress, 0.0, 0.05), threads=threads)
-    budgets, ahead = levels.budgets(total), part(progress, 0.05, 1.0)
-    coarsest, left_before, number = 0.0, total, 0
-    made = (_absorbing if levels.absorb else _deleting)(scene, budgets, ahead, threads)
-    for place, (keep, left, result, absorbed) in enumerate(made, start=1):
-        gone, left_before = left_before - len(left), len(left)
-        if not gone:
+    original = OriginalPictures(
+        *scene.scene(), progress=part(progress, 0.0, COMPARING), threads=threads
+    )
+    after = part(progress, COMPARING, 1.0)
+    made = (_absorbing if levels.absorb else _deleting)(
+        scene, levels.budgets(total), after, threads
+    )
+    left_before, number = total, 0
+    for place, (keep, splats, result, absorbed) in enumerate(made):
+        if len(splats) == left_before:
             continue
-        number += 1
-        end = 0.05 + 0.95 * place / len(levels) if levels.absorb else 1.0
-        reach = lookout.reach(
-            left, keep, absorbed.changed if absorbed else None, progress=part(progress, end, end)
-        )
-        # What a level has changed is changed in all after it, though they may measure as less.
-        coarsest = max(coarsest, reach.error)
-        reach = replace(reach, error=coarsest)
+        number, left_before = number + 1, len(splats)
+        end = (place + 1) / len(levels) if levels.absorb else 1.0
         if number == 1:
             scores = result.scores
-        report = result.report
         level = Level(
-            number, levels.asked[place - 1], keep, left, report["estimated_psnr"], reach, scores,
-            absorbed, report["budget_remark"],
+            number, levels.asked[place], keep, splats, result.report["estimated_psnr"],
+            original.reach(splats, progress=part(after, end, end)), scores,
+            absorbed, result.report["budget_remark"],
         )  # fmt: skip
         yield level if forced is None else level.for_all(~forced)
     if not number:
         msg = f"no level has fewer splats than the input, which has {total}"
         raise RefineError(msg)
+
+
+class _Made(NamedTuple):
+    """The splats of a level, and how they were decided; the attributes are those of `Level`."""
+
+    keep: NDArray[np.bool_]
+    splats: Splats
+    result: Result
+    absorbed: Absorbed | None
 
 
 def _deleting(
@@ -307,9 +312,8 @@ def _deleting(
     splats, views = scene.scene()
     scores = score(splats, views, scene.settings, quality=True, progress=progress, threads=threads)
     for budget in budgets:
-        task = replace(scene, budget=budget, scores=scores)
-        result = decide(task, threads=threads)
-        yield result.keep, splats.take(result.keep), result, None
+        result = decide(replace(scene, budget=budget, scores=scores), threads=threads)
+        yield _Made(result.keep, splats.take(result.keep), result, None)
 
 
 def _absorbing(
@@ -319,19 +323,18 @@ def _absorbing(
     count, ray_sample, whole = len(scene.scene()[0]), None, None
     task = replace(scene, absorb=True)
     for number, budget in enumerate(budgets):
-        ahead = part(progress, number / len(budgets), (number + 1) / len(budgets))
-        result = decide(replace(task, budget=budget), progress=ahead, threads=threads)
+        of_level = part(progress, number / len(budgets), (number + 1) / len(budgets))
+        result = decide(replace(task, budget=budget), progress=of_level, threads=threads)
         assert result.absorbed is not None  # noqa: S101 - the task says so
-        psnr = result.report["estimated_psnr"]
         whole = result.absorbed if whole is None else _both(whole, result.absorbed)
-        yield whole.keep, whole.splats, result, whole
+        yield _Made(whole.keep, whole.splats, result, whole)
         if number == 0:
             ray_sample = result.scores.ray_sample
         task = replace(
             task,
             splats=whole.splats,
             protected=None if scene.protected is None else scene.protected[whole.keep],
-            origin=Origin(count, ray_sample, psnr),
+            origin=Origin(count, ray_sample, result.report["estimated_psnr"]),
         )
 
 

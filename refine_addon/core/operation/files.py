@@ -1,4 +1,4 @@
-"""Operations from a file to a file."""
+"""A file as a source, and a file as a sink."""
 
 from __future__ import annotations
 
@@ -11,11 +11,10 @@ import numpy as np
 from ..formats.registry import as_written, format_named, read_splats
 from ..report import Files, held
 from ..volumes import forced
-from ..whole_file import expanded, refuse_existing, refuse_mapped
-from ..work import Progress, report, silent
+from ..whole_file import refuse_existing, refuse_mapped
+from ..work import report
 from .loaded import Loaded, RowSizes
-from .prune import DECIDED
-from .run import Written, run
+from .run import DECIDED, Written
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -25,58 +24,8 @@ if TYPE_CHECKING:
 
     from ..absorbing.absorb import Absorbed
     from ..formats.format import Format
-    from ..task import Result
     from ..volumes import Zone
-    from .prune import PruneRequest
     from .run import Runtime
-
-
-def prune_file(
-    source: Path | str,
-    output: Path | str | None,
-    request: PruneRequest,
-    *,
-    progress: Progress = silent,
-    threads: int | None = None,
-) -> Result:
-    """Prune a file of splats, and write the result to another file.
-
-    Parameters
-    ----------
-    source : path-like
-        The file to read, of any format (`read_splats`).
-    output : path-like or None
-        The file to write, in the format that its suffix names; None decides without writing, as for
-        a plain PLY.
-    request : PruneRequest
-        What is asked.
-    progress, threads
-        See `run`.
-
-    Returns
-    -------
-    Result
-        Its report also has the names and sizes of the files.
-
-    Raises
-    ------
-    RefineError, Cancelled
-        See `run`, `FileSource`, `FileSink` and `PruneRequest`. Nothing is written then, unless the
-        message says so.
-
-    Examples
-    --------
-    To leave half of the splats, with what they absorbed::
-
-        prune_file("in.ply", "out.ply", PruneRequest(views, Budget(ratio=0.5), absorb=True))
-    """
-    sink = FileSink(
-        None if output is None else expanded(output),
-        source=expanded(source),
-        overwrite=request.overwrite,
-        dry_run=request.dry_run,
-    )
-    return run(FileSource(source, request.zones), request, sink, progress=progress, threads=threads)
 
 
 @dataclass(frozen=True)
@@ -134,6 +83,25 @@ class Choice(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """Which splats stay, all of them as they are.
+
+    Attributes
+    ----------
+    keep : (N,) bool
+    report : dict
+    """
+
+    keep: NDArray[np.bool_]
+    report: dict[str, Any]
+
+    @property
+    def absorbed(self) -> None:
+        """Nothing is absorbed."""
+        return
+
+
 @dataclass(frozen=True)
 class FileSink:
     """A file to be made of what stays.
@@ -181,6 +149,10 @@ class FileSink:
                 refuse_mapped(self.written, self.source)
         yield
 
+    def columns(self, loaded: Loaded, choice: Choice) -> dict[str, NDArray[Any]]:
+        """Return the properties that are written otherwise than they are stored."""
+        return loaded.columns(choice.absorbed)
+
     def write(self, loaded: Loaded, choice: Choice, runtime: Runtime) -> Written:
         """Write what stays: all of it, or nothing.
 
@@ -191,7 +163,7 @@ class FileSink:
         """
         report(runtime.progress, DECIDED, "writing")
         made = as_written(loaded.file(), self.path)
-        columns = loaded.columns(choice.absorbed)
+        columns = self.columns(loaded, choice)
         path, size = self.written, made.size(choice.keep, columns)
         if path is not None:
             made.write(path, choice.keep, columns=columns, overwrite=self.overwrite)

@@ -75,7 +75,7 @@ class Loaded:
         Returns the source as the file that is written, in the frame of the source.
     matrix : (4, 4) float64
         From that frame to that of the views.
-    remarks : tuple of str
+    notes : tuple of str
         What the user should know about the source, in sentences.
     reusable : bool
         Whether the scores are kept for other budgets; see `Task`.
@@ -89,16 +89,13 @@ class Loaded:
     stored: Columns | NDArray[Any]
     file: Callable[[], SplatFile]
     matrix: NDArray[np.float64]
-    remarks: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     reusable: bool = False
 
-    def facts(self) -> dict[str, Any]:
-        """Return what the report says of what must stay and go."""
-        return {"volumes": list(self.forced.facts)}
-
-    def notes(self) -> list[str]:
-        """Return the remarks."""
-        return [*self.remarks]
+    @property
+    def volumes(self) -> list[dict[str, Any]]:
+        """What the report says of the volumes that force splats to stay and go."""
+        return list(self.forced.facts)
 
     def take(self, rows: NDArray[np.bool_]) -> Loaded:
         """Return what decides on some of the splats, (N,) bool; `stored` and `file` stay whole."""

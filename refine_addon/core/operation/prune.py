@@ -1,4 +1,4 @@
-"""What is asked of a prune, and how it is decided where all splats are in memory."""
+"""Pruning where all splats are in memory: what is asked, and how it is decided."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ import numpy as np
 
 from ..affine import is_uniform, transformed
 from ..cleaning.clean import clean
-from ..estimate.written import written_facts
 from ..formats.registry import read_written, refuse_unknown_size
 from ..pipeline import decide
 from ..task import DEFAULTS, Settings, Task
+from ..whole_file import expanded
+from ..work import Progress, silent
+from .files import FileSink, FileSource
+from .run import DECIDED, Request, run
+from .written import written_facts
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -30,12 +34,12 @@ if TYPE_CHECKING:
     from .loaded import Loaded
     from .run import Runtime
 
-CLEANED, DECIDED, COMPARED = 0.4, 0.8, 0.85
-"""Where in the progress of a prune cleaning and deciding end, and where pictures begin."""
+CLEANED, COMPARED = 0.4, 0.85
+"""Where in the progress of a prune cleaning ends, and where pictures begin."""
 
 
 @dataclass(frozen=True, eq=False)
-class PruneRequest:
+class PruneRequest(Request["Loaded", "Result"]):
     """What is asked of a prune.
 
     Attributes
@@ -134,7 +138,11 @@ class PruneRequest:
             fixed_bytes=loaded.sizes.fixed,
             reusable=loaded.reusable,
         )
-        return decide(task, clock=runtime.clock, progress=runtime.progress, threads=runtime.threads)
+        result = decide(
+            task, clock=runtime.clock, progress=runtime.progress, threads=runtime.threads
+        )
+        result.report["volumes"] = loaded.volumes
+        return result
 
     def compare(
         self, loaded: Loaded, result: Result, path: Path | None, runtime: Runtime
@@ -183,3 +191,51 @@ def _as_written(loaded: Loaded, result: Result, path: Path | None) -> Splats:
     if rounded is None:
         return result.survivors(loaded.splats)
     return rounded if np.array_equal(matrix, np.eye(4)) else transformed(rounded, matrix)
+
+
+def prune_file(
+    source: Path | str,
+    output: Path | str | None,
+    request: PruneRequest,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Result:
+    """Prune a file of splats, and write the result to another file.
+
+    Parameters
+    ----------
+    source : path-like
+        The file to read, of any format (`read_splats`).
+    output : path-like or None
+        The file to write, in the format that its suffix names; None decides without writing, as for
+        a plain PLY.
+    request : PruneRequest
+        What is asked.
+    progress, threads
+        See `run`.
+
+    Returns
+    -------
+    Result
+        Its report also has the names and sizes of the files.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `run`, `FileSource`, `FileSink` and `PruneRequest`. Nothing is written then, unless the
+        message says so.
+
+    Examples
+    --------
+    To leave half of the splats, with what they absorbed::
+
+        prune_file("in.ply", "out.ply", PruneRequest(views, Budget(ratio=0.5), absorb=True))
+    """
+    sink = FileSink(
+        None if output is None else expanded(output),
+        source=expanded(source),
+        overwrite=request.overwrite,
+        dry_run=request.dry_run,
+    )
+    return run(FileSource(source, request.zones), request, sink, progress=progress, threads=threads)

@@ -4,25 +4,36 @@ A request says what is to be done, a source where the splats are, a sink where t
 
 | | source | request | sink | in |
 |---|---|---|---|---|
-| `prune_file` | `FileSource` | `PruneRequest` | `FileSink` | `core/operation/files.py` |
+| `prune_file` | `FileSource` | `PruneRequest` | `FileSink` | `core/operation/prune.py` |
+| `clean_file` | `FileSource` | `CleanRequest` | `FileSink` | `core/operation/clean.py` |
+| `score_file` | `FileSource` | `ScoreRequest` | `ScoreSink` | `core/operation/score.py` |
+| `convert_file` | `FileSource` | `ConvertRequest` | `FileSink` | `core/operation/convert.py` |
 | `lod_file` | `FileSource` | `LevelsRequest` | `LevelSink` | `core/levels/files.py` |
-| `prune_object` | `ObjectSource` | `PruneRequest` | `ObjectSink` | `objects/prune_object.py` |
+| `prune_object` | `ObjectSource` | `PruneRequest` | `ObjectSink` | `objects/operation.py` |
+| `score_object` | `ObjectSource` | `ScoreRequest` | `ScoreSink` | `objects/operation.py` |
 | `prune_tiles` | `TileSource` | `TilesRequest` | `TileSink` | `core/tiles/prune.py` |
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from ..report import Clock
 from ..work import Progress, part, silent
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
     from contextlib import AbstractContextManager
     from pathlib import Path
 
     from ..formats.format import Format
+
+
+DECIDED = 0.8
+"""Part of the progress of a run after which it is decided what is written to a file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,12 +86,9 @@ class Written:
 class Input(Protocol):
     """What a source gives."""
 
-    def facts(self) -> dict[str, Any]:
-        """Return what the report says of it."""
-        ...
-
-    def notes(self) -> list[str]:
-        """Return what the user should know about it, in sentences."""
+    @property
+    def notes(self) -> Sequence[str]:
+        """What the user should know about it, in sentences."""
         ...
 
 
@@ -108,22 +116,29 @@ class Source(Protocol[InputT_co]):
         ...
 
 
-class Request(Protocol[InputT_contra, DecisionT]):
+class Request(ABC, Generic[InputT_contra, DecisionT]):
     """What is to be done."""
 
-    def opened(self, form: Format | None) -> AbstractContextManager[None]:
-        """Refuse what can be had of no splats, before any are read."""
-        ...
+    @contextmanager
+    def opened(self, _form: Format | None) -> Iterator[None]:
+        """Refuse what can be had of no splats, before any are read.
 
+        Parameters
+        ----------
+        form : Format or None
+            Of the output; None is plain PLY.
+        """
+        yield
+
+    @abstractmethod
     def decide(self, read: InputT_contra, runtime: Runtime) -> DecisionT:
         """Decide; nothing is changed or written."""
-        ...
 
     def compare(
-        self, read: InputT_contra, decision: DecisionT, path: Path | None, runtime: Runtime
+        self, _read: InputT_contra, _decision: DecisionT, _path: Path | None, _runtime: Runtime
     ) -> dict[str, Any]:
-        """Return what the report says of the pictures of the file that was written."""
-        ...
+        """Return what the report says of the pictures of the file that was written, if anything."""
+        return {}
 
 
 class Sink(Protocol[InputT_contra, DecisionT_contra]):
@@ -187,8 +202,8 @@ def run(
         compared = request.compare(read, decision, written.path, runtime)
     runtime.clock.stop()
     report = decision.report
-    report |= written.facts | compared | read.facts()
+    report |= written.facts | compared
     report["splats"] |= written.splats
-    report["notes"] += [*written.notes, *read.notes()]
+    report["notes"] += [*written.notes, *read.notes]
     report |= {"files": written.files, "timings": runtime.clock.timings}
     return decision

@@ -25,8 +25,8 @@ import numpy as np
 from .. import radix
 from ..errors import RefineError
 from ..rendering import NEAR_RELATIVE
-from ..scene import principal_axes, size_of
 from ..scores import Scores
+from ..seeing.scene import principal_axes, size_of
 from ..splats import refuse_undrawable
 from ..work import Progress, part, silent
 from . import adaptive

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..scene import MIX, fingerprint
+from ..seeing.scene import MIX, fingerprint
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

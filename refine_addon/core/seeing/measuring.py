@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
     from ..views import View, ViewSet
     from ..work import Progress
     from .projection import Footprints, Gaussians
     from .ray_sample import RaySample
     from .rays import Rays
+    from .scene import Scene
 
 VIEW_GROUPS = 8
 """Views are measured in so many groups; sums are added group by group, so they do not depend on

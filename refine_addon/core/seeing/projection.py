@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..rendering import ALPHA_CUT, LOW_PASS, NEAR_RELATIVE
-from ..scene import Scene, scene_of, spatial_order, splat_fingerprint
 from ..splats import SH_C0, drawable, opacity, rotation_matrices
 from ..work import Progress, checkpoint, for_chunks, part, report, silent
 from . import frustum
+from .scene import Scene, scene_of, spatial_order, splat_fingerprint
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
     from ..splats import Splats
     from ..views import View, ViewSet
     from .projection import Footprints, Gaussians
     from .rays import Rays
+    from .scene import Scene
 
 VALIDATION_RAYS = 1 << 14
 """How many validation rays all views together have."""

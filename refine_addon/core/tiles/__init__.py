@@ -1,6 +1,8 @@
 """Many files as one scene, larger than memory: one ranking and one budget over all of them.
 
-`units` cuts the files into runs of rows, `steps` does one step with one run, `folder` keeps what
-stands between the steps, `prune` puts the steps together, and `workers` does them in this process;
-`cluster` does them on a Dask cluster.
+`prune` is the way through. `units` cuts the files into runs of rows, `folder` keeps what stands
+between the steps, and `workers` does the steps in this process or `cluster` on a Dask cluster. A
+step is a class with `run`: of the closed form in `closed_form`, of what views see in `gaussians`,
+`measuring` and `rays`, of absorbing in `regions`, of the selection in `selecting`, and of the
+tiles in `writing`.
 """

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..absorb_splats import FIRST, PARTS
 from ..absorbing.absorb import STAGE, Counts, patience, stages
-from ..pipeline import FIRST, PARTS
 from ..seeing.measuring import Measured
 from ..selection import Budget, select
 from .gaussians import store_gaussians
@@ -129,8 +129,8 @@ def absorb(tiles: MeasuredTiles, goal: int, settings: Settings, runner: Runner) 
     factor = patience(1.0 - goal / len(rows))
     counts = stages(len(rows), goal, STAGE)
     for number, count in enumerate(counts):
-        ahead = runner.part(number / len(counts), (number + 1) / len(counts))
-        regions, left = _stage(tiles.context, number, left, count, factor, ahead)
+        stage_runner = runner.part(number / len(counts), (number + 1) / len(counts))
+        regions, left = _stage(tiles.context, number, left, count, factor, stage_runner)
     origin, members = (_of_all(regions, name) for name in ("origin", "members"))
     merged = int(members.sum()) - goal
     return Survivors(regions, origin, members > 1, merged, total - goal - merged)
@@ -179,20 +179,26 @@ def _stage(
         context = replace(scene, folder=folder.inner("seen"))
         left = _measured_again(context, left, number - 1, runner.part(0.0, 0.5))
     stage = StageContext(folder, scene.views, scene.scene, left.sources, factor)
-    Runner(runner.workers).run_all(stage, [SaveMeans(source) for source in left.sources], "")
-    means = np.concatenate([folder.map(source.index, "means") for source in left.sources])
-    boxes = divided(means[left.rows], REGION, number)
-    for index, places in enumerate(boxes):
-        _save_region(folder, index, left, places)
-    sizes = [*map(len, boxes)]
+    sizes = _save_regions(stage, left, number, runner)
     stay = _staying(stage, sizes, count, runner.part(0.5, 0.8))
     steps = [AbsorbRegion(index, survivors) for index, survivors in enumerate(stay)]
     survivors = runner.part(0.8, 1.0).run(stage, steps, "absorbing", sizes)
     regions = [Region(index, size, folder) for index, size in enumerate(survivors)]
-    expected = _of_all(regions, "expected", axis=1)
-    rows = np.arange(expected.shape[1])
-    measured = Measured(expected[0], expected[1], np.zeros(len(rows), np.int32))
+    contribution, error = _of_all(regions, "expected", axis=1)
+    rows = np.arange(len(error))
+    measured = Measured(contribution, error, np.zeros(len(rows), np.int32))
     return regions, _Left(regions, rows, measured)
+
+
+def _save_regions(stage: StageContext, left: _Left, number: int, runner: Runner) -> list[int]:
+    """Divide the splats that are left; return how many each region has."""
+    steps = [SaveMeans(source) for source in left.sources]
+    Runner(runner.workers).run_all(stage, steps, "absorbing")
+    means = [stage.folder.map(source.index, "means") for source in left.sources]
+    boxes = divided(np.concatenate(means)[left.rows], REGION, number)
+    for index, places in enumerate(boxes):
+        _save_region(stage.folder, index, left, places)
+    return [*map(len, boxes)]
 
 
 def _save_region(folder: Folder, index: int, left: _Left, places: NDArray[np.int64]) -> None:
@@ -223,8 +229,8 @@ def _measured_again(scene: SceneContext, left: _Left, turn: int, runner: Runner)
     gaussians, good = store_gaussians(scene, left.sources, runner.part(0.0, 0.2))
     measuring = TileMeasuring(scene, runner)
     groups = measuring.groups_of_part(turn, PARTS)
-    ahead = runner.part(0.2, 1.0).progress
-    sums = measuring.measure(gaussians, groups, ahead)  # type: ignore[arg-type]
+    progress = runner.part(0.2, 1.0).progress
+    sums = measuring.measure(gaussians, groups, progress)  # type: ignore[arg-type]
     measured = Measured.sum(sums.values()).for_all(gaussians.index, len(good))
     others = 1.0 - measuring.weight_share(groups)
     measured.contribution[:] += others * left.measured.contribution
@@ -247,7 +253,7 @@ def _staying(stage: StageContext, sizes: Sequence[int], left: int, runner: Runne
     left : int
     runner : Runner
     """
-    total, numbers = sum(sizes), range(len(sizes))
+    numbers = range(len(sizes))
     gather = [GatherRegion(index) for index in numbers]
     whole = np.sum([*runner.part(0.0, 0.4).run(stage, gather, "absorbing", sizes)], axis=0)
     price = [PriceRegion(index, whole) for index in numbers]
@@ -255,14 +261,31 @@ def _staying(stage: StageContext, sizes: Sequence[int], left: int, runner: Runne
     priced = [stage.folder.load(index, ("costs", "weights")) for index in numbers]
     costs = np.concatenate([arrays["costs"] for arrays in priced])
     weights = np.concatenate([arrays["weights"] for arrays in priced])
-    order = np.argsort(costs, kind="stable")
-    last = int(np.searchsorted(np.cumsum(weights[order], dtype=np.float64), total - left))
-    weights[order[last + 1 :]] = 0.0
-    ends = np.cumsum(sizes)
-    of_regions = np.split(weights, ends[:-1])
-    gone = np.cumsum([weights.sum(dtype=np.float64) for weights in of_regions])
+    return _shared_out(costs, weights, sizes, left)
+
+
+def _shared_out(
+    costs: NDArray[np.float64], weights: NDArray[np.float32], sizes: Sequence[int], left: int
+) -> list[int]:
+    """Return how many splats of each region stay; see `_staying`.
+
+    Parameters
+    ----------
+    costs : (n,) float64
+        Of each splat's cheapest operation, region by region.
+    weights : (n,) float32
+        How many splats go by it, 1 or .5.
+    sizes : sequence of int
+    left : int
+    """
+    order, goal = np.argsort(costs, kind="stable"), len(costs) - left
+    last = int(np.searchsorted(np.cumsum(weights[order], dtype=np.float64), goal))
+    goes, chosen = np.zeros_like(weights), order[: last + 1]
+    goes[chosen] = weights[chosen]
+    of_regions = np.split(goes, np.cumsum(sizes)[:-1])
+    gone = np.cumsum([in_region.sum(dtype=np.float64) for in_region in of_regions])
     # Rounded so that the sum is exact: each gets what is added up to its end.
-    gone = np.rint(gone * ((total - left) / gone[-1])).astype(np.int64)
+    gone = np.rint(gone * (goal / gone[-1])).astype(np.int64)
     return [size - int(go) for size, go in zip(sizes, np.diff(gone, prepend=0), strict=True)]
 
 

@@ -179,12 +179,12 @@ def by_closed_form(
     """
     views, settings = context.views, context.settings
     steps = _Steps(context, units, runner)
-    with np.errstate(under="ignore"):  # as in `pipeline.score`
-        found = closed_form.steps(
+    with np.errstate(under="ignore"):  # as in `score_splats.score`
+        results = closed_form.steps(
             steps.each, sum(map(len, units)), views, settings, remember=context.folder.once
         )
     scores = Scores(
-        np.empty(0, np.float32), np.empty(0, np.int32), len(views), found.undrawable,
-        found.facts, method="closed-form", frustum=settings.frustum,
+        np.empty(0, np.float32), np.empty(0, np.int32), len(views), results.undrawable,
+        results.facts, method="closed-form", frustum=settings.frustum,
     )  # fmt: skip
-    return scores, found.size
+    return scores, results.size

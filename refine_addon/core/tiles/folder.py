@@ -1,7 +1,7 @@
 """The folder of a job: arrays between the steps, and notes of what has been done.
 
-Every file is written whole or not at all, and holds the same bytes whoever writes
-it. So a step may be done twice, or again after whoever did it was killed.
+Every file is written whole or not at all, and holds the same bytes whoever writes it. So a step
+may be done twice, or again after whoever did it was killed.
 """
 
 from __future__ import annotations
@@ -90,13 +90,13 @@ class Folder:
     def once(self, name: str, make: Callable[[], Any]) -> Any:  # noqa: ANN401 - as made, or `noted`
         """Return the noted result of that name; if there is none, make and note it.
 
-        A name of what arrays of one number were saved by begins with that number, six digits long:
-        if one of them is damaged, the next run makes them again.
+        Where `make` saves arrays, the name begins with their number in six digits and a dot: if one
+        turns out to be damaged, these results are forgotten, and made again by the next run.
 
         Raises
         ------
         Interrupted
-            If an array that it needs is gone; the next run makes all arrays again.
+            If an array that it needs is gone; all results are forgotten then.
         """
         done, result = self.noted(name)
         if done:
@@ -192,11 +192,14 @@ class Folder:
         RefineError
             If it cannot be made, or another process works on the job.
         """
+        fresh = not self.path.exists()
         try:
             self.tiles.mkdir(parents=True, exist_ok=True)
             self.inner("")
             stream = (self.path / "lock").open("wb")
         except OSError as error:
+            if fresh:
+                self.remove()
             msg = f"{self.path}: cannot be made ({error.strerror or error})"
             raise RefineError(msg) from error
         try:
@@ -231,6 +234,11 @@ class Folder:
         except _DAMAGE as error:
             self._forget(start)
             msg = f"{path}: is damaged"
+            raise Interrupted(msg) from error
+        except FileNotFoundError:
+            raise
+        except OSError as error:
+            msg = f"{path}: cannot be read ({error.strerror})"
             raise Interrupted(msg) from error
 
     def _forget(self, start: str) -> None:

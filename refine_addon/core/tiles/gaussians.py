@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..scene import code_order, moments, spatial_code, splat_fingerprint
 from ..seeing import projection
 from ..seeing.projection import Gaussians
+from ..seeing.scene import code_order, moments, spatial_code, splat_fingerprint
 from ..splats import drawable
 
 if TYPE_CHECKING:
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
     from ..seeing.measuring import Sampling
+    from ..seeing.scene import Scene
     from ..views import View, ViewSet
     from ..work import Progress
     from .folder import Folder

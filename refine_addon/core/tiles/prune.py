@@ -13,17 +13,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...version import VERSION
-from ..errors import Cancelled, RefineError
+from ..errors import RefineError
 from ..estimate.psnr import psnr_kept
 from ..estimate.quality import needed
 from ..formats.ply_header import with_count
-from ..pipeline import MEASURES, conclude, remark
-from ..report import Clock, Files, complete_report, make_report
+from ..report import MEASURES, Clock, Files, complete_report, conclude, make_report, remark
 from ..scoring.closed_form_block import ROWS
 from ..selection import Budget, refuse_none_left
 from ..task import DEFAULTS, Settings
 from ..urls import Url
-from ..work import Progress, silent
+from ..work import Cancelled, Progress, silent
 from . import absorbing
 from .closed_form import ClosedFormContext, by_closed_form
 from .folder import Folder, Interrupted
@@ -107,49 +106,70 @@ def prune_tiles(  # noqa: PLR0913 - as `file_to_file.prune_file`
     _refuse_what_needs_all(budget, settings, absorb=absorb)
     tiles = tiles_at(sources)
     used = views.spread(settings.views)
-    with contextlib.ExitStack() as held:
-        outputs = None
-        if folder is None:
-            job = Folder(Path(held.enter_context(tempfile.TemporaryDirectory(prefix="refine-"))))
-        else:
-            output = located(folder)
-            held.callback(_remove_empty, make_folder(output))
-            near = Path.cwd() if isinstance(output, Url) else output.absolute()
-            digest = _digest(tiles, used, budget, settings, absorb=absorb)
-            job = Folder(near / f".refine-{digest}")
-            outputs = Outputs.of(job, tiles, output, overwrite=overwrite)
-        pruning = _Pruning(job, tiles, used, Runner(workers or InProcess(threads), progress))
-        with _kept_if_interrupted(job, outputs):
-            facts = pruning.decide(budget, settings, views, clock, absorb=absorb)
-            sizes = pruning.write(outputs) if outputs else pruning.sizes()
-            if outputs:
-                outputs.publish()
+    digest = _digest(tiles, used, budget, settings, absorb=absorb)
+    with _opened(folder, digest, tiles, overwrite=overwrite) as (job, outputs):
+        runner = Runner(workers or InProcess(threads), progress)
+        pruning = _Pruning(job, tiles, used, runner)
+        facts = pruning.decide(budget, settings, views, clock, absorb=absorb)
+        sizes = pruning.write(outputs) if outputs else pruning.sizes()
+        if outputs:
+            outputs.publish()
     clock.lap("write_s")
     facts["splats"]["written"] = facts["splats"]["kept"] if outputs else None
     before, after = sum(tile.size for tile in tiles), sum(sizes)
-    target = None if folder is None else str(output)
+    target = None if folder is None else str(located(folder))
     complete_report(facts, clock, Files(f"{len(tiles)} tiles", target, before, after))
     facts["tiles"] = pruning.facts(outputs, sizes)
     return facts
 
 
 @contextlib.contextmanager
-def _kept_if_interrupted(job: Folder, outputs: Outputs | None) -> Iterator[None]:
-    """Open the folder of a job; remove it when the block ends, unless the job can go on."""
-    with job.opened():
-        try:
-            yield
-        except Interrupted as error:
-            if outputs is None:
-                raise
-            msg = f"{error}; the same command goes on where this one was"
-            raise Interrupted(msg) from error
-        except (RefineError, Cancelled):
-            job.remove()
-            if outputs:
+def _opened(
+    folder: Path | str | None, digest: str, tiles: Sequence[Tile], *, overwrite: bool
+) -> Iterator[tuple[Folder, Outputs | None]]:
+    """Open the folder of a job for the block; remove it afterwards, unless the job can go on.
+
+    Parameters
+    ----------
+    folder : path-like or None
+        Where the tiles go; None writes nothing.
+    digest : str
+        Name of the job.
+    tiles : sequence of Tile
+    overwrite : bool
+
+    Yields
+    ------
+    Folder, Outputs or None
+        That of the job, and where each tile goes.
+    """
+    if folder is None:
+        with tempfile.TemporaryDirectory(prefix="refine-") as temporary:
+            job = Folder(Path(temporary))
+            with job.opened():
+                yield job, None
+        return
+    output = located(folder)
+    made = make_folder(output)
+    try:
+        near = Path.cwd() if isinstance(output, Url) else output.absolute()
+        job = Folder(near / f".refine-{digest}")
+        outputs = Outputs.of(job, tiles, output, overwrite=overwrite)
+        with job.opened():
+            try:
+                yield job, outputs
+            except Interrupted as error:
+                msg = f"{error}; the same command goes on where this one was"
+                raise Interrupted(msg) from error
+            except (RefineError, Cancelled):
+                job.remove()
                 outputs.discard()
-            raise
-        job.remove()
+                raise
+            job.remove()
+    finally:
+        with contextlib.suppress(OSError):  # those that hold something stay
+            for path in made:
+                path.rmdir()
 
 
 @dataclass
@@ -328,13 +348,6 @@ def _refuse_what_needs_all(budget: Budget, settings: Settings, *, absorb: bool) 
         msg = f"over tiles {settings.method} estimates no PSNR: choose auto or occlusion"
         raise RefineError(msg)
     budget.refuse_meaningless(settings.method, frustum=settings.frustum)
-
-
-def _remove_empty(folders: Sequence[Path]) -> None:
-    """Remove folders that are empty, the innermost first."""
-    with contextlib.suppress(OSError):
-        for folder in folders:
-            folder.rmdir()
 
 
 def _digest(

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
     from ..seeing.projection import Footprints, Gaussians
+    from ..seeing.scene import Scene
     from ..splats import Splats
     from ..work import Progress
     from .gaussians import SceneContext, StoredGaussians

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..absorb_splats import absorb_removed
 from ..absorbing import merge_field
 from ..absorbing.absorb import mergeable, reduced
 from ..absorbing.merge_field import Field, ViewSums
 from ..absorbing.merge_graph import MergeGraph
-from ..pipeline import absorb_removed
 from ..scores import Scores
 from ..seeing.measuring import Measured
 from ..splats import joined
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..scene import Scene
+    from ..seeing.scene import Scene
     from ..splats import Splats
     from ..task import Settings
     from ..views import ViewSet
@@ -105,17 +106,17 @@ class StageContext:
         starts = np.cumsum([0, *map(len, self.sources)])
         edges = np.searchsorted(rows, starts)
         for number, source in enumerate(self.sources):
-            mine = rows[edges[number] : edges[number + 1]] - starts[number]
-            if not len(mine):
+            places = rows[edges[number] : edges[number + 1]] - starts[number]
+            if not len(places):
                 continue
-            tables.append(source.splats().take(mine))
+            tables.append(source.splats().take(places))
             if isinstance(source, Region):
                 arrays = source.folder.load(source.index, ("origin", "members"))
-                origins.append(arrays["origin"][mine])
-                members.append(arrays["members"][mine])
+                origins.append(arrays["origin"][places])
+                members.append(arrays["members"][places])
             else:
-                origins.append(mine + starts[number])
-                members.append(np.ones(len(mine), np.int64))
+                origins.append(places + starts[number])
+                members.append(np.ones(len(places), np.int64))
         return packed(joined(tables)), np.concatenate(origins), np.concatenate(members)
 
 
@@ -163,14 +164,14 @@ class GatherRegion:
         table, origin, members = context.gathered(rows)
         splats = unpacked(table)
         places = mergeable(splats, context.scene, np.zeros(len(rows), np.bool_))
-        found = merge_field.unallowed(
+        unallowed = merge_field.unallowed(
             splats, places, context.views, context.scene, ViewSums(*sums),
             progress=progress, threads=threads,
         )  # fmt: skip
         arrays = dict(zip(_GATHERED, (table, origin, members, places), strict=True))
-        arrays |= {"mass": found.mass, "seen_by": found.seen}
-        context.folder.save(self.index, arrays | vars(found.field))
-        return found.seen_and_whole()
+        arrays |= {"mass": unallowed.mass, "seen_by": unallowed.seen}
+        context.folder.save(self.index, arrays | vars(unallowed.field))
+        return unallowed.seen_and_whole()
 
 
 @dataclass(frozen=True)
@@ -243,15 +244,7 @@ class AbsorbRegion:
     ) -> NDArray[np.int64]:
         folder = context.folder
         arrays = folder.load(self.index, (*_GATHERED, "sums"))
-
-        def graph() -> MergeGraph:
-            priced = folder.load(self.index, (*_FIELD, *_PRICED)).values()
-            *field, contribution, error, first, second, cost = priced
-            return MergeGraph.connected_by(
-                replace(Field(*field), contribution=contribution, error=error),
-                context.scene, context.factor, (first, second, cost), threads=threads,
-            )  # fmt: skip
-
+        graph = partial(self._graph, context, threads)
         protected = np.zeros(len(arrays["gathered"]), np.bool_)
         with np.errstate(under="ignore"):
             left, keep, taken, expected = reduced(
@@ -271,6 +264,15 @@ class AbsorbRegion:
             },
         )
         return np.array(len(left))
+
+    def _graph(self, context: StageContext, threads: int | None) -> MergeGraph:
+        """Return the graph that `PriceRegion` saved."""
+        priced = context.folder.load(self.index, (*_FIELD, *_PRICED)).values()
+        *field, contribution, error, first, second, cost = priced
+        return MergeGraph.connected_by(
+            replace(Field(*field), contribution=contribution, error=error),
+            context.scene, context.factor, (first, second, cost), threads=threads,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -347,15 +349,21 @@ class SettleUnit:
         origin, place, changed = (folder.mapped(name) for name in SURVIVORS)
         end = self.begin + len(self.unit)
         here = slice(*np.searchsorted(origin, (self.begin, end)).tolist())
-        rows, mine = origin[here] - self.begin, changed[here]
+        rows, changed_here = origin[here] - self.begin, changed[here]
         keep = np.zeros(len(self.unit), np.bool_)
         keep[rows] = True
-        starts, at = np.cumsum([0, *map(len, self.regions)]), place[here][mine]
-        region = np.searchsorted(starts, at, side="right") - 1
-        columns = self.regions[0].table().shape[1] if self.regions else 0
-        became = np.empty((len(at), columns))
-        for index in np.unique(region).tolist():
-            of_region = region == index
-            became[of_region] = self.regions[index].table()[at[of_region] - starts[index]]
-        folder.save(self.unit.index, {"changed": rows[mine], "became": became})
+        folder.save(
+            self.unit.index,
+            {"changed": rows[changed_here], "became": self._table(place[here][changed_here])},
+        )
         return save_kept(self.unit, folder, keep)
+
+    def _table(self, places: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the table of some survivors, given their places among those of all regions."""
+        starts = np.cumsum([0, *map(len, self.regions)])
+        region = np.searchsorted(starts, places, side="right") - 1
+        table = np.empty((len(places), self.regions[0].table().shape[1] if self.regions else 0))
+        for index in np.unique(region).tolist():
+            here = region == index
+            table[here] = self.regions[index].table()[places[here] - starts[index]]
+        return table

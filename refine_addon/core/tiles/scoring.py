@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..pipeline import with_quality
-from ..scene import Scene, principal_axes
+from ..score_splats import with_quality
 from ..scoring import auto
 from ..scoring.occlusion import FIRST_END, PRIOR, OcclusionScoring
+from ..seeing.scene import Scene, principal_axes
 from ..work import Progress, part
 from .closed_form import by_closed_form
 from .gaussians import SceneContext, SumMoments, store_gaussians
@@ -87,12 +87,12 @@ def by_occlusion(
     by_auto = settings.method == "auto"
     groups = auto.groups_of(closed_form.views) if by_auto else None
     scoring = TileScoring(closed_form, units, settings.occlusion, groups, runner.part(0.0, 0.2))
-    ahead = runner.part(0.2, 0.98).progress
+    progress = runner.part(0.2, 0.98).progress
     with np.errstate(under="ignore"):
         if by_auto:
-            scores = auto.finish(scoring, settings.tolerance, settled=settled, progress=ahead)
+            scores = auto.finish(scoring, settings.tolerance, settled=settled, progress=progress)
         else:
-            scores = scoring.finish(ahead, settled)
+            scores = scoring.finish(progress, settled)
     return scoring.save(scores, runner.part(0.98, 1.0).progress)
 
 

@@ -58,8 +58,8 @@ def file_key(path: Path | Url) -> Hashable:
     if not name.startswith(_LOCAL):
         return name
     with _explained(path, "cannot be read"):
-        found = Path(name.removeprefix(_LOCAL)).stat()
-    return (found.st_dev, found.st_ino) if found.st_ino else name
+        status = Path(name.removeprefix(_LOCAL)).stat()
+    return (status.st_dev, status.st_ino) if status.st_ino else name
 
 
 def state(path: Path | Url) -> tuple[int, int | str]:
@@ -72,8 +72,8 @@ def state(path: Path | Url) -> tuple[int, int | str]:
     """
     with _explained(path, "cannot be read"):
         if not isinstance(path, Url):
-            found = path.stat()
-            return found.st_size, found.st_mtime_ns
+            status = path.stat()
+            return status.st_size, status.st_mtime_ns
         system, inner = _opened(path)
         system.invalidate_cache()
         facts = system.info(inner)
@@ -83,12 +83,12 @@ def state(path: Path | Url) -> tuple[int, int | str]:
         if facts.get("size") is None:
             msg = f"{path}: the server does not say how long it is, which a tile needs"
             raise RefineError(msg)
-        told = {
+        lasting = {
             name: str(fact)
             for name, fact in facts.items()
             if not any(word in name.lower() for word in _FLEETING)
         }
-        return int(facts["size"]), repr(sorted(told.items()))
+        return int(facts["size"]), repr(sorted(lasting.items()))
 
 
 def beginning(url: Url, size: int, whole: int) -> bytes:

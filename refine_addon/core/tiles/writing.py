@@ -60,18 +60,18 @@ class WriteTile:
 
     def run(self, folder: Folder, _progress: Progress, _threads: int | None) -> int:
         """Write the file, unless it is there; return its bytes."""
-        made, name = folder.tiles / self.tile.name, f"{self.number:06d}.written"
+        waiting_file, name = folder.tiles / self.tile.name, f"{self.number:06d}.written"
         done, size = folder.noted(name)
-        if not (done and made.exists()):
-            size = self._write(folder, made)
+        if not (done and waiting_file.exists()):
+            size = self._write(folder, waiting_file)
             folder.note(name, np.array(size))
         if self.url is not None:
-            storage.upload(made, self.url)
+            storage.upload(waiting_file, self.url)
         return int(size)
 
-    def _write(self, folder: Folder, made: Path) -> int:
+    def _write(self, folder: Folder, waiting_file: Path) -> int:
         tile = self.tile
-        with folder.writing(made) as stream:
+        with folder.writing(waiting_file) as stream:
             stream.write(with_count(header_of(tile), self.kept))
             for beside in bytes_of(tile, tile.header, tile.begin):
                 stream.write(beside.data)
@@ -214,6 +214,6 @@ class Outputs:
 def _state(path: Path | Url) -> tuple[int, int]:
     """Return the bytes of a file, and on a disk the time of its last change, ns."""
     if isinstance(path, Path):
-        found = path.stat()
-        return found.st_size, found.st_mtime_ns
+        status = path.stat()
+        return status.st_size, status.st_mtime_ns
     return storage.size_of(path) or 0, 0

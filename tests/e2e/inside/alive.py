@@ -194,9 +194,9 @@ class Gate:
 
     def __init__(self) -> None:
         self.running = importlib.import_module(f"{extension.MODULE}.ui.running")
-        pipeline = importlib.import_module(f"{extension.MODULE}.core.pipeline")
+        scoring = importlib.import_module(f"{extension.MODULE}.core.score_splats")
         work = importlib.import_module(f"{extension.MODULE}.core.work")
-        self.opened, score = threading.Event(), pipeline.score
+        self.opened, score = threading.Event(), scoring.score
 
         def held(splats: Any, views: Any, settings: Any, *, progress: Any, **options: Any) -> Any:
             step = 0
@@ -205,7 +205,7 @@ class Gate:
                 work.report(progress, min(0.2 + 0.0005 * step, 0.9), "looking")
             return score(splats, views, settings, progress=progress, **options)
 
-        pipeline.score = held
+        scoring.score = held
 
     def refining(self) -> bool:
         """Tell whether the closed form's scores are shown and being refined."""

@@ -1,4 +1,4 @@
-"""What panels say of the scene, asked once until the scene changes, not at each draw."""
+"""What panels say of the scene, computed once until the scene changes, not at each draw."""
 
 from __future__ import annotations
 
@@ -15,24 +15,23 @@ Answer = TypeVar("Answer")
 _answers: dict[Hashable, Any] = {}
 
 _EVENTS = ("depsgraph_update_post", "frame_change_post", "undo_post", "redo_post", "load_post")
-"""After these anything may be otherwise. A change of the settings is one of them too."""
-
+"""Handlers that are called after anything changed, the settings too."""
 
 _NOT_SETTINGS = {"rna_type", "name"}  # of every group of properties
 
 
-def answer(what: Hashable, context: bpy.types.Context, ask: Callable[[], Answer]) -> Answer:
-    """Return what `ask` answered last of the active object and the settings, if nothing changed.
+def cached(what: Hashable, context: bpy.types.Context, compute: Callable[[], Answer]) -> Answer:
+    """Return what `compute` returns of the active object and the settings, until anything changes.
 
-    What a script changes without telling Blender, such as a custom property, counts from the next
-    change on.
+    What a script changes without telling Blender, such as a custom property, is seen after the next
+    change.
 
     Parameters
     ----------
     what : hashable
-        The question, apart from the object and the settings.
+        Names the value, beside the object and the settings.
     context : bpy.types.Context
-    ask : callable
+    compute : callable
         Reads the scene, the active object and the panel's settings, and nothing else.
     """
     obj, settings = context.object, context.scene.refine
@@ -40,7 +39,7 @@ def answer(what: Hashable, context: bpy.types.Context, ask: Callable[[], Answer]
     values = repr([getattr(settings, name) for name in names if name not in _NOT_SETTINGS])
     key = (what, context.scene.session_uid, obj and obj.session_uid, values)
     if key not in _answers:
-        _answers[key] = ask()
+        _answers[key] = compute()
     return _answers[key]
 
 

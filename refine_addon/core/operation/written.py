@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..affine import is_uniform, transformed
+from ..estimate.psnr import psnr_against
 from ..formats.registry import format_named, read_written
-from .psnr import psnr_against
 
 if TYPE_CHECKING:
     from pathlib import Path

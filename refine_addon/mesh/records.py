@@ -1,4 +1,4 @@
-"""What custom properties of a mesh say, as JSON."""
+"""Records of how data came to be: custom properties that hold JSON."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 
 
 @lru_cache(maxsize=16)
-def parsed(text: str) -> Any:  # noqa: ANN401 - whatever was noted
-    """Return a note as values, which nobody may change: panels ask whenever they are drawn.
+def parsed(text: str) -> Any:  # noqa: ANN401 - whatever was recorded
+    """Return a record as values, which nobody may change: panels ask whenever they are drawn.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What ``prune --object`` does: an object as a source and a sink of `core.operation`."""
+"""What the command does with an object: a source and a sink of `core.operation`."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from ..core.errors import RefineError
 from ..core.operation.files import FileSink
 from ..core.operation.loaded import Loaded, RowSizes
 from ..core.operation.run import run
+from ..core.operation.score import ScoreSink
 from ..core.work import Progress, silent
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from ..core.formats.format import Format
     from ..core.operation.prune import PruneRequest
     from ..core.operation.run import Runtime, Written
+    from ..core.operation.score import ScoreRequest
     from ..core.task import Result
 
 
@@ -71,9 +73,46 @@ def prune_object(
     """
     checked = check(find(name))
     save = save and not request.dry_run
-    source = ObjectSource(checked, request, demands + Demands(zones=tuple(request.zones)), save)
+    # Where the scale is uneven there are no pictures, for which it is not refused.
+    harmonics = True if request.absorb else None if request.compares_pictures else False
+    demands += Demands(zones=tuple(request.zones))
+    source = ObjectSource(checked, demands, harmonics=harmonics, reusable=save)
     file = FileSink(output, overwrite=request.overwrite, dry_run=request.dry_run)
     return run(source, request, ObjectSink(checked, request, file, save), progress=progress).report
+
+
+def score_object(
+    name: str,
+    request: ScoreRequest,
+    demands: Demands = NONE,
+    *,
+    output: Path,
+    progress: Progress = silent,
+) -> dict[str, Any]:
+    """Score an object of the open scene, and write it to a PLY; nothing in the scene changes.
+
+    Parameters
+    ----------
+    name, demands, progress
+        See `prune_object`.
+    request : ScoreRequest
+        What is asked; its zones count besides those of `demands`.
+    output : Path
+        The file to make.
+
+    Returns
+    -------
+    dict
+        The report, as of `refine_addon.core.score_file`.
+
+    Raises
+    ------
+    RefineError
+        See `refine_addon.core.operation.run` and `ObjectSource`; also if there is no such object.
+    """
+    source = ObjectSource(check(find(name)), demands + Demands(zones=tuple(request.zones)))
+    sink = ScoreSink(output, overwrite=request.overwrite)
+    return run(source, request, sink, progress=progress).report
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,17 +122,18 @@ class ObjectSource:
     Attributes
     ----------
     checked : SplatObject
-    request : PruneRequest
     demands : Demands
         What must stay and what must go.
+    harmonics : bool or None
+        Whether to bring view-dependent colour along; see `gather`.
     reusable : bool
         Whether the scores are kept.
     """
 
     checked: SplatObject
-    request: PruneRequest
     demands: Demands
-    reusable: bool
+    harmonics: bool | None = False
+    reusable: bool = False
 
     def read(self, form: Format | None) -> Loaded:
         """Read the object; the frame of the views is the world.
@@ -105,18 +145,16 @@ class ObjectSource:
         """
         checked = self.checked
         row, fixed = mesh_attributes.file_size(checked)
-        # Where the scale is uneven there are no pictures, for which it is not refused.
-        seen = None if self.request.compares_pictures else False
         return Loaded(
             name=f"{bpy.data.filepath}#{checked.obj.name}",
             bytes=row * len(checked) + fixed,
-            splats=gather(checked, whole=self.request.absorb or seen),
+            splats=gather(checked, whole=self.harmonics),
             forced=self.demands.forced(checked),
             sizes=self._sizes(form) if form else RowSizes(row, row, fixed),
             stored=mesh_attributes.stored_columns(checked),
             file=lambda: mesh_attributes.file_from_object(checked),
             matrix=world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get()),
-            remarks=tuple(modifier_notes(checked.obj)),
+            notes=tuple(modifier_notes(checked.obj)),
             reusable=self.reusable,
         )
 

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .work import chunks
+from ..work import chunks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
-    from .splats import Splats
-    from .views import ViewSet
+    from ..splats import Splats
+    from ..views import ViewSet
 
 MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio: its multiples spread numbers that differ little."""

@@ -1,0 +1,158 @@
+"""What ``prune`` does and says."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import TYPE_CHECKING, Any
+
+from ..core import PruneRequest, picture_files, prune_file, prune_tiles
+from ..core.estimate.quality import UNSEEN, in_words
+from ..core.formats.registry import without_suffix
+from ..core.picture_files import PictureFiles
+from ..core.tiles.storage import located
+from . import zones
+from .options import budget, cleaning, settings
+from .words import by, sizes, written
+
+if TYPE_CHECKING:
+    import argparse
+    from pathlib import Path
+
+    from ..core import ViewSet
+    from ..core.tiles.workers import Workers
+    from .run import Run
+
+
+def prune(run: Run) -> None:
+    """Prune each input, all of them together, or an object."""
+    options = run.options
+    if options.object:
+        run.attempt(options.object, lambda: _prune_object(run))
+    elif options.together:
+        views, label = run.views(), f"{len(options.inputs)} tiles"
+        run.attempt(label, lambda: _prune_together(run, label, views))
+    else:
+        run.each(_prune_one)
+
+
+def _request(options: argparse.Namespace, views: ViewSet, name: str) -> PruneRequest:
+    """Return what is asked of a prune; `name` is the first part of the names of its pictures."""
+    pictures = None
+    if options.pictures is not None:
+        pictures = PictureFiles(options.pictures, name, options.overwrite)
+    return PruneRequest(
+        views,
+        budget(options),
+        settings(options),
+        zones=() if options.object else zones.of_files(options),
+        absorb=options.absorb,
+        cleaning=cleaning(options) if options.clean else None,
+        pictures=pictures,
+        overwrite=options.overwrite,
+        dry_run=options.dry_run,
+    )
+
+
+def _prune_one(run: Run, source: Path, output: Path | None, views: ViewSet) -> dict[str, Any]:
+    request = _request(run.options, views, without_suffix(source.name))
+    result = prune_file(source, output, request, progress=run.progress(source.name))
+    run.terminal.clear()
+    _say_result(run, str(source), result.report)
+    return result.report
+
+
+def _prune_together(run: Run, label: str, views: ViewSet) -> dict[str, Any]:
+    options = run.options
+    try:
+        with _workers(options) as workers:
+            done = prune_tiles(
+                options.inputs,
+                None if options.dry_run else options.output_dir,
+                views,
+                budget(options),
+                settings(options),
+                absorb=options.absorb,
+                overwrite=options.overwrite,
+                progress=run.progress(label),
+                workers=workers,
+            )
+    except KeyboardInterrupt:
+        run.terminal.clear()
+        if not options.dry_run:
+            run.terminal.say("the same command goes on where this one was")
+        raise
+    run.terminal.clear()
+    _say_result(run, label, done)
+    for tile in done["tiles"]:
+        share = (tile["before"] - tile["kept"]) / max(tile["before"], 1)
+        run.terminal.say(
+            f"  {located(tile['input']).name}: {tile['kept']:,} of {tile['before']:,} splats "
+            f"({share:.1%} removed), {sizes(tile['input_bytes'], tile['output_bytes'])}"
+        )
+    return done
+
+
+def _workers(options: argparse.Namespace) -> contextlib.AbstractContextManager[Workers | None]:
+    """Return who works on tiles; None for this process alone."""
+    if options.workers is None and not options.scheduler:
+        return contextlib.nullcontext()
+    from ..core.tiles.cluster import cluster  # noqa: PLC0415 - needs Dask
+
+    return cluster(options.workers, options.scheduler)
+
+
+def _prune_object(run: Run) -> dict[str, Any]:
+    from ..objects.operation import prune_object  # noqa: PLC0415 - needs Blender
+
+    options, name = run.options, run.options.object
+    request, demanded = _request(options, run.views(), name), zones.of_object(options)
+    done = prune_object(
+        name, request, demanded,
+        output=options.output, save=options.save, progress=run.progress(name),
+    )  # fmt: skip
+    run.terminal.clear()
+    _say_result(run, name, done)
+    return done
+
+
+def _say_result(run: Run, label: str, done: dict[str, Any]) -> None:
+    splats, views, files = done["splats"], done["views"], done["files"]
+    verb = "would keep" if run.options.dry_run else "kept"
+    share = splats["removed"] / splats["before"]
+    parts = [
+        f"{verb} {splats['kept']:,} of {splats['before']:,} splats ({share:.1%} removed)"
+        + written(splats),
+        sizes(files["input_bytes"], files["output_bytes"]),
+        by(views),
+        f"{done['timings']['total_s']:.2f} s",
+    ]
+    target = f" -> {files['output']}" if files["output"] else ""
+    run.terminal.say(f"{run.named(label)}: {', '.join(parts)}{target}")
+    run.say_cameras()
+    run.say_demanded(done)
+    cleaned = sum(count for count in done.get("cleaned", {}).values() if isinstance(count, int))
+    run.say_unseen(splats["unseen"], splats["before"] - cleaned - splats["forced"])
+    if "cleaned" in done:
+        run.terminal.say(f"  cleaned: {done['cleaned']['words']}")
+    quality = _quality(done)
+    if quality:
+        run.terminal.say(f"  quality: {quality}")
+    if "pictures" in done:
+        measured = picture_files.in_words(done["pictures"])
+        run.terminal.say(f"  pictures: {measured} -> {run.options.pictures}")
+    run.terminal.notes(done["notes"])
+
+
+def _quality(done: dict[str, Any]) -> str:
+    """Return what is estimated of the pictures, in words; "" where nothing is."""
+    psnr, absorbed = done["estimated_psnr"], done["estimated_psnr_absorbed"]
+    if psnr is None:
+        return ""
+    words = f"{in_words(psnr)} in these views"
+    if done.get("written_psnr") is not None:
+        words += f", {in_words(done['written_psnr'])} as written"
+    if "absorbed" in done or psnr > UNSEEN:
+        return words
+    if absorbed is None:
+        return f"{words}; {done['estimated_psnr_absorbed_note']}"
+    return f"{words}; with --absorb {in_words(absorbed)}"

@@ -1,0 +1,139 @@
+"""What all subcommands do alike: go from input to input, say and note what came of each."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..core import RefineError
+from ..core.errors import printable
+from ..core.pace import Pace
+from ..core.urls import Url
+from ..core.whole_file import new_folder
+from . import report
+from .cameras import deciding
+from .terminal import Terminal, complain, described
+from .words import left_unseen
+from .zones import words
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable
+
+    from ..core import ViewSet
+    from ..core.work import Progress
+
+
+class Run:
+    """What one call of the command did so far.
+
+    Parameters
+    ----------
+    options : argparse.Namespace
+
+    Attributes
+    ----------
+    options : argparse.Namespace
+    terminal : Terminal
+    entries : list of dict
+        Of the report, one an input.
+    failed : bool
+        Whether an input failed.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.options = options
+        self.terminal = Terminal(quiet=options.quiet)
+        self.entries: list[dict[str, Any]] = []
+        self.failed = False
+        self._started = time.perf_counter()
+        each = [_size(path) for path in options.inputs]
+        together = getattr(options, "together", False)
+        self._pace = Pace([sum(each)] if together else each or [0])
+        self._cameras: dict[str, Any] = {}
+
+    def views(self) -> ViewSet:
+        """Return the views that decide, and note where they are from for the report."""
+        views, facts = deciding(self.options)
+        self._cameras = {"cameras": facts}
+        return views
+
+    def named(self, name: str) -> str:
+        """Return what to call the file under way; see `Pace.named`."""
+        return self._pace.named(name)
+
+    def progress(self, name: str) -> Progress:
+        """Return what draws how much of the file under way is done, and the time left."""
+        return self.terminal.progress(self.named(name), self._pace.left)
+
+    def say_cameras(self) -> None:
+        """Say which cameras of the scene decided; those of a file were named by the user."""
+        if words := self._cameras["cameras"].get("words"):
+            self.terminal.say(f"  cameras: {words}")
+
+    def say_unseen(self, unseen: int, scored: int) -> None:
+        """Say how many of the splats that were scored no view holds, if any."""
+        if unseen:
+            self.terminal.say(f"  {left_unseen(unseen, scored)}")
+
+    def say_demanded(self, done: dict[str, Any]) -> None:
+        """Say what had to stay and go, by the report of an input."""
+        if said := words(done):
+            self.terminal.say(f"  {said}")
+
+    def each(self, work: Callable[[Run, Path, Path | None, ViewSet], dict[str, Any]]) -> None:
+        """Do the work of every input: with its output, if there is to be one, and the views."""
+        options, views = self.options, self.views()
+        folder = None if getattr(options, "dry_run", False) else options.output_dir
+        with new_folder(folder) if folder else contextlib.nullcontext():
+            for source in options.inputs:
+                output = options.output
+                if options.output_dir:
+                    output = options.output_dir / source.name
+                self.attempt(
+                    str(source),
+                    lambda source=source, output=output: work(self, source, output, views),
+                )
+
+    def attempt(self, label: str, work: Callable[[], dict[str, Any]]) -> None:
+        """Do one input's work; note its error, so that the others go on."""
+        self._pace.next()
+        try:
+            self.entries.append({"status": "done", **work(), **self._cameras})
+        except (RefineError, OSError, MemoryError) as error:
+            self.failed = True
+            message = str(error) if isinstance(error, RefineError) else described(error)
+            # What is wrong with the splats is said without the file.
+            files = (Path(label), getattr(self.options, "output", None))
+            if not any(file and printable(file.name) in message for file in files):
+                message = f"{label}: {message}"
+            self.entries.append({"status": "failed", "input": label, "error": message})
+            complain(message)
+
+    def finish(self) -> None:
+        """Write the report, where one is wanted."""
+        options = self.options
+        if options.report is None:
+            return
+        writes = options.command != "info" and not getattr(options, "dry_run", False)
+        if options.command == "clean":
+            writes = bool(options.output or options.output_dir)
+        report.write(
+            options.report,
+            self.entries,
+            time.perf_counter() - self._started,
+            overwrite=options.overwrite,
+            splats=writes and any(entry["status"] == "done" for entry in self.entries),
+        )
+
+
+def _size(path: Path | Url) -> int:
+    """Return the bytes of a file, 0 where reading it will fail anyway, or a URL is not asked."""
+    if isinstance(path, Url):
+        return 0
+    try:
+        return path.stat().st_size
+    except (OSError, ValueError):
+        return 0

@@ -1,0 +1,58 @@
+"""What ``score`` does and says."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from ..core import ScoreRequest, score_file
+from . import zones
+from .options import settings
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ..core import ViewSet
+    from .run import Run
+
+
+def score(run: Run) -> None:
+    """Score the input, or an object."""
+    options = run.options
+    if options.object:
+        run.attempt(options.object, lambda: _score_object(run))
+        return
+    views, source = run.views(), options.inputs[0]
+    run.attempt(str(source), lambda: _score_file(run, source, views))
+
+
+def _score_file(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
+    options = run.options
+    request = ScoreRequest(views, settings(options), zones.of_files(options), options.overwrite)
+    progress = run.progress(source.name)
+    done = score_file(source, options.output, request, progress=progress).report
+    return _said(run, str(source), done)
+
+
+def _score_object(run: Run) -> dict[str, Any]:
+    from ..objects.operation import score_object  # noqa: PLC0415 - needs Blender
+
+    options, name = run.options, run.options.object
+    request = ScoreRequest(run.views(), settings(options), overwrite=options.overwrite)
+    demands, progress = zones.of_object(options), run.progress(name)
+    done = score_object(name, request, demands, output=options.output, progress=progress)
+    return _said(run, name, done)
+
+
+def _said(run: Run, label: str, done: dict[str, Any]) -> dict[str, Any]:
+    """Say what was done, and return the report of it."""
+    run.terminal.clear()
+    splats = done["splats"]
+    run.terminal.say(
+        f"{label}: scored {splats['before']:,} splats by {done['views']['used']} views "
+        f"-> {run.options.output}"
+    )
+    run.say_cameras()
+    run.say_demanded(done)
+    run.say_unseen(splats["unseen"], splats["before"] - splats["forced"])
+    run.terminal.notes(done["notes"])
+    return done

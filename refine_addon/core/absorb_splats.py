@@ -1,0 +1,214 @@
+"""Absorbing down to a budget: how many survive, what is deleted first, what is measured when."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .absorbing import absorb as absorbing
+from .absorbing.merging import ViewSums
+from .estimate.psnr import psnr_against
+from .estimate.quality import left_to_lose
+from .score_splats import score_once, with_quality
+from .scoring import occlusion
+from .selection import Budget, quality_of, select
+from .task import DEFAULTS, Settings
+from .work import Progress, part, silent
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .absorbing.absorb import Absorbed
+    from .scores import Scores
+    from .seeing.measuring import Measured
+    from .splats import Splats
+    from .task import Task
+    from .views import ViewSet
+
+TRIES = 3
+"""How often absorbing is done at most to reach a PSNR."""
+
+CLOSE = 0.7
+"""How close to a PSNR the estimate for a result must be, dB, or absorbing is done again."""
+
+FIRST = 0.1
+"""Share of the splats that is deleted before any are merged: those with the lowest scores, whose
+deletion changes the pictures less than any merge."""
+
+PARTS = 2
+"""While splats are merged, they are measured again in one of so many parts of the views, which take
+turns; what the other views see is carried over."""
+
+
+def absorb_task(
+    task: Task,
+    count: int,
+    known: tuple[Scores, Measured] | None,
+    progress: Progress,
+    threads: int | None,
+) -> tuple[Absorbed, float | None]:
+    """Return what absorbing makes of a task, and the estimated PSNR of it, dB.
+
+    Parameters
+    ----------
+    task : Task
+    count : int
+        How many survive, unless the budget is a PSNR: then as few as keep it.
+    known : tuple of Scores and Measured, optional
+        See `absorb_removed`.
+    progress : callable
+    threads : int, optional
+
+    Returns
+    -------
+    absorbed : Absorbed
+    psnr : float or None
+        None if too little is seen.
+    """
+    goal, start = task.budget.psnr, 0.0 if known else 0.2
+    if known is None:
+        splats, views = task.scene()
+        known = score_once(
+            splats, views, task.settings, part(progress, 0.0, start), threads,
+            curve=goal is not None,
+        )  # fmt: skip
+    progress = part(progress, start, 1.0)
+    if goal is None:
+        return _absorb_to_count(task, count, known, progress, threads)
+    return _absorb_to_psnr(task, goal, known, progress, threads)
+
+
+def _absorb_to_count(
+    task: Task,
+    count: int,
+    known: tuple[Scores, Measured],
+    progress: Progress,
+    threads: int | None,
+) -> tuple[Absorbed, float | None]:
+    """Return what so many survivors become, and the estimated PSNR of it, dB."""
+    splats, views = task.scene()
+    origin = task.origin
+    absorbed = absorb_removed(
+        splats, views, count, task.settings, known=known, protected=task.protected,
+        began=None if origin is None else origin.count,
+        progress=part(progress, 0.0, 0.95), threads=threads,
+    )  # fmt: skip
+    truth = known[0].ray_sample if origin is None else origin.ray_sample
+    if truth is None:
+        return absorbed, None
+    used = views.spread(task.settings.views)
+    ahead = part(progress, 0.95, 1.0)
+    return absorbed, psnr_against(truth, absorbed.splats, used, progress=ahead, threads=threads)
+
+
+def _absorb_to_psnr(
+    task: Task,
+    goal: float,
+    known: tuple[Scores, Measured],
+    progress: Progress,
+    threads: int | None,
+) -> tuple[Absorbed, float | None]:
+    """Return the result with as few survivors as keep a PSNR, dB.
+
+    What a number of survivors reaches is read from the curve of the scores, and put right by what
+    the last try reached.
+    """
+    scores, total = known[0], len(task.scene()[0])
+    if scores.quality is None:
+        scores = with_quality(scores, protected=task.protected, threads=threads)
+    curve = quality_of(scores)
+    # By how much results are closer than the curve expects, dB.
+    offset = 0.0 if task.origin is None else goal - left_to_lose(goal, task.origin.psnr)
+    best: tuple[Absorbed, float] | None = None
+    for number in range(TRIES):
+        count = total - math.floor(curve.share(goal - offset, absorb=True) * total)
+        ahead = part(progress, number / TRIES, (number + 1) / TRIES)
+        absorbed, psnr = _absorb_to_count(task, count, known, ahead, threads)
+        if psnr is None:
+            return absorbed, None
+        if best is None or abs(psnr - goal) < abs(best[1] - goal):
+            best = absorbed, psnr
+        if abs(psnr - goal) <= CLOSE:
+            break
+        offset = psnr - curve.at(1.0 - len(absorbed.splats) / total, absorb=True)
+    assert best is not None  # noqa: S101 - every try gives one
+    return best
+
+
+def absorb_removed(  # noqa: PLR0913 - as `pipeline.prune`
+    splats: Splats,
+    views: ViewSet,
+    count: int,
+    settings: Settings = DEFAULTS,
+    *,
+    known: tuple[Scores, Measured] | None = None,
+    began: int | None = None,
+    protected: NDArray[np.bool_] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Absorbed:
+    """Reduce splats to `count` survivors that absorb the others.
+
+    Parameters
+    ----------
+    splats, views, settings, progress, threads
+        See `score_splats.score`; the occlusion settings are used for every method.
+    count : int
+        How many survive.
+    known : tuple of Scores and Measured, optional
+        The results of `occlusion.score_once` for these splats and views, if known.
+    began : int, optional
+        How many splats there were before some of them became these by absorbing. What is deleted
+        first, and how patient merging is, go by the share that has gone of those.
+    protected : (N,) bool, optional
+        Splats that are neither removed nor changed.
+
+    Returns
+    -------
+    Absorbed
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `score_splats.score`.
+    """
+    used, total = views.spread(settings.views), len(splats)
+    scores, measured = known or score_once(
+        splats, views, settings, part(progress, 0.0, 0.2), threads
+    )
+    began = total if began is None else began
+    # How many of all are deleted before any are merged, and how many of those are still there.
+    deleted = max(min(math.floor(FIRST * began), began - count), 0)
+    first = max(deleted - (began - total), 0)
+    # Undrawable splats have the lowest scores, so these go first.
+    rest = select(scores, Budget(keep=total - first), protected=protected)
+    # The deleted splats hid almost nothing, so the first stage need not measure again.
+    at_first = [ViewSums(measured.contribution[rest], measured.error[rest])]
+    del known, scores, measured
+    turns = itertools.count()
+
+    def measure(now: Splats, expected: ViewSums | None, ahead: Progress) -> ViewSums:
+        if expected is None:
+            return at_first.pop()
+        found, share = occlusion.measure_part(
+            now, used, settings.occlusion, next(turns), PARTS, progress=ahead, threads=threads
+        )
+        return ViewSums(
+            found.contribution + (1.0 - share) * expected.contribution,
+            found.error + (1.0 - share) * expected.error,
+        )
+
+    with np.errstate(under="ignore"):  # as in `score_splats.score`
+        absorbed = absorbing.absorb(
+            splats.take(rest), used, measure, count,
+            began=began - deleted, protected=None if protected is None else protected[rest],
+            progress=part(progress, 0.2, 1.0), threads=threads,
+        )  # fmt: skip
+    keep = np.zeros(total, np.bool_)
+    keep[np.flatnonzero(rest)[absorbed.keep]] = True
+    gone = total - int(np.count_nonzero(rest))
+    return replace(absorbed, keep=keep, deleted=absorbed.deleted + gone)

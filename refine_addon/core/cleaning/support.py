@@ -1,0 +1,388 @@
+"""How much of what the rays see stops near a splat, and how much goes on to what lies behind.
+
+A ray hits splats front to back, and each takes a share of the light that reaches it. Of the light
+that reaches a place, a share stops near that place, and the rest goes on. At a surface nearly all
+of it stops; at a floater most goes on::
+
+    support = light that stops near the place / light that stops there or behind
+
+A splat is hit where its density is highest along the ray, not at the depth of its centre, so that a
+large wall that is seen obliquely is a surface along all of it. Two hits are near each other if
+their nearness (1 / depth, in scene sizes) differs by less than `WINDOW` of it, or by `PARALLAX`:
+beyond, cameras a scene size apart see one move against the other.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from ..seeing import projection
+from ..seeing.cast import cast, depth_complexity, pixels
+from ..seeing.ray_sums import in_front
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..seeing.projection import Footprints, Gaussians
+    from ..seeing.rays import Rays
+    from ..seeing.scene import Scene
+    from ..views import View
+
+RAYS = 2500
+"""Rays of a view."""
+
+MAX_HITS = 1 << 20
+"""About how many hits the rays of a view may have; there are fewer rays in dense scenes."""
+
+WINDOW = 0.1
+"""Hits on a ray are near each other if their nearness differs by less than this share of it."""
+
+PARALLAX = 0.05
+"""They are as well if it differs by less than this, per scene size."""
+
+REACHED = 1e-3
+"""Hits that less of the light reaches tell nothing."""
+
+NOTHING = 0.02
+"""Where less of the light stops behind a place, there is nothing behind it."""
+
+SEEN = 0.1
+"""A view sees what lies at and behind a splat if this share of the light stops there."""
+
+PAST = 0.15
+"""A view sees past a splat if a lower share of the light stops near it."""
+
+_NEAREST = 0.2  # of the depth of its centre: as near as a ray may hit a splat
+_FRACTION = 0.999  # how much of the numbers from one ray to the next the places on a ray take
+_TINY = 1e-30  # replaces 0 as a divisor
+
+
+class Around(NamedTuple):
+    """What lies around r hits on their rays, as places among all hits, (r,) int64 each.
+
+    Attributes
+    ----------
+    first, last : (r,) int64
+        The first hit that is near, and the one behind the last that is.
+    end : (r,) int64
+        The end of the ray.
+    """
+
+    first: NDArray[np.int64]
+    last: NDArray[np.int64]
+    end: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """The h hits of the rays of one view on u Gaussians: ray by ray, near to far.
+
+    Attributes
+    ----------
+    hit : (u,) int64
+        The Gaussians that any ray hits.
+    width : (u,) float32
+        The longer standard deviation of their footprints, as a share of the image's longer side.
+    owner : (h,) int32
+        Which of them each hit is on.
+    alpha, transmittance, weight : (h,) float64
+        Alpha there, the share of the light that reaches it, and the share that it takes: their
+        product, or 0 where the Gaussian counts as absent.
+    ray : (h,) float64
+        The number of the ray.
+    key : (h,) float64
+        Ray plus place on it, 0 to 1; ascending.
+    window : (h,) float64
+        Hits on the same ray are near if their keys differ by at most this.
+    """
+
+    hit: NDArray[np.int64]
+    width: NDArray[np.float32]
+    owner: NDArray[np.int32]
+    alpha: NDArray[np.float64]
+    transmittance: NDArray[np.float64]
+    weight: NDArray[np.float64]
+    ray: NDArray[np.float64]
+    key: NDArray[np.float64]
+    window: NDArray[np.float64]
+
+    def around(self, rows: NDArray[np.int64]) -> Around:
+        """Return what lies around some hits on their rays."""
+        key, window, ray = self.key[rows], self.window[rows], self.ray[rows]
+        end = ray + (1.0 + _FRACTION) / 2.0
+        return Around(
+            np.searchsorted(self.key, np.maximum(key - window, ray)),
+            np.searchsorted(self.key, np.minimum(key + window, end), side="right"),
+            np.searchsorted(self.key, end),
+        )
+
+    def sums(self, rows: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return for each of `hit` the sum of values, (r,), of some hits, (u,)."""
+        return np.asarray(np.bincount(self.owner[rows], values, len(self.hit)), np.float64)
+
+
+def hits_of_view(
+    gaussians: Gaussians,
+    footprints: Footprints,
+    scene: Scene,
+    view: View,
+    number: int,
+    absent: NDArray[np.bool_],
+) -> Hits | None:
+    """Return what the rays of one view hit; None if nothing.
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    footprints : Footprints
+        Of these in the view.
+    scene : Scene
+    view : View
+    number : int
+        Of the view: each has its rays in other pixels.
+    absent : (M,) bool
+        Gaussians that take no light, though they are hit.
+    """
+    count = min(RAYS, MAX_HITS / max(depth_complexity(footprints, view), 1.0))
+    rays = cast(footprints, *pixels(view, number, count))
+    if not len(rays.ray):
+        return None
+    present = ~absent[rays.hit].take(rays.owner)  # (hits of the rays,)
+    _, counts = np.unique(rays.ray, return_counts=True)
+    log_front = in_front(rays.log_passed * present.astype(np.float64), counts)
+    reached = np.flatnonzero(log_front > math.log(REACHED))  # (h,)
+    place = np.empty(len(gaussians), np.int64)
+    place[footprints.index] = np.arange(len(footprints.index))
+    footprints = footprints.take(place[rays.hit])  # of the u that are hit
+    depth = _depths(gaussians.take(rays.hit), footprints, scene, view, rays, reached)
+    key, window = _keys(rays.ray[reached], 1.0 / depth)
+    order = np.argsort(key, kind="stable")
+    reached = reached[order]
+    alpha, transmittance = rays.alpha[reached].astype(np.float64), np.exp(log_front[reached])
+    return Hits(
+        rays.hit,
+        footprints.sigmas[0] / np.float32(max(view.width, view.height)),
+        rays.owner[reached],
+        alpha,
+        transmittance,
+        transmittance * alpha * present[reached],
+        rays.ray[reached].astype(np.float64),
+        key[order],
+        window[order],
+    )
+
+
+def _keys(
+    ray: NDArray[np.int32], nearness: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return `key` and `window` of hits, (h,) each, by their nearness, 1 / depth in scene sizes."""
+    scale = _FRACTION / float(nearness.max())
+    key = ray.astype(np.float64) + _FRACTION - scale * nearness
+    return key, scale * np.maximum(WINDOW * nearness, PARALLAX)
+
+
+def _depths(
+    gaussians: Gaussians,
+    footprints: Footprints,
+    scene: Scene,
+    view: View,
+    rays: Rays,
+    reached: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Return how deep rays hit splats, scene sizes, (h,): where the splats are densest on them.
+
+    Given the place in the image, the mean depth of a Gaussian is that of its centre plus
+    ``c' C^-1 d``, with C its covariance in the image, c that of image and depth, and d the step
+    from its centre. That is the sum of ``(c.a / s^2) (d.a / s^2)`` over the footprint's axes a, of
+    length s.
+
+    Parameters
+    ----------
+    gaussians, footprints : Gaussians, Footprints
+        The u that are hit.
+    scene, view
+    rays : Rays
+    reached : (h,) int64
+        Which of their hits.
+    """
+    means, covariances = (
+        values.astype(np.float64) for values in projection.in_camera(gaussians, scene, view)
+    )
+    x, y, z = means
+    with_depth = (  # (u,) each: covariance of column and row with the depth
+        view.fx / z * (covariances[2] - x / z * covariances[5]),
+        view.fy / z * (covariances[4] - y / z * covariances[5]),
+    )
+    owner, ray = rays.owner[reached], rays.ray[reached]
+    step = (  # (h,) each: from the splat's centre, pixels
+        rays.columns[ray % len(rays.columns)] + 0.5 - footprints.centers[0, owner],
+        rays.rows[ray // len(rays.columns)] + 0.5 - footprints.centers[1, owner],
+    )
+    longest = gaussians.largest.astype(np.float64)
+    depth = z[owner]
+    for axes, sigmas in zip((footprints.major, footprints.minor), footprints.sigmas, strict=True):
+        unit = axes / sigmas.astype(np.float64) ** 2  # (2, u)
+        slope = with_depth[0] * unit[0] + with_depth[1] * unit[1]  # (u,), for a step of one sigma
+        slope = slope.clip(-longest, longest)  # no splat is deeper than long
+        along = step[0] * unit[0][owner] + step[1] * unit[1][owner]  # (h,), in sigmas
+        depth = depth + slope[owner] * along
+    return np.asarray(np.maximum(depth, _NEAREST * z[owner]), np.float64)
+
+
+def own_support(hits: Hits) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the light that each of `hit` takes, and that times its support by others, (u,) each.
+
+    Others support it as they would if it were gone: then ``1 / (1 - alpha)`` times as much light
+    reaches what lies behind it.
+    """
+    every = np.arange(len(hits.key))
+    before = _running(hits.weight)
+    around = hits.around(every)
+    more = 1.0 / (1.0 - hits.alpha)
+    near = before[every] - before[around.first]
+    near += (before[around.last] - before[every + 1]) * more
+    behind = (before[around.end] - before[around.last]) * more
+    support = near / np.maximum(near + behind, _TINY)
+    support = np.where(behind > NOTHING * hits.transmittance, support, 1.0)
+    return hits.sums(every, hits.weight), hits.sums(every, hits.weight * support)
+
+
+@dataclass(frozen=True, eq=False)
+class Support:
+    """What views see of M Gaussians, all of them present.
+
+    Attributes
+    ----------
+    weight, supported : (M,) float64
+        The light that each takes, and that times its support by others; sums over views.
+    views : (M,) float64
+        In how many views the centre lies.
+    width : (M,) float64
+        The largest of `Hits.width`.
+    """
+
+    weight: NDArray[np.float64]
+    supported: NDArray[np.float64]
+    views: NDArray[np.float64]
+    width: NDArray[np.float64]
+
+    @classmethod
+    def zero(cls, count: int) -> Support:
+        """Return what no views see."""
+        return cls(*np.zeros((4, count)))
+
+    def add(self, footprints: Footprints, hits: Hits | None) -> None:
+        """Add what one view sees."""
+        self.views[footprints.index[footprints.inside]] += 1.0
+        if hits is not None:
+            weight, supported = own_support(hits)
+            self.weight[hits.hit] += weight
+            self.supported[hits.hit] += supported
+            self.width[hits.hit] = np.maximum(self.width[hits.hit], hits.width)
+
+    def merge(self, other: Support) -> None:
+        """Add what other views see."""
+        for name in ("weight", "supported", "views"):
+            getattr(self, name)[:] += getattr(other, name)
+        np.maximum(self.width, other.width, out=self.width)
+
+    def shares(self) -> NDArray[np.float64]:
+        """Return the share of its light that others support, (M,); 1 where no view sees it."""
+        lit = self.weight > 0.0
+        return np.where(lit, self.supported / np.where(lit, self.weight, 1.0), 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What views see of M Gaussians with all suspects gone; sums over views, for the suspects.
+
+    Attributes
+    ----------
+    near, behind : (M,) float64
+        Light that stops near their places, and behind them, times their alpha.
+    contrast : (M,) float64
+        The latter times the difference of colour between suspect and what lies behind.
+    views, past : (M,) float64
+        How many views see what lies at and behind it, and how many of them see past it.
+    """
+
+    near: NDArray[np.float64]
+    behind: NDArray[np.float64]
+    contrast: NDArray[np.float64]
+    views: NDArray[np.float64]
+    past: NDArray[np.float64]
+
+    @classmethod
+    def zero(cls, count: int) -> Evidence:
+        """Return the sums of no views."""
+        return cls(*np.zeros((5, count)))
+
+    def add(self, hits: Hits, suspects: NDArray[np.bool_], colors: NDArray[np.float32]) -> None:
+        """Add what one view sees.
+
+        Parameters
+        ----------
+        hits : Hits
+            With the suspects absent.
+        suspects : (M,) bool
+        colors : (M, 3) float32
+        """
+        rows = np.flatnonzero(suspects[hits.hit].take(hits.owner))
+        around = hits.around(rows)
+        before = _running(hits.weight)
+        near = before[around.last] - before[around.first]
+        behind = before[around.end] - before[around.last]
+        alpha = hits.alpha[rows]
+        mass, stops, passes = (
+            hits.sums(rows, alpha * values) for values in (np.ones_like(near), near, behind)
+        )
+        contrast = _contrast(hits, rows, around, behind, colors)
+        self.near[hits.hit] += stops
+        self.behind[hits.hit] += passes
+        self.contrast[hits.hit] += hits.sums(rows, alpha * behind * contrast)
+        sees = (stops + passes > SEEN * mass) & (mass > 0.0)
+        self.views[hits.hit[sees]] += 1.0
+        self.past[hits.hit[sees & (stops < PAST * (stops + passes))]] += 1.0
+
+    def merge(self, other: Evidence) -> None:
+        """Add the sums of other views."""
+        for item in fields(self):
+            getattr(self, item.name)[:] += getattr(other, item.name)
+
+
+def _contrast(
+    hits: Hits,
+    rows: NDArray[np.int64],
+    around: Around,
+    behind: NDArray[np.float64],
+    colors: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    """Return how much hits differ in colour from what lies behind them, (r,): root mean square.
+
+    Parameters
+    ----------
+    hits : Hits
+    rows : (r,) int64
+        Which of them.
+    around : Around
+        Of these.
+    behind : (r,) float64
+        Light that stops behind them.
+    colors : (M, 3) float32
+    """
+    squared = np.zeros(len(rows))
+    for channel in colors[hits.hit].T.astype(np.float64):
+        of_hits = channel.take(hits.owner)
+        before = _running(hits.weight * of_hits)
+        color = (before[around.end] - before[around.last]) / np.maximum(behind, _TINY)
+        squared += (of_hits[rows] - color) ** 2
+    return np.where(behind > NOTHING, np.sqrt(squared / 3.0), 0.0)
+
+
+def _running(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the sum of the values before each place, and of all, (h + 1,)."""
+    return np.append(0.0, np.cumsum(values))

@@ -1,0 +1,188 @@
+"""Scoring splats: by any method, with what there is to say of the views."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .estimate.alignment import alignment
+from .estimate.psnr import quality_curve
+from .scoring import auto, closed_form, occlusion
+from .seeing.ray_sample import validation_rays
+from .task import DEFAULTS, Settings
+from .volumes import refuse_all
+from .work import Progress, part, silent
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from .scores import Scores
+    from .seeing.measuring import Measured
+    from .splats import Splats
+    from .views import ViewSet
+
+
+def score(  # noqa: PLR0913 - as `pipeline.prune`
+    splats: Splats,
+    views: ViewSet,
+    settings: Settings = DEFAULTS,
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
+    quality: bool = False,
+    settled: int | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Scores:
+    """Score splats by how much each matters to the pictures of the views.
+
+    Parameters
+    ----------
+    splats : Splats
+        In the frame of the views.
+    views : ViewSet
+    settings : Settings
+    protected : (N,) bool, optional
+        Splats that are not removed: no score depends on them, the estimate of the pictures' quality
+        does.
+    removed : (N,) bool, optional
+        Splats that are to go in any case: the others are scored as if they had gone, and they
+        score 0; see `Task`.
+    quality : bool
+        Whether the scores get an estimate of the pictures' quality even if that takes longer than
+        scoring by the closed form; scores by occlusion always have one.
+    settled : int, optional
+        How many splats must be in their final order, those that are `removed` left out: scoring by
+        occlusion takes less time where these are few. By default all.
+    progress : callable, optional
+        ``progress(fraction, what)``; returning ``False`` cancels.
+    threads : int, optional
+
+    Returns
+    -------
+    Scores
+
+    Raises
+    ------
+    RefineError
+        If there are no splats, if none of them can be drawn, or if no view sees any.
+    Cancelled
+        If `progress` answers ``False``.
+    """
+    if removed is not None and removed.any():
+        refuse_all(removed)
+        rest = ~removed
+        found = score(
+            splats.take(rest), views, settings,
+            protected=None if protected is None else protected[rest],
+            quality=quality, settled=settled, progress=progress, threads=threads,
+        )  # fmt: skip
+        return found.for_all(rest)
+    whole, estimates = progress, quality or settings.estimates
+    progress = part(progress, 0.0, 0.9 if estimates else 1.0)
+    # Numbers that underflow to 0 are negligible in all sums.
+    with np.errstate(under="ignore"):
+        used = views.spread(settings.views)
+        if settings.method == "occlusion":
+            scores = occlusion.score(
+                splats, used, settings.occlusion,
+                settled=settled, progress=progress, threads=threads,
+            )  # fmt: skip
+        elif settings.method == "auto":
+            scores = auto.score(
+                splats, used, settings.tolerance, settings.occlusion,
+                settled=settled, progress=progress, threads=threads,
+            )  # fmt: skip
+        else:
+            scores = closed_form.score(
+                splats, used, settings.closed_form, progress=progress, threads=threads
+            )
+        if quality and scores.ray_sample is None:
+            rays = validation_rays(splats, used, progress=part(whole, 0.9, 0.95), threads=threads)
+            scores = replace(scores, ray_sample=rays)
+    scores = _with_views(scores, splats, views, used, part(whole, 0.95, 0.95), threads)
+    ahead = part(whole, 0.95, 1.0)
+    return with_quality(scores, protected=protected, progress=ahead, threads=threads)
+
+
+def with_quality(
+    scores: Scores,
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Scores:
+    """Return scores with the curve of the estimated PSNR, as far as their validation rays tell it.
+
+    Parameters
+    ----------
+    scores : Scores
+    protected : (N,) bool, optional
+        Splats that are not removed.
+    progress : callable, optional
+    threads : int, optional
+    """
+    if scores.ray_sample is None:
+        return scores
+    curve = quality_curve(
+        scores.ray_sample, scores.values, protected=protected, settled=scores.settled,
+        progress=progress, threads=threads,
+    )  # fmt: skip
+    return replace(scores, quality=curve)
+
+
+def _with_views(
+    scores: Scores,
+    splats: Splats,
+    views: ViewSet,
+    used: ViewSet,
+    progress: Progress,
+    threads: int | None,
+) -> Scores:
+    """Return scores with what there is to say of all views, not only of those used.
+
+    Parameters
+    ----------
+    scores : Scores
+    splats : Splats
+    views, used : ViewSet
+        Those given, and those chosen from them.
+    progress : callable
+    threads : int, optional
+    """
+    notes = (*scores.notes, views.note) if views.note else scores.notes
+    # Beside the closed form, measuring would take as long as scoring.
+    some = None if scores.ray_sample is None else used
+    found = alignment(splats, views, some, progress=progress, threads=threads)
+    return replace(scores, views_given=len(views), notes=notes, alignment=found)
+
+
+def score_once(
+    splats: Splats,
+    views: ViewSet,
+    settings: Settings,
+    progress: Progress,
+    threads: int | None,
+    *,
+    curve: bool = False,
+) -> tuple[Scores, Measured]:
+    """Return scores by occlusion in one round, and what was measured of each splat.
+
+    Parameters
+    ----------
+    splats, views, settings, progress, threads
+        See `score`.
+    curve : bool
+        Whether the validation rays are to tell the whole curve of the PSNR. Else there are fewer
+        of them, which tell that of a result.
+    """
+    used = views.spread(settings.views)
+    with np.errstate(under="ignore"):  # as in `score`
+        scores, measured = occlusion.score_once(
+            splats, used, settings.occlusion, few_views=not curve,
+            progress=part(progress, 0.0, 0.99), threads=threads,
+        )  # fmt: skip
+    ahead = part(progress, 0.99, 1.0)
+    return _with_views(scores, splats, views, used, ahead, threads), measured
