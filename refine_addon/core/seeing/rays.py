@@ -176,7 +176,7 @@ class Rays:
         ----------
         keep : (u,) bool
         nobody : int
-            Stands where no hit of the ray is kept.
+            Returned where no hit of the ray is kept.
         """
         kept, here = keep.take(self.owner), np.arange(len(self.owner))
         none = len(here)  # farther than any hit
