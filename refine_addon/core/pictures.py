@@ -186,9 +186,6 @@ def _picture(
         In the view.
     colors : (3, n) float64
         Of the footprints.
-    view : View
-    progress : callable
-    threads : int, optional
     """
 
     def work(piece: slice) -> NDArray[np.float64]:
@@ -215,7 +212,6 @@ def _strip(
 
     Parameters
     ----------
-    footprints : Footprints
     colors : (3, n) float64
     columns, rows : (C,), (R,) int64
         Ascending.

@@ -233,12 +233,8 @@ def _fineness(
 
     Parameters
     ----------
-    splats : Splats
     rows : (n,) int64
         Those that stand for all.
-    views : ViewSet
-    progress : callable
-    threads : int, optional
     """
     stand_for = len(splats) / len(rows)
     sample = splats.take(rows)
@@ -276,11 +272,8 @@ def _fineness_of(
     ----------
     gaussians : Gaussians
         Each stands for `stand_for` splats, and its footprint is as much larger.
-    scene : Scene
-    view : View
     columns_and_rows : tuple of (C,) and (R,) int64
         Of the pixels that the rays go through.
-    stand_for : float
     """
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)

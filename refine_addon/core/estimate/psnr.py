@@ -216,7 +216,6 @@ def _removing(sample: RaySample, place: NDArray[np.int64], counts: Sequence[int]
 
     Parameters
     ----------
-    sample : RaySample
     place : (M,) int64
         Of each of the Gaussians in the order of removal.
     counts : sequence of int

@@ -180,7 +180,6 @@ class _Node:
     ----------
     start : int
         Where its splats begin among those of the file.
-    place : Place
     matrix : (4, 4) float64
         From the frame of the mesh to that of the scene.
     """
@@ -195,7 +194,6 @@ class _Mesh:
 
     Parameters
     ----------
-    document : Document
     index : int
         Of the mesh.
     place : Place
@@ -256,14 +254,7 @@ class _Mesh:
 
 
 class _Part:
-    """The splats of one primitive.
-
-    Parameters
-    ----------
-    document : Document
-    primitive : dict
-    place : Place
-    """
+    """The splats of one primitive."""
 
     def __init__(self, document: Document, primitive: dict[str, Any], place: Place) -> None:
         self._document, self._place = document, place.at("attributes")
@@ -349,7 +340,6 @@ class _Attribute:
 
     Attributes
     ----------
-    name : str
     width, kind : int
         Numbers of one splat, and their component type.
     values : callable

@@ -181,11 +181,6 @@ class Packed:
     """The splats of a file as another format than plain PLY holds them.
 
     It has what `SplatFile` has for writing.
-
-    Attributes
-    ----------
-    file : SplatFile
-    form : Format
     """
 
     file: SplatFile

@@ -212,14 +212,12 @@ def _frame(
 
     Parameters
     ----------
-    each : callable
     good : int
         How many splats can be drawn.
     moments : (4, 3) float64
         As `RowBlock.read` returns them, of all splats.
     highest : (1, 65536) int64
         What the step "count" would return of the highest digit, of all splats.
-    settings : ClosedForm
     """
 
     def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:

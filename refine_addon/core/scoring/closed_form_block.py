@@ -393,7 +393,6 @@ class RowBlock:
         reach : (n,) float64
         views : (v,) int64
             Those that see some of them; of these, the first `partly` may not see all.
-        partly : int
         """
         total = np.zeros(points.shape[1])  # (n,), H before alpha
         seen = np.full(points.shape[1], len(views) - partly, np.int32)

@@ -430,8 +430,6 @@ class OcclusionScoring:
         ----------
         measured : Measured
             Sums over these groups, (M,).
-        groups : sequence of int
-        progress : callable
         """
         chosen, sample = tuple(sorted(groups)), self._sample
         worth = self.prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)

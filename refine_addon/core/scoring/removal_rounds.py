@@ -43,7 +43,6 @@ class _ViewRays:
 
     Attributes
     ----------
-    rays : Rays
     colors : (3, u) float32
         Of the splats that they hit.
     area : float

@@ -205,7 +205,6 @@ def _patches(
 
     Parameters
     ----------
-    frame : _CellFrame
     kinds : (n,) uint8
         Which lattice each footprint gets.
 
@@ -246,7 +245,6 @@ def _lay_out(
 
     Parameters
     ----------
-    frame : _CellFrame
     rows, patches, whole : (q,) array
         See `_patches`.
 
@@ -310,7 +308,6 @@ def _lay_out_at_edge(
 
     Parameters
     ----------
-    frame : _CellFrame
     rows, patches : (q,) int64
         See `_patches`.
     first : (q,) int64
@@ -422,7 +419,6 @@ def _sort_into_cells(
     shares : (p,) float32
     inside, squares : (n,) float64
         See `Points`; `squares` before merging, and changed in place.
-    area : float
     """
     filled = np.bincount(cells, minlength=_OUTSIDE)[:_OUTSIDE]
     counts = filled[filled > 0]  # (C,)

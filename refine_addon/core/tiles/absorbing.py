@@ -168,11 +168,8 @@ def _stage(
         In which all splats were measured.
     number : int
         Of the stage; before all but the first, the splats are measured anew.
-    left : _Left
-    count : int
     factor : float
         See `StageContext`.
-    runner : Runner
     """
     folder = scene.folder.inner(f"stage-{number}")
     if number:
@@ -224,7 +221,6 @@ def _measured_again(scene: SceneContext, left: _Left, turn: int, runner: Runner)
         All rows of its sources.
     turn : int
         See `occlusion.measure_part`.
-    runner : Runner
     """
     gaussians, good = store_gaussians(scene, left.sources, runner.part(0.0, 0.2))
     measuring = TileMeasuring(scene, runner)
@@ -247,11 +243,8 @@ def _staying(stage: StageContext, sizes: Sequence[int], left: int, runner: Runne
 
     Parameters
     ----------
-    stage : StageContext
     sizes : sequence of int
         Splats of each region.
-    left : int
-    runner : Runner
     """
     numbers = range(len(sizes))
     gather = [GatherRegion(index) for index in numbers]
@@ -275,8 +268,6 @@ def _shared_out(
         Of each splat's cheapest operation, region by region.
     weights : (n,) float32
         How many splats go by it, 1 or .5.
-    sizes : sequence of int
-    left : int
     """
     order, goal = np.argsort(costs, kind="stable"), len(costs) - left
     last = int(np.searchsorted(np.cumsum(weights[order], dtype=np.float64), goal))

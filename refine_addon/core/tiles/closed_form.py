@@ -125,9 +125,6 @@ class _Steps:
 
     Attributes
     ----------
-    context : ClosedFormContext
-    units : sequence of Unit
-    runner : Runner
     stored : int
         How many arguments lie in the folder.
     """

@@ -82,12 +82,7 @@ class SceneContext:
 
 @dataclass(frozen=True)
 class SumMoments:
-    """Sums what the axes of the scene are made of over a source.
-
-    Attributes
-    ----------
-    source : Source
-    """
+    """Sums what the axes of the scene are made of over a source."""
 
     source: Source
 
@@ -103,12 +98,7 @@ class SumMoments:
 
 @dataclass(frozen=True)
 class ActivateSplats:
-    """Activates the splats of a source.
-
-    Attributes
-    ----------
-    source : Source
-    """
+    """Activates the splats of a source."""
 
     source: Source
 

@@ -69,8 +69,6 @@ class _OneView:
 
     Attributes
     ----------
-    context : SceneContext
-    numbers : list of int
     kinds : list of bool
         See `MeasureViews`.
     """

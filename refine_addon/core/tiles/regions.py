@@ -122,12 +122,7 @@ class StageContext:
 
 @dataclass(frozen=True)
 class SaveMeans:
-    """Saves where the splats of a source are.
-
-    Attributes
-    ----------
-    source : Source
-    """
+    """Saves where the splats of a source are."""
 
     source: Source
 

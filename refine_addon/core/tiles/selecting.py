@@ -113,13 +113,7 @@ class CountTied:
 
 @dataclass(frozen=True)
 class ChooseByScore:
-    """Decides which splats of a unit stay.
-
-    Attributes
-    ----------
-    unit : Unit
-    rule : Rule
-    """
+    """Decides which splats of a unit stay."""
 
     unit: Unit
     rule: Rule

@@ -109,13 +109,7 @@ class Tile(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Rows ``start`` to ``stop`` of a tile.
-
-    Attributes
-    ----------
-    tile : Tile
-    start, stop : int
-    """
+    """Rows ``start`` to ``stop`` of a tile."""
 
     tile: Tile
     start: int
