@@ -123,18 +123,10 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Unit:
-    """A run of the rows of all tiles together, which may begin in one tile and end in another.
-
-    Attributes
-    ----------
-    index : int
-        Which one of all.
-    parts : tuple of Part
-        Of the tiles that it lies in, in their order; none is empty.
-    """
+    """A run of the rows of all tiles together, which may begin in one tile and end in another."""
 
     index: int
-    parts: tuple[Part, ...]
+    parts: tuple[Part, ...]  # of the tiles that it lies in, in their order; none is empty
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -191,19 +183,9 @@ class Unit:
 
 
 class Piece(NamedTuple):
-    """Rows of a tile that lie in one unit.
+    """Rows of a tile that lie in one unit: which of the unit, `place`, and of the tile, `part`."""
 
-    Attributes
-    ----------
-    unit : int
-        Index of the unit.
-    place : slice
-        Which rows of the unit they are.
-    part : Part
-        Which rows of the tile they are.
-    """
-
-    unit: int
+    unit: int  # its index
     place: slice
     part: Part
 
