@@ -93,10 +93,7 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
 def _shown(document: Document, most: int) -> list[_Mesh]:
     """Return the meshes with splats that the nodes of a scene show, and by which nodes.
 
-    Raises
-    ------
-    RefineError
-        If the nodes show more splats than `most`: one mesh may be shown by many of them.
+    Raise `RefineError` if they show more splats than `most`: one mesh may be shown by many of them.
     """
     meshes: dict[int, _Mesh] = {}
     count = 0

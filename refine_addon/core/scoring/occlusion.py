@@ -398,20 +398,11 @@ class OcclusionScoring:
         removal: _Removal,
         go: int,
     ) -> NDArray[np.int64]:
-        """Return the places in `left` of the n splats left, in the order of removal.
+        """Return the places in `left`, (n,) rows of Gaussians, in the order of removal.
 
-        Parameters
-        ----------
-        left : (n,) int64
-            Rows of the Gaussians.
-        measured : Measured
-            What these are worth now.
-        weights : sequence of float
-            Of the floor, up to each of `coverage.SHARES`.
-        removal : _Removal
-            What was removed before.
-        go : int
-            How many are removed in this round; the order of the others is not exact.
+        `measured` is what these are worth now, `weights` are of the floor, up to each of
+        `coverage.SHARES`, and `removal` is what was removed before. In this round `go` are removed;
+        the order of the others is not exact.
         """
         prior = self.prior[self.gaussians.index[left]]  # (n,)
         count, gone = len(removal.values), removal.gone
@@ -426,10 +417,7 @@ class OcclusionScoring:
     ) -> list[float]:
         """Choose the weights of the floor by leaving out each of some groups of views.
 
-        Parameters
-        ----------
-        measured : Measured
-            Sums over these groups, (M,).
+        `measured` has the sums over these groups, (M,).
         """
         chosen, sample = tuple(sorted(groups)), self._sample
         worth = self.prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)
@@ -504,12 +492,8 @@ class MemoryScoring(OcclusionScoring):
 class _Removal:
     """The order in which splats are removed.
 
-    Attributes
-    ----------
-    values : (N,) float32
-        For each splat that was added: the share of all N removed once this one is.
-    gone : int
-        How many were added.
+    `values`, (N,) float32, are for each splat that was added the share of all N removed once it is;
+    `gone` splats were added.
     """
 
     def __init__(self, count: int) -> None:

@@ -201,12 +201,8 @@ def _members(
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """Return the u Gaussians that are hit, ascending, and for each hit its place among them.
 
-    Parameters
-    ----------
-    index : (n,) int64
-        The Gaussian of each footprint, each once.
-    footprint : (h,) int32
-        Of each hit.
+    `index`, (n,), is the Gaussian of each footprint, each once, `footprint`, (h,), that of each
+    hit.
     """
     used = np.zeros(len(index), np.bool_)
     used[footprint] = True

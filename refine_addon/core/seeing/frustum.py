@@ -30,8 +30,7 @@ _STACK = 16
 _POINTS = 4096
 """Points that are counted at a time: what is known of them in all views stays in the caches."""
 
-_ROUNDING = 1e-14
-"""More than a sum of four products rounds, over the sum of their sizes."""
+_ROUNDING = 1e-14  # more than a sum of four products rounds, over the sum of their sizes
 
 _STEEPEST = 1e100
 """Limit of a focal length over half the image: its product with any length can be squared."""
@@ -254,14 +253,10 @@ def census(
 
 
 def _rows(views: ViewSet, centers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows whose products with ``(p, 1)`` are x', y' and z of every view.
+    """Return rows, (3, V, 4), whose products with ``(p, 1)`` are x', y' and z of every view.
 
     x' and y' contain the principal point and the half image size, so a point p lies in the image
     where ``|x'| <= z`` and ``|y'| <= z``.
-
-    Returns
-    -------
-    (3, V, 4) float64
     """
     rows = np.empty((3, len(views), 4))
     for index, (view, center) in enumerate(zip(views, centers, strict=True)):

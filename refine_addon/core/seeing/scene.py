@@ -124,13 +124,7 @@ def _principal_axes(
 
     A position at distance r has the weight 1 / (1 + r^2)^2, so that a few far ones hardly matter.
     Axes point to where more of the splats lie. If two variances are equal, two axes are arbitrary.
-
-    Parameters
-    ----------
-    means, drawable
-        See `scene_of`.
-    scene : Scene
-        Its origin and size are used.
+    Of `scene` the origin and the size are used; for the others see `scene_of`.
     """
     total = np.zeros((4, 3))
     for sums in moments(means, drawable, scene):

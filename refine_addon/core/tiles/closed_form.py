@@ -37,8 +37,7 @@ _NAMES = {"read": "reading", "count": "reading"}  # of steps; the others are "sc
 _REPEATED = ("count",)
 """Steps of `STEPS` that are done with several arguments: their results are not noted."""
 
-_SMALL = 1 << 16
-"""Bytes of an argument that travels with each step; larger ones lie in the folder."""
+_SMALL = 1 << 16  # bytes of an argument that travels with each step; larger ones lie in the folder
 
 
 class _Stored(NamedTuple):

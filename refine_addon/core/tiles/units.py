@@ -32,8 +32,7 @@ if TYPE_CHECKING:
 _HEADER = 1 << 16
 """Bytes that are fetched of a tile behind a URL for its header, which hardly ever has more."""
 
-_PIECE = 1 << 24
-"""Bytes beside the rows that are copied at a time."""
+_PIECE = 1 << 24  # bytes beside the rows that are copied at a time
 
 
 class Source(Protocol):
