@@ -116,8 +116,8 @@ def compare(
     ]
 
 
-def fitted(view: View, longest: int = LONGEST) -> View:
-    """Return a view with the same sight and at most so many pixels along the longer side.
+def fitted(view: View) -> View:
+    """Return a view with the same sight and at most `LONGEST` pixels along the longer side.
 
     Examples
     --------
@@ -127,7 +127,7 @@ def fitted(view: View, longest: int = LONGEST) -> View:
     >>> small.width, small.height, small.fx, small.cy
     (960, 540, 500.0, 270.0)
     """
-    scale = longest / max(view.width, view.height)
+    scale = LONGEST / max(view.width, view.height)
     if scale >= 1.0:
         return view
     width, height = (max(round(size * scale), 1) for size in (view.width, view.height))

@@ -179,35 +179,7 @@ def score_once(
     return scoring.rank(silent), measured.for_all(scoring.gaussians.index, len(splats))
 
 
-def measure(
-    splats: Splats,
-    views: ViewSet,
-    settings: Occlusion = Occlusion(),
-    *,
-    progress: Progress = silent,
-    threads: int | None = None,
-) -> Measured:
-    """Measure what the views see of each splat, hidden by all others.
-
-    Parameters
-    ----------
-    splats, views, settings, progress, threads
-        See `score`; `settings.rounds` is ignored.
-
-    Returns
-    -------
-    Measured
-        Of all N splats; 0 for splats that no view shows or that cannot be drawn.
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
-    """
-    return measure_part(splats, views, settings, 0, 1, progress=progress, threads=threads)[0]
-
-
-def measure_part(  # noqa: PLR0913 - as `measure`, and which part
+def measure_part(  # noqa: PLR0913 - as `score`, and which part
     splats: Splats,
     views: ViewSet,
     settings: Occlusion,
@@ -217,12 +189,12 @@ def measure_part(  # noqa: PLR0913 - as `measure`, and which part
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Measured, float]:
-    """Measure what one part of the views sees of each splat.
+    """Measure what one part of the views sees of each splat, hidden by all others.
 
     Parameters
     ----------
     splats, views, settings, progress, threads
-        See `measure`.
+        See `score`; `settings.rounds` is ignored.
     turn, parts : int
         The views are divided into so many parts, or into fewer if there are fewer views; each part
         is spread over all of them. Turn 0 measures the first, and so on, and then the first again.
@@ -230,7 +202,7 @@ def measure_part(  # noqa: PLR0913 - as `measure`, and which part
     Returns
     -------
     Measured
-        See `measure`.
+        Of all N splats; 0 for splats that no view shows or that cannot be drawn.
     share : float
         Of the weights of all views, those of this part.
 

@@ -13,7 +13,7 @@ from ..seeing.cast import cast
 from ..seeing.ray_sample import RaySample, cast_view
 from ..seeing.rays import Rays
 from ..splats import joined
-from .splat_table import unpacked
+from .units import unpacked
 from .workers import Runner
 
 if TYPE_CHECKING:

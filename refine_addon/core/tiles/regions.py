@@ -17,7 +17,7 @@ from ..scores import Scores
 from ..seeing.measuring import Measured
 from ..splats import joined
 from .selecting import save_kept
-from .splat_table import packed, unpacked
+from .units import packed, unpacked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -16,8 +16,7 @@ from ..survivors import columns_with
 from ..urls import Url
 from . import storage
 from .folder import Interrupted
-from .splat_table import unpacked
-from .units import bytes_of, header_of, rows_of
+from .units import bytes_of, header_of, rows_of, unpacked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
