@@ -39,9 +39,9 @@ CAMERAS = 3
 """How many views are drawn at most, spread evenly over all."""
 
 AMPLIFIED = 8
-"""The difference of two pictures is shown so many times as large."""
+"""Factor by which the difference of two pictures is shown larger."""
 
-_PIXELS = 1 << 15  # about so many are drawn at a time, which limits temporary memory
+_PIXELS = 1 << 15  # drawn at a time, about, which limits temporary memory
 _PAIRS = 1 << 18  # pairs of footprint and pixel at a time
 
 
@@ -117,7 +117,7 @@ def compare(
 
 
 def fitted(view: View) -> View:
-    """Return a view with the same sight and at most `LONGEST` pixels along the longer side.
+    """Return a view of the same field of view, at most `LONGEST` pixels along its longer side.
 
     Examples
     --------

@@ -144,7 +144,7 @@ def start(seconds: float, threads: int | None = None) -> None:
 
 
 def _least(number: int) -> float:
-    """Return the seconds of work that so many processes are worth."""
+    """Return from how many seconds of work on it is worth having `number` processes."""
     with _lock:
         return WORTH_READY if sum(process.ready for process in _idle) >= number else WORTH
 
@@ -158,7 +158,7 @@ def _possible() -> bool:
 def _apart(
     work: Callable[[int], Result], count: int, number: int, progress: Progress, what: str
 ) -> Iterator[Result]:
-    """Do the work of `for_each` in so many processes.
+    """Do the work of `for_each` in `number` processes.
 
     Raise `_LostError` if they, or the file that they share, cannot be had.
     """

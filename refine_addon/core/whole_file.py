@@ -165,10 +165,10 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
                 stream.flush()  # before the permissions: a write would take setuid away
                 mode = _inherited(target, stream.fileno(), mode)
                 if stat.S_IMODE(os.fstat(stream.fileno()).st_mode) != mode:
-                    # By descriptor: whoever owns the folder may have put a link of that name.
+                    # By descriptor: the owner of the folder may have put a link of that name there.
                     named = stream.fileno() if os.chmod in os.supports_fd else temporary
                     os.chmod(named, mode)  # noqa: PTH101 - pathlib takes no descriptor
-            checkpoint()  # whoever cancels while the file is written wants none
+            checkpoint()  # cancelled while the file was written: leave none
             if overwrite:
                 temporary.replace(target)
             else:

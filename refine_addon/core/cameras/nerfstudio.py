@@ -145,7 +145,7 @@ class _Entry:
         return axes * OPENGL_TO_OPENCV, matrix[:3, 3]
 
     def size(self) -> tuple[int, int]:
-        """Return width and height by their keys, or of the image if those are missing."""
+        """Return width and height from their keys, or from the image if a key is missing."""
         if self.has("w") and self.has("h"):
             width, height = (self.at(key).side(self.get(key)) for key in ("w", "h"))
             return width, height

@@ -1,7 +1,7 @@
 """``.splat`` files: 32 bytes a splat and nothing else, as antimatter15/splat introduced them.
 
 Mean and linear scale are float32, colour, opacity and rotation 8 bits each. The files have no
-signature, so that their name alone tells.
+signature and are known by their name alone.
 """
 
 from __future__ import annotations

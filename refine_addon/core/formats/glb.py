@@ -176,7 +176,7 @@ class _Node:
     Attributes
     ----------
     start : int
-        Where its splats begin among those of the file.
+        Row of the file's splats at which those of this node begin.
     matrix : (4, 4) float64
         From the frame of the mesh to that of the scene.
     """
@@ -201,7 +201,7 @@ class _Mesh:
     parts : list of _Part
         Its primitives of splats.
     nodes : list of _Node
-        Those that show it, in the order of their splats; none if it has no splats.
+        The nodes that show it, in the order of their splats; empty if it has no splats.
     degree : int
         Highest of the harmonics.
     """
@@ -224,7 +224,7 @@ class _Mesh:
         return self._count
 
     def fill(self, splats: Splats) -> None:
-        """Set the values of all splats that its nodes show; `splats` are those of the file."""
+        """Set the values of all splats that its nodes show, among all `splats` of the file."""
         if not self.nodes:
             return
         first, *others = (splats.take(slice(n.start, n.start + len(self))) for n in self.nodes)
@@ -233,7 +233,7 @@ class _Mesh:
             for part in self.parts:
                 part.fill(first.take(slice(at, at + len(part))))
                 at += len(part)
-            # The first node's splats last, since the others are made of them as they stand.
+            # The first node last: the splats of the others are computed from its untouched ones.
             for node, target in reversed([*zip(self.nodes, (first, *others), strict=True)]):
                 for piece in pieces(len(self)):
                     shown_there = self._moved(first.take(piece), node)
@@ -272,7 +272,7 @@ class _Part:
         return self._count
 
     def _values(self, name: str, width: int) -> Callable[[slice], NDArray[Any]]:
-        """Return a function that returns some of the values of an attribute, (n, width)."""
+        """Return a function that returns a slice of the values of an attribute, (n, width)."""
         if name not in self._attributes:
             self._place.fail(f"no {name}")
         index, place = self._attributes[name], self._place.at(name)
@@ -287,7 +287,7 @@ class _Part:
         return lambda piece: values[piece]
 
     def fill(self, splats: Splats) -> None:
-        """Set the values of as many splats, in the frame of the file; absent harmonics are 0."""
+        """Set the values of `splats`, one for each of these; harmonics that are absent are 0."""
         for piece in pieces(len(splats)):
             target = splats.take(piece)
             target.means[:] = self._means(piece)
@@ -340,7 +340,7 @@ class _Attribute:
     width, kind : int
         Numbers of one splat, and their component type.
     values : callable
-        Returns them, (n, width), of some splats that were turned.
+        Returns them, (n, width), for splats in the frame of glTF.
     """
 
     name: str
@@ -416,7 +416,7 @@ def write(stream: BinaryIO, splats: Splats) -> None:
 
 
 def _json(attributes: list[_Attribute], count: int, low: list[float], high: list[float]) -> bytes:
-    """Return the JSON of a file, as many spaces behind it as its length in fours needs."""
+    """Return the JSON of a file, padded with spaces to a multiple of 4 bytes."""
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     at = 0

@@ -192,7 +192,7 @@ def spatial_order(
     place: NDArray[np.float64],
     ties: Callable[[NDArray[np.int64]], NDArray[np.uint64]] | None = None,
 ) -> NDArray[np.int64]:
-    """Return the order of positions along a Z-shaped curve, near ones together (Morton, 1966).
+    """Return the order of positions along a Z-shaped curve: neighbours follow (Morton, 1966).
 
     Parameters
     ----------
