@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ..core import ScoreRequest, score_file
+from ..core import ScoreRequest, file_to_file
 from . import zones
 from .options import settings
 
@@ -29,7 +29,7 @@ def _score_file(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
     options = run.options
     request = ScoreRequest(views, settings(options), zones.of_files(options), options.overwrite)
     progress = run.progress(source.name)
-    done = score_file(source, options.output, request, progress=progress).report
+    done = file_to_file(source, options.output, request, progress=progress).report
     return _said(run, str(source), done)
 
 

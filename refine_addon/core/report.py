@@ -185,12 +185,6 @@ def make_report(
     }
 
 
-def complete_report(report: dict[str, Any], clock: Clock, files: Files) -> None:
-    """Add the names and sizes of the files and the total time to a report."""
-    clock.stop()
-    report["files"] = asdict(files)
-
-
 def remark(budget: Budget, gone: int, total: int, psnr: float | None, size: int) -> str:
     """Return why a budget is out of reach or removes nothing, or "".
 

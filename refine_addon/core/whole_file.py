@@ -81,17 +81,6 @@ def mode_of(path: Path) -> int:
         return 0
 
 
-def make_folder(path: Path) -> bool:
-    """Make a folder and those above it; return whether it was there, or raise `RefineError`."""
-    try:
-        there = bool(mode_of(path))
-        path.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        msg = f"{path}: cannot be made ({reason_of(error)})"
-        raise RefineError(msg) from error
-    return there
-
-
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[None]:
     """Make a folder and those above it; remove those that were not there and are empty at the end.
@@ -103,9 +92,12 @@ def new_folder(path: Path) -> Iterator[None]:
     """
     made: list[Path] = []
     try:
-        with contextlib.suppress(OSError, ValueError):  # which `make_folder` explains
+        try:
             made += itertools.takewhile(lambda folder: not mode_of(folder), (path, *path.parents))
-        make_folder(path)
+            path.mkdir(parents=True, exist_ok=True)
+        except (OSError, ValueError) as error:
+            msg = f"{path}: cannot be made ({getattr(error, 'strerror', None) or error})"
+            raise RefineError(msg) from error
         yield
     finally:
         for folder in made:

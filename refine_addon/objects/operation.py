@@ -13,7 +13,6 @@ from ..core.errors import RefineError
 from ..core.operation.files import FileSink
 from ..core.operation.loaded import Loaded, RowSizes
 from ..core.operation.run import run
-from ..core.operation.score import ScoreSink
 from ..core.work import Progress, silent
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
@@ -28,9 +27,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ..core.formats.format import Format
-    from ..core.operation.prune import PruneRequest
+    from ..core.operation.requests import PruneRequest, ScoreRequest
     from ..core.operation.run import Runtime, Written
-    from ..core.operation.score import ScoreRequest
     from ..core.task import Result
 
 
@@ -111,7 +109,7 @@ def score_object(
         See `refine_addon.core.operation.run` and `ObjectSource`; also if there is no such object.
     """
     source = ObjectSource(check(find(name)), demands + Demands(zones=tuple(request.zones)))
-    sink = ScoreSink(output, overwrite=request.overwrite)
+    sink = FileSink(output, overwrite=request.overwrite)
     return run(source, request, sink, progress=progress).report
 
 

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import RefineError
 from ..estimate.quality import PSNR_CAP
-from ..pipeline import decide
-from ..score_splats import score
+from ..pipeline import decide, score
 from ..selection import Budget
 from ..splats import among_all
 from ..task import DEFAULTS, Origin, Task
@@ -243,7 +242,7 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     Raises
     ------
     RefineError, Cancelled
-        See `score_splats.score`; also if no level would have fewer splats than the original.
+        See `pipeline.score`; also if no level would have fewer splats than the original.
 
     Examples
     --------

@@ -1,7 +1,7 @@
 """Method *auto*: occlusion with no more views than the pictures need.
 
 Half of the views, spread evenly, measure the splats first, then an eighth more. Others validate:
-their rays tell the PSNR of the pictures that each of the two rankings leaves. The error of a mean
+their rays tell the PSNR after removing splats by each of the two rankings. The error of a mean
 over k views falls as 1 / k, so the PSNR is about ``limit - slope / k``, and what the eighth has
 gained tells what the rest would gain. Where that is within the tolerance, the rest is not measured.
 All that is measured to find out is used, so finding out costs no more than two rankings and the

@@ -242,7 +242,8 @@ class OcclusionScoring:
     validation_rays : RaySample or None
         Those of the views that have measured all splats.
     scoring_rays : RaySample or None
-        The same of the rays that order splats; None in a single round, and once it ranks.
+        The rays that order splats after the first round; None if there is but one, and once `rank`
+        has taken them.
     prior : (N,) float32
         Orders the splats that are not among the Gaussians, and is the floor of all others.
     undrawable : (N,) bool

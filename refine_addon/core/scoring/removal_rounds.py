@@ -184,8 +184,7 @@ def _grown(
     before, now : (n,) float64
         What the rays told then, and what they tell now.
     known : (n,) float64
-        How many times the measured sum the growth of the scene counts: many for a splat that few
-        rays hit.
+        Weight of the scene's growth, over the measured sum: large for a splat that few rays hit.
     """
     total = float(before.sum())
     scene_growth = float(now.sum()) / total if total > 0.0 else 1.0

@@ -25,7 +25,7 @@ MIN_RAYS_OF_VIEW = 16
 """A view has at least this many rays, if it has as many pixels."""
 
 _PAIRS = 1 << 17  # pairs of footprint and pixel at a time, which limits temporary memory
-_MAX_TABLE = 1 << 14  # pixels; up to here a table says how many rays lie before each
+_MAX_TABLE = 1 << 14  # pixels; images up to this size are looked up in a table, see `_before`
 
 _STEPS = (0.7548776662466927, 0.5698402909980532)
 """1 / p and 1 / p^2 of the plastic number p: their multiples modulo 1 spread evenly over the unit
@@ -33,13 +33,13 @@ square (the R2 sequence, Roberts 2018)."""
 
 
 def pixels(view: View, number: int, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the columns and rows of a view in which about `count` rays lie, spread evenly.
+    """Return the columns and rows of a view through which about `count` rays go, spread evenly.
 
     Parameters
     ----------
     view : View
     number : int
-        Each number gives other pixels.
+        Different numbers give different pixels.
     count : float
 
     Returns
@@ -215,7 +215,7 @@ def boxes(
     axis : int
         0 for columns, 1 for rows.
     places : (C,) int64
-        Numbers of the columns or rows, ascending; their centres are half a pixel on.
+        Numbers of the columns or rows, ascending; their centres are at + 0.5.
     """
     center = footprints.centers[axis] - np.float32(0.5)
     half = np.sqrt(reach * (footprints.major[axis] ** 2 + footprints.minor[axis] ** 2))
@@ -240,7 +240,7 @@ def _mahalanobis(
 ) -> NDArray[np.float32]:
     """Return the squared Mahalanobis distance of pixels to footprints, (p,).
 
-    `owner`, (p,), is the row of the footprint; the centre of a pixel is half a pixel on.
+    `owner`, (p,), is the row of the footprint; the centre of a pixel is at + 0.5.
     """
     across = column.astype(np.float32) + np.float32(0.5) - footprints.centers[0].take(owner)
     down = row.astype(np.float32) + np.float32(0.5) - footprints.centers[1].take(owner)

@@ -27,22 +27,22 @@ if TYPE_CHECKING:
     from .projection import Footprints
 
 FEW_CELLS = 10_000
-"""An image may have this many cells however few footprints it has."""
+"""An image may always have this many cells, even with few footprints."""
 
 FOOTPRINTS = 4.0
-"""An image of more than `FEW_CELLS` cells has at least this many footprints for each of them. So
-the cells follow the splats, not the pixels: finer ones show nothing that the splats have."""
+"""Beyond `FEW_CELLS` cells, an image has at most one cell for this many footprints: cells that are
+much smaller than the splats only cost points."""
 
 MAX_CELLS = 65535
 """Most cells of an image: NumPy sorts numbers of 16 bits by radix, in linear time."""
 
 MAX_POINTS = 1 << 22
-"""Most points of a view, as estimated: cells grow until it is met. A point takes about 100 bytes.
-"""
+"""Limit of the estimated number of points of a view: cells grow until it holds. A point takes about
+100 bytes."""
 
 LEAST_POINTS = 1.25
-"""A view has this many points a footprint where `MAX_POINTS` would be fewer: a footprint has at
-least one point, however large the cells are."""
+"""Point limit of a view: ``max(MAX_POINTS, LEAST_POINTS x footprints)``. A footprint has at least
+one point, however large the cells are."""
 
 _GROWTH = 2.0**0.25  # factor by which the side of a cell grows in a step
 _SLACK = 1.01  # on the side of a cell: a column of cells may lie partly outside the image
@@ -141,7 +141,7 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
     kinds = _kinds(footprints, view, density / side)  # (n,)
     frame = _in_cells(footprints, view, side)
     vast = kinds == len(lattices()) - 1  # (n,), the few footprints much larger than the image
-    frame.axes[:, vast] = 0.0  # in the image; `_flat_points` replaces their points
+    frame.axes[:, vast] = 0.0  # nothing is cut off; `_flat_points` replaces their points
     rows, patches, whole = _patches(frame, kinds)  # (q,) each
     sizes = lattice_table().sizes.take(patches)  # (q,)
     owners = np.repeat(rows.astype(np.int32), sizes)  # (p,)
@@ -227,7 +227,7 @@ def _lay_out(
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]:
     """Return the points of q patches of `_patches`, one after the other.
 
-    Of p points these are the cells, (p,) uint16, `_OUTSIDE` beside the image, and their shares of
+    Of p points these are the cells, (p,) uint16, `_OUTSIDE` outside the image, and their shares of
     the mass, (p,) float32; of each patch the sums of the shares of its points inside the image, and
     of their squares, (2, q).
     """
@@ -236,7 +236,7 @@ def _lay_out(
     first = np.cumsum(sizes) - sizes  # (q,), number of each patch's first point
     cells = np.empty(int(sizes.sum()), np.uint16)
     shares, sums = np.empty(len(cells), np.float32), table.sums.take(patches, axis=1)
-    # Patches alike are laid out together, which needs no look-up for each point.
+    # Equal patches are laid out together: they have the same points, so none needs an index.
     inner = np.flatnonzero(whole)
     inner = inner.take(np.argsort(patches.take(inner).astype(np.uint16), kind="stable"))  # (s,)
     axes, begin = frame.axes.take(rows.take(inner), axis=1), first.take(inner)
@@ -275,7 +275,7 @@ def _lay_out_at_edge(
     """Return the points of q patches of `_patches` that lie across the edge of the image.
 
     `first`, (q,), is the number of each patch's first point. Return the numbers, cells and shares
-    of the points, (p,) each, `_OUTSIDE` and 0 for those beside the image, and of each patch the
+    of the points, (p,) each, `_OUTSIDE` and 0 for those outside the image, and of each patch the
     sums of its shares and of their squares, (2, q).
     """
     table = lattice_table()
@@ -314,7 +314,7 @@ def _positions(
 def _cell_numbers(
     place: tuple[NDArray[np.float32], NDArray[np.float32]], size: tuple[float, float]
 ) -> NDArray[np.uint16]:
-    """Return the number of each point's cell; it means nothing beside the image.
+    """Return the number of each point's cell; meaningless for points outside the image.
 
     The place of each point and the size of the image are across and down, in cells.
     """

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..absorb_splats import FIRST, PARTS
 from ..absorbing.absorb import STAGE, Counts, patience, stages
+from ..pipeline.absorb_splats import FIRST, PARTS
 from ..seeing.measuring import Measured
 from ..selection import Budget, select
 from .gaussians import store_gaussians

@@ -145,7 +145,7 @@ def by_closed_form(
     """
     views, settings = context.views, context.settings
     steps = _Steps(context, units, runner)
-    with np.errstate(under="ignore"):  # as in `score_splats.score`
+    with np.errstate(under="ignore"):  # as in `pipeline.score`
         results = closed_form.steps(
             steps.each, sum(map(len, units)), views, settings, remember=context.folder.once
         )

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..absorb_splats import absorb_removed
 from ..absorbing import merge_field
 from ..absorbing.absorb import mergeable, reduced
 from ..absorbing.merge_field import Field, ViewSums
 from ..absorbing.merge_graph import MergeGraph
+from ..pipeline.absorb_splats import absorb_removed
 from ..scores import Scores
 from ..seeing.measuring import Measured
 from ..splats import joined

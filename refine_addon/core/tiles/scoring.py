@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..score_splats import with_quality
+from ..pipeline.score_splats import with_quality
 from ..scoring import auto
 from ..scoring.occlusion import FIRST_END, PRIOR, OcclusionScoring
 from ..seeing.scene import Scene, principal_axes

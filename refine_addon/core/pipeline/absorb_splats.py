@@ -9,25 +9,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .absorbing import absorb as absorbing
-from .absorbing.merging import ViewSums
-from .estimate.psnr import psnr_against
-from .estimate.quality import left_to_lose
+from ..absorbing import absorb as absorbing
+from ..absorbing.merging import ViewSums
+from ..estimate.psnr import psnr_against
+from ..estimate.quality import left_to_lose
+from ..scoring import occlusion
+from ..selection import Budget, quality_of, select
+from ..task import DEFAULTS, Settings
+from ..work import Progress, part, silent
 from .score_splats import score_once, with_quality
-from .scoring import occlusion
-from .selection import Budget, quality_of, select
-from .task import DEFAULTS, Settings
-from .work import Progress, part, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .absorbing.absorb import Absorbed
-    from .scores import Scores
-    from .seeing.measuring import Measured
-    from .splats import Splats
-    from .task import Task
-    from .views import ViewSet
+    from ..absorbing.absorb import Absorbed
+    from ..scores import Scores
+    from ..seeing.measuring import Measured
+    from ..splats import Splats
+    from ..task import Task
+    from ..views import ViewSet
 
 TRIES = 3
 """How often absorbing is done at most to reach a PSNR."""

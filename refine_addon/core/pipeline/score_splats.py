@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .estimate.alignment import alignment
-from .estimate.psnr import quality_curve
-from .scoring import auto, closed_form, occlusion
-from .seeing.ray_sample import validation_rays
-from .task import DEFAULTS, Settings
-from .volumes import refuse_all
-from .work import Progress, part, silent
+from ..estimate.alignment import alignment
+from ..estimate.psnr import quality_curve
+from ..scoring import auto, closed_form, occlusion
+from ..seeing.ray_sample import validation_rays
+from ..task import DEFAULTS, Settings
+from ..volumes import refuse_all
+from ..work import Progress, part, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .scores import Scores
-    from .seeing.measuring import Measured
-    from .splats import Splats
-    from .views import ViewSet
+    from ..scores import Scores
+    from ..seeing.measuring import Measured
+    from ..splats import Splats
+    from ..views import ViewSet
 
 
 def score(  # noqa: PLR0913 - as `pipeline.prune`

@@ -11,23 +11,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import selection
+from .. import selection
+from ..estimate.psnr import psnr_kept
+from ..estimate.quality import needed
+from ..report import MEASURES, Clock, conclude, make_report, remark
+from ..task import DEFAULTS, Result, Settings, Task
+from ..work import Progress, part, report, silent
 from .absorb_splats import absorb_task
-from .estimate.psnr import psnr_kept
-from .estimate.quality import needed
-from .report import MEASURES, Clock, conclude, make_report, remark
 from .score_splats import score, score_once, with_quality
-from .task import DEFAULTS, Result, Settings, Task
-from .work import Progress, part, report, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .scores import Scores
-    from .seeing.measuring import Measured
-    from .selection import Budget, RowBytes
-    from .splats import Splats
-    from .views import ViewSet
+    from ..scores import Scores
+    from ..seeing.measuring import Measured
+    from ..selection import Budget, RowBytes
+    from ..splats import Splats
+    from ..views import ViewSet
 
 
 def prune(  # noqa: PLR0913 - the main function of core; all but three are optional
