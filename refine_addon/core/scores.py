@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from .estimate.quality import Quality
     from .seeing.ray_sample import RaySample
 
-_DISTINCT = 1 << 24
-"""Largest number of equal steps from 0 to 1 that are distinct in float32."""
+_DISTINCT = 1 << 24  # largest number of equal steps from 0 to 1 that are distinct in float32
 
 
 @dataclass(frozen=True, eq=False)

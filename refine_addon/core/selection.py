@@ -336,13 +336,7 @@ def refuse_none_left(budget: Budget, before: int, after: int) -> None:
 def _refuse_unsettled(scores: Scores, budget: Budget, gone: NDArray[np.bool_]) -> None:
     """Raise `RefineError` if scores were computed for a budget that removes fewer splats.
 
-    Parameters
-    ----------
-    scores : Scores
-        Of which some are settled.
-    budget : Budget
-    gone : (N,) bool
-        What it removes.
+    Some of the scores are settled; `gone`, (N,), is what this budget removes.
     """
     settled = scores.settled or 0
     # A PSNR that all of the curve reaches may be reached beyond its end, too.

@@ -132,12 +132,7 @@ class Solid:
     ) -> NDArray[np.bool_]:
         """Return which cells of a grid lie inside, (G, G, G); meaningless where one is touched.
 
-        Parameters
-        ----------
-        low, scale : (3,) float64
-            The lowest corner of the grid, and cells a unit.
-        cells : int
-            G.
+        It has G = `cells` each way, the lowest corner `low`, (3,), and `scale` cells a unit, (3,).
         """
         centers = np.arange(cells) + 0.5
         columns = np.stack(np.meshgrid(centers, centers, indexing="ij"), -1).reshape(-1, 2)
@@ -152,23 +147,14 @@ class Solid:
     def _crossings(
         self, places: NDArray[np.float64]
     ) -> Iterator[tuple[Index, NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield where rays along z cross triangles.
+        """Yield where rays along z through places, (N, 2), cross triangles.
 
         An edge is crossed on the same side of a ray for both of its triangles, since its vertices
         are taken in the same order for both, and rays through a vertex count the edges that begin
         there: so no ray slips between two triangles or hits both.
 
-        Parameters
-        ----------
-        places : (N, 2) float64
-
-        Yields
-        ------
-        rows : (C,) int64
-            Which rays.
-        heights : (C,) float64
-        signs : (C,) float64
-            1 or -1 by the way that the triangle turns, or 1 throughout if not all are `turned`.
+        Of C crossings these are the rays, the heights, and the signs, (C,) each: 1 or -1 by the way
+        that the triangle turns, or 1 throughout if not all are `turned`.
         """
         for rows, triangles in _pairs(places, self.vertices[self.triangles, :2]):
             px, py = places[rows].T
@@ -239,10 +225,7 @@ def _pairs(
 ) -> Iterator[tuple[Index, Index]]:
     """Yield places and triangles whose boxes hold them, as pairs: (C,) and (C,).
 
-    Parameters
-    ----------
-    places : (N, 2) float64
-    corners : (T, 3, 2) float64
+    Places are (N, 2), corners of the triangles (T, 3, 2).
     """
     batch: list[tuple[Index, Index]] = []
     total = 0
@@ -292,15 +275,8 @@ def _touched(vertices: NDArray[np.float64], triangles: Index, cells: int) -> NDA
     """Return which cells of a grid triangles touch, (G * G * G,), and some beside them.
 
     Triangles wider than a cell are halved until they are not; of the eight cells in which the
-    others may lie, those that the triangle's plane crosses are touched.
-
-    Parameters
-    ----------
-    vertices : (V, 3) float64
-        In cells.
-    triangles : (T, 3) int64
-    cells : int
-        G.
+    others may lie, those that the triangle's plane crosses are touched. Vertices, (V, 3), are in
+    cells.
     """
     touched = np.zeros(cells**3, np.bool_)
     corners = vertices[triangles]  # (T, 3, 3)

@@ -247,11 +247,8 @@ def _new_temporary(target: Path, cleanup: contextlib.ExitStack) -> tuple[Path, i
 def _inherited(target: Path, descriptor: int, mode: int) -> int:
     """Give an open file the owner and group of `target`, as far as this process may.
 
-    Returns
-    -------
-    int
-        The permissions that the file is to have: those of `target`, without setuid and setgid where
-        it could not be given; `mode` if there is no such file.
+    Return the permissions that the file is to have: those of `target`, without setuid and setgid
+    where it could not be given; `mode` if there is no such file.
     """
     try:
         old = target.stat()

@@ -231,14 +231,7 @@ def _fineness(
 ) -> tuple[float, ...]:
     """Return the fineness of the pictures of views, turned by each of `QUARTERS`.
 
-    Parameters
-    ----------
-    splats : Splats
-    rows : (n,) int64
-        Those that stand for all.
-    views : ViewSet
-    progress : callable
-    threads : int, optional
+    Of the splats, `rows`, (n,), stand for all.
     """
     stand_for = len(splats) / len(rows)
     sample = splats.take(rows)
@@ -270,17 +263,9 @@ def _fineness_of(
     columns_and_rows: tuple[NDArray[np.int64], NDArray[np.int64]],
     stand_for: float,
 ) -> float:
-    """Return the fineness of one picture.
+    """Return the fineness of one picture, through the pixels in (C,) columns and (R,) rows.
 
-    Parameters
-    ----------
-    gaussians : Gaussians
-        Each stands for `stand_for` splats, and its footprint is as much larger.
-    scene : Scene
-    view : View
-    columns_and_rows : tuple of (C,) and (R,) int64
-        Of the pixels that the rays go through.
-    stand_for : float
+    Each Gaussian stands for `stand_for` splats, and its footprint is as much larger.
     """
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)

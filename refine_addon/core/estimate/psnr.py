@@ -214,13 +214,8 @@ def mean_psnr(
 def _removing(sample: RaySample, place: NDArray[np.int64], counts: Sequence[int]) -> Compare:
     """Return a function that gives the PSNR of one view after each of L removals, dB.
 
-    Parameters
-    ----------
-    sample : RaySample
-    place : (M,) int64
-        Of each of the Gaussians in the order of removal.
-    counts : sequence of int
-        Ascending: Gaussians whose place is lower are removed.
+    `place`, (M,), is that of each of the Gaussians in the order of removal: those whose place is
+    below one of the ascending `counts` are removed.
     """
 
     def compare(number: int, rays: Rays) -> list[float]:

@@ -30,8 +30,7 @@ _ROW = np.dtype(
 )
 """Of one splat: colour is red, green, blue and opacity, rotation is w x y z."""
 
-_NO_TURN = 128.0
-"""Code of 0 in a rotation, and the step from 0 to 1."""
+_NO_TURN = 128.0  # code of 0 in a rotation, and the step from 0 to 1
 
 
 def matches(path: Path, head: bytes) -> bool:

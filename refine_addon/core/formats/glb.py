@@ -93,10 +93,7 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
 def _shown(document: Document, most: int) -> list[_Mesh]:
     """Return the meshes with splats that the nodes of a scene show, and by which nodes.
 
-    Raises
-    ------
-    RefineError
-        If the nodes show more splats than `most`: one mesh may be shown by many of them.
+    Raise `RefineError` if they show more splats than `most`: one mesh may be shown by many of them.
     """
     meshes: dict[int, _Mesh] = {}
     count = 0
@@ -180,7 +177,6 @@ class _Node:
     ----------
     start : int
         Row of the file's splats at which those of this node begin.
-    place : Place
     matrix : (4, 4) float64
         From the frame of the mesh to that of the scene.
     """
@@ -195,7 +191,6 @@ class _Mesh:
 
     Parameters
     ----------
-    document : Document
     index : int
         Of the mesh.
     place : Place
@@ -256,14 +251,7 @@ class _Mesh:
 
 
 class _Part:
-    """The splats of one primitive.
-
-    Parameters
-    ----------
-    document : Document
-    primitive : dict
-    place : Place
-    """
+    """The splats of one primitive."""
 
     def __init__(self, document: Document, primitive: dict[str, Any], place: Place) -> None:
         self._document, self._place = document, place.at("attributes")
@@ -349,7 +337,6 @@ class _Attribute:
 
     Attributes
     ----------
-    name : str
     width, kind : int
         Numbers of one splat, and their component type.
     values : callable

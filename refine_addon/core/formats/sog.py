@@ -46,29 +46,17 @@ NAME = "SOG"
 _VERSION = 2
 _DEGREES = 3
 
-_ACROSS = 64
-"""Entries of the palette in a row of its image."""
-
-_LABEL_BITS = 16
-"""Of the number of an entry of the palette: two channels of an image."""
-
-_TABLE = 256
-"""Values of a table, whose places are a byte."""
-
-_COORDINATE = 65535.0
-"""Largest code of a coordinate: two bytes, in two images."""
-
-_ROTATIONS = 252
-"""In the alpha of a rotation: this, and which component is the largest."""
-
-_NO_SIZE = -20.0
-"""Log scale written for anything smaller, since tables hold finite numbers."""
+_ACROSS = 64  # entries of the palette in a row of its image
+_LABEL_BITS = 16  # of the number of an entry of the palette: two channels of an image
+_TABLE = 256  # values of a table, whose places are a byte
+_COORDINATE = 65535.0  # largest code of a coordinate: two bytes, in two images
+_ROTATIONS = 252  # in the alpha of a rotation: this, and which component is the largest
+_NO_SIZE = -20.0  # log scale written for anything smaller, since tables hold finite numbers
 
 _META_LIMIT = 1 << 20
 """Bytes of the longest ``meta.json`` that is read; with four tables it has some 20,000."""
 
-_MOST_PIXELS = 16383
-"""Of a side of a WebP image."""
+_MOST_PIXELS = 16383  # of a side of a WebP image
 
 _SPARE_PIXELS = 1 << 16
 """An image has at most four times the pixels that are needed, and these: writers pad images."""
@@ -111,16 +99,9 @@ class _Bundle:
         return self.numbers(name, "codebook", _TABLE)
 
     def pixels(self, name: str, index: int, count: int, width: int = 0) -> NDArray[np.uint8]:
-        """Return an image of at least `count` pixels, (height, width, 4).
+        """Return an image of at least `count` pixels, (height, width, 4): a file of an attribute.
 
-        Parameters
-        ----------
-        name, index
-            Which of the files of an attribute.
-        count : int
-            How many are needed; far more are refused.
-        width : int
-            What the width must be; 0 for any.
+        Far more pixels are refused, and so is another width than `width`, unless that is 0.
         """
         section, place = self.section(name)
         files = place.at("files").items(section.get("files"))
@@ -331,12 +312,7 @@ def _image_size(count: int) -> tuple[int, int]:
 def _image(size: tuple[int, int], values: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return an image (height, width, 4) of a pixel for each splat, opaque where nothing is said.
 
-    Parameters
-    ----------
-    size : tuple of int
-        Height and width.
-    values : (N, C) uint8
-        The first C channels of each pixel.
+    `values`, (N, C) uint8, are the first C channels of each pixel.
     """
     image = np.zeros((*size, 4), np.uint8)
     image[..., 3] = 255
@@ -349,11 +325,7 @@ def _coordinates(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint8], NDArray[np.uint8]]:
     """Return the range of the logarithms of positions (N, 3), and their codes within it.
 
-    Returns
-    -------
-    low, high : (3,) float64
-    lower, upper : (N, 3) uint8
-        The two bytes of the codes.
+    The range is two (3,) float64, the codes are two (N, 3) uint8: their lower and upper bytes.
     """
     means = np.asarray(means, np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))

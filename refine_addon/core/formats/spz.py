@@ -39,8 +39,7 @@ there are."""
 _TABLE_AT = struct.Struct("<I12x")
 """Behind the header in version 4: the byte at which the table of streams begins."""
 
-_STREAM = struct.Struct("<QQ")
-"""In that table: bytes of a stream, and of what is in it."""
+_STREAM = struct.Struct("<QQ")  # in that table: bytes of a stream, and of what is in it
 
 _VERSIONS = (2, 3, 4)
 _ONE_TURN, _ZSTD = 2, 4  # versions: rotations without the smallest three, streams by zstd
@@ -54,15 +53,13 @@ _BUCKETS = (8, 16)
 _USUAL_FRACTION, _LEAST_STEPS = 12, 18
 """Bits of a position behind the point in most files, and of the largest coordinate at least."""
 
-_LARGEST_CODE = (1 << 23) - 1
-"""Of a position: of its 24 bits, one is the sign."""
+_LARGEST_CODE = (1 << 23) - 1  # of a position: of its 24 bits, one is the sign
 
 _INFLATION = 1032
 """A file holds no more than this many times its bytes: gzip makes nothing smaller. Zstd does, but
 not of splats that differ."""
 
-_PIECE = 1 << 20
-"""Bytes that a zstd stream is unpacked to at a time."""
+_PIECE = 1 << 20  # bytes that a zstd stream is unpacked to at a time
 
 _STEP = 1 << 12
 """Bytes of a gzip stream that are unpacked at a time where what they hold is not used."""

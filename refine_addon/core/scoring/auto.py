@@ -142,26 +142,10 @@ def groups_of(views: ViewSet) -> list[list[int]] | None:
 def _measure(
     scoring: OcclusionScoring, tolerance: float, progress: Progress, threads: int | None
 ) -> tuple[float, dict[str, list[float]]]:
-    """Measure the splats from as many views as are needed.
+    """Measure the splats from as many of the views of `groups_of` as are needed; see `score`.
 
-    Parameters
-    ----------
-    scoring : OcclusionScoring
-        With the groups of `groups_of`.
-    tolerance, progress, threads
-        See `score`.
-
-    Returns
-    -------
-    loss : float
-        What the views that were left out are estimated to gain, dB.
-    expected : dict of str to list of float
-        The PSNR that the validation views tell of the two rankings at `RATIOS`, dB.
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
+    Return what the views that were left out are estimated to gain, dB, and the PSNR that the
+    validation views tell of the two rankings at `RATIOS`, dB.
     """
     groups, rays = scoring.measuring.groups, scoring.validation_rays
     validating = [number for k in VALIDATING for number in groups[k]]

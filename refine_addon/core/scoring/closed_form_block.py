@@ -387,13 +387,8 @@ class RowBlock:
     ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
         """Return H before alpha of n splats, and in how many views each lies, (n,) each.
 
-        Parameters
-        ----------
-        points : (4, n) float64
-        reach : (n,) float64
-        views : (v,) int64
-            Those that see some of them; of these, the first `partly` may not see all.
-        partly : int
+        `points` is (4, n), `reach` (n,). Only `views`, (v,), see some of them; of these, the first
+        `partly` may not see all.
         """
         total = np.zeros(points.shape[1])  # (n,), H before alpha
         seen = np.full(points.shape[1], len(views) - partly, np.int32)

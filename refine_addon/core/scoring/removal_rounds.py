@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 KNOWN = 10.0
 """What was measured counts as much as so many rays."""
 
-_LOADING = 0.3
-"""Share of the time that getting colours takes, to show progress."""
+_LOADING = 0.3  # share of the time that getting colours takes, to show progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +42,6 @@ class _ViewRays:
 
     Attributes
     ----------
-    rays : Rays
     colors : (3, u) float32
         Of the splats that they hit.
     area : float

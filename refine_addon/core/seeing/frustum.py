@@ -255,14 +255,10 @@ def census(
 
 
 def _rows(views: ViewSet, centers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows whose products with ``(p, 1)`` are x', y' and z of every view.
+    """Return rows, (3, V, 4), whose products with ``(p, 1)`` are x', y' and z of every view.
 
     x' and y' contain the principal point and the half image size, so a point p lies in the image
     where ``|x'| <= z`` and ``|y'| <= z``.
-
-    Returns
-    -------
-    (3, V, 4) float64
     """
     rows = np.empty((3, len(views), 4))
     for index, (view, center) in enumerate(zip(views, centers, strict=True)):

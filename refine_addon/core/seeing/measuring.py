@@ -266,11 +266,8 @@ class _MeasureAndCast:
 
     Attributes
     ----------
-    gaussians : Gaussians
-    scene : Scene
     views : list of (View, float)
         All of them.
-    sampling : Sampling
     numbers : list of int
         Of the views to measure.
     wanted : list of (bool, set of int)

@@ -399,7 +399,6 @@ def _ellipses(
         Camera coordinates of the centres, scene sizes.
     shape : (6, n) float32
         Covariances in camera coordinates, squared scene sizes.
-    view : View
     """
     x, y, z = local
     across, down = x / z, y / z
@@ -422,7 +421,6 @@ def _image_covariance(
         is computed at the edge that `_BEYOND` sets, because J grows without bound.
     shape : (6, n) float32
         S: xx, xy, xz, yy, yz, zz.
-    view : View
     """
     across, down, z = ray
     beyond = _BEYOND * view.width / view.fx, _BEYOND * view.height / view.fy

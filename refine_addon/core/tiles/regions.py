@@ -17,7 +17,7 @@ from ..scores import Scores
 from ..seeing.measuring import Measured
 from ..splats import joined
 from .selecting import save_kept
-from .splat_table import packed, unpacked
+from .units import packed, unpacked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,16 +44,7 @@ _NEEDED_NO_MORE = (*_FIELD, *_PRICED, *_GATHERED, "mass", "seen_by")
 
 @dataclass(frozen=True)
 class Region:
-    """The splats that are left in a region after a stage: a `Source` of the next.
-
-    Attributes
-    ----------
-    index : int
-        Which one of all.
-    count : int
-    folder : Folder
-        Of the stage.
-    """
+    """The splats that are left in a region after a stage: a `Source` of the next."""
 
     index: int
     count: int
@@ -122,12 +113,7 @@ class StageContext:
 
 @dataclass(frozen=True)
 class SaveMeans:
-    """Saves where the splats of a source are.
-
-    Attributes
-    ----------
-    source : Source
-    """
+    """Saves where the splats of a source are."""
 
     source: Source
 
@@ -139,13 +125,7 @@ class SaveMeans:
 
 @dataclass(frozen=True)
 class GatherRegion:
-    """Gets a region ready to merge, but for the allowance.
-
-    Attributes
-    ----------
-    index : int
-        Which region.
-    """
+    """Gets a region ready to merge, but for the allowance."""
 
     index: int
 
@@ -176,18 +156,10 @@ class GatherRegion:
 
 @dataclass(frozen=True)
 class PriceRegion:
-    """Finds what merging and deleting the splats of a region costs.
-
-    Attributes
-    ----------
-    index : int
-        Which region.
-    whole : (2, 2) float64
-        What `GatherRegion` returns, of all regions together.
-    """
+    """Finds what merging and deleting the splats of a region costs."""
 
     index: int
-    whole: NDArray[np.float64]
+    whole: NDArray[np.float64]  # what `GatherRegion` returns, of all regions together
 
     def run(self, context: StageContext, progress: Progress, threads: int | None) -> None:
         """Save the graph, and of each splat the cost of its cheapest operation and its weight."""
@@ -219,15 +191,7 @@ class PriceRegion:
 
 @dataclass(frozen=True)
 class AbsorbRegion:
-    """Absorbs a region down to some splats.
-
-    Attributes
-    ----------
-    index : int
-        Which region.
-    count : int
-        How many survive.
-    """
+    """Absorbs a region down to `count` splats."""
 
     index: int
     count: int
@@ -277,19 +241,10 @@ class AbsorbRegion:
 
 @dataclass(frozen=True)
 class AbsorbAtOnce:
-    """Absorbs all splats that are left, of which there is one region, as in memory.
-
-    Attributes
-    ----------
-    goal : int
-        How many survive.
-    total : int
-        How many splats there were before some of them were deleted.
-    settings : Settings
-    """
+    """Absorbs all splats that are left, of which there is one region, as in memory."""
 
     goal: int
-    total: int
+    total: int  # before some of them were deleted
     settings: Settings
 
     def run(
@@ -329,20 +284,11 @@ class AbsorbAtOnce:
 
 @dataclass(frozen=True)
 class SettleUnit:
-    """Notes which splats of a unit survive absorbing, and what those became that changed.
-
-    Attributes
-    ----------
-    unit : Unit
-    begin : int
-        How many splats lie before it.
-    regions : sequence of Region
-        Where the survivors are.
-    """
+    """Notes which splats of a unit survive absorbing, and what those became that changed."""
 
     unit: Unit
-    begin: int
-    regions: Sequence[Region]
+    begin: int  # how many splats lie before it
+    regions: Sequence[Region]  # where the survivors are
 
     def run(self, folder: Folder, _progress: Progress, _threads: int | None) -> NDArray[np.int64]:
         """Note them; return what `save_kept` returns."""
