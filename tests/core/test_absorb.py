@@ -191,7 +191,7 @@ def test_the_cost_is_the_squared_error_of_the_pictures():
     )
 
 
-def test_a_merge_along_the_line_of_sight_costs_what_views_from_aside_see():
+def test_a_merge_along_the_viewing_direction_costs_what_views_from_aside_see():
     """One behind the other: alike from the front; from the side as two that lie side by side."""
     field = flat([0.01, 0.01], [[0.0, 0, 0], [0, 0, 4]], [[1.0, 1, 1]] * 2)
     turned = flat([0.01, 0.01], [[0.0, 0, 0], [4, 0, 0]], [[1.0, 1, 1]] * 2)
