@@ -45,7 +45,7 @@ def _given(options: argparse.Namespace) -> CameraChoice:
     frames = options.frames or CameraChoice.of_scene(bpy.context.scene).frames
     collection = bpy.data.collections.get(name)
     if kind == "COLLECTION" and collection is None:
-        names = ", ".join(sorted(found.name for found in bpy.data.collections)) or "none"
+        names = ", ".join(sorted(each.name for each in bpy.data.collections)) or "none"
         msg = f"no collection '{name}' in the open .blend (collections: {names})"
         raise RefineError(msg)
     return CameraChoice(kind, collection, frames)

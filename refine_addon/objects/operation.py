@@ -13,7 +13,6 @@ from ..core.errors import RefineError
 from ..core.operation.files import FileSink
 from ..core.operation.loaded import Loaded, RowSizes
 from ..core.operation.run import run
-from ..core.operation.score import ScoreSink
 from ..core.whole_file import expanded
 from ..core.work import Progress, silent
 from ..mesh import attributes as mesh_attributes
@@ -29,9 +28,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ..core.formats.format import Format
-    from ..core.operation.prune import PruneRequest
+    from ..core.operation.requests import PruneRequest, ScoreRequest
     from ..core.operation.run import Runtime, Written
-    from ..core.operation.score import ScoreRequest
     from ..core.task import Result
 
 
@@ -113,7 +111,7 @@ def score_object(
         See `refine_addon.core.operation.run` and `ObjectSource`; also if there is no such object.
     """
     source = ObjectSource(check(find(name)), demands + Demands(zones=tuple(request.zones)))
-    sink = ScoreSink(expanded(output), overwrite=request.overwrite)
+    sink = FileSink(expanded(output), overwrite=request.overwrite)
     return run(source, request, sink, progress=progress).report
 
 

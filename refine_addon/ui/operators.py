@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 
 from ..cameras.sets import CameraChoice
-from ..core import pipeline, score_splats
+from ..core import pipeline
 from ..core.estimate.quality import in_words
 from ..core.levels.lod import Level, Levels, lod
 from ..core.report import scoring_notes, sizes_in_words
@@ -145,7 +145,7 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
         """Score, and count how many splats lie in each view."""
         forced_out, means = job.forced.removed, job.splats.means
-        scores = score_splats.score(
+        scores = pipeline.score(
             job.splats, job.views, job.settings,
             protected=job.forced.protected, removed=forced_out,
             quality=job.quality, progress=part(progress, 0.0, _SCORED),
@@ -190,7 +190,7 @@ def _by_closed_form(job: _Scoring) -> Settings:
 
 
 def _sketch(job: _Scoring, progress: Progress) -> Scores:
-    return score_splats.score(
+    return pipeline.score(
         job.splats, job.views, _by_closed_form(job), removed=job.forced.removed, progress=progress
     )
 

@@ -564,7 +564,7 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
 @pytest.mark.parametrize(
     ("module", "function", "operator", "arguments"),
     [
-        ("core.score_splats", "score", "score", {}),
+        ("core.pipeline", "score", "score", {}),
         ("core.pipeline", "decide", "apply", {}),
         ("ui.import_operators", "read_splats", "import_ply", {"filepath": "in.ply"}),
         ("ui.import_operators", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),
