@@ -157,10 +157,10 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
                 stream.flush()  # before the permissions: a write would take setuid away
                 mode = _inherited(target, stream.fileno(), mode)
                 if stat.S_IMODE(os.fstat(stream.fileno()).st_mode) != mode:
-                    # By descriptor: whoever owns the folder may have put a link of that name.
+                    # By descriptor: the owner of the folder may have put a link of that name there.
                     named = stream.fileno() if os.chmod in os.supports_fd else temporary
                     os.chmod(named, mode)  # noqa: PTH101 - pathlib takes no descriptor
-            checkpoint()  # whoever cancels while the file is written wants none
+            checkpoint()  # cancelled while the file was written: leave none
             if overwrite:
                 temporary.replace(target)
             else:
@@ -247,11 +247,8 @@ def _new_temporary(target: Path, cleanup: contextlib.ExitStack) -> tuple[Path, i
 def _inherited(target: Path, descriptor: int, mode: int) -> int:
     """Give an open file the owner and group of `target`, as far as this process may.
 
-    Returns
-    -------
-    int
-        The permissions that the file is to have: those of `target`, without setuid and setgid where
-        it could not be given; `mode` if there is no such file.
+    Return the permissions that the file is to have: those of `target`, without setuid and setgid
+    where it could not be given; `mode` if there is no such file.
     """
     try:
         old = target.stat()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..absorbing import absorb as absorbing
-from ..absorbing.merging import ViewSums
+from ..absorbing.merge_field import ViewSums
 from ..estimate.psnr import psnr_against
 from ..estimate.quality import left_to_lose
 from ..scoring import occlusion

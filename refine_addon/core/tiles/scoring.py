@@ -31,19 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredTiles:
-    """What views see of N splats, hidden by one another.
-
-    Attributes
-    ----------
-    context : SceneContext
-    units : sequence of Unit
-        The splats.
-    scores : Scores
-    measured : Measured
-        Of all N.
-    rays : StoredRays
-        The validation rays.
-    """
+    """What views see of all splats, hidden by one another, and their validation rays."""
 
     context: SceneContext
     units: Sequence[Unit]
