@@ -37,7 +37,7 @@ def start(addon, few):  # noqa: ARG001
 @pytest.fixture
 def gate(addon, monkeypatch):
     """Hold back the scoring that was asked for, not its sketch, until `open`; or let it fail."""
-    gate, score = SimpleNamespace(open=threading.Event(), error=None), addon.core.score_splats.score
+    gate, score = SimpleNamespace(open=threading.Event(), error=None), addon.core.pipeline.score
 
     def held(splats, views, settings, *, progress, **options):
         if threading.current_thread().name == "refine" and settings.method != "closed-form":
@@ -47,7 +47,7 @@ def gate(addon, monkeypatch):
                 raise gate.error
         return score(splats, views, settings, progress=progress, **options)
 
-    monkeypatch.setattr(addon.core.score_splats, "score", held)
+    monkeypatch.setattr(addon.core.pipeline, "score", held)
     return gate
 
 
@@ -189,7 +189,7 @@ def test_a_fault_on_the_thread_is_raised_and_locks_nothing(addon, start, gate, m
         def fault(*_arguments, **_options):
             raise gate.error
 
-        monkeypatch.setattr(addon.core.score_splats, "score", fault)
+        monkeypatch.setattr(addon.core.pipeline, "score", fault)
     operator, context, _ = start()
 
     with pytest.raises(ValueError, match="a fault"):

@@ -176,8 +176,8 @@ def noted(addon, monkeypatch):
         monkeypatch.setattr(module, name, noting)
 
     note(addon.objects.splat_object, "gather")
-    note(addon.core.score_splats, "score")
-    note(addon.core.absorb_splats, "absorb_removed")
+    note(addon.core.pipeline, "score")
+    note(addon.core.pipeline.absorb_splats, "absorb_removed")
     return references
 
 
@@ -218,7 +218,7 @@ def work(addon, monkeypatch):
 
         core = addon.core
         module, function = {
-            "score": (core.score_splats, "score"), "apply": (core.pipeline, "decide"),
+            "score": (core.pipeline, "score"), "apply": (core.pipeline, "decide"),
         }[name]  # fmt: skip
         monkeypatch.setattr(module, function, instead)
 

@@ -4,14 +4,12 @@ A request says what is to be done, a source where the splats are, a sink where t
 
 | | source | request | sink | in |
 |---|---|---|---|---|
-| `prune_file` | `FileSource` | `PruneRequest` | `FileSink` | `core/operation/prune.py` |
-| `clean_file` | `FileSource` | `CleanRequest` | `FileSink` | `core/operation/clean.py` |
-| `score_file` | `FileSource` | `ScoreRequest` | `ScoreSink` | `core/operation/score.py` |
-| `convert_file` | `FileSource` | `ConvertRequest` | `FileSink` | `core/operation/convert.py` |
+| `prune_file` | `FileSource` | `PruneRequest` | `FileSink` | `core/operation/files.py` |
+| `file_to_file` | `FileSource` | any of `requests.py` | `FileSink` | `core/operation/files.py` |
 | `lod_file` | `FileSource` | `LevelsRequest` | `LevelSink` | `core/levels/files.py` |
 | `prune_object` | `ObjectSource` | `PruneRequest` | `ObjectSink` | `objects/operation.py` |
-| `score_object` | `ObjectSource` | `ScoreRequest` | `ScoreSink` | `objects/operation.py` |
-| `prune_tiles` | `TileSource` | `TilesRequest` | `TileSink` | `core/tiles/prune.py` |
+| `score_object` | `ObjectSource` | `ScoreRequest` | `FileSink` | `objects/operation.py` |
+| `prune_tiles` | `TileScene` | `TilesRequest` | `TileSink` | `core/tiles/prune.py` |
 """
 
 from __future__ import annotations
@@ -30,6 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ..formats.format import Format
+    from ..volumes import Zone
 
 
 DECIDED = 0.8
@@ -71,7 +70,7 @@ class Written:
     splats : dict of str to int or None
         Counts to add to ``splats``: how many the files hold.
     notes : list of str
-        What the user should know about the files.
+        What the user should know about the source and the files.
     facts : dict
         Anything else.
     """
@@ -83,15 +82,6 @@ class Written:
     facts: dict[str, Any] = field(default_factory=dict)
 
 
-class Input(Protocol):
-    """What a source gives."""
-
-    @property
-    def notes(self) -> Sequence[str]:
-        """What the user should know about it, in sentences."""
-        ...
-
-
 class Decision(Protocol):
     """What a request decided of an input; `run` completes its report."""
 
@@ -101,9 +91,9 @@ class Decision(Protocol):
         ...
 
 
-InputT = TypeVar("InputT", bound=Input)
-InputT_co = TypeVar("InputT_co", bound=Input, covariant=True)
-InputT_contra = TypeVar("InputT_contra", bound=Input, contravariant=True)
+InputT = TypeVar("InputT")
+InputT_co = TypeVar("InputT_co", covariant=True)
+InputT_contra = TypeVar("InputT_contra", contravariant=True)
 DecisionT = TypeVar("DecisionT", bound=Decision)
 DecisionT_contra = TypeVar("DecisionT_contra", bound=Decision, contravariant=True)
 
@@ -117,17 +107,25 @@ class Source(Protocol[InputT_co]):
 
 
 class Request(ABC, Generic[InputT_contra, DecisionT]):
-    """What is to be done."""
+    """What is to be done.
+
+    Attributes
+    ----------
+    zones : sequence of Zone
+        Volumes that say which splats must stay and which must go, in the frame of the views.
+    overwrite : bool
+        Whether files may be replaced.
+    dry_run : bool
+        Whether to decide as for the output, and write no splats.
+    """
+
+    zones: Sequence[Zone] = ()
+    overwrite: bool = False
+    dry_run: bool = False
 
     @contextmanager
     def opened(self, _form: Format | None) -> Iterator[None]:
-        """Refuse what can be had of no splats, before any are read.
-
-        Parameters
-        ----------
-        form : Format or None
-            Of the output; None is plain PLY.
-        """
+        """Refuse what can be had of no splats in the format of the output, before any are read."""
         yield
 
     @abstractmethod
@@ -204,6 +202,6 @@ def run(
     report = decision.report
     report |= written.facts | compared
     report["splats"] |= written.splats
-    report["notes"] += [*written.notes, *read.notes]
+    report["notes"] += written.notes
     report |= {"files": written.files, "timings": runtime.clock.timings}
     return decision

@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 KNOWN = 10.0
 """What was measured counts as much as so many rays."""
 
-_LOADING = 0.3
-"""Share of the time that getting colours takes, to show progress."""
+_LOADING = 0.3  # share of the time that getting colours takes, to show progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +42,6 @@ class _ViewRays:
 
     Attributes
     ----------
-    rays : Rays
     colors : (3, u) float32
         Of the splats that they hit.
     area : float
@@ -186,8 +184,7 @@ def _grown(
     before, now : (n,) float64
         What the rays told then, and what they tell now.
     known : (n,) float64
-        How many times the measured sum the growth of the scene counts: many for a splat that few
-        rays hit.
+        Weight of the scene's growth, over the measured sum: large for a splat that few rays hit.
     """
     total = float(before.sum())
     scene_growth = float(now.sum()) / total if total > 0.0 else 1.0

@@ -26,7 +26,7 @@ REACH = 3.3
 """Standard deviations to which a footprint is followed; alpha = 1 falls to `ALPHA_CUT` at 3.33."""
 
 BRIGHTEST = 16.0
-"""Brightest colour that is told apart, where white is 1; keeps sums finite."""
+"""Colours are clipped to this, white being 1; keeps sums finite."""
 
 _CHUNK = 1 << 14
 _FARTHEST = 1e6  # scene sizes; splats farther from the middle are in no view
@@ -326,7 +326,7 @@ def _touches(
     view: View,
     planes: tuple[float, float],
 ) -> NDArray[np.bool_]:
-    """Return which footprints may reach into the image, (M,); some that do not are included.
+    """Return which footprints may reach into the image, (M,); on the safe side.
 
     It is `frustum.contains` with the image widened by the reach of each footprint.
     """
@@ -371,7 +371,7 @@ def boxes_touch(boxes: NDArray[np.float32], scene: Scene, view: View) -> NDArray
 
 def _reach(side: frustum.Side) -> float:
     """Return how far a footprint reaches, px times depth, for a longest standard deviation of 1."""
-    # A footprint is longest where the ray is steepest; the projection is linearised no further.
+    # A footprint is longest where its ray is most oblique; beyond `_BEYOND` it grows no further.
     slope = (abs(side.offset) + (1.0 + 2.0 * _BEYOND) * side.half) / side.focal
     return REACH * side.focal * float(np.hypot(1.0, slope))
 
@@ -399,7 +399,6 @@ def _ellipses(
         Camera coordinates of the centres, scene sizes.
     shape : (6, n) float32
         Covariances in camera coordinates, squared scene sizes.
-    view : View
     """
     x, y, z = local
     across, down = x / z, y / z
@@ -422,7 +421,6 @@ def _image_covariance(
         is computed at the edge that `_BEYOND` sets, because J grows without bound.
     shape : (6, n) float32
         S: xx, xy, xz, yy, yz, zz.
-    view : View
     """
     across, down, z = ray
     beyond = _BEYOND * view.width / view.fx, _BEYOND * view.height / view.fy

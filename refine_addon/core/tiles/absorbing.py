@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..absorb_splats import FIRST, PARTS
 from ..absorbing.absorb import STAGE, Counts, patience, stages
+from ..pipeline.absorb_splats import FIRST, PARTS
 from ..seeing.measuring import Measured
 from ..selection import Budget, select
 from .gaussians import store_gaussians
@@ -57,7 +57,7 @@ _ASKEW = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]], np.float32) / np.float32
 
 @dataclass(frozen=True, eq=False)
 class Survivors(Counts):
-    """What is left of N splats.
+    """What is left of N splats: K of them; for the counts see `absorb.Absorbed`.
 
     Attributes
     ----------
@@ -67,8 +67,6 @@ class Survivors(Counts):
         Rows of the survivors among the N, region by region, in no order.
     changed : (K,) bool
         Which of them absorbed others.
-    merged, deleted : int
-        See `absorb.Absorbed`.
     """
 
     regions: Sequence[Region]
@@ -80,20 +78,10 @@ class Survivors(Counts):
 
 @dataclass(frozen=True, eq=False)
 class _Left:
-    """The n splats that are left before a stage.
-
-    Attributes
-    ----------
-    sources : sequence of Source
-        Where they are.
-    rows : (n,) int64
-        Which rows of all sources together, ascending.
-    measured : Measured
-        What the views see of them, or are expected to see.
-    """
+    """The n splats that are left before a stage, and what views see of them or are expected to."""
 
     sources: Sequence[Source]
-    rows: NDArray[np.int64]
+    rows: NDArray[np.int64]  # (n,), of all sources together, ascending
     measured: Measured
 
 
@@ -162,17 +150,8 @@ def _stage(
 ) -> tuple[list[Region], _Left]:
     """Reduce the splats that are left to `count`, region by region.
 
-    Parameters
-    ----------
-    scene : SceneContext
-        In which all splats were measured.
-    number : int
-        Of the stage; before all but the first, the splats are measured anew.
-    left : _Left
-    count : int
-    factor : float
-        See `StageContext`.
-    runner : Runner
+    Before all stages but the first, `number` 0, they are measured anew. For `factor` see
+    `StageContext`.
     """
     folder = scene.folder.inner(f"stage-{number}")
     if number:
@@ -216,15 +195,8 @@ def _of_all(regions: Sequence[Region], name: str, axis: int = 0) -> NDArray[Any]
 def _measured_again(scene: SceneContext, left: _Left, turn: int, runner: Runner) -> _Left:
     """Measure all splats in a part of the views, and add what the others are expected to see.
 
-    Parameters
-    ----------
-    scene : SceneContext
-        With a folder of its own.
-    left : _Left
-        All rows of its sources.
-    turn : int
-        See `occlusion.measure_part`.
-    runner : Runner
+    Left are all rows of the sources. The scene has a folder of its own. For `turn` see
+    `occlusion.measure_part`.
     """
     gaussians, good = store_gaussians(scene, left.sources, runner.part(0.0, 0.2))
     measuring = TileMeasuring(scene, runner)
@@ -239,19 +211,11 @@ def _measured_again(scene: SceneContext, left: _Left, turn: int, runner: Runner)
 
 
 def _staying(stage: StageContext, sizes: Sequence[int], left: int, runner: Runner) -> list[int]:
-    """Return how many splats of each region stay, of `left` that do of all.
+    """Return how many of the `sizes` splats of each region stay, of `left` that do of all.
 
     As many go as a region has among the cheapest merges and deletions of all. A merge counts half,
     since of two splats that merge one goes; so all of them together may count half of the splats,
     and `STAGE` has to be .5 or more, or there would not be enough to go.
-
-    Parameters
-    ----------
-    stage : StageContext
-    sizes : sequence of int
-        Splats of each region.
-    left : int
-    runner : Runner
     """
     numbers = range(len(sizes))
     gather = [GatherRegion(index) for index in numbers]
@@ -269,14 +233,8 @@ def _shared_out(
 ) -> list[int]:
     """Return how many splats of each region stay; see `_staying`.
 
-    Parameters
-    ----------
-    costs : (n,) float64
-        Of each splat's cheapest operation, region by region.
-    weights : (n,) float32
-        How many splats go by it, 1 or .5.
-    sizes : sequence of int
-    left : int
+    Of each splat's cheapest operation, region by region: its cost, (n,), and how many splats go by
+    it, 1 or .5.
     """
     order, goal = np.argsort(costs, kind="stable"), len(costs) - left
     last = int(np.searchsorted(np.cumsum(weights[order], dtype=np.float64), goal))

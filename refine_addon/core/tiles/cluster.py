@@ -36,14 +36,12 @@ if TYPE_CHECKING:
 _AHEAD = 3
 """Groups of steps a thread of a worker that are handed out ahead: so many wait here at most."""
 
-_TOGETHER = 16
-"""Most steps in a group: each group takes scheduler and coordinator about 15 ms."""
+_TOGETHER = 16  # most steps in a group: each group takes scheduler and coordinator about 15 ms
 
 _TURNS = 4
 """Groups a thread at least, where there are as many steps, so that all end at about one time."""
 
-_PATIENCE = 0.2
-"""Seconds between two looks whether to go on."""
+_PATIENCE = 0.2  # seconds between two looks whether to go on
 
 _MEMORY = {
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 28,
@@ -52,8 +50,7 @@ _MEMORY = {
 """Dask lets glibc hand back memory at once, in bytes; arrays of a chunk would be page-faulted anew
 for each chunk, which takes longer than the work."""
 
-_CONNECT = 10
-"""Seconds to find a scheduler, and a worker."""
+_CONNECT = 10  # seconds to find a scheduler, and a worker
 
 _TRIES = 3
 """How often workers are asked whether they see the files of a job, if all of them get lost."""

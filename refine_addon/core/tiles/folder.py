@@ -30,8 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-_DAMAGE = (ValueError, EOFError)
-"""What NumPy raises for a file that is not a whole array."""
+_DAMAGE = (ValueError, EOFError)  # what NumPy raises for a file that is not a whole array
 
 
 class Interrupted(RefineError):  # noqa: N818 - the input is not at fault

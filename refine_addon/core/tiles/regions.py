@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..absorb_splats import absorb_removed
 from ..absorbing import merge_field
 from ..absorbing.absorb import mergeable, reduced
 from ..absorbing.merge_field import Field, ViewSums
 from ..absorbing.merge_graph import MergeGraph
+from ..pipeline.absorb_splats import absorb_removed
 from ..scores import Scores
 from ..seeing.measuring import Measured
 from ..splats import joined
 from .selecting import save_kept
-from .splat_table import packed, unpacked
+from .units import packed, unpacked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,16 +44,7 @@ _NEEDED_NO_MORE = (*_FIELD, *_PRICED, *_GATHERED, "mass", "seen_by")
 
 @dataclass(frozen=True)
 class Region:
-    """The splats that are left in a region after a stage: a `Source` of the next.
-
-    Attributes
-    ----------
-    index : int
-        Which one of all.
-    count : int
-    folder : Folder
-        Of the stage.
-    """
+    """The splats that are left in a region after a stage: a `Source` of the next."""
 
     index: int
     count: int
@@ -122,12 +113,7 @@ class StageContext:
 
 @dataclass(frozen=True)
 class SaveMeans:
-    """Saves where the splats of a source are.
-
-    Attributes
-    ----------
-    source : Source
-    """
+    """Saves where the splats of a source are."""
 
     source: Source
 
@@ -139,20 +125,14 @@ class SaveMeans:
 
 @dataclass(frozen=True)
 class GatherRegion:
-    """Gets a region ready to merge, but for the allowance.
-
-    Attributes
-    ----------
-    index : int
-        Which region.
-    """
+    """Gets a region ready to merge, but for the allowance."""
 
     index: int
 
     def run(
         self, context: StageContext, progress: Progress, threads: int | None
     ) -> NDArray[np.float64]:
-        """Save the region; return `merge_field.Unallowed.seen_and_whole`, (2, 2)."""
+        """Save the region; return `merge_field.MeasuredField.seen_and_whole`, (2, 2)."""
         name = f"{self.index:06d}.gathered"
         sums = context.folder.once(name, lambda: self._gathered(context, progress, threads))
         return np.asarray(sums)
@@ -164,30 +144,22 @@ class GatherRegion:
         table, origin, members = context.gathered(rows)
         splats = unpacked(table)
         places = mergeable(splats, context.scene, np.zeros(len(rows), np.bool_))
-        unallowed = merge_field.unallowed(
+        measured = merge_field.measured_field(
             splats, places, context.views, context.scene, ViewSums(*sums),
             progress=progress, threads=threads,
         )  # fmt: skip
         arrays = dict(zip(_GATHERED, (table, origin, members, places), strict=True))
-        arrays |= {"mass": unallowed.mass, "seen_by": unallowed.seen}
-        context.folder.save(self.index, arrays | vars(unallowed.field))
-        return unallowed.seen_and_whole()
+        arrays |= {"mass": measured.mass, "seen_by": measured.seen}
+        context.folder.save(self.index, arrays | vars(measured.field))
+        return measured.seen_and_whole()
 
 
 @dataclass(frozen=True)
 class PriceRegion:
-    """Finds what merging and deleting the splats of a region costs.
-
-    Attributes
-    ----------
-    index : int
-        Which region.
-    whole : (2, 2) float64
-        What `GatherRegion` returns, of all regions together.
-    """
+    """Finds what merging and deleting the splats of a region costs."""
 
     index: int
-    whole: NDArray[np.float64]
+    whole: NDArray[np.float64]  # what `GatherRegion` returns, of all regions together
 
     def run(self, context: StageContext, progress: Progress, threads: int | None) -> None:
         """Save the graph, and of each splat the cost of its cheapest operation and its weight."""
@@ -199,9 +171,9 @@ class PriceRegion:
         folder = context.folder
         arrays = folder.load(self.index, (*_FIELD, "mass", "seen_by", "rows", "mergeable"))
         field = Field(*(arrays[name] for name in _FIELD))
-        bare = merge_field.Unallowed(field, arrays["mass"], arrays["seen_by"])
+        measured = merge_field.MeasuredField(field, arrays["mass"], arrays["seen_by"])
         graph = MergeGraph(
-            bare.with_allowance(self.whole), context.scene, context.factor, threads=threads
+            measured.with_allowance(self.whole), context.scene, context.factor, threads=threads
         )
         graph.connect(progress)
         best, merges = graph.best()
@@ -219,15 +191,7 @@ class PriceRegion:
 
 @dataclass(frozen=True)
 class AbsorbRegion:
-    """Absorbs a region down to some splats.
-
-    Attributes
-    ----------
-    index : int
-        Which region.
-    count : int
-        How many survive.
-    """
+    """Absorbs a region down to `count` splats."""
 
     index: int
     count: int
@@ -277,19 +241,10 @@ class AbsorbRegion:
 
 @dataclass(frozen=True)
 class AbsorbAtOnce:
-    """Absorbs all splats that are left, of which there is one region, as in memory.
-
-    Attributes
-    ----------
-    goal : int
-        How many survive.
-    total : int
-        How many splats there were before some of them were deleted.
-    settings : Settings
-    """
+    """Absorbs all splats that are left, of which there is one region, as in memory."""
 
     goal: int
-    total: int
+    total: int  # before some of them were deleted
     settings: Settings
 
     def run(
@@ -329,20 +284,11 @@ class AbsorbAtOnce:
 
 @dataclass(frozen=True)
 class SettleUnit:
-    """Notes which splats of a unit survive absorbing, and what those became that changed.
-
-    Attributes
-    ----------
-    unit : Unit
-    begin : int
-        How many splats lie before it.
-    regions : sequence of Region
-        Where the survivors are.
-    """
+    """Notes which splats of a unit survive absorbing, and what those became that changed."""
 
     unit: Unit
-    begin: int
-    regions: Sequence[Region]
+    begin: int  # how many splats lie before it
+    regions: Sequence[Region]  # where the survivors are
 
     def run(self, folder: Folder, _progress: Progress, _threads: int | None) -> NDArray[np.int64]:
         """Note them; return what `save_kept` returns."""

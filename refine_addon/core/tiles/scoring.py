@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..score_splats import with_quality
+from ..pipeline.score_splats import with_quality
 from ..scoring import auto
 from ..scoring.occlusion import FIRST_END, PRIOR, OcclusionScoring
 from ..seeing.scene import Scene, principal_axes
@@ -31,19 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredTiles:
-    """What views see of N splats, hidden by one another.
-
-    Attributes
-    ----------
-    context : SceneContext
-    units : sequence of Unit
-        The splats.
-    scores : Scores
-    measured : Measured
-        Of all N.
-    rays : StoredRays
-        The validation rays.
-    """
+    """What views see of all splats, hidden by one another, and their validation rays."""
 
     context: SceneContext
     units: Sequence[Unit]

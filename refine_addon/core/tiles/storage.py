@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import secrets
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -136,8 +135,9 @@ def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDA
         return np.frombuffer(sent, dtype, len(sent) // dtype.itemsize)
 
 
-def make_folder(folder: Path | Url) -> list[Path]:
-    """Make a folder, if it is not there; return the folders that were made, the innermost first.
+@contextlib.contextmanager
+def new_folder(folder: Path | Url) -> Iterator[None]:
+    """Make a folder, if it is not there; remove it if it is empty at the end.
 
     Behind a URL an empty file is written there, moved and removed, so that a storage that does not
     let us is known before long work starts.
@@ -148,9 +148,9 @@ def make_folder(folder: Path | Url) -> list[Path]:
         If it cannot be made, or no file be written there.
     """
     if not isinstance(folder, Url):
-        with _explained(folder, "cannot be made"):
-            parents = [*itertools.takewhile(lambda each: not each.exists(), folder.parents)]
-            return [] if whole_file.make_folder(folder) else [folder, *parents]
+        with whole_file.new_folder(folder):
+            yield
+        return
     with _explained(folder, "cannot be written to"):
         system, inner = _opened(folder)
         system.makedirs(inner, exist_ok=True)
@@ -159,7 +159,7 @@ def make_folder(folder: Path | Url) -> list[Path]:
         system.pipe_file(here, b"")
         system.mv(here, there)
         system.rm_file(there)
-    return []
+    yield
 
 
 def refuse_existing(path: Path | Url, *, overwrite: bool) -> None:

@@ -16,7 +16,7 @@ from ..formats.ply_columns import splats_from_columns
 from ..formats.ply_header import HEADER_LIMIT, TEXT, format_of
 from ..formats.registry import read_splats
 from ..scoring.closed_form_block import ROWS
-from ..splats import joined
+from ..splats import Splats, joined
 from ..urls import Url
 from . import storage
 
@@ -27,13 +27,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..splats import Splats
 
 _HEADER = 1 << 16
 """Bytes that are fetched of a tile behind a URL for its header, which hardly ever has more."""
 
-_PIECE = 1 << 24
-"""Bytes beside the rows that are copied at a time."""
+_PIECE = 1 << 24  # bytes beside the rows that are copied at a time
 
 
 class Source(Protocol):
@@ -109,13 +107,7 @@ class Tile(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Rows ``start`` to ``stop`` of a tile.
-
-    Attributes
-    ----------
-    tile : Tile
-    start, stop : int
-    """
+    """Rows ``start`` to ``stop`` of a tile."""
 
     tile: Tile
     start: int
@@ -129,18 +121,10 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Unit:
-    """A run of the rows of all tiles together, which may begin in one tile and end in another.
-
-    Attributes
-    ----------
-    index : int
-        Which one of all.
-    parts : tuple of Part
-        Of the tiles that it lies in, in their order; none is empty.
-    """
+    """A run of the rows of all tiles together, which may begin in one tile and end in another."""
 
     index: int
-    parts: tuple[Part, ...]
+    parts: tuple[Part, ...]  # of the tiles that it lies in, in their order; none is empty
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -197,19 +181,9 @@ class Unit:
 
 
 class Piece(NamedTuple):
-    """Rows of a tile that lie in one unit.
+    """Rows of a tile that lie in one unit: which of the unit, `place`, and of the tile, `part`."""
 
-    Attributes
-    ----------
-    unit : int
-        Index of the unit.
-    place : slice
-        Which rows of the unit they are.
-    part : Part
-        Which rows of the tile they are.
-    """
-
-    unit: int
+    unit: int  # its index
     place: slice
     part: Part
 
@@ -361,3 +335,19 @@ def pieces_of(tiles: Sequence[Tile], units: Sequence[Unit]) -> list[list[Piece]]
         for part, place in zip(unit.parts, unit.slices(), strict=True):
             pieces[numbers[part.tile]].append(Piece(unit.index, place, part))
     return pieces
+
+
+def packed(splats: Splats) -> NDArray[np.float64]:
+    """Return splats as one table, (n, 14 + 3 K), for harmonics of K coefficients a channel."""
+    count = len(splats)
+    columns = [splats.means, splats.log_scales, splats.quaternions]
+    columns += [splats.opacity_logits[:, None], splats.sh_dc, splats.sh_rest.reshape(count, -1)]
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        return np.concatenate([np.asarray(values, np.float64) for values in columns], axis=1)
+
+
+def unpacked(table: NDArray[np.float64]) -> Splats:
+    """Return the splats of a table, in float64."""
+    means, scales, quaternions, logits, constant, rest = np.split(table, [3, 6, 10, 11, 14], axis=1)
+    harmonics = rest.reshape(len(table), rest.shape[1] // 3, 3)
+    return Splats(means, scales, quaternions, logits[:, 0], constant, harmonics)

@@ -103,13 +103,7 @@ class InProcess:
 
 @dataclass(frozen=True)
 class Runner:
-    """Has workers do steps, and tells how far they are.
-
-    Attributes
-    ----------
-    workers : Workers
-    progress : callable
-    """
+    """Has workers do steps, and tells how far they are."""
 
     workers: Workers
     progress: Progress = silent
