@@ -67,24 +67,15 @@ class Region:
 class StageContext:
     """What all steps of a stage need.
 
-    Attributes
-    ----------
-    folder : Folder
-        Of the stage. It has for each region ``rows``, those of its splats among the rows of all
-        sources, ascending, and ``sums``, what the views see of them: see `ViewSums`.
-    views : ViewSet
-    scene : Scene
-    sources : sequence of Source
-        What the stage before left.
-    factor : float
-        On the cost of merging where it is priced by regions, see `absorb.patience`.
+    The folder is that of the stage. It has for each region ``rows``, those of its splats among the
+    rows of all sources, ascending, and ``sums``, what the views see of them: see `ViewSums`.
     """
 
     folder: Folder
     views: ViewSet
     scene: Scene
-    sources: Sequence[Source]
-    factor: float = 1.0
+    sources: Sequence[Source]  # what the stage before left
+    factor: float = 1.0  # on the cost of merging, priced by regions: see `absorb.patience`
 
     def gathered(
         self, rows: NDArray[np.int64]
