@@ -31,8 +31,6 @@ def _clean(run: Run, source: Path, output: Path | None, views: ViewSet) -> dict[
         f"{run.named(str(source))}: {done['cleaned']['words']}; {splats['kept']:,} of "
         f"{splats['before']:,} splats stay{written(splats)}, {by(done['views'])}{to}"
     )
-    run.say_cameras()
-    run.say_demanded(done)
-    run.say_unseen(splats["unseen"], splats["before"] - splats["forced"])
+    run.say_what_decided(done)
     run.terminal.notes(done["notes"])
     return done

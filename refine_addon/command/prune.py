@@ -121,10 +121,8 @@ def _say_result(run: Run, label: str, done: dict[str, Any]) -> None:
     ]
     target = f" -> {files['output']}" if files["output"] else ""
     run.terminal.say(f"{run.named(label)}: {', '.join(parts)}{target}")
-    run.say_cameras()
-    run.say_demanded(done)
     cleaned = sum(count for count in done.get("cleaned", {}).values() if isinstance(count, int))
-    run.say_unseen(splats["unseen"], splats["before"] - cleaned - splats["forced"])
+    run.say_what_decided(done, cleaned)
     if "cleaned" in done:
         run.terminal.say(f"  cleaned: {done['cleaned']['words']}")
     quality = _quality(done)

@@ -51,8 +51,6 @@ def _said(run: Run, label: str, done: dict[str, Any]) -> dict[str, Any]:
         f"{label}: scored {splats['before']:,} splats by {done['views']['used']} views "
         f"-> {run.options.output}"
     )
-    run.say_cameras()
-    run.say_demanded(done)
-    run.say_unseen(splats["unseen"], splats["before"] - splats["forced"])
+    run.say_what_decided(done)
     run.terminal.notes(done["notes"])
     return done

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from ..cameras.sets import Choice
+from ..cameras.sets import CameraChoice
 from ..core import pipeline
 from ..core.estimate.quality import in_words
 from ..core.levels.lod import Level, Levels, lod
@@ -24,6 +24,7 @@ from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
+from ..mesh.scores import Provenance
 from ..objects import level_objects, splat_group, splat_object
 from ..objects.demands import Demands
 from . import plans, staleness
@@ -60,7 +61,7 @@ _SCORED = 0.97
 
 def chosen_views(context: bpy.types.Context) -> ViewSet:
     """Return the views of the cameras that the panel names."""
-    return Choice.of_scene(context.scene).views(context, context.object)
+    return CameraChoice.of_scene(context.scene).views(context, context.object)
 
 
 def apply_task(
@@ -137,10 +138,10 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     ) -> None:
         """Store the closed form's scores, to be looked at until those asked for are there."""
         group = splat_group.by_uids(job.uids, checked)
-        provenance = splat_group.Provenance(
-            _by_closed_form(job), job.origins, forced=job.forced, asked=job.settings
+        provenance = Provenance(
+            _by_closed_form(job), protected=job.forced.protected, asked=job.settings
         )
-        splat_group.store(group, scores, provenance)
+        splat_group.store(group, scores, provenance, job.origins)
         plans.refresh(context)
 
     @staticmethod
@@ -167,8 +168,8 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         pairs = zip(job.views, counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
         group = splat_group.by_uids(job.uids, checked)
-        provenance = splat_group.Provenance(job.settings, job.origins, cameras, job.forced)
-        splat_group.store(group, scores, provenance)
+        provenance = Provenance(job.settings, cameras=cameras, protected=job.forced.protected)
+        splat_group.store(group, scores, provenance, job.origins)
         plans.refresh(context)
         self.report({"INFO"}, _scored_in_words(group, scores, job.forced.counts()["forced"]))
         modifiers = [note for each in group for note in splat_object.modifier_notes(each.obj)]

@@ -12,7 +12,7 @@ import numpy as np
 from bpy.props import EnumProperty, IntProperty
 
 from ..cameras.objects import UPRIGHT, WEIGHT, world_matrix
-from ..cameras.sets import chosen_cameras
+from ..cameras.sets import CameraChoice
 from ..core.errors import RefineError
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
@@ -166,9 +166,9 @@ def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:
     RefineError
         If there is none.
     """
-    scene, settings = context.scene, context.scene.refine
-    cameras = chosen_cameras(context, settings.source, settings.collection)
-    if settings.source == "FRAMES":
+    scene, choice = context.scene, CameraChoice.of_scene(context.scene)
+    cameras = choice.cameras(context)
+    if choice.source == "FRAMES":
         cameras = [marker.camera for marker in scene.timeline_markers] + [scene.camera]
         cameras = list(dict.fromkeys(camera for camera in cameras if camera))
     if not cameras:
@@ -280,6 +280,6 @@ def _join(context: bpy.types.Context, ring: bpy.types.Collection) -> None:
     if parent:
         ring.children.link(parent)
     else:
-        for camera in chosen_cameras(context, settings.source, None):
+        for camera in CameraChoice(settings.source).cameras(context):
             ring.objects.link(camera)
     settings.collection, settings.source = ring, "COLLECTION"

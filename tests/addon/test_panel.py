@@ -190,7 +190,7 @@ def test_nothing_is_asked_of_the_scene_twice_until_it_changes(
 
     bpy.ops.refine.score()
     panel = addon.ui.panel
-    monkeypatch.setattr(panel, "chosen_cameras", counting("cameras", panel.chosen_cameras))
+    monkeypatch.setattr(panel, "_cameras", counting("cameras", panel._cameras))
     for module, name in ((panel.staleness, "changes"), (panel.mesh_layout, "export_bytes")):
         monkeypatch.setattr(module, name, counting(name, getattr(module, name)))
     bpy.context.view_layer.update()

@@ -273,11 +273,11 @@ def each_level(
         *scene.scene(), progress=part(progress, 0.0, COMPARING), threads=threads
     )
     after = part(progress, COMPARING, 1.0)
-    made = (_absorbing if levels.absorb else _deleting)(
+    decided = (_absorbing if levels.absorb else _deleting)(
         scene, levels.budgets(total), after, threads
     )
     left_before, number = total, 0
-    for place, (keep, splats, result, absorbed) in enumerate(made):
+    for place, (keep, splats, result, absorbed) in enumerate(decided):
         if len(splats) == left_before:
             continue
         number, left_before = number + 1, len(splats)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from ..formats.registry import as_written, format_named, read_splats
-from ..report import Files, held
+from ..report import files_facts, held
 from ..volumes import forced
 from ..whole_file import expanded, refuse_existing, refuse_mapped
 from ..work import Progress, report, silent
@@ -184,15 +184,15 @@ class FileSink:
             See `SplatFile.write`.
         """
         report(runtime.progress, DECIDED, "writing")
-        made = as_written(loaded.file(), self.path)
+        writer = as_written(loaded.file(), self.path)
         columns = choice.columns if isinstance(choice, Kept) else loaded.columns(choice.absorbed)
-        path, size = self.written, made.size(choice.keep, columns)
+        path, size = self.written, writer.size(choice.keep, columns)
         if path is not None:
-            made.write(path, choice.keep, columns=columns, overwrite=self.overwrite)
+            writer.write(path, choice.keep, columns=columns, overwrite=self.overwrite)
             size = path.stat().st_size
         return Written(
-            files=asdict(Files(loaded.name, str(path) if path else None, loaded.bytes, size)),
+            files=files_facts(loaded.name, str(path) if path else None, loaded.bytes, size),
             path=path,
-            splats=held(made, choice.keep, written=path is not None),
-            notes=[*made.notes(choice.keep), *loaded.notes],
+            splats=held(writer, choice.keep, written=path is not None),
+            notes=[*writer.notes(choice.keep), *loaded.notes],
         )

@@ -149,8 +149,7 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     absorbed = None
     if task.absorb:
         count = int(np.count_nonzero(keep))
-        ahead = part(progress, 0.2, 1.0)
-        absorbed, psnr = absorb_task(task, count, known, ahead, threads)
+        absorbed, psnr = absorb_task(task, count, known, part(progress, 0.2, 1.0), threads)
         keep = absorbed.keep
         clock.lap("absorb_s")
     else:
@@ -217,6 +216,6 @@ def _settled(task: Task) -> int | None:
         return None
     total = len(task.scene()[0])
     held = 0 if task.protected is None else int(np.count_nonzero(task.protected))
-    found = needed(task.budget.removals(total, task.row_bytes, task.fixed_bytes), total)
+    removed = needed(task.budget.removals(total, task.row_bytes, task.fixed_bytes), total)
     # Those that are protected stay, wherever in the order they are.
-    return None if found is None or found + held >= total else found + held
+    return None if removed is None or removed + held >= total else removed + held

@@ -6,7 +6,7 @@ import contextlib
 import functools
 import hashlib
 import tempfile
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from ..estimate.psnr import psnr_kept
 from ..estimate.quality import needed
 from ..formats.ply_header import with_count
 from ..operation.run import Request, Written, run
-from ..report import MEASURES, Files, conclude, make_report, remark
+from ..report import MEASURES, conclude, files_facts, make_report, remark
 from ..scoring.closed_form_block import ROWS
 from ..selection import refuse_none_left
 from ..urls import Url
@@ -364,7 +364,7 @@ class TileSink:
         target = None if outputs is None else str(self._folder)
         before = sum(tile.size for tile in scene.tiles)
         return Written(
-            files=asdict(Files(f"{len(scene.tiles)} tiles", target, before, sum(sizes))),
+            files=files_facts(f"{len(scene.tiles)} tiles", target, before, sum(sizes)),
             splats={"written": None if outputs is None else sum(kept)},
             facts={"tiles": _facts(scene.tiles, outputs, sizes, decision.counts)},
         )

@@ -123,7 +123,7 @@ class GatherRegion:
     def run(
         self, context: StageContext, progress: Progress, threads: int | None
     ) -> NDArray[np.float64]:
-        """Save the region; return `merge_field.Unallowed.seen_and_whole`, (2, 2)."""
+        """Save the region; return `merge_field.MeasuredField.seen_and_whole`, (2, 2)."""
         name = f"{self.index:06d}.gathered"
         sums = context.folder.once(name, lambda: self._gathered(context, progress, threads))
         return np.asarray(sums)
@@ -135,14 +135,14 @@ class GatherRegion:
         table, origin, members = context.gathered(rows)
         splats = unpacked(table)
         places = mergeable(splats, context.scene, np.zeros(len(rows), np.bool_))
-        unallowed = merge_field.unallowed(
+        measured = merge_field.measured_field(
             splats, places, context.views, context.scene, ViewSums(*sums),
             progress=progress, threads=threads,
         )  # fmt: skip
         arrays = dict(zip(_GATHERED, (table, origin, members, places), strict=True))
-        arrays |= {"mass": unallowed.mass, "seen_by": unallowed.seen}
-        context.folder.save(self.index, arrays | vars(unallowed.field))
-        return unallowed.seen_and_whole()
+        arrays |= {"mass": measured.mass, "seen_by": measured.seen}
+        context.folder.save(self.index, arrays | vars(measured.field))
+        return measured.seen_and_whole()
 
 
 @dataclass(frozen=True)
@@ -161,9 +161,9 @@ class PriceRegion:
         folder = context.folder
         arrays = folder.load(self.index, (*_FIELD, "mass", "seen_by", "rows", "mergeable"))
         field = Field(*(arrays[name] for name in _FIELD))
-        bare = merge_field.Unallowed(field, arrays["mass"], arrays["seen_by"])
+        measured = merge_field.MeasuredField(field, arrays["mass"], arrays["seen_by"])
         graph = MergeGraph(
-            bare.with_allowance(self.whole), context.scene, context.factor, threads=threads
+            measured.with_allowance(self.whole), context.scene, context.factor, threads=threads
         )
         graph.connect(progress)
         best, merges = graph.best()
