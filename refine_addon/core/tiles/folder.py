@@ -63,6 +63,10 @@ class Folder:
         """Return arrays that were saved, by name."""
         return {name: self._loaded(index, name) for name in names}
 
+    def joined(self, indices: Iterable[int], name: str, axis: int = 0) -> NDArray[Any]:
+        """Return the arrays of several units, chunks or regions as one."""
+        return np.concatenate([self.map(index, name) for index in indices], axis)
+
     def map(self, index: int, name: str) -> NDArray[Any]:
         """Return an array that was saved, without reading it yet."""
         return self._loaded(index, name, mode="r")

@@ -119,9 +119,7 @@ class _TileScoring(OcclusionScoring):
         self._job, self._units = closed_form.folder, units
         prior = replace(closed_form, folder=self._job.inner("prior"), settings=PRIOR)
         _, size = by_closed_form(prior, units, runner.part(0.0, 0.5))
-        values = np.concatenate(
-            [prior.folder.load(unit.index, ["values"])["values"] for unit in units]
-        )
+        values = prior.folder.joined((unit.index for unit in units), "values")
         unturned = Scene(prior.middle[0], size, np.eye(3))
         context = SceneContext(self._job.inner("seen"), prior.views, settings, unturned)
         context = replace(context, scene=_turned(context, units, runner.part(0.5, 0.6)))
