@@ -393,12 +393,8 @@ def _ellipses(
 ) -> tuple[NDArray[np.float32], ...]:
     """Return centres, major and minor half axes and their lengths, each (2, n), pixels.
 
-    Parameters
-    ----------
-    local : (3, n) float32
-        Camera coordinates of the centres, scene sizes.
-    shape : (6, n) float32
-        Covariances in camera coordinates, squared scene sizes.
+    `local`, (3, n), are the camera coordinates of the centres, scene sizes, and `shape`, (6, n),
+    the covariances in camera coordinates, squared scene sizes.
     """
     x, y, z = local
     across, down = x / z, y / z
@@ -412,15 +408,9 @@ def _image_covariance(
     """Return xx, xy, yy, (n,) each, of ``J S J'`` in pixels, without the low-pass.
 
     J is the Jacobian of the projection at ``(x, y, z)``: rows ``(fx / z, 0, -fx x / z^2)`` and
-    ``(0, fy / z, -fy y / z^2)``.
-
-    Parameters
-    ----------
-    ray : (across, down, z)
-        ``x / z``, ``y / z`` and z of the centres, (n,) each. For a centre far outside the image, J
-        is computed at the edge that `_BEYOND` sets, because J grows without bound.
-    shape : (6, n) float32
-        S: xx, xy, xz, yy, yz, zz.
+    ``(0, fy / z, -fy y / z^2)``. `ray` has ``x / z``, ``y / z`` and z of the centres, (n,) each.
+    For a centre far outside the image, J is computed at the edge that `_BEYOND` sets, because J
+    grows without bound. `shape` is S: xx, xy, xz, yy, yz, zz, (6, n).
     """
     across, down, z = ray
     beyond = _BEYOND * view.width / view.fx, _BEYOND * view.height / view.fy
