@@ -67,7 +67,7 @@ def quiet() -> Iterator[None]:
 def picture(name: str, mode: str) -> Path:
     """Render what the camera sees of the splats into ``out/``; return the file."""
     scene, obj = bpy.context.scene, bpy.context.object
-    preview.show(obj, mode, style="SPLATS")
+    preview.show(obj, mode)
     scene.render.filepath = str(OUT / name)
     with quiet():
         bpy.ops.render.render(write_still=True)

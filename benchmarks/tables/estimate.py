@@ -24,7 +24,7 @@ import numpy as np
 
 from refine_addon.core import Settings, prune
 from refine_addon.core.errors import RefineError
-from refine_addon.core.score_splats import with_quality
+from refine_addon.core.pipeline.score_splats import with_quality
 from refine_addon.core.selection import Budget
 
 from .evaluate import Evaluator, read_scene

@@ -21,33 +21,77 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Choice:
+class CameraChoice:
     """Which cameras decide: what the panel and the command name, and a .blend keeps.
 
     Attributes
     ----------
     source : {"ACTIVE", "SELECTED", "VISIBLE", "COLLECTION", "FRAMES"}
-    collection : bpy.types.Collection or None
-        For COLLECTION.
-    frames : range or None
+    collection : bpy.types.Collection, optional
+        For COLLECTION: its cameras and those of the collections in it, hidden or not.
+    frames : range, optional
         For FRAMES.
     """
 
     source: str
     collection: bpy.types.Collection | None = None
-    frames: range | None = None
+    frames: range = range(0)
 
     @classmethod
-    def of_scene(cls, scene: bpy.types.Scene) -> Choice:
+    def of_scene(cls, scene: bpy.types.Scene) -> CameraChoice:
         """Return what is chosen in the panel, as the scene keeps it."""
         settings = scene.refine
         return cls(settings.source, settings.collection, settings.to_frames(scene))
 
-    def views(self, context: bpy.types.Context, splats: bpy.types.Object | None) -> ViewSet:
-        """Return the views of these cameras; see `views_from_scene`."""
-        return views_from_scene(
-            context, self.source, collection=self.collection, frames=self.frames, splats=splats
-        )
+    def cameras(self, context: bpy.types.Context) -> list[bpy.types.Object]:
+        """Return the cameras, of any type; of FRAMES all of the scene. Quick enough for drawing."""
+        layer = context.view_layer
+        if self.source == "ACTIVE":
+            objects = [context.scene.camera]
+        elif self.source == "COLLECTION":
+            objects = self.collection.all_objects if self.collection else []
+        else:
+            objects = layer.objects
+        cameras = [obj for obj in objects if obj and obj.type == "CAMERA"]
+        if self.source == "SELECTED":
+            return [camera for camera in cameras if camera.select_get(view_layer=layer)]
+        if self.source == "VISIBLE":
+            return [camera for camera in cameras if camera.visible_get(view_layer=layer)]
+        return cameras
+
+    def views(self, context: bpy.types.Context, splats: bpy.types.Object | None = None) -> ViewSet:
+        """Return the views of these cameras.
+
+        Parameters
+        ----------
+        context : bpy.types.Context
+        splats : bpy.types.Object, optional
+            See `views_from_frames`.
+
+        Raises
+        ------
+        RefineError
+            If there is no such camera; and see `view_from_camera`.
+        """
+        scene = context.scene
+        if self.source == "FRAMES":
+            return views_from_frames(context, self.frames, splats)
+        if self.source == "COLLECTION" and self.collection is None:
+            msg = "no cameras: choose the collection that holds them"
+            raise RefineError(msg)
+        context.view_layer.update()  # or the list of objects holds gaps where some were removed
+        cameras = [_active_camera(scene)] if self.source == "ACTIVE" else self.cameras(context)
+        if not cameras:
+            where = f"none is visible in scene '{scene.name}'"
+            if self.source == "SELECTED":
+                where = "none is selected"
+            elif self.source == "COLLECTION":
+                where = f"none is in collection '{self.collection.name}'"
+            msg = f"no cameras: {where}; scoring needs at least one"
+            raise RefineError(msg)
+        depsgraph = context.evaluated_depsgraph_get()
+        views = tuple(view_from_camera(camera, scene, depsgraph) for camera in cameras)
+        return ViewSet(views, turn=_turn(cameras, views, splats, depsgraph))
 
 
 def create_cameras(
@@ -122,58 +166,6 @@ def views_from_frames(
     return ViewSet(tuple(views))
 
 
-def views_from_scene(
-    context: bpy.types.Context,
-    source: str,
-    *,
-    collection: bpy.types.Collection | None = None,
-    frames: range | None = None,
-    splats: bpy.types.Object | None = None,
-) -> ViewSet:
-    """Return the view set that a user chose.
-
-    Parameters
-    ----------
-    context : bpy.types.Context
-    source : {"ACTIVE", "SELECTED", "VISIBLE", "COLLECTION", "FRAMES"}
-    collection : bpy.types.Collection, optional
-        For COLLECTION: its cameras and those of the collections in it, hidden or not.
-    frames : range, optional
-        For FRAMES; by default the scene's.
-    splats : bpy.types.Object, optional
-        See `views_from_frames`.
-
-    Raises
-    ------
-    RefineError
-        If there is no such camera; and see `view_from_camera`.
-    """
-    scene = context.scene
-    if source == "FRAMES":
-        if frames is None:
-            frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
-        return views_from_frames(context, frames, splats)
-    if source == "COLLECTION" and collection is None:
-        msg = "no cameras: choose the collection that holds them"
-        raise RefineError(msg)
-    context.view_layer.update()  # or the list of objects holds gaps where some were just removed
-    if source == "ACTIVE":
-        cameras = [_active_camera(scene)]
-    else:
-        cameras = chosen_cameras(context, source, collection)
-    if not cameras:
-        where = f"none is visible in scene '{scene.name}'"
-        if source == "SELECTED":
-            where = "none is selected"
-        elif source == "COLLECTION":
-            where = f"none is in collection '{collection.name}'"
-        msg = f"no cameras: {where}; scoring needs at least one"
-        raise RefineError(msg)
-    depsgraph = context.evaluated_depsgraph_get()
-    views = tuple(view_from_camera(camera, scene, depsgraph) for camera in cameras)
-    return ViewSet(views, turn=_turn(cameras, views, splats, depsgraph))
-
-
 def _turn(
     cameras: Sequence[bpy.types.Object],
     views: Sequence[View],
@@ -197,33 +189,6 @@ def _turn(
     turns = [t for camera, view in pairs if (t := quarter_turn(camera, view, axes)) is not None]
     alike = len(set(turns)) == 1 and 2 * len(turns) >= len(cameras)
     return turns[0] if alike else None
-
-
-def chosen_cameras(
-    context: bpy.types.Context, source: str, collection: bpy.types.Collection | None
-) -> list[bpy.types.Object]:
-    """Return the cameras that a user chose, of any type; quick enough for drawing.
-
-    Parameters
-    ----------
-    context : bpy.types.Context
-    source : {"ACTIVE", "SELECTED", "VISIBLE", "COLLECTION"}
-    collection : bpy.types.Collection or None
-        See `views_from_scene`.
-    """
-    layer = context.view_layer
-    if source == "ACTIVE":
-        objects = [context.scene.camera]
-    elif source == "COLLECTION":
-        objects = collection.all_objects if collection else []
-    else:
-        objects = layer.objects
-    cameras = [obj for obj in objects if obj and obj.type == "CAMERA"]
-    if source == "SELECTED":
-        return [camera for camera in cameras if camera.select_get(view_layer=layer)]
-    if source == "VISIBLE":
-        return [camera for camera in cameras if camera.visible_get(view_layer=layer)]
-    return cameras
 
 
 def _active_camera(scene: bpy.types.Scene) -> bpy.types.Object:

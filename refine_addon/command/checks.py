@@ -10,7 +10,8 @@ from ..core import RefineError
 from ..core.formats.registry import format_named, without_suffix
 from ..core.levels.files import MANIFEST, check_goal, is_manifest, level_paths
 from ..core.urls import Url, refuse_url
-from . import options, zones
+from . import zones
+from .options import DEFAULT_LEVELS, budget, cleaning, levels, settings
 from .report import is_report
 from .zones import ROLES
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Refuse what cannot go together, and outputs that would replace something else.
 
     Wrong usage leaves through ``parser.error``, code 2.
@@ -30,40 +31,40 @@ def check(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
     RefineError
         If a file that would be replaced cannot be looked into.
     """
-    if given.command == "prune" and not given.together:
-        _refuse_urls(parser, given)
-    _check_report(parser, given)
-    for path in _outputs(given):
+    if options.command == "prune" and not options.together:
+        _refuse_urls(parser, options)
+    _check_report(parser, options)
+    for path in _outputs(options):
         _check_output(parser, path)
-    if given.command == "lod":
-        _check_manifest(parser, given)
-    if given.command in ("info", "convert"):
+    if options.command == "lod":
+        _check_manifest(parser, options)
+    if options.command in ("info", "convert"):
         return
     try:
-        _check_settings(given)
+        _check_settings(options)
     except RefineError as error:
         parser.error(str(error))
-    zones.check(parser, given)
-    if given.command == "prune":
-        _check_prune(parser, given)
-    elif given.command == "clean":
-        _check_files(parser, given)
-    elif given.command == "score":
-        _check_score(parser, given)
-    if given.cameras is None and not (given.scene and open_blend()):
+    zones.check(parser, options)
+    if options.command == "prune":
+        _check_prune(parser, options)
+    elif options.command == "clean":
+        _check_files(parser, options)
+    elif options.command == "score":
+        _check_score(parser, options)
+    if options.cameras is None and not (options.scene and open_blend()):
         parser.error("no cameras: give --cameras, or open a .blend that has some")
 
 
-def _refuse_urls(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+def _refuse_urls(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Refuse URLs where each input is pruned by itself."""
     try:
-        for path in filter(None, [*given.inputs, given.output_dir]):
+        for path in filter(None, [*options.inputs, options.output_dir]):
             refuse_url(path)
     except RefineError as error:
         parser.error(str(error))
 
 
-def _check_settings(given: argparse.Namespace) -> None:
+def _check_settings(options: argparse.Namespace) -> None:
     """Refuse values that cannot be, and a budget that means nothing to the method.
 
     Raises
@@ -71,15 +72,15 @@ def _check_settings(given: argparse.Namespace) -> None:
     RefineError
         For a value.
     """
-    if given.command == "clean":
-        options.cleaning(given)
+    if options.command == "clean":
+        cleaning(options)
         return
-    if given.command == "lod":
-        options.levels(given)
-        check_goal(given.distance_psnr)
-    settings = options.settings(given)
-    if given.command == "prune":
-        options.budget(given).refuse_meaningless(settings.method, frustum=settings.frustum)
+    if options.command == "lod":
+        levels(options)
+        check_goal(options.distance_psnr)
+    scoring = settings(options)
+    if options.command == "prune":
+        budget(options).refuse_meaningless(scoring.method, frustum=scoring.frustum)
 
 
 def open_blend() -> str:
@@ -89,33 +90,33 @@ def open_blend() -> str:
     return str(bpy.data.filepath)
 
 
-def _outputs(given: argparse.Namespace) -> Sequence[Path | Url]:
+def _outputs(options: argparse.Namespace) -> Sequence[Path | Url]:
     """Return the splat files to be made."""
-    if given.command == "lod":
-        count = len(given.psnr or given.levels or options.DEFAULT_LEVELS)
-        return level_paths(given.inputs[0], given.output_dir, count, given.format)
-    if getattr(given, "output_dir", None):
-        return [given.output_dir / path.name for path in given.inputs]
-    return [given.output] if getattr(given, "output", None) else []
+    if options.command == "lod":
+        count = len(options.psnr or options.levels or DEFAULT_LEVELS)
+        return level_paths(options.inputs[0], options.output_dir, count, options.format)
+    if getattr(options, "output_dir", None):
+        return [options.output_dir / path.name for path in options.inputs]
+    return [options.output] if getattr(options, "output", None) else []
 
 
-def _check_report(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+def _check_report(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Refuse a report that would replace what is read or written, even with --overwrite."""
-    if given.report is None:
+    if options.report is None:
         return
-    others = [*given.inputs, *_outputs(given), getattr(given, "cameras", None)]
-    if given.command == "lod":
-        others.append(given.output_dir / MANIFEST)
-    if given.scene:
+    others = [*options.inputs, *_outputs(options), getattr(options, "cameras", None)]
+    if options.command == "lod":
+        others.append(options.output_dir / MANIFEST)
+    if options.scene:
         others.append(open_blend())
-    path = os.path.realpath(given.report)
+    path = os.path.realpath(options.report)
     for other in filter(None, others):
         # Unlike pathlib's, these two never fail, whatever the name.
         if os.path.realpath(os.path.expanduser(other)) == path:  # noqa: PTH111
-            parser.error(f"--report {given.report} is {other}, expected a file of its own")
-    beginning = _beginning(given.report) if given.overwrite else None
+            parser.error(f"--report {options.report} is {other}, expected a file of its own")
+    beginning = _beginning(options.report) if options.overwrite else None
     if beginning is not None and not is_report(beginning):
-        parser.error(f"{given.report} exists and is no report: write to another name")
+        parser.error(f"{options.report} exists and is no report: write to another name")
 
 
 def _check_output(parser: argparse.ArgumentParser, path: Path | Url) -> None:
@@ -132,10 +133,10 @@ def _check_output(parser: argparse.ArgumentParser, path: Path | Url) -> None:
         parser.error(f"{path} exists and is no PLY: write to another name")
 
 
-def _check_manifest(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+def _check_manifest(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Refuse a folder in which another file has the name of the manifest."""
-    path = given.output_dir / MANIFEST
-    beginning = _beginning(path) if given.overwrite else None
+    path = options.output_dir / MANIFEST
+    beginning = _beginning(path) if options.overwrite else None
     if beginning is not None and not is_manifest(beginning):
         parser.error(f"{path} exists and lists no levels: write to another folder")
 
@@ -154,85 +155,85 @@ def _beginning(path: Path) -> bytes | None:
         raise RefineError(msg) from error
 
 
-def _check_source(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+def _check_source(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Refuse an object beside files or out of Blender, and a choice of cameras beside another."""
-    if bool(given.inputs) == bool(given.object):
+    if bool(options.inputs) == bool(options.object):
         parser.error("expected INPUT files or --object NAME, and not both")
-    if given.object and not given.scene:
-        command = f"blender -b scene.blend --command refine {given.command} ..."
+    if options.object and not options.scene:
+        command = f"blender -b scene.blend --command refine {options.command} ..."
         parser.error(f"--object needs Blender: {command}")
-    if not (given.source or given.frames):
+    if not (options.source or options.frames):
         return
-    option = "--source" if given.source else "--frames"
-    if not given.object:
+    option = "--source" if options.source else "--frames"
+    if not options.object:
         parser.error(f"{option} goes with --object; for INPUT files give --cameras")
-    if given.cameras is not None:
+    if options.cameras is not None:
         parser.error(f"expected --cameras or {option}, and not both")
-    if given.frames and given.source and given.source[0] != "FRAMES":
+    if options.frames and options.source and options.source[0] != "FRAMES":
         parser.error("--frames goes with --source frames alone, or without --source")
 
 
-def _check_prune(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
-    if given.clean and given.object:
+def _check_prune(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    if options.clean and options.object:
         parser.error("--clean goes with INPUT files, not with --object")
-    if given.together:
-        _check_together(parser, given)
-    elif given.workers is not None or given.scheduler:
+    if options.together:
+        _check_together(parser, options)
+    elif options.workers is not None or options.scheduler:
         parser.error("--workers and --scheduler go with --together")
-    _check_source(parser, given)
-    if given.object:
-        if given.output_dir:
+    _check_source(parser, options)
+    if options.object:
+        if options.output_dir:
             parser.error("--object is written with -o, not with --output-dir")
-        if not (given.output or given.save or given.dry_run):
+        if not (options.output or options.save or options.dry_run):
             parser.error("--object needs -o OUT.ply, --save or --dry-run")
     else:
-        if given.save:
+        if options.save:
             parser.error("--save goes with --object")
-        if not (given.output or given.output_dir or given.dry_run):
+        if not (options.output or options.output_dir or options.dry_run):
             parser.error("expected -o OUT.ply, --output-dir DIR or --dry-run")
-        _check_files(parser, given)
+        _check_files(parser, options)
 
 
-def _check_together(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
+def _check_together(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Refuse what needs all splats at once, or one output."""
     alone = ("object", "output", "clean", *ROLES)
     for name in alone:
-        if getattr(given, name, None):
+        if getattr(options, name, None):
             option = "-o" if name == "output" else f"--{name.replace('_', '-')}"
             parser.error(f"{option} does not go with --together")
-    if given.psnr is not None and (given.absorb or given.method == "closed-form"):
+    if options.psnr is not None and (options.absorb or options.method == "closed-form"):
         parser.error("with --together, --psnr goes with --method auto or occlusion, not --absorb")
-    if given.workers is not None and given.scheduler:
+    if options.workers is not None and options.scheduler:
         parser.error("expected --workers or --scheduler, and not both")
-    if given.workers is not None and given.workers < 1:
-        parser.error(f"workers is {given.workers}, expected 1 or more")
+    if options.workers is not None and options.workers < 1:
+        parser.error(f"workers is {options.workers}, expected 1 or more")
 
 
-def _check_score(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
-    _check_source(parser, given)
-    if len(given.inputs) > 1:
-        parser.error(f"expected one INPUT, got {len(given.inputs)}")
-    if format_named(given.output):
-        parser.error(f"-o {given.output}: only a .ply holds scores")
+def _check_score(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    _check_source(parser, options)
+    if len(options.inputs) > 1:
+        parser.error(f"expected one INPUT, got {len(options.inputs)}")
+    if format_named(options.output):
+        parser.error(f"-o {options.output}: only a .ply holds scores")
 
 
-def _check_files(parser: argparse.ArgumentParser, given: argparse.Namespace) -> None:
-    if given.output and given.output_dir:
+def _check_files(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    if options.output and options.output_dir:
         parser.error("expected -o or --output-dir, and not both")
-    if given.output and len(given.inputs) > 1:
-        parser.error(f"-o takes one input, got {len(given.inputs)}: use --output-dir")
-    if given.output_dir:
+    if options.output and len(options.inputs) > 1:
+        parser.error(f"-o takes one input, got {len(options.inputs)}: use --output-dir")
+    if options.output_dir:
         advice = "call the command for each, with its own --output-dir or -o"
-        if getattr(given, "together", False):
+        if getattr(options, "together", False):
             advice = "rename one of them"
-        _refuse_doubles(parser, given.inputs, lambda path: given.output_dir / path.name, advice)
-    if getattr(given, "pictures", None):
-        if given.together:
+        _refuse_doubles(parser, options.inputs, lambda path: options.output_dir / path.name, advice)
+    if getattr(options, "pictures", None):
+        if options.together:
             parser.error("--pictures draws each input by itself, not --together")
         _refuse_doubles(
             parser,
-            given.inputs,
-            lambda path: given.pictures / f"{without_suffix(path.name)}-CAMERA-after.png",
+            options.inputs,
+            lambda path: options.pictures / f"{without_suffix(path.name)}-CAMERA-after.png",
             "call the command for each, with its own --pictures",
         )
 
@@ -240,12 +241,12 @@ def _check_files(parser: argparse.ArgumentParser, given: argparse.Namespace) -> 
 def _refuse_doubles(
     parser: argparse.ArgumentParser,
     inputs: Sequence[Path],
-    made: Callable[[Path], Path],
+    output_of: Callable[[Path], Path],
     advice: str,
 ) -> None:
     """Refuse two inputs of which the same file would be made."""
     first: dict[Path, Path] = {}
     for path in inputs:
-        other = first.setdefault(made(path), path)
+        other = first.setdefault(output_of(path), path)
         if other is not path:
-            parser.error(f"{other} and {path} would both be {made(path)}: {advice}")
+            parser.error(f"{other} and {path} would both be {output_of(path)}: {advice}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ..core import CleanRequest, clean_file
+from ..core import CleanRequest, file_to_file
 from . import zones
 from .options import cleaning
 from .words import by, written
@@ -24,15 +24,13 @@ def clean(run: Run) -> None:
 def _clean(run: Run, source: Path, output: Path | None, views: ViewSet) -> dict[str, Any]:
     options = run.options
     request = CleanRequest(views, cleaning(options), zones.of_files(options), options.overwrite)
-    done = clean_file(source, output, request, progress=run.progress(source.name)).report
+    done = file_to_file(source, output, request, progress=run.progress(source.name)).report
     run.terminal.clear()
     splats, to = done["splats"], f" -> {output}" if output else ""
     run.terminal.say(
         f"{run.named(str(source))}: {done['cleaned']['words']}; {splats['kept']:,} of "
         f"{splats['before']:,} splats stay{written(splats)}, {by(done['views'])}{to}"
     )
-    run.say_cameras()
-    run.say_demanded(done)
-    run.say_unseen(splats["unseen"], splats["before"] - splats["forced"])
+    run.say_what_decided(done)
     run.terminal.notes(done["notes"])
     return done

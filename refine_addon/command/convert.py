@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ..core import convert_file
+from ..core import ConvertRequest, file_to_file
 from .words import sizes, written
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ def convert(run: Run) -> None:
 
 def _convert(run: Run, source: Path) -> dict[str, Any]:
     output = run.options.output
-    done = convert_file(source, output, overwrite=run.options.overwrite).report
+    done = file_to_file(source, output, ConvertRequest(run.options.overwrite)).report
     splats, files = done["splats"], done["files"]
     size = sizes(files["input_bytes"], files["output_bytes"])
     run.terminal.say(f"{source}: {splats['before']:,} splats{written(splats)}, {size} -> {output}")

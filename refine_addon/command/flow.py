@@ -6,7 +6,8 @@ import argparse
 from typing import TYPE_CHECKING
 
 from ..core import RefineError
-from . import checks, options, runs
+from . import checks, runs
+from .options import make_parser
 from .terminal import complain, described, flush
 
 if TYPE_CHECKING:
@@ -29,11 +30,11 @@ def run(arguments: Sequence[str], *, scene: bool) -> int:
     int
         Exit code: `DONE`, `FAILED` or `USAGE`.
     """
-    parser = options.make_parser()
+    parser = make_parser()
     try:
-        given = parser.parse_args(list(arguments), argparse.Namespace(scene=scene))
-        checks.check(parser, given)
-        return DONE if runs.execute(given) else FAILED
+        options = parser.parse_args(list(arguments), argparse.Namespace(scene=scene))
+        checks.check(parser, options)
+        return DONE if runs.execute(options) else FAILED
     except SystemExit as leaving:  # argparse leaves the process; Blender wants a number
         flush()
         return int(leaving.code or DONE)

@@ -37,13 +37,12 @@ def _make_levels(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
     )
     done = lod_file(source, options.output_dir, request, progress=run.progress(source.name))
     terminal.clear()
-    count, made = done["splats"]["before"], len(done["levels"])
+    count, number = done["splats"]["before"], len(done["levels"])
     terminal.say(
-        f"{source}: {made} level{'s' if made > 1 else ''} of {count:,} splats, "
+        f"{source}: {number} level{'s' if number > 1 else ''} of {count:,} splats, "
         f"{by(done['views'])}, {done['timings']['total_s']:.2f} s -> {options.output_dir}"
     )
-    run.say_demanded(done)
-    run.say_unseen(done["splats"]["unseen"], count - done["splats"]["forced"])
+    run.say_what_decided(done)
     for entry in done["levels"]:
         terminal.say(f"  {_in_words(entry, done['goal_psnr'])}")
     terminal.notes(done["notes"])

@@ -465,5 +465,6 @@ def levels(options: argparse.Namespace) -> Levels:
 def budget(options: argparse.Namespace) -> Budget:
     """Return how much goes, or raise `RefineError` where a value cannot be."""
     names = ("ratio", "keep", "max_mb", "threshold", "min_seen", "psnr")
-    given = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    return Budget(**(given or {"ratio": DEFAULT_RATIO}))
+    amounts = {name: getattr(options, name) for name in names}
+    amounts = {name: amount for name, amount in amounts.items() if amount is not None}
+    return Budget(**(amounts or {"ratio": DEFAULT_RATIO}))

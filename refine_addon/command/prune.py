@@ -63,18 +63,11 @@ def _prune_one(run: Run, source: Path, output: Path | None, views: ViewSet) -> d
 
 def _prune_together(run: Run, label: str, views: ViewSet) -> dict[str, Any]:
     options = run.options
+    request, progress = _request(options, views, ""), run.progress(label)
     try:
         with _workers(options) as workers:
             done = prune_tiles(
-                options.inputs,
-                None if options.dry_run else options.output_dir,
-                views,
-                budget(options),
-                settings(options),
-                absorb=options.absorb,
-                overwrite=options.overwrite,
-                progress=run.progress(label),
-                workers=workers,
+                options.inputs, options.output_dir, request, progress=progress, workers=workers
             )
     except KeyboardInterrupt:
         run.terminal.clear()
@@ -128,10 +121,8 @@ def _say_result(run: Run, label: str, done: dict[str, Any]) -> None:
     ]
     target = f" -> {files['output']}" if files["output"] else ""
     run.terminal.say(f"{run.named(label)}: {', '.join(parts)}{target}")
-    run.say_cameras()
-    run.say_demanded(done)
     cleaned = sum(count for count in done.get("cleaned", {}).values() if isinstance(count, int))
-    run.say_unseen(splats["unseen"], splats["before"] - cleaned - splats["forced"])
+    run.say_what_decided(done, cleaned)
     if "cleaned" in done:
         run.terminal.say(f"  cleaned: {done['cleaned']['words']}")
     quality = _quality(done)

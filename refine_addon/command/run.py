@@ -7,15 +7,13 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core import RefineError
+from ..core import RefineError, read_cameras
 from ..core.errors import printable
 from ..core.pace import Pace
 from ..core.urls import Url
 from ..core.whole_file import new_folder
 from . import report
-from .cameras import deciding
 from .terminal import Terminal, complain, described
-from .words import left_unseen
 from .zones import words
 
 if TYPE_CHECKING:
@@ -56,7 +54,13 @@ class Run:
 
     def views(self) -> ViewSet:
         """Return the views that decide, and note where they are from for the report."""
-        views, facts = deciding(self.options)
+        path = self.options.cameras
+        if path is not None:
+            views, facts = read_cameras(path), {"source": "file", "file": str(path)}
+        else:
+            from . import scene_cameras  # noqa: PLC0415 - needs Blender
+
+            views, facts = scene_cameras.chosen(self.options)
         self._cameras = {"cameras": facts}
         return views
 
@@ -68,20 +72,20 @@ class Run:
         """Return what draws how much of the file under way is done, and the time left."""
         return self.terminal.progress(self.named(name), self._pace.left)
 
-    def say_cameras(self) -> None:
-        """Say which cameras of the scene decided; those of a file were named by the user."""
-        if words := self._cameras["cameras"].get("words"):
-            self.terminal.say(f"  cameras: {words}")
+    def say_what_decided(self, done: dict[str, Any], cleaned: int = 0) -> None:
+        """Say what the report of an input tells of what decided.
 
-    def say_unseen(self, unseen: int, scored: int) -> None:
-        """Say how many of the splats that were scored no view holds, if any."""
-        if unseen:
-            self.terminal.say(f"  {left_unseen(unseen, scored)}")
-
-    def say_demanded(self, done: dict[str, Any]) -> None:
-        """Say what had to stay and go, by the report of an input."""
-        if said := words(done):
-            self.terminal.say(f"  {said}")
+        That is which cameras of the scene, since those of a file were named by the user; what had
+        to stay and go; and how many of the splats that were scored no view holds.
+        """
+        if cameras := self._cameras["cameras"].get("words"):
+            self.terminal.say(f"  cameras: {cameras}")
+        if demanded := words(done):
+            self.terminal.say(f"  {demanded}")
+        splats = done["splats"]
+        if splats["unseen"]:
+            scored = splats["before"] - splats["forced"] - cleaned
+            self.terminal.say(f"  {splats['unseen']:,} of {scored:,} splats lie in no view")
 
     def each(self, work: Callable[[Run, Path, Path | None, ViewSet], dict[str, Any]]) -> None:
         """Do the work of every input: with its output, if there is to be one, and the views."""

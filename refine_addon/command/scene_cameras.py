@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from ..cameras.sets import Choice
+from ..cameras.sets import CameraChoice
 from ..core import RefineError
 from ..objects import splat_object
 
@@ -25,33 +25,33 @@ def chosen(options: argparse.Namespace) -> tuple[ViewSet, dict[str, Any]]:
     Raises
     ------
     RefineError
-        If there is no such object, collection or camera, or no frame; see `Choice.views`.
+        If there is no such object, collection or camera, or no frame; see `CameraChoice.views`.
     """
     name = getattr(options, "object", None)
     if not name:
-        choice = Choice("VISIBLE")
+        choice = CameraChoice("VISIBLE")
         return choice.views(bpy.context, None), _facts(choice, "of the open scene")
     obj = splat_object.find(name)
     if options.source or options.frames:
         choice, why = _given(options), "as the command line says"
     else:
-        choice, why = Choice.of_scene(bpy.context.scene), "as chosen in the panel"
+        choice, why = CameraChoice.of_scene(bpy.context.scene), "as chosen in the panel"
     return choice.views(bpy.context, obj), _facts(choice, why)
 
 
-def _given(options: argparse.Namespace) -> Choice:
+def _given(options: argparse.Namespace) -> CameraChoice:
     """Return the choice of --source and --frames; frames are the panel's where none are given."""
     kind, name = options.source or ("FRAMES", "")
-    frames = options.frames or Choice.of_scene(bpy.context.scene).frames
+    frames = options.frames or CameraChoice.of_scene(bpy.context.scene).frames
     collection = bpy.data.collections.get(name)
     if kind == "COLLECTION" and collection is None:
-        names = ", ".join(sorted(found.name for found in bpy.data.collections)) or "none"
+        names = ", ".join(sorted(each.name for each in bpy.data.collections)) or "none"
         msg = f"no collection '{name}' in the open .blend (collections: {names})"
         raise RefineError(msg)
-    return Choice(kind, collection, frames)
+    return CameraChoice(kind, collection, frames)
 
 
-def _facts(choice: Choice, why: str) -> dict[str, Any]:
+def _facts(choice: CameraChoice, why: str) -> dict[str, Any]:
     """Return what there is to know of a choice, as plain JSON values."""
     facts: dict[str, Any] = {"source": choice.source.lower()}
     if choice.source == "COLLECTION":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ..core import ScoreRequest, score_file
+from ..core import ScoreRequest, file_to_file
 from . import zones
 from .options import settings
 
@@ -29,7 +29,7 @@ def _score_file(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
     options = run.options
     request = ScoreRequest(views, settings(options), zones.of_files(options), options.overwrite)
     progress = run.progress(source.name)
-    done = score_file(source, options.output, request, progress=progress).report
+    done = file_to_file(source, options.output, request, progress=progress).report
     return _said(run, str(source), done)
 
 
@@ -51,8 +51,6 @@ def _said(run: Run, label: str, done: dict[str, Any]) -> dict[str, Any]:
         f"{label}: scored {splats['before']:,} splats by {done['views']['used']} views "
         f"-> {run.options.output}"
     )
-    run.say_cameras()
-    run.say_demanded(done)
-    run.say_unseen(splats["unseen"], splats["before"] - splats["forced"])
+    run.say_what_decided(done)
     run.terminal.notes(done["notes"])
     return done

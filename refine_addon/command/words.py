@@ -28,11 +28,6 @@ def written(splats: Mapping[str, Any]) -> str:
     return f", {splats['written']:,} written" if splats["left_out"] and splats["written"] else ""
 
 
-def left_unseen(unseen: int, scored: int) -> str:
-    """Return how many of the splats that were scored no view holds."""
-    return f"{unseen:,} of {scored:,} splats lie in no view"
-
-
 def sizes(before: int, after: int | None) -> str:
     """Return what became of the size of a file; None where only writing tells it.
 

@@ -18,7 +18,7 @@ ROLES: dict[str, Role] = {"protect": "protect", "remove_inside": "remove", "keep
 
 
 @dataclass(frozen=True)
-class Given:
+class ZoneArgument:
     """What an option names.
 
     Attributes
@@ -33,7 +33,7 @@ class Given:
     volume: Volume | None
 
 
-def given(text: str) -> Given:
+def zone_argument(text: str) -> ZoneArgument:
     """Return what an argument names.
 
     Raises
@@ -45,7 +45,7 @@ def given(text: str) -> Given:
         msg = "expected a name or a volume, got none"
         raise argparse.ArgumentTypeError(msg)
     try:
-        return Given(text, parse(text))
+        return ZoneArgument(text, parse(text))
     except RefineError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
 
@@ -76,7 +76,7 @@ def add(parser: argparse.ArgumentParser, *, protects: bool = True, names: str = 
                 option,
                 action="append",
                 default=[],
-                type=given,
+                type=zone_argument,
                 metavar="VOLUME" if not (names and option == "--protect") else "NAME_OR_VOLUME",
                 help=f"{text}; may be given several times",
             )
@@ -144,7 +144,7 @@ def words(done: dict[str, Any]) -> str:
     return " ".join([", ".join(parts), f"({'; '.join(volumes)})" if volumes else ""]).strip()
 
 
-def _items(options: argparse.Namespace) -> list[tuple[Role, Given]]:
+def _items(options: argparse.Namespace) -> list[tuple[Role, ZoneArgument]]:
     return [
         (role, item) for name, role in ROLES.items() for item in getattr(options, name, ()) or ()
     ]
@@ -154,7 +154,7 @@ def _marks(obj: Any, name: str) -> bool:  # noqa: ANN401 - an object of Blender
     return name in obj.vertex_groups or name in getattr(obj.data, "attributes", ())
 
 
-def _zone(role: Role, item: Given, also: str) -> Zone:
+def _zone(role: Role, item: ZoneArgument, also: str) -> Zone:
     if item.volume is not None:
         return Zone(role, f"'{item.text}'", item.volume)
     import bpy  # noqa: PLC0415 - only there inside Blender

@@ -14,12 +14,9 @@ from .formats.ply import SplatFile, read_ply
 from .formats.registry import as_written, read_splats
 from .levels.files import LevelsRequest, lod_file
 from .levels.lod import Level, Levels, lod
-from .operation.clean import CleanRequest, clean_file
-from .operation.convert import convert_file
-from .operation.prune import PruneRequest, prune_file
-from .operation.score import ScoreRequest, score_file
-from .pipeline import prune
-from .score_splats import score
+from .operation.files import file_to_file, prune_file
+from .operation.requests import CleanRequest, ConvertRequest, PruneRequest, ScoreRequest
+from .pipeline import prune, score
 from .scores import Scores
 from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
@@ -43,6 +40,7 @@ __all__ = [
     "Cleaned",
     "Cleaning",
     "ClosedForm",
+    "ConvertRequest",
     "Level",
     "Levels",
     "LevelsRequest",
@@ -63,8 +61,7 @@ __all__ = [
     "Zone",
     "as_written",
     "clean",
-    "clean_file",
-    "convert_file",
+    "file_to_file",
     "forced",
     "lod",
     "lod_file",
@@ -76,7 +73,6 @@ __all__ = [
     "read_ply",
     "read_splats",
     "score",
-    "score_file",
     "select",
     "survivor_columns",
 ]

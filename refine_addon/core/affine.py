@@ -24,15 +24,13 @@ QUARTERS = {0: np.eye(3), 1: QUARTER, -1: QUARTER.T}
 _UNIFORM = 1e-4
 """Relative difference between the scales of a matrix that still counts as uniform scaling."""
 
-_FLAT = 1e-9
-"""Least over largest scale of a matrix that cannot be inverted in practice."""
+_FLAT = 1e-9  # least over largest scale of a matrix that cannot be inverted in practice
 
 _SMALLEST, _LARGEST = 1e-30, 1e30
 """Scales of a matrix that is applied: its determinant is in the range of float64, and usual splats
 stay in that of float32."""
 
-_CHUNK = 1 << 16
-"""Splats whose covariances are computed together, which limits temporary memory."""
+_CHUNK = 1 << 16  # splats whose covariances are computed together, which limits temporary memory
 
 
 def scales_of(matrix: NDArray[Any]) -> NDArray[np.float64]:

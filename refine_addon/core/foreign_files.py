@@ -18,7 +18,10 @@ _POINTER = b"version https://git-lfs.github.com/spec/"
 GZIP = b"\x1f\x8b"
 """The first bytes of a gzip file."""
 
-_ZIP, _SPZ = b"PK\x03\x04", b"NGSP"
+SPZ = b"NGSP"
+"""The first bytes of what an SPZ file holds."""
+
+_ZIP = b"PK\x03\x04"
 _CONVERT = "convert it to a plain 3DGS PLY first (SuperSplat and splat-transform do)"
 _READ = "'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
 
@@ -77,16 +80,32 @@ def foreign_kind(path: Path | Url, head: bytes) -> str:
     suffix = path.suffix.lower()
     if suffix in _UNSIGNED:
         return f"a {suffix} file: {_UNSIGNED[suffix]}"
-    if head.startswith(_SPZ) or unpacked_beginning(head).startswith(_SPZ):
+    if is_spz(head):
         return f"an SPZ file: {_READ}"
-    if head.startswith(GZIP):
-        return "compressed with gzip: unpack it first"
-    if head.startswith(_ZIP):
-        sog = suffix == ".sog" or _lists_sog(path)
-        return f"a SOG file: {_READ}" if sog else "a ZIP archive: unpack it first"
+    if is_sog(path, head):
+        return f"a SOG file: {_READ}"
+    for signature, packed in ((GZIP, "compressed with gzip"), (_ZIP, "a ZIP archive")):
+        if head.startswith(signature):
+            return f"{packed}: unpack it first"
     if suffix == ".spz" and head and not head.startswith(b"ply"):
-        return f"a damaged SPZ file: begins with {head[:4]!r}, expected {_SPZ!r} or {GZIP!r}"
+        return f"a damaged SPZ file: begins with {head[:4]!r}, expected {SPZ!r} or {GZIP!r}"
     return ""
+
+
+def is_spz(head: bytes) -> bool:
+    """Return whether a file with these first bytes is an SPZ file, as it is or within gzip."""
+    if head.startswith(SPZ):
+        return True
+    try:
+        beginning = zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, len(SPZ))
+    except zlib.error:
+        return False
+    return beginning.startswith(SPZ)
+
+
+def is_sog(path: Path | Url, head: bytes) -> bool:
+    """Return whether a file is a SOG file: a ZIP archive by that name or with what SOG holds."""
+    return head.startswith(_ZIP) and (path.suffix.lower() == ".sog" or _lists_sog(path))
 
 
 def _lists_sog(path: Path | Url) -> bool:
@@ -99,11 +118,3 @@ def _lists_sog(path: Path | Url) -> bool:
     return any(name.name == "meta.json" for name in names) and any(
         name.suffix == ".webp" for name in names
     )
-
-
-def unpacked_beginning(head: bytes) -> bytes:
-    """Return the first bytes of a gzip file's content; none if it is not a gzip file."""
-    try:
-        return zlib.decompressobj(16 + zlib.MAX_WBITS).decompress(head, len(_SPZ))
-    except zlib.error:
-        return b""

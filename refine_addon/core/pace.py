@@ -11,8 +11,7 @@ if TYPE_CHECKING:
 
 _MINUTE = 60
 
-_EARLY = 2.0
-"""Seconds before which a pace says little."""
+_EARLY = 2.0  # seconds before which a pace says little
 
 
 class Pace:

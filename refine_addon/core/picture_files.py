@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .views import ViewSet
 
 KINDS = ("before", "after", "difference")
-"""The pictures of a view, as the ends of their names."""
+"""The three pictures of a view; each is the end of a file name."""
 
 _IMAGE = re.compile(r"\.(png|jpe?g|webp|tiff?|exr|bmp)$", re.IGNORECASE)
 """The suffix of a photo, after which imported cameras are named."""

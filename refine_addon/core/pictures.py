@@ -39,9 +39,9 @@ CAMERAS = 3
 """How many views are drawn at most, spread evenly over all."""
 
 AMPLIFIED = 8
-"""The difference of two pictures is shown so many times as large."""
+"""Factor by which the difference of two pictures is shown larger."""
 
-_PIXELS = 1 << 15  # about so many are drawn at a time, which limits temporary memory
+_PIXELS = 1 << 15  # drawn at a time, about, which limits temporary memory
 _PAIRS = 1 << 18  # pairs of footprint and pixel at a time
 
 
@@ -116,8 +116,8 @@ def compare(
     ]
 
 
-def fitted(view: View, longest: int = LONGEST) -> View:
-    """Return a view with the same sight and at most so many pixels along the longer side.
+def fitted(view: View) -> View:
+    """Return a view of the same field of view, at most `LONGEST` pixels along its longer side.
 
     Examples
     --------
@@ -127,7 +127,7 @@ def fitted(view: View, longest: int = LONGEST) -> View:
     >>> small.width, small.height, small.fx, small.cy
     (960, 540, 500.0, 270.0)
     """
-    scale = longest / max(view.width, view.height)
+    scale = LONGEST / max(view.width, view.height)
     if scale >= 1.0:
         return view
     width, height = (max(round(size * scale), 1) for size in (view.width, view.height))
@@ -178,18 +178,7 @@ def _picture(
     progress: Progress,
     threads: int | None,
 ) -> NDArray[np.float64]:
-    """Return a picture, (3, H, W), 0..1.
-
-    Parameters
-    ----------
-    footprints : Footprints
-        In the view.
-    colors : (3, n) float64
-        Of the footprints.
-    view : View
-    progress : callable
-    threads : int, optional
-    """
+    """Return a picture, (3, H, W), 0..1, of footprints of these colours, (3, n), in a view."""
 
     def work(piece: slice) -> NDArray[np.float64]:
         rows = np.arange(piece.start, piece.stop)
@@ -208,17 +197,10 @@ def _strip(
     columns: NDArray[np.int64],
     rows: NDArray[np.int64],
 ) -> NDArray[np.float64]:
-    """Return the colours of the pixels in C columns and R rows, (3, R * C).
+    """Return the colours of the pixels in C columns and R rows, ascending, (3, R * C).
 
     Footprints come front to back, some at a time; pixels through which nothing more is seen are
-    left out of those that follow.
-
-    Parameters
-    ----------
-    footprints : Footprints
-    colors : (3, n) float64
-    columns, rows : (C,), (R,) int64
-        Ascending.
+    left out of those that follow. Their colours are (3, n) float64.
     """
     pixels = len(columns) * len(rows)
     log_left, image = np.zeros(pixels), np.zeros((3, pixels))  # logarithm of the transmittance
@@ -241,13 +223,8 @@ def _weights(
 ) -> NDArray[np.float64]:
     """Return the share of its pixel that each hit makes up, (h,), and darken what lies behind.
 
-    Parameters
-    ----------
-    pixel : (h,) integer
-        Ascending; the hits of one pixel are front to back.
-    alpha : (h,) float32
-    log_left : (P,) float64
-        Logarithm of the transmittance of each pixel in front of these hits; afterwards behind them.
+    Hits come pixel by pixel, ascending, and front to back in each. `log_left`, (P,), is the
+    logarithm of the transmittance of each pixel in front of these hits; afterwards behind them.
     """
     if not len(pixel):
         return np.empty(0)

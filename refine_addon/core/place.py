@@ -25,8 +25,7 @@ LARGEST_COUNT = 1 << 53
 NEGLIGIBLE = 1e-30
 """Smaller numbers are read as 0, so that products of two numbers do not underflow."""
 
-_SHOWN = 40
-"""Most characters of a value in a message."""
+_SHOWN = 40  # most characters of a value in a message
 
 
 @dataclass(frozen=True)

@@ -62,14 +62,7 @@ _lock = threading.Lock()
 class _Task(NamedTuple):
     """Work for a process.
 
-    Attributes
-    ----------
-    pickled : bytes
-        All but the arrays.
-    path : str
-        Of the file that holds these.
-    places : list of (int, int)
-        Where each array begins in the file, and ends.
+    What was pickled, and the file of the arrays, each from one byte to another.
     """
 
     pickled: bytes
@@ -151,7 +144,7 @@ def start(seconds: float, threads: int | None = None) -> None:
 
 
 def _least(number: int) -> float:
-    """Return the seconds of work that so many processes are worth."""
+    """Return from how many seconds of work on it is worth having `number` processes."""
     with _lock:
         return WORTH_READY if sum(process.ready for process in _idle) >= number else WORTH
 
@@ -165,12 +158,9 @@ def _possible() -> bool:
 def _apart(
     work: Callable[[int], Result], count: int, number: int, progress: Progress, what: str
 ) -> Iterator[Result]:
-    """Do the work of `for_each` in so many processes.
+    """Do the work of `for_each` in `number` processes.
 
-    Raises
-    ------
-    _LostError
-        If they, or the file that they share, cannot be had.
+    Raise `_LostError` if they, or the file that they share, cannot be had.
     """
     with _shared(work) as (task, folder):
         team = _taken(number)
@@ -208,10 +198,8 @@ def _apart(
 def _tell_all(team: list[_Process], task: object) -> None:
     """Tell all of a team what to call from now on, and wait until they know; None: nothing more.
 
-    Raises
-    ------
-    _LostError
-        If one cannot do that: it has ended, or does not find a module that this process has.
+    Raise `_LostError` if one cannot do that: it has ended, or does not find a module that this
+    process has.
     """
     for process in team:
         process.tell(task)
@@ -223,13 +211,7 @@ def _tell_all(team: list[_Process], task: object) -> None:
 
 
 def _taken(number: int) -> list[_Process]:
-    """Return processes that nobody else uses: idle ones, and new ones.
-
-    Raises
-    ------
-    _LostError
-        If one cannot be started.
-    """
+    """Return processes that nobody else uses: idle ones, and new ones; or raise `_LostError`."""
     with _lock:
         team = [process for process in _idle if process.ready]
         for process in set(_idle) - set(team):
@@ -256,13 +238,7 @@ def end_idle() -> None:
 
 
 class _Process:
-    """One process, as seen from here.
-
-    Raises
-    ------
-    OSError
-        If it cannot be started.
-    """
+    """One process, as seen from here; `OSError` if it cannot be started."""
 
     def __init__(self) -> None:
         away: dict[str, Any] = {"start_new_session": True}  # Ctrl-C reaches this process alone
@@ -293,10 +269,7 @@ class _Process:
     def tell(self, message: object) -> None:
         """Send a task, None for none any more, or the number of a call; see `answer`.
 
-        Raises
-        ------
-        _LostError
-            If the process has ended.
+        Raise `_LostError` if the process has ended.
         """
         self._used = time.monotonic()
         try:
@@ -308,10 +281,7 @@ class _Process:
     def answer(self) -> Any:  # noqa: ANN401 - whatever the work returns
         """Wait for the answer to what was told; return what the work returns, or raise its error.
 
-        Raises
-        ------
-        _LostError
-            If the process has ended, or its answer means nothing here.
+        Raise `_LostError` if the process has ended, or its answer means nothing here.
         """
         try:
             done, result = pickle.load(self._from)  # noqa: S301 - our own process
@@ -333,19 +303,9 @@ class _Process:
 
 @contextmanager
 def _shared(work: object) -> Iterator[tuple[_Task, tempfile.TemporaryDirectory[str]]]:
-    """Write the arrays of `work` to a file, which all processes map.
+    """Write the arrays of `work` to a file, which all processes map; yield `_Task` and its folder.
 
-    Yields
-    ------
-    task : tuple
-        See `_Task`.
-    folder : TemporaryDirectory
-        Where the file is.
-
-    Raises
-    ------
-    _LostError
-        If the file cannot be written.
+    Raise `_LostError` if the file cannot be written.
     """
     arrays: list[pickle.PickleBuffer] = []
     pickled = pickle.dumps(work, protocol=5, buffer_callback=arrays.append)

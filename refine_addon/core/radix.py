@@ -32,7 +32,7 @@ def keys_of(values: NDArray[np.floating[Any]]) -> NDArray[np.unsignedinteger[Any
     Returns
     -------
     (N,) uint32 or uint64
-        Of as many bits.
+        With the same number of bits.
 
     Examples
     --------

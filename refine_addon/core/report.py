@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -54,25 +54,11 @@ class Clock:
         self.timings["total_s"] = time.perf_counter() - self._start
 
 
-@dataclass(frozen=True)
-class Files:
-    """The files of a prune, under their names in the report.
-
-    Attributes
-    ----------
-    input : str
-        A file, or a .blend file and the object in it.
-    output : str or None
-        The file that was written, if any.
-    input_bytes : int
-    output_bytes : int or None
-        Sizes; None for a file that is not written and whose size only writing tells.
-    """
-
-    input: str
-    output: str | None
-    input_bytes: int
-    output_bytes: int | None
+def files_facts(
+    source: str, output: str | None, before: int, after: int | None
+) -> dict[str, str | int | None]:
+    """Return what a report says of files: their names, and bytes; see docs/report.md."""
+    return {"input": source, "output": output, "input_bytes": before, "output_bytes": after}
 
 
 def size_in_words(count: int) -> str:
@@ -135,19 +121,19 @@ def kept_and_removed(keep: NDArray[np.bool_]) -> dict[str, int]:
 
 
 def held(
-    made: SplatFile | Packed, keep: NDArray[np.bool_], *, written: bool = True
+    writer: SplatFile | Packed, keep: NDArray[np.bool_], *, written: bool = True
 ) -> dict[str, int | None]:
     """Return how many splats a file of the kept rows holds, and how many its format leaves out.
 
     Parameters
     ----------
-    made : SplatFile or Packed
+    writer : SplatFile or Packed
         What writes the file.
     keep : (N,) bool
     written : bool
         Whether there is a file; without one, ``written`` is None.
     """
-    missing = made.left_out(keep)
+    missing = writer.left_out(keep)
     count = int(np.count_nonzero(keep)) - missing
     return {"written": count if written else None, "left_out": missing}
 
@@ -183,12 +169,6 @@ def make_report(
         "notes": scoring_notes(scores),
         "versions": {"python": platform.python_version(), "numpy": np.__version__},
     }
-
-
-def complete_report(report: dict[str, Any], clock: Clock, files: Files) -> None:
-    """Add the names and sizes of the files and the total time to a report."""
-    clock.stop()
-    report["files"] = asdict(files)
 
 
 def remark(budget: Budget, gone: int, total: int, psnr: float | None, size: int) -> str:

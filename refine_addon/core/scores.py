@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from .estimate.quality import Quality
     from .seeing.ray_sample import RaySample
 
-_DISTINCT = 1 << 24
-"""Largest number of equal steps from 0 to 1 that are distinct in float32."""
+_DISTINCT = 1 << 24  # largest number of equal steps from 0 to 1 that are distinct in float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +49,7 @@ class Scores:
     ray_sample : RaySample, optional
         Validation rays, which tell the PSNR of any choice of the splats that were scored.
     quality : Quality, optional
-        How close the pictures stay with ever more of these removed in the order of the scores.
+        The PSNR over the share removed in the order of the scores.
     alignment : Alignment, optional
         How the views stand to the splats.
     settled : int, optional
@@ -76,12 +75,12 @@ class Scores:
     scored: NDArray[np.bool_] | None = None
 
     def for_all(self, rest: NDArray[np.bool_]) -> Scores:
-        """Return scores of what was left of N splats as scores of them all.
+        """Return these scores as scores of all N splats, of which some were forced out before.
 
         Parameters
         ----------
         rest : (N,) bool
-            Which were left. The others, which the scene has without them, get the score 0.
+            Which were scored. The others get the score 0.
         """
         values, seen = among_all(self.values, rest), among_all(self.seen, rest)
         settled = None if self.settled is None else self.settled + len(rest) - len(self.values)
@@ -89,7 +88,7 @@ class Scores:
         return replace(self, values=values, seen=seen, settled=settled, scored=scored)
 
     def of(self, rest: NDArray[np.bool_]) -> Scores:
-        """Return the scores of some splats; the reverse of `for_all` where those had been left.
+        """Return the scores of some splats: the inverse of `for_all`.
 
         Parameters
         ----------

@@ -185,8 +185,8 @@ def select(
     """Return which splats stay.
 
     The splats with the lowest scores are removed; of equal scores, the first in the file. Protected
-    splats always stay, and others are removed instead, as far as there are any. Of rows of several
-    lengths, as many are removed in that order as it takes until the others fit.
+    splats always stay, and others are removed instead, as far as there are any. Where rows of text
+    differ in length, splats are removed in that order until the others fit in `Budget.max_mb`.
 
     Parameters
     ----------
@@ -336,13 +336,7 @@ def refuse_none_left(budget: Budget, before: int, after: int) -> None:
 def _refuse_unsettled(scores: Scores, budget: Budget, gone: NDArray[np.bool_]) -> None:
     """Raise `RefineError` if scores were computed for a budget that removes fewer splats.
 
-    Parameters
-    ----------
-    scores : Scores
-        Of which some are settled.
-    budget : Budget
-    gone : (N,) bool
-        What it removes.
+    Some of the scores are settled; `gone`, (N,), is what this budget removes.
     """
     settled = scores.settled or 0
     # A PSNR that all of the curve reaches may be reached beyond its end, too.
@@ -387,7 +381,7 @@ def lowest(
     edge : int
         The key of the last one that goes.
     left : int
-        Of the splats at the edge go as many of the first as have this weight together, or more.
+        Weight that the splats at the edge which go have together, at least; the first of them go.
     weights : (N,) int64, optional
         By default 1 each.
     """

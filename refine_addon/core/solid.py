@@ -37,7 +37,7 @@ class Solid:
 
     A point on its surface belongs to the side towards which x, y and z grow, but for rounding, so
     that solids that share a face share no point. Parts that overlap are joined; where one turns its
-    faces the other way, their overlap is outside, as the hollow of a sphere in a sphere is.
+    faces the other way, their overlap is outside, like the hollow of a hollow sphere.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ class Solid:
         return self._holds(turns)
 
     def _holds(self, turns: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which winding numbers are those of the inside."""
+        """Return which winding numbers mean inside."""
         return np.asarray(turns != 0.0 if self.turned else turns % 2.0 == 1.0)
 
     def _grid(
@@ -132,12 +132,7 @@ class Solid:
     ) -> NDArray[np.bool_]:
         """Return which cells of a grid lie inside, (G, G, G); meaningless where one is touched.
 
-        Parameters
-        ----------
-        low, scale : (3,) float64
-            The lowest corner of the grid, and cells a unit.
-        cells : int
-            G.
+        It has G = `cells` each way, the lowest corner `low`, (3,), and `scale` cells a unit, (3,).
         """
         centers = np.arange(cells) + 0.5
         columns = np.stack(np.meshgrid(centers, centers, indexing="ij"), -1).reshape(-1, 2)
@@ -152,37 +147,21 @@ class Solid:
     def _crossings(
         self, places: NDArray[np.float64]
     ) -> Iterator[tuple[Index, NDArray[np.float64], NDArray[np.float64]]]:
-        """Yield where rays along z cross triangles.
+        """Yield where rays along z through places, (N, 2), cross triangles.
 
         An edge is crossed on the same side of a ray for both of its triangles, since its vertices
         are taken in the same order for both, and rays through a vertex count the edges that begin
         there: so no ray slips between two triangles or hits both.
 
-        Parameters
-        ----------
-        places : (N, 2) float64
-
-        Yields
-        ------
-        rows : (C,) int64
-            Which rays.
-        heights : (C,) float64
-        signs : (C,) float64
-            1 or -1 by the way that the triangle turns, or 1 throughout if not all are `turned`.
+        Of C crossings these are the rays, the heights, and the signs, (C,) each: 1 or -1 by the way
+        that the triangle turns, or 1 throughout if not all are `turned`.
         """
-        y = self.vertices[:, 1]
         for rows, triangles in _pairs(places, self.vertices[self.triangles, :2]):
             px, py = places[rows].T
-            corners = self.triangles[triangles]  # (C, 3)
-            below = y[corners] <= py[:, None]
-            one_below = below.sum(axis=1) == 1
-            # A line along x through the ray has one corner on one side, and the two edges that end
-            # in this corner cross it.
-            alone = np.where(one_below, below.argmax(axis=1), below.argmin(axis=1))
-            every = np.arange(len(rows))
-            apex = corners[every, alone]
-            x1, z1 = self._cut(apex, corners[every, (alone + 1) % 3], py)
-            x2, z2 = self._cut(corners[every, (alone + 2) % 3], apex, py)
+            apex, after, before, one_below = self._apexes(triangles, py)
+            # The edges that end in the apex cross the line along x through the ray here.
+            x1, z1 = self._cut(apex, after, py)
+            x2, z2 = self._cut(before, apex, py)
             crossed = (x1 > px) != (x2 > px)
             x1, x2, z1, z2, px = (values[crossed] for values in (x1, x2, z1, z2, px))
             heights = z1 + (px - x1) / (x2 - x1) * (z2 - z1)
@@ -190,6 +169,22 @@ class Solid:
             if self.turned:
                 signs[(x1 > px) != one_below[crossed]] = -1.0
             yield rows[crossed], heights, signs
+
+    def _apexes(
+        self, triangles: Index, height: NDArray[np.float64]
+    ) -> tuple[Index, Index, Index, NDArray[np.bool_]]:
+        """Return the corners of triangles, (C,), by the side of a line along x on which they lie.
+
+        `height`, (C,), is y of the line. These are the vertex that is alone on its side, the next
+        in the triangle, the one before it, and whether that side is below, (C,) each.
+        """
+        corners = self.triangles[triangles]  # (C, 3)
+        below = self.vertices[corners, 1] <= height[:, None]
+        one_below = below.sum(axis=1) == 1
+        alone = np.where(one_below, below.argmax(axis=1), below.argmin(axis=1))
+        every = np.arange(len(corners))
+        apex, after, before = (corners[every, (alone + step) % 3] for step in range(3))
+        return apex, after, before, one_below
 
     def _cut(
         self, one: Index, other: Index, height: NDArray[np.float64]
@@ -220,10 +215,7 @@ def _pairs(
 ) -> Iterator[tuple[Index, Index]]:
     """Yield places and triangles whose boxes hold them, as pairs: (C,) and (C,).
 
-    Parameters
-    ----------
-    places : (N, 2) float64
-    corners : (T, 3, 2) float64
+    Places are (N, 2), corners of the triangles (T, 3, 2).
     """
     batch: list[tuple[Index, Index]] = []
     total = 0
@@ -273,15 +265,8 @@ def _touched(vertices: NDArray[np.float64], triangles: Index, cells: int) -> NDA
     """Return which cells of a grid triangles touch, (G * G * G,), and some beside them.
 
     Triangles wider than a cell are halved until they are not; of the eight cells in which the
-    others may lie, those count that their plane meets.
-
-    Parameters
-    ----------
-    vertices : (V, 3) float64
-        In cells.
-    triangles : (T, 3) int64
-    cells : int
-        G.
+    others may lie, those that the triangle's plane crosses are touched. Vertices, (V, 3), are in
+    cells.
     """
     touched = np.zeros(cells**3, np.bool_)
     corners = vertices[triangles]  # (T, 3, 3)

@@ -220,7 +220,7 @@ class ViewSet:
             return np.asarray(weights / weights.sum())
 
     def middle(self) -> tuple[NDArray[np.float64], float]:
-        """Return the middle of the views and how far they are from it; stray ones hardly count.
+        """Return the middle of the views and how far they are from it; outliers hardly count.
 
         Returns
         -------
@@ -234,7 +234,7 @@ class ViewSet:
             middle = weights @ centers
             for _ in range(100):
                 distance = np.linalg.norm(centers - middle, axis=1)
-                # A median, so that stray views do not change it.
+                # A median, so that outliers do not change it.
                 reach = _median(distance, weights)
                 if reach == 0.0:
                     break
@@ -275,7 +275,7 @@ class ViewSet:
         return self.take(np.sort(usable[chosen]))
 
     def by_name(self) -> list[int]:
-        """Return the indices of the views in the order of their names, of equal names in theirs.
+        """Return the indices of the views sorted by name; views of one name keep their order.
 
         An order that neither a motion of the scene nor another order of the set changes.
         """
@@ -292,7 +292,7 @@ class ViewSet:
         for _ in range(2):
             distance = np.einsum("ij,ij->i", centers, centers)
             largest = float(distance.max()) or 1.0
-            # Rounded, so that distances that differ by rounding only keep their order.
+            # Rounded: distances that differ only by rounding count as equal and keep their order.
             order = order[np.argsort(np.round(distance[order] / largest, 9), kind="stable")]
             centers = centers - centers[order[-1]]
         weights = self.weights

@@ -1,4 +1,4 @@
-"""Volumes that say what must stay and what must go: splats count by where their centres lie."""
+"""Volumes that say which splats must stay and which must go, by where their centres lie."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Box:
         Raises
         ------
         RefineError
-            If one of them is no number, or does not lie above the other.
+            If one of them is NaN, or the second is not above the first along every axis.
         """
         for axis, low, high in zip("xyz", self.low, self.high, strict=True):
             if not low < high:

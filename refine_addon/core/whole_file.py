@@ -81,17 +81,6 @@ def mode_of(path: Path) -> int:
         return 0
 
 
-def make_folder(path: Path) -> bool:
-    """Make a folder and those above it; return whether it was there, or raise `RefineError`."""
-    try:
-        there = bool(mode_of(path))
-        path.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:
-        msg = f"{path}: cannot be made ({reason_of(error)})"
-        raise RefineError(msg) from error
-    return there
-
-
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[None]:
     """Make a folder and those above it; remove those that were not there and are empty at the end.
@@ -103,9 +92,12 @@ def new_folder(path: Path) -> Iterator[None]:
     """
     made: list[Path] = []
     try:
-        with contextlib.suppress(OSError, ValueError):  # which `make_folder` explains
+        try:
             made += itertools.takewhile(lambda folder: not mode_of(folder), (path, *path.parents))
-        make_folder(path)
+            path.mkdir(parents=True, exist_ok=True)
+        except (OSError, ValueError) as error:
+            msg = f"{path}: cannot be made ({getattr(error, 'strerror', None) or error})"
+            raise RefineError(msg) from error
         yield
     finally:
         for folder in made:
@@ -165,10 +157,10 @@ def whole_file(path: Path, *, overwrite: bool) -> Iterator[BinaryIO]:
                 stream.flush()  # before the permissions: a write would take setuid away
                 mode = _inherited(target, stream.fileno(), mode)
                 if stat.S_IMODE(os.fstat(stream.fileno()).st_mode) != mode:
-                    # By descriptor: whoever owns the folder may have put a link of that name.
+                    # By descriptor: the owner of the folder may have put a link of that name there.
                     named = stream.fileno() if os.chmod in os.supports_fd else temporary
                     os.chmod(named, mode)  # noqa: PTH101 - pathlib takes no descriptor
-            checkpoint()  # whoever cancels while the file is written wants none
+            checkpoint()  # cancelled while the file was written: leave none
             if overwrite:
                 temporary.replace(target)
             else:
@@ -255,11 +247,8 @@ def _new_temporary(target: Path, cleanup: contextlib.ExitStack) -> tuple[Path, i
 def _inherited(target: Path, descriptor: int, mode: int) -> int:
     """Give an open file the owner and group of `target`, as far as this process may.
 
-    Returns
-    -------
-    int
-        The permissions that the file is to have: those of `target`, without setuid and setgid where
-        it could not be given; `mode` if there is no such file.
+    Return the permissions that the file is to have: those of `target`, without setuid and setgid
+    where it could not be given; `mode` if there is no such file.
     """
     try:
         old = target.stat()

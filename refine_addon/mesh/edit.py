@@ -262,17 +262,13 @@ def group_weights(obj: bpy.types.Object, name: str) -> NDArray[np.float32]:
         bpy.data.node_groups.remove(tree)
 
 
-def add_delete(tree: bpy.types.NodeTree) -> bpy.types.Node:
-    """Add a node that deletes the points marked by `REMOVE`, or none where nothing is marked."""
+def _deleting_tree() -> bpy.types.NodeTree:
+    """Return nodes that delete the points marked by `REMOVE`."""
+    tree = new_tree("REFINE delete")
     node = tree.nodes.new("GeometryNodeDeleteGeometry")
     node.domain = "POINT"
     tree.links.new(named_attribute(tree, REMOVE, "BOOLEAN"), node.inputs["Selection"])
-    return node
-
-
-def _deleting_tree() -> bpy.types.NodeTree:
-    tree = new_tree("REFINE delete")
-    chain(tree, [add_delete(tree)])
+    chain(tree, [node])
     return tree
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -54,24 +54,14 @@ class Together(NamedTuple):
     ranks: NDArray[np.float64]
 
 
-def store(  # noqa: PLR0913 - all that a record holds
-    checked: SplatObject,
-    scores: Scores,
-    settings: Settings,
-    origin: dict[str, Any] | None = None,
-    cameras: list[tuple[str, int]] | None = None,
-    *,
-    protected: NDArray[np.bool_] | None = None,
-    asked: Settings | None = None,
-    together: Together | None = None,
-) -> None:
-    """Write scores to the attributes of an object's mesh, and record how they came to be.
+@dataclass(frozen=True, eq=False)
+class Provenance:
+    """How scores came to be.
 
-    Parameters
+    Attributes
     ----------
-    checked : SplatObject
-    scores, settings
-        What `core.score` gave, and was given.
+    settings : Settings
+        What they were made with.
     origin : dict, optional
         See `staleness.origin`.
     cameras : list of (str, int), optional
@@ -81,7 +71,19 @@ def store(  # noqa: PLR0913 - all that a record holds
     asked : Settings, optional
         What the scores are to be refined by, if that is still to come.
     together : Together, optional
-        Where other objects were scored with them; the curve of `scores` is that of all then.
+        Where other objects were scored with them; the curve is that of all then.
+    """
+
+    settings: Settings
+    origin: dict[str, Any] | None = None
+    cameras: list[tuple[str, int]] | None = None
+    protected: NDArray[np.bool_] | None = None
+    asked: Settings | None = None
+    together: Together | None = None
+
+
+def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
+    """Write scores to the attributes of an object's mesh, and record how they came to be.
 
     Raises
     ------
@@ -96,11 +98,12 @@ def store(  # noqa: PLR0913 - all that a record holds
             f"{len(scores.values)}; score it again"
         )
         raise RefineError(msg)
+    together, asked = provenance.together, provenance.asked
     ranks = together.ranks if together else rank(scores.values)
     new_record = json.dumps(
         {
             "splats": len(scores.values),
-            "settings": asdict(settings),
+            "settings": asdict(provenance.settings),
             "method": scores.method,
             "frustum": scores.frustum,
             "views_given": scores.views_given,
@@ -110,9 +113,9 @@ def store(  # noqa: PLR0913 - all that a record holds
             "notes": scores.notes,
             "quality": scores.quality.facts() if scores.quality else None,
             "alignment": scores.alignment.facts() if scores.alignment else None,
-            "origin": origin,
-            "cameras": cameras,
-            "protected": digest(protected),
+            "origin": provenance.origin,
+            "cameras": provenance.cameras,
+            "protected": digest(provenance.protected),
             "asked": asdict(asked) if asked else None,
             "together": together and {"id": together.id, "splats": together.splats},
         }

@@ -13,13 +13,13 @@ from ..core.errors import RefineError
 from ..core.operation.files import FileSink
 from ..core.operation.loaded import Loaded, RowSizes
 from ..core.operation.run import run
-from ..core.operation.score import ScoreSink
+from ..core.whole_file import expanded
 from ..core.work import Progress, silent
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject, check
-from ..mesh.scores import store
+from ..mesh.scores import Provenance, store
 from .demands import NONE, Demands
 from .splat_object import find, gather, modifier_notes, reduce_object
 
@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ..core.formats.format import Format
-    from ..core.operation.prune import PruneRequest
+    from ..core.operation.requests import PruneRequest, ScoreRequest
     from ..core.operation.run import Runtime, Written
-    from ..core.operation.score import ScoreRequest
     from ..core.task import Result
 
 
@@ -77,7 +76,8 @@ def prune_object(
     harmonics = True if request.absorb else None if request.compares_pictures else False
     demands += Demands(zones=tuple(request.zones))
     source = ObjectSource(checked, demands, harmonics=harmonics, reusable=save)
-    file = FileSink(output, overwrite=request.overwrite, dry_run=request.dry_run)
+    target = None if output is None else expanded(output)
+    file = FileSink(target, overwrite=request.overwrite, dry_run=request.dry_run)
     return run(source, request, ObjectSink(checked, request, file, save), progress=progress).report
 
 
@@ -111,7 +111,7 @@ def score_object(
         See `refine_addon.core.operation.run` and `ObjectSource`; also if there is no such object.
     """
     source = ObjectSource(check(find(name)), demands + Demands(zones=tuple(request.zones)))
-    sink = ScoreSink(output, overwrite=request.overwrite)
+    sink = FileSink(expanded(output), overwrite=request.overwrite)
     return run(source, request, sink, progress=progress).report
 
 
@@ -221,7 +221,7 @@ class ObjectSink:
         if self.save:
             columns = loaded.columns(result.absorbed)
             with mesh_edit.all_or_nothing(self.checked.obj):
-                store(self.checked, result.scores, self.request.settings)
+                store(self.checked, result.scores, Provenance(self.request.settings))
                 reduce_object(self.checked, result.keep, columns)
                 _save(written.path)
         return written

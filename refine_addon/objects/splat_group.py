@@ -7,7 +7,7 @@ Operators of the panel work on the selection through here. A single object is ha
 from __future__ import annotations
 
 import uuid
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -18,7 +18,7 @@ from ..core.estimate.quality import Quality
 from ..core.selection import rank
 from ..core.splats import joined
 from ..core.task import DEFAULTS, Task
-from ..core.volumes import FREE, Forced
+from ..core.volumes import Forced
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from ..core.task import Result, Settings
     from ..core.views import ViewSet
     from ..mesh.layout import SplatObject
+    from ..mesh.scores import Provenance
 
 Members = list["SplatObject"]
 """The objects, by name; one at least."""
@@ -174,28 +175,9 @@ def gather(group: Members, *, whole: bool | None = False) -> Splats:
     return joined([splat_object.gather(member, whole=whole) for member in group])
 
 
-@dataclass(frozen=True, eq=False)
-class Provenance:
-    """How scores came to be; see `mesh.scores.store`.
-
-    Attributes
-    ----------
-    settings, cameras, asked
-        See there.
-    origins : sequence of dict
-        Of each object.
-    forced : Forced
-        Which splats of all objects had to stay and to go.
-    """
-
-    settings: Settings
-    origins: Sequence[dict[str, Any]]
-    cameras: list[tuple[str, int]] | None = None
-    forced: Forced = FREE
-    asked: Settings | None = None
-
-
-def store(group: Members, scores: Scores, provenance: Provenance) -> None:
+def store(
+    group: Members, scores: Scores, provenance: Provenance, origins: Sequence[dict[str, Any]]
+) -> None:
     """Write scores of all objects' splats to their meshes; see `mesh.scores.store`.
 
     Parameters
@@ -204,21 +186,23 @@ def store(group: Members, scores: Scores, provenance: Provenance) -> None:
     scores : Scores
         Of the splats of `gather`.
     provenance : Provenance
+        Of them all.
+    origins : sequence of dict
+        Of each object.
     """
     _check_counts(group, len(scores.values))
     ranks, scoring = rank(scores.values), uuid.uuid4().hex
-    stay = parts_of(provenance.forced.protected, group)
-    for member, origin, rows, protected in zip(
-        group, provenance.origins, _rows(group), stay, strict=True
-    ):
+    protected = parts_of(provenance.protected, group)
+    for member, origin, rows, mask in zip(group, origins, _rows(group), protected, strict=True):
         scores_of_member, together = scores, None
         if len(group) > 1:
             scores_of_member = _scores_of_rows(scores, rows)
             together = mesh_scores.Together(scoring, len(scores.values), ranks[rows])
         mesh_scores.store(
-            member, scores_of_member, provenance.settings, origin, provenance.cameras,
-            protected=protected, asked=provenance.asked, together=together,
-        )  # fmt: skip
+            member,
+            scores_of_member,
+            replace(provenance, origin=origin, protected=mask, together=together),
+        )
 
 
 def _scores_of_rows(scores: Scores, rows: slice) -> Scores:
@@ -365,10 +349,7 @@ def _scores(group: Members, parts: list[Scores], masks: dict[str, Any]) -> Score
 def _protecting(group: Members, name: str) -> list[bool]:
     """Return which objects have a vertex group or an attribute of that name that protects.
 
-    Raises
-    ------
-    RefineError
-        If none has.
+    Raise `RefineError` if none has.
     """
     protecting, errors = [], []
     for member in group:

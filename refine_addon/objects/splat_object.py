@@ -18,11 +18,9 @@ from ..cameras.objects import world_matrix
 from ..core.affine import is_uniform, transformed
 from ..core.errors import RefineError
 from ..core.formats.ply import columns_from_splats
-from ..core.formats.registry import as_written
 from ..core.survivors import survivor_columns
 from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.volumes import FREE, Forced
-from ..core.whole_file import expanded, refuse_existing
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
@@ -31,13 +29,11 @@ from ..mesh.scores import RECORD, stored_scores
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
     from ..core.absorbing.absorb import Absorbed
     from ..core.formats.ply import SplatFile
-    from ..core.formats.registry import Packed
     from ..core.levels.lod import Level
     from ..core.selection import Budget
     from ..core.splats import Splats
@@ -175,10 +171,6 @@ def apply_object(checked: SplatObject, result: Result | Level) -> Outcome:
     result : Result or Level
         What was decided of the object's splats.
 
-    Returns
-    -------
-    Outcome
-
     Raises
     ------
     RefineError
@@ -253,77 +245,22 @@ def absorbed_columns(checked: SplatObject, absorbed: Absorbed) -> dict[str, NDAr
     return survivor_columns(stored, absorbed, np.linalg.inv(matrix))
 
 
-def export_object(
-    checked: SplatObject,
-    path: Path | str,
-    *,
-    keep: NDArray[np.bool_] | None = None,
-    columns: dict[str, NDArray[Any]] | None = None,
-    apply_transform: bool = False,
-    overwrite: bool = False,
-) -> SplatFile | Packed:
-    """Write an object to a file: as PLY, in the layout of the file it was imported from.
+def exported_file(checked: SplatObject, *, apply_transform: bool = False) -> SplatFile:
+    """Return an object as the PLY file it would be, in the layout it was imported with; in memory.
 
     Parameters
     ----------
     checked : SplatObject
-    path : path-like
-        Its suffix names the format.
-    keep : (N,) bool, optional
-        Which splats to write; all by default.
-    columns : mapping of str to (N,), optional
-        Properties to write with these values, in the object's frame, in place of the object's.
     apply_transform : bool
-        Whether to write the splats as they stand in the world, harmonics turned with them.
-    overwrite : bool
-        Whether `path` may be replaced.
-
-    Returns
-    -------
-    SplatFile or Packed
-        What was written, all rows.
+        Whether the splats are to be as they stand in the world, harmonics turned with them.
 
     Raises
     ------
     RefineError
-        If the object's scale is uneven and is to be applied, or the file cannot be written; nothing
-        is written then.
+        If the object's scale is uneven and is to be applied.
     """
-    target = export_target(path, overwrite=overwrite)
-    file = export_source(checked, columns=columns, apply_transform=apply_transform)
-    return write_export(file, target, keep=keep, overwrite=overwrite)
-
-
-def export_target(path: Path | str, *, overwrite: bool) -> Path:
-    """Return the file that `export_object` would write, or raise `RefineError` if it cannot."""
-    target = expanded(path)
-    refuse_existing(target, overwrite=overwrite)
-    return target
-
-
-def export_source(
-    checked: SplatObject,
-    *,
-    columns: dict[str, NDArray[Any]] | None = None,
-    apply_transform: bool = False,
-) -> SplatFile:
-    """Return what `export_object` writes, in memory."""
-    return mesh_attributes.file_from_object(
-        checked, _world_columns(checked) if apply_transform else columns
-    )
-
-
-def write_export(
-    file: SplatFile,
-    target: Path,
-    *,
-    keep: NDArray[np.bool_] | None = None,
-    overwrite: bool = False,
-) -> SplatFile | Packed:
-    """Write what `export_source` returned, as `export_object` does; without Blender's data."""
-    written = as_written(file, target)
-    written.write(target, keep, overwrite=overwrite)
-    return written
+    columns = _world_columns(checked) if apply_transform else None
+    return mesh_attributes.file_from_object(checked, columns)
 
 
 def _outcome(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:

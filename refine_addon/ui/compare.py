@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import bpy
 import numpy as np
 
-from ..cameras.sets import Choice
+from ..cameras.sets import CameraChoice
 from ..core import pipeline
 from ..core.estimate.quality import in_words
 from ..core.picture_files import KINDS
@@ -62,7 +62,7 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Comparing:
         """Gather what Apply would decide by, the splats and the view of the active camera."""
-        view = Choice("ACTIVE").views(context, checked.obj)[0]
+        view = CameraChoice("ACTIVE").views(context, checked.obj)[0]
         group = splat_group.members(context.view_layer, checked)
         task = apply_task(context, group, splat_group.forced_of_each(context.scene, group))
         splats = task.splats or splat_group.gather(group, whole=None)
@@ -120,13 +120,7 @@ def _image(name: str, pixels: NDArray[np.uint8]) -> bpy.types.Image:
 
 
 def _show(context: bpy.types.Context, images: list[bpy.types.Image]) -> None:
-    """Show images side by side in a window of their own, as renders are; or where they are shown.
-
-    Parameters
-    ----------
-    context : bpy.types.Context
-    images : list of bpy.types.Image
-    """
+    """Show images side by side in a window of their own, unless all are shown already."""
     manager = context.window_manager
     shown = [
         area.spaces.active.image

@@ -13,7 +13,8 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..core.formats.registry import FORMATS, Packed, without_suffix
+from ..core.formats.registry import FORMATS, Packed, as_written, without_suffix
+from ..core.whole_file import expanded, refuse_existing
 from ..core.work import report
 from ..mesh import scores as mesh_scores
 from ..objects import splat_object
@@ -96,17 +97,18 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
 
     def prepare(self, _context: bpy.types.Context, checked: SplatObject) -> _Export:
         """Refuse what cannot be written, and gather what is."""
-        target = splat_object.export_target(
-            bpy.path.abspath(self.filepath), overwrite=self.overwrite
-        )
-        file = splat_object.export_source(checked, apply_transform=self.apply_transform)
+        target = expanded(bpy.path.abspath(self.filepath))
+        refuse_existing(target, overwrite=self.overwrite)
+        file = splat_object.exported_file(checked, apply_transform=self.apply_transform)
         return _Export(file, target, self.overwrite)
 
     @staticmethod
     def work(job: _Export, progress: Progress) -> SplatFile | Packed:
         """Write the file."""
         report(progress, 0.0, job.target.name)
-        return splat_object.write_export(job.file, job.target, overwrite=job.overwrite)
+        file = as_written(job.file, job.target)
+        file.write(job.target, overwrite=job.overwrite)
+        return file
 
     def finish(
         self,

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import numpy as np
 
-from ..cameras.sets import Choice
-from ..core import pipeline, score_splats
+from ..cameras.sets import CameraChoice
+from ..core import pipeline
 from ..core.estimate.quality import in_words
 from ..core.levels.lod import Level, Levels, lod
 from ..core.report import scoring_notes, sizes_in_words
@@ -24,6 +24,7 @@ from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
+from ..mesh.scores import Provenance
 from ..objects import level_objects, splat_group, splat_object
 from ..objects.demands import Demands
 from . import plans, staleness
@@ -32,11 +33,8 @@ from .on_thread import OnThread
 from .operator_bases import (
     Answer,
     AtOnce,
-    Needing,
     OnSplats,
     in_object_mode,
-    on_splats,
-    out_of_edit_mode,
     scored,
 )
 from .running import Sketch
@@ -60,7 +58,7 @@ _SCORED = 0.97
 
 def chosen_views(context: bpy.types.Context) -> ViewSet:
     """Return the views of the cameras that the panel names."""
-    return Choice.of_scene(context.scene).views(context, context.object)
+    return CameraChoice.of_scene(context.scene).views(context, context.object)
 
 
 def apply_task(
@@ -137,17 +135,17 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     ) -> None:
         """Store the closed form's scores, to be looked at until those asked for are there."""
         group = splat_group.by_uids(job.uids, checked)
-        provenance = splat_group.Provenance(
-            _by_closed_form(job), job.origins, forced=job.forced, asked=job.settings
+        provenance = Provenance(
+            _by_closed_form(job), protected=job.forced.protected, asked=job.settings
         )
-        splat_group.store(group, scores, provenance)
+        splat_group.store(group, scores, provenance, job.origins)
         plans.refresh(context)
 
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
         """Score, and count how many splats lie in each view."""
         forced_out, means = job.forced.removed, job.splats.means
-        scores = score_splats.score(
+        scores = pipeline.score(
             job.splats, job.views, job.settings,
             protected=job.forced.protected, removed=forced_out,
             quality=job.quality, progress=part(progress, 0.0, _SCORED),
@@ -167,8 +165,8 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         pairs = zip(job.views, counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
         group = splat_group.by_uids(job.uids, checked)
-        provenance = splat_group.Provenance(job.settings, job.origins, cameras, job.forced)
-        splat_group.store(group, scores, provenance)
+        provenance = Provenance(job.settings, cameras=cameras, protected=job.forced.protected)
+        splat_group.store(group, scores, provenance, job.origins)
         plans.refresh(context)
         self.report({"INFO"}, _scored_in_words(group, scores, job.forced.counts()["forced"]))
         modifiers = [note for each in group for note in splat_object.modifier_notes(each.obj)]
@@ -192,23 +190,9 @@ def _by_closed_form(job: _Scoring) -> Settings:
 
 
 def _sketch(job: _Scoring, progress: Progress) -> Scores:
-    return score_splats.score(
+    return pipeline.score(
         job.splats, job.views, _by_closed_form(job), removed=job.forced.removed, progress=progress
     )
-
-
-class REFINE_OT_plan(Needing, bpy.types.Operator):
-    """Work out again how many splats stay and go"""
-
-    bl_idname = "refine.plan"
-    bl_label = "Update"
-    bl_options = {"INTERNAL"}
-    needs = (on_splats, out_of_edit_mode, scored)
-
-    def execute(self, context: bpy.types.Context) -> Answer:
-        """Work it out."""
-        plans.refresh(context)
-        return {"FINISHED"}
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from ..cameras.sets import chosen_cameras
+from ..cameras.sets import CameraChoice
 from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
@@ -230,23 +230,9 @@ class REFINE_PT_preview(_InSidebar, bpy.types.Panel):
         obj = context.object
         splats = mesh_layout.looks_like_splats(obj)
         _draw_modes(layout, obj if splats else None)
-        mode, hidden = preview.shown(obj) if splats else ("", False)
-        row = layout.row(align=True)
-        row.label(text="Points")
-        for choice, text in (("HEAT", "Heat Map"), ("COLOR", "Colour")):
-            cell = row.row(align=True)
-            cell.enabled = choice == "COLOR" or (splats and preview.has_heat(obj))
-            button = cell.operator("refine.preview", text=text, depress=mode == choice)
-            button.mode = "OFF" if mode == choice else choice
-            button.hide_removed = hidden
-        row = layout.row()
-        row.enabled = bool(mode)
-        icon = "HIDE_ON" if hidden else "HIDE_OFF"
-        button = row.operator("refine.preview", text="Hide What Goes", depress=hidden, icon=icon)
-        button.mode = mode or "HEAT"
-        button.hide_removed = not hidden
-        button = layout.operator("refine.preview", text="Show in Renders", icon="RENDER_STILL")
-        button.mode, button.style, button.hide_removed = "COLOR", "SPLATS", hidden
+        mode = preview.shown(obj) if splats else ""
+        button = layout.operator("refine.preview", icon="RENDER_STILL", depress=bool(mode))
+        button.mode = "OFF" if mode else "COLOR"
 
 
 class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
@@ -339,8 +325,7 @@ def _has(obj: bpy.types.Object | None, attribute: str) -> bool:
 
 
 def _cameras(context: bpy.types.Context) -> list[bpy.types.Object]:
-    settings = context.scene.refine
-    return chosen_cameras(context, settings.source, settings.collection)
+    return CameraChoice.of_scene(context.scene).cameras(context)
 
 
 def _changes(context: bpy.types.Context, obj: bpy.types.Object) -> list[str]:
@@ -370,8 +355,7 @@ def _draw_plan(
     obj, settings = context.object, context.scene.refine
     plan = plans.stored(obj, settings)
     if plan is None:
-        layout.operator("refine.plan", icon="FILE_REFRESH")
-        return
+        return  # it is being made
     if "error" in plan:
         waits = mesh_scores.unrefined(record) and settings.budget == "psnr"
         text = plans.remark(plan, record) if waits else plan["error"]

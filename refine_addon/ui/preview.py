@@ -1,21 +1,19 @@
-"""Splats made visible without touching them: a geometry nodes modifier and a material.
+"""Splats that Cycles renders as they are: a geometry nodes modifier and a material.
 
-Two styles. Points are quick: one sphere a splat, for the viewport. Splats are true: each Gaussian
-is integrated along the ray, blended in depth order; for Cycles, and for a few hundred thousand.
-Harmonics beyond the constant are not shown.
+Each Gaussian is integrated along the ray, blended in depth order; for a few hundred thousand.
+Harmonics beyond the constant are not shown. The 3D views draw splats by themselves (`viewport`).
 """
 
 from __future__ import annotations
 
 from math import e
-from typing import TYPE_CHECKING
 
 import bpy
 
 from ..core.errors import RefineError
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
-from ..mesh import heat_map, native
+from ..mesh import heat_map
 from ..mesh import scores as mesh_scores
 from ..mesh.layout import check
 from ..mesh.node_trees import (
@@ -29,17 +27,11 @@ from ..mesh.node_trees import (
 )
 from ..version import VERSION
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
 MODIFIER = "REFINE preview"
 """Name of the modifier."""
 
 MODES = {"COLOR": heat_map.COLOR, "HEAT": heat_map.HEAT}
 """What can be shown -> the colour attribute that holds it."""
-
-STYLES = ("POINTS", "SPLATS", "CLOUD", "NATIVE")
-"""CLOUD and NATIVE are POINTS of a point cloud: with the values of a file, with Blender's own."""
 
 MADE_BY = "refine_version"
 """Custom property of our node groups and materials: the version of the add-on that made them. Those
@@ -48,16 +40,11 @@ of another version, from an old .blend, are made anew in place, so that what use
 _LEAST = 1 / 255
 """Opacity below which a Gaussian is not drawn, as in the reference rasterizer."""
 
-_POINT = 1.5
-"""Radius of a point over the mean size of its splat, of an opaque one."""
-
 _CIRCUMSCRIBED = 1.26
 """Radius of an icosphere of 20 faces over that of the sphere inside it."""
 
 
-def show(
-    obj: bpy.types.Object, mode: str, *, hide_removed: bool = False, style: str = "POINTS"
-) -> bpy.types.Modifier:
+def show(obj: bpy.types.Object, mode: str) -> bpy.types.Modifier:
     """Show the splats of an object by a modifier; the mesh but gains a colour attribute.
 
     Parameters
@@ -65,10 +52,6 @@ def show(
     obj : bpy.types.Object
     mode : {"COLOR", "HEAT"}
         The splats' own colour, or the heat map of their ranks.
-    hide_removed : bool
-        Whether to hide what the budget last planned (`splat_group.mark_removed`) would remove.
-    style : {"POINTS", "SPLATS"}
-        See the module.
 
     Returns
     -------
@@ -78,12 +61,12 @@ def show(
     Raises
     ------
     RefineError
-        If the object holds no splats or cannot be changed; for the heat map, if it was not scored;
-        for style SPLATS, if it holds Blender's own splats, which Blender draws itself.
+        If the object holds no splats, or cannot be changed, or is a point cloud; for the heat map,
+        if it was not scored.
     """
     checked = check(obj)
     mesh_edit.check_writable(obj)
-    if style == "SPLATS" and obj.type == "POINTCLOUD":
+    if obj.type == "POINTCLOUD":
         msg = f"object '{obj.name}': is a point cloud; convert it to a mesh to see it as splats"
         raise RefineError(msg)
     if mode == "HEAT" and not has_heat(obj):
@@ -91,11 +74,8 @@ def show(
         raise RefineError(msg)
     if mode == "COLOR" and heat_map.COLOR not in obj.data.attributes:
         heat_map.write_base_color(checked)
-    if obj.type == "POINTCLOUD":
-        style = "NATIVE" if checked.layout.native else "CLOUD"
-    tree = _tree(mode, style, hide_removed=hide_removed)
     modifier = obj.modifiers.get(MODIFIER) or obj.modifiers.new(MODIFIER, "NODES")
-    modifier.node_group = tree
+    modifier.node_group = _tree(mode)
     _purge()
     return modifier
 
@@ -115,17 +95,15 @@ def has_heat(obj: bpy.types.Object) -> bool:
     return heat_map.HEAT in obj.data.attributes and mesh_scores.RANK in obj.data.attributes
 
 
-def shown(obj: bpy.types.Object) -> tuple[str, bool]:
-    """Return which mode is shown, "" if none, and whether removed splats are hidden."""
+def shown(obj: bpy.types.Object) -> str:
+    """Return which mode is shown, "" if none."""
     modifier = obj.modifiers.get(MODIFIER)
     tree = modifier.node_group if modifier else None
-    if tree is None:
-        return "", False
-    return tree.get("mode", ""), bool(tree.get("hide_removed", False))
+    return "" if tree is None else str(tree.get("mode", ""))
 
 
 def set_up_render(scene: bpy.types.Scene, samples: int = 1) -> None:
-    """Make a scene render splats (style SPLATS) as they are: Cycles, plain colours, no light.
+    """Make a scene render splats as they are: Cycles, plain colours, no light.
 
     Parameters
     ----------
@@ -145,69 +123,22 @@ def set_up_render(scene: bpy.types.Scene, samples: int = 1) -> None:
     scene.view_settings.look = "None"
 
 
-def _tree(mode: str, style: str, *, hide_removed: bool) -> bpy.types.NodeTree:
-    """Return the node group of a way to show; objects share it."""
-    name = f"REFINE {mode.lower()} {style.lower()}{' kept' if hide_removed else ''}"
+def _tree(mode: str) -> bpy.types.NodeTree:
+    """Return the node group of a mode; objects share it."""
+    name = _name(mode)
     tree = bpy.data.node_groups.get((name, None))  # not one that is linked from a library
     if tree and tree.get(MADE_BY) == VERSION:
         return tree
     tree = tree or bpy.data.node_groups.new(name, "GeometryNodeTree")
     make_empty(tree)
-    tree["mode"], tree["hide_removed"], tree[MADE_BY] = mode, hide_removed, VERSION
-    builders: dict[str, Callable[..., list[bpy.types.Node]]] = {
-        "POINTS": _points,
-        "SPLATS": _splats,
-        "CLOUD": _cloud,
-        "NATIVE": _native,
-    }
-    nodes = [mesh_edit.add_delete(tree)] if hide_removed else []
-    material = _material(mode, "SPLATS" if style == "SPLATS" else "POINTS")
-    chain(tree, nodes + builders[style](tree, material))
+    tree["mode"], tree[MADE_BY] = mode, VERSION
+    chain(tree, _splats(tree, _material(mode)))
     return tree
 
 
-def _points(tree: bpy.types.NodeTree, material: bpy.types.Material) -> list[bpy.types.Node]:
-    """Return nodes that draw a sphere a splat: its mean size, less where it is translucent."""
-    logs = [named_attribute(tree, f"scale_{axis}", "FLOAT") for axis in range(3)]
-    total = math(tree, "ADD", math(tree, "ADD", logs[0], logs[1]), logs[2])
-    size = math(tree, "EXPONENT", math(tree, "DIVIDE", total, 3.0))
-    opaque = logistic(tree, named_attribute(tree, "opacity", "FLOAT"))
-    return _spheres(tree, material, size, opaque)
-
-
-def _cloud(tree: bpy.types.NodeTree, material: bpy.types.Material) -> list[bpy.types.Node]:
-    """Return what `_points` does, for a point cloud."""
-    return [add(tree, "GeometryNodePointsToVertices"), *_points(tree, material)]
-
-
-def _native(tree: bpy.types.NodeTree, material: bpy.types.Material) -> list[bpy.types.Node]:
-    """Return what `_points` does, for a point cloud with Blender's own splats.
-
-    As vertices in between, they are points afterwards and no splats, which Blender would draw.
-    """
-    parts = add(tree, "ShaderNodeSeparateXYZ")
-    tree.links.new(named_attribute(tree, native.SCALE, "FLOAT_VECTOR"), parts.inputs[0])
-    x, y, z = parts.outputs
-    product = math(tree, "MULTIPLY", math(tree, "MULTIPLY", x, y), z)
-    size = math(tree, "POWER", product, 1.0 / 3.0)
-    base = add(tree, "FunctionNodeSeparateColor")
-    tree.links.new(named_attribute(tree, native.BASE, "FLOAT_COLOR"), base.inputs[0])
-    spheres = _spheres(tree, material, size, base.outputs["Alpha"])
-    return [add(tree, "GeometryNodePointsToVertices"), *spheres]
-
-
-def _spheres(
-    tree: bpy.types.NodeTree,
-    material: bpy.types.Material,
-    size: bpy.types.NodeSocket,
-    opaque: bpy.types.NodeSocket,
-) -> list[bpy.types.Node]:
-    points = add(tree, "GeometryNodeMeshToPoints")
-    radius = math(tree, "MULTIPLY", math(tree, "MULTIPLY", size, opaque), _POINT)
-    tree.links.new(radius, points.inputs["Radius"])
-    paint = add(tree, "GeometryNodeSetMaterial")
-    paint.inputs["Material"].default_value = material
-    return [points, paint]
+def _name(mode: str) -> str:
+    """Return the name of the node group and the material of a mode."""
+    return f"REFINE {mode.lower()} splats"
 
 
 def _splats(tree: bpy.types.NodeTree, material: bpy.types.Material) -> list[bpy.types.Node]:
@@ -234,8 +165,8 @@ def _splats(tree: bpy.types.NodeTree, material: bpy.types.Material) -> list[bpy.
     return [add(tree, "GeometryNodeMeshToPoints"), instances]
 
 
-def _material(mode: str, style: str) -> bpy.types.Material:
-    name = f"REFINE {mode.lower()} {style.lower()}"
+def _material(mode: str) -> bpy.types.Material:
+    name = _name(mode)
     material = bpy.data.materials.get((name, None))
     if material and material.get(MADE_BY) == VERSION:
         return material
@@ -244,18 +175,14 @@ def _material(mode: str, style: str) -> bpy.types.Material:
     material.use_nodes = True
     tree = material.node_tree
     tree.nodes.clear()
-    place = "INSTANCER" if style == "SPLATS" else "GEOMETRY"
-    color = add(tree, "ShaderNodeAttribute", attribute_type=place, attribute_name=MODES[mode])
+    color = add(tree, "ShaderNodeAttribute", attribute_type="INSTANCER", attribute_name=MODES[mode])
     light = add(tree, "ShaderNodeEmission")
     tree.links.new(color.outputs["Color"], light.inputs["Color"])
-    surface = light.outputs[0]
-    if style == "SPLATS":
-        mix = add(tree, "ShaderNodeMixShader")
-        tree.links.new(_gaussian(tree), mix.inputs[0])
-        tree.links.new(add(tree, "ShaderNodeBsdfTransparent").outputs[0], mix.inputs[1])
-        tree.links.new(surface, mix.inputs[2])
-        surface = mix.outputs[0]
-    tree.links.new(surface, add(tree, "ShaderNodeOutputMaterial").inputs["Surface"])
+    mix = add(tree, "ShaderNodeMixShader")
+    tree.links.new(_gaussian(tree), mix.inputs[0])
+    tree.links.new(add(tree, "ShaderNodeBsdfTransparent").outputs[0], mix.inputs[1])
+    tree.links.new(light.outputs[0], mix.inputs[2])
+    tree.links.new(mix.outputs[0], add(tree, "ShaderNodeOutputMaterial").inputs["Surface"])
     return material
 
 
@@ -301,13 +228,8 @@ def _gaussian(tree: bpy.types.NodeTree) -> bpy.types.NodeSocket:
 
 def _purge() -> None:
     """Remove the node groups and materials of ours that nothing uses any more."""
-    ways = [f"{mode.lower()} {style.lower()}" for mode in MODES for style in STYLES]
-    for way in ways:
-        for name in (f"REFINE {way}", f"REFINE {way} kept"):
-            tree = bpy.data.node_groups.get(name)
-            if tree and not tree.users:
-                bpy.data.node_groups.remove(tree)
-    for way in ways:
-        material = bpy.data.materials.get(f"REFINE {way}")
-        if material and not material.users:
-            bpy.data.materials.remove(material)
+    for blocks in (bpy.data.node_groups, bpy.data.materials):
+        for name in map(_name, MODES):
+            block = blocks.get(name)
+            if block and not block.users:
+                blocks.remove(block)

@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 
 from ..cameras.objects import SOURCE, WEIGHT, render_size
-from ..cameras.sets import chosen_cameras
+from ..cameras.sets import CameraChoice
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
@@ -155,7 +155,7 @@ def _cameras(context: bpy.types.Context) -> dict[str, Any]:
         frames = settings.to_frames(scene)
         camera = scene.camera.name if scene.camera else ""
         return {"frames": [frames.start, frames.stop, frames.step, camera]}
-    cameras = chosen_cameras(context, settings.source, settings.collection)
+    cameras = CameraChoice(settings.source, settings.collection).cameras(context)
     (width, height), aspect = render_size(scene)
     frame = (width, height, aspect)
     numbers = np.array([_numbers(camera, frame) for camera in cameras])

@@ -1,4 +1,4 @@
-"""Operators that show splats: drawn in the 3D views, or by modifiers."""
+"""Operators that show splats: drawn in the 3D views, or in renders."""
 
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty
+from bpy.props import EnumProperty
 
 from ..viewport import draw
 from . import preview
@@ -47,68 +47,28 @@ class REFINE_OT_view(bpy.types.Operator):
 
 
 class REFINE_OT_preview(AtOnce, Needing, bpy.types.Operator):
-    """Show the splats as points, or in renders as they are, without changing them"""
+    """Let renders show the splats as they are; sets the scene to Cycles, without light and with the view transform Standard"""  # noqa: E501 - a tooltip is one line
 
     bl_idname = "refine.preview"
-    bl_label = "Preview"
+    bl_label = "Show in Renders"
     bl_options = {"REGISTER", "UNDO"}
     needs = (on_splats, out_of_edit_mode)
 
     mode: EnumProperty(
         name="Show",
-        description="What the points show",
+        description="What renders show",
         items=(
+            ("COLOR", "Colour", "The splats' own colours"),
             ("HEAT", "Heat Map", "Rank of each splat: dark goes first, yellow last"),
-            ("COLOR", "Colour", "The splat's own colour"),
-            ("OFF", "Off", "Show the plain mesh again"),
+            ("OFF", "Off", "Nothing but the plain mesh"),
         ),
     )
-    hide_removed: BoolProperty(
-        name="Hide What Goes", description="Hide the splats that the budget removes"
-    )
-    style: EnumProperty(
-        name="Style",
-        description="What is made of each splat",
-        items=(
-            ("POINTS", "Points", "A sphere, for the viewport"),
-            ("SPLATS", "For Renders", "The Gaussian itself, for pictures that Cycles renders"),
-        ),
-        options={"SKIP_SAVE"},
-    )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: Any) -> str:  # noqa: ANN401
-        """Return the tooltip of a button."""
-        if properties.style == "SPLATS" and properties.mode != "OFF":
-            return (
-                "Let renders show the splats as they are; sets the scene to Cycles, without light "
-                "and with the view transform Standard"
-            )
-        if properties.mode == "OFF":
-            return "Show the plain mesh again"
-        if properties.hide_removed:
-            return "Hide the splats that would be removed; nothing is deleted"
-        return {
-            "HEAT": "Colour each splat by its rank: dark goes first, yellow goes last",
-            "COLOR": "Show each splat in its own colour",
-        }[properties.mode]
 
     def act(self, context: bpy.types.Context) -> Answer:
-        """Add, change or remove the preview."""
-        obj, shows = context.object, self.mode != "OFF"
-        if shows:
-            preview.show(obj, self.mode, hide_removed=self.hide_removed, style=self.style)
+        """Add, change or remove what renders show."""
+        if self.mode == "OFF":
+            preview.hide(context.object)
         else:
-            preview.hide(obj)
-        if shows and self.style == "SPLATS":
+            preview.show(context.object, self.mode)
             preview.set_up_render(context.scene)
-            return {"FINISHED"}  # too slow for the viewport, which draws them by itself
-        draw.stop()
-        shading = getattr(context.space_data, "shading", None)
-        # Solid mode draws every point in one grey.
-        if shows and shading and shading.type in {"SOLID", "WIREFRAME"}:
-            shading.type = "MATERIAL"
-        overlay = getattr(context.space_data, "overlay", None)
-        if overlay:  # outlines of a million selected points hide their colours
-            overlay.show_outline_selected = not shows
         return {"FINISHED"}

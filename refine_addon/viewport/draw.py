@@ -93,34 +93,36 @@ def _forget() -> None:
     _state.content, _state.views = Content(), {}
 
 
+def _listeners() -> tuple[tuple[Callable[..., None], tuple[str, ...]], ...]:
+    """Return what is called at which events of Blender."""
+    return (
+        (_updated, ("depsgraph_update_post", "frame_change_post")),
+        (_undone, ("undo_post", "redo_post")),
+        (_leaving, ("load_pre",)),
+        (_loaded, ("load_post",)),
+    )
+
+
 def _hook() -> None:
-    space, handlers = bpy.types.SpaceView3D, bpy.app.handlers
+    space = bpy.types.SpaceView3D
     _state.handles = [
         space.draw_handler_add(partial(_guarded, _draw), (), "WINDOW", "POST_VIEW"),
         space.draw_handler_add(partial(_guarded, _draw_legend), (), "WINDOW", "POST_PIXEL"),
     ]
-    handlers.depsgraph_update_post.append(_updated)
-    handlers.frame_change_post.append(_updated)
-    handlers.undo_post.append(_undone)
-    handlers.redo_post.append(_undone)
-    handlers.load_pre.append(_leaving)
-    handlers.load_post.append(_loaded)
+    for handler, names in _listeners():
+        for name in names:
+            getattr(bpy.app.handlers, name).append(handler)
 
 
 def _unhook() -> None:
-    handlers = bpy.app.handlers
     for handle in _state.handles:
         bpy.types.SpaceView3D.draw_handler_remove(handle, "WINDOW")
     _state.handles = []
-    for handler, listeners in (
-        (_updated, (handlers.depsgraph_update_post, handlers.frame_change_post)),
-        (_undone, (handlers.undo_post, handlers.redo_post)),
-        (_leaving, (handlers.load_pre,)),
-        (_loaded, (handlers.load_post,)),
-    ):
-        for listener in listeners:
-            if handler in listener:
-                listener.remove(handler)
+    for handler, names in _listeners():
+        for name in names:
+            listening = getattr(bpy.app.handlers, name)
+            if handler in listening:
+                listening.remove(handler)
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
 

@@ -57,6 +57,12 @@ def core(addon):
     return addon.core
 
 
+def export(addon, checked, path, **options):
+    """Write an object to a file, as *Export* does; see `exported_file` for the options."""
+    file = addon.objects.splat_object.exported_file(checked, **options)
+    addon.core.formats.registry.as_written(file, path).write(path)
+
+
 def keep_mask(addon, obj, budget, protect=""):
     """Return which splats of a scored object stay, as *Apply* decides it; `protect` names some."""
     checked = addon.mesh.layout.check(obj)
@@ -130,7 +136,9 @@ def score(addon):
         scores = addon.core.score(
             addon.objects.splat_object.gather(addon.mesh.layout.check(obj)), views, settings
         )
-        addon.mesh.scores.store(addon.mesh.layout.check(obj), scores, settings)
+        addon.mesh.scores.store(
+            addon.mesh.layout.check(obj), scores, addon.mesh.scores.Provenance(settings)
+        )
 
     return score
 

@@ -37,7 +37,7 @@ def start(addon, few):  # noqa: ARG001
 @pytest.fixture
 def gate(addon, monkeypatch):
     """Hold back the scoring that was asked for, not its sketch, until `open`; or let it fail."""
-    gate, score = SimpleNamespace(open=threading.Event(), error=None), addon.core.score_splats.score
+    gate, score = SimpleNamespace(open=threading.Event(), error=None), addon.core.pipeline.score
 
     def held(splats, views, settings, *, progress, **options):
         if threading.current_thread().name == "refine" and settings.method != "closed-form":
@@ -47,7 +47,7 @@ def gate(addon, monkeypatch):
                 raise gate.error
         return score(splats, views, settings, progress=progress, **options)
 
-    monkeypatch.setattr(addon.core.score_splats, "score", held)
+    monkeypatch.setattr(addon.core.pipeline, "score", held)
     return gate
 
 
@@ -127,13 +127,13 @@ def test_only_one_operation_works_at_a_time(start, gate, addon):  # noqa: ARG001
 
     before = polls(names)
     operator, context, _ = start()
-    during, looks = polls(names), polls(["preview", "plan"])
+    during, looks = polls(names), polls(["preview"])
     operator.modal(context, event("ESC"))
     until_over(operator, context)
 
     assert before == polls(names) == [True] * 10
     assert during == [False] * 10
-    assert looks == [True, True]
+    assert looks == [True]
 
 
 def test_what_stays_and_goes_is_not_changed_while_a_thread_works(start, gate):  # noqa: ARG001
@@ -189,7 +189,7 @@ def test_a_fault_on_the_thread_is_raised_and_locks_nothing(addon, start, gate, m
         def fault(*_arguments, **_options):
             raise gate.error
 
-        monkeypatch.setattr(addon.core.score_splats, "score", fault)
+        monkeypatch.setattr(addon.core.pipeline, "score", fault)
     operator, context, _ = start()
 
     with pytest.raises(ValueError, match="a fault"):

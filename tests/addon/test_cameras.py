@@ -218,7 +218,7 @@ def test_a_disabled_camera_is_read_if_it_can_be(addon):
 
 
 def _names(addon, source, **options):
-    views = addon.cameras.sets.views_from_scene(bpy.context, source, **options)
+    views = addon.cameras.sets.CameraChoice(source, **options).views(bpy.context)
     return [view.name for view in views]
 
 
@@ -240,7 +240,7 @@ def test_each_source_gives_its_cameras(addon):
     assert _names(addon, "SELECTED") == ["second"]
     assert sorted(_names(addon, "VISIBLE")) == ["first", "second"]
     assert sorted(_names(addon, "COLLECTION", collection=outer)) == ["second", "third"]
-    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
+    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     assert views.views[0].name in ("first", "second")
 
 
@@ -341,7 +341,7 @@ def _close(got, expected):
 def test_imported_cameras_give_back_the_views_of_their_file(addon, room_cameras, room_views):
     """To the last digit, though Blender's matrices are float32 and the render size is another."""
     bpy.context.scene.render.resolution_x = 999
-    views = addon.cameras.sets.views_from_scene(bpy.context, "COLLECTION", collection=room_cameras)
+    views = addon.cameras.sets.CameraChoice("COLLECTION", room_cameras).views(bpy.context)
 
     assert len(views) == 72
     for got, expected in zip(views, room_views, strict=True):
@@ -352,7 +352,7 @@ def test_blender_shows_what_the_imported_camera_saw(addon, room_cameras, room_vi
     """Without the note: at the file's resolution pose and frame agree to float32."""
     for camera in room_cameras.objects:
         del camera["refine_view"]
-    views = addon.cameras.sets.views_from_scene(bpy.context, "COLLECTION", collection=room_cameras)
+    views = addon.cameras.sets.CameraChoice("COLLECTION", room_cameras).views(bpy.context)
 
     for got, expected in zip(views, room_views, strict=True):
         assert np.allclose(got.rotation, expected.rotation, atol=1e-6)
@@ -374,7 +374,7 @@ def test_the_kept_rows_do_not_hang_on_the_note(addon, core, room, room_cameras, 
     ).keep
     for camera in room_cameras.objects:
         del camera["refine_view"]
-    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
+    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     got = core.prune(
         addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         views,

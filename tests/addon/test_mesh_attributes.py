@@ -10,6 +10,8 @@ import pytest
 
 from tests.strategies import ply_of
 
+from .conftest import export
+
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 
 
@@ -31,7 +33,7 @@ def _file(addon, path, columns, comments=()):
 
 def test_import_and_export_of_the_room_gives_the_same_bytes(addon, room, tmp_path):
     """Nothing is computed on the way: 39755 rows of 62 floats, the header as it was."""
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
+    export(addon, addon.mesh.layout.check(room), tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (ROOM / "point_cloud.ply").read_bytes()
 
@@ -50,7 +52,7 @@ def test_every_degree_of_harmonics_comes_back(addon, make_splats, tmp_path, degr
     """3 ((d + 1)^2 - 1) coefficients: 0, 9, 24, 45, 72."""
     file = _file(addon, tmp_path / "in.ply", make_splats(degree=degree))
     obj = _link(addon.mesh.attributes.mesh_from_file(file))
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(obj), tmp_path / "out.ply")
+    export(addon, addon.mesh.layout.check(obj), tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
     assert addon.mesh.layout.sh_degree(obj.data) == degree
@@ -66,7 +68,7 @@ def test_extra_properties_of_every_type_keep_type_place_and_value(
     columns = make_splats(count=8)
     columns = {"label": np.resize(np.array([limits.min, limits.max, 0, 1], dtype), 8), **columns}
     file = _file(addon, tmp_path / "in.ply", columns, comments=["made by a test"])
-    addon.objects.splat_object.export_object(_linked(addon, file), tmp_path / "out.ply")
+    export(addon, _linked(addon, file), tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
 
@@ -78,7 +80,7 @@ def test_a_property_with_a_name_that_blender_keeps_survives(addon, make_splats, 
     """Blender's own names are stored under others; the layout knows the way back."""
     columns = {**make_splats(count=8), name: np.arange(8, dtype=np.float32)}
     file = _file(addon, tmp_path / "in.ply", columns)
-    addon.objects.splat_object.export_object(_linked(addon, file), tmp_path / "out.ply")
+    export(addon, _linked(addon, file), tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
 
@@ -92,7 +94,7 @@ def test_big_endian_files_come_back_big_endian(addon, make_splats, tmp_path):
     swapped = np.frombuffer(body, "<f4").astype(">f4").tobytes()
     (tmp_path / "in.ply").write_bytes(header + swapped)
     file = addon.core.read_ply(tmp_path / "in.ply")
-    addon.objects.splat_object.export_object(_linked(addon, file), tmp_path / "out.ply")
+    export(addon, _linked(addon, file), tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
 
@@ -102,7 +104,7 @@ def test_doubles_are_rounded_and_said_so(addon, make_splats, tmp_path):
     columns = {**make_splats(count=8), "fine": np.full(8, 1 / 3)}
     file = _file(addon, tmp_path / "in.ply", columns)
     notes = addon.mesh.attributes.import_notes(file)
-    addon.objects.splat_object.export_object(_linked(addon, file), tmp_path / "out.ply")
+    export(addon, _linked(addon, file), tmp_path / "out.ply")
     got = addon.core.read_ply(tmp_path / "out.ply").rows["fine"]
 
     assert len(notes) == 1
@@ -122,7 +124,7 @@ def test_a_text_file_comes_out_binary_with_the_same_values(addon, make_splats, t
     )
     file = addon.core.read_ply(tmp_path / "in.ply")
     notes = addon.mesh.attributes.import_notes(file)
-    addon.objects.splat_object.export_object(_linked(addon, file), tmp_path / "out.ply")
+    export(addon, _linked(addon, file), tmp_path / "out.ply")
     got = addon.core.read_ply(tmp_path / "out.ply")
 
     assert b"format binary_little_endian 1.0\ncomment kept\n" in got.header
@@ -136,9 +138,7 @@ def test_meshes_of_blenders_own_importer_are_read(addon, make_splats, tmp_path):
     columns = make_splats(count=50, degree=3)
     _file(addon, tmp_path / "in.ply", columns)
     bpy.ops.wm.ply_import(filepath=str(tmp_path / "in.ply"))
-    addon.objects.splat_object.export_object(
-        addon.mesh.layout.check(bpy.context.object), tmp_path / "out.ply"
-    )
+    export(addon, addon.mesh.layout.check(bpy.context.object), tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "in.ply").read_bytes()
     size = addon.mesh.layout.export_bytes(bpy.context.object)  # what the panel says

@@ -11,7 +11,7 @@ import pytest
 
 from tests.strategies import ply_of
 
-from .conftest import keep_mask
+from .conftest import export, keep_mask
 
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 TYPES = bpy.types.Attribute.bl_rna.properties["data_type"].enum_items.keys()
@@ -123,7 +123,7 @@ def contents(addon, obj):
 
 def test_an_import_of_blenders_exports_the_splats_of_the_file(addon, core, file, cloud, tmp_path):
     """Blender's float32 formulas are off by a few roundings of 6e-8; what it copies is equal."""
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(cloud), tmp_path / "out.ply")
+    export(addon, addon.mesh.layout.check(cloud), tmp_path / "out.ply")
     found = differences(core, core.read_ply(tmp_path / "out.ply").splats(), file.splats())
 
     assert found["means"] == found["harmonics"] == 0.0
@@ -139,7 +139,7 @@ def test_harmonics_are_counted_by_numbers_not_by_letters(addon, make_splats, tmp
     (tmp_path / "in.ply").write_bytes(ply_of(columns))
     rows = addon.core.read_ply(tmp_path / "in.ply").rows
     obj = as_blender_imports(rows)
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(obj), tmp_path / "out.ply")
+    export(addon, addon.mesh.layout.check(obj), tmp_path / "out.ply")
     got = addon.core.read_ply(tmp_path / "out.ply").rows
 
     assert addon.mesh.layout.sh_degree(obj.data) == degree
@@ -167,7 +167,7 @@ def test_what_blender_can_store_and_no_file_says_is_stated(addon, make_splats, t
 def test_a_point_cloud_is_scored_like_the_file_it_exports(addon, core, cloud, room_cameras,
                                                           room_views, tmp_path):  # fmt: skip
     """Logarithms and logits are rounded to float32 before scoring, as they are in the file."""
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(cloud), tmp_path / "out.ply")
+    export(addon, addon.mesh.layout.check(cloud), tmp_path / "out.ply")
     expected = core.score(
         core.read_ply(tmp_path / "out.ply").splats(), room_views, core.Settings("closed-form")
     )
@@ -280,7 +280,7 @@ def test_undo_brings_points_back_and_a_saved_file_has_them(addon, cloud, room_ca
 def test_the_command_prunes_a_point_cloud(addon, cloud, room_cameras, tmp_path):
     """Half of 39755 go: 19878 rows of what an export gives, and as many points in the .blend."""
     assert room_cameras.objects
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(cloud), tmp_path / "all.ply")
+    export(addon, addon.mesh.layout.check(cloud), tmp_path / "all.ply")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     words = ["prune", "--object", "room", "-o", str(tmp_path / "out.ply"), "--save", "--quiet"]
 
@@ -297,7 +297,7 @@ def test_every_format_takes_a_point_cloud(addon, core, cloud, tmp_path):
     addon.mesh.edit.delete_vertices(cloud, np.arange(len(cloud.data.points)) >= 300)
     checked = addon.mesh.layout.check(cloud)
     for suffix in core.formats.registry.SUFFIXES:
-        addon.objects.splat_object.export_object(checked, tmp_path / f"panel{suffix}")
+        export(addon, checked, tmp_path / f"panel{suffix}")
         expected = tmp_path / f"core{suffix}"
         core.as_written(core.read_ply(tmp_path / "panel.ply"), expected).write(expected)
 
@@ -312,9 +312,7 @@ def test_an_export_with_the_transform_turns_harmonics(addon, core, cloud, file, 
         @ mathutils.Matrix.Scale(2.0, 4)
     )
     bpy.context.view_layer.update()
-    addon.objects.splat_object.export_object(
-        addon.mesh.layout.check(cloud), tmp_path / "moved.ply", apply_transform=True
-    )
+    export(addon, addon.mesh.layout.check(cloud), tmp_path / "moved.ply", apply_transform=True)
     matrix = np.array(cloud.matrix_world, np.float64)
     expected = core.affine.transformed(file.splats(), matrix)
     found = differences(core, core.read_ply(tmp_path / "moved.ply").splats(), expected)
@@ -327,7 +325,7 @@ def test_mesh_to_native_to_ply_keeps_activated_values(addon, core, room, file, t
     """Less than 1e-6 of each; the header, normals and all that is not activated are equal."""
     bpy.ops.refine.convert()
     cloud = bpy.data.objects["room"]
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(cloud), tmp_path / "out.ply")
+    export(addon, addon.mesh.layout.check(cloud), tmp_path / "out.ply")
     made = core.read_ply(tmp_path / "out.ply")
     found = differences(core, made.splats(), file.splats())
 
@@ -405,7 +403,7 @@ def test_a_conversion_keeps_what_belongs_to_the_object(addon, core, room, room_c
     for name in before.keys() - {"type", "matrix"}:
         if not name.startswith(("scale_", "rot_", "opacity")):
             assert there[name] == before[name], name
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(mesh), tmp_path / "out.ply")
+    export(addon, addon.mesh.layout.check(mesh), tmp_path / "out.ply")
     source = core.read_ply(ROOM / "point_cloud.ply").splats()
     found = differences(core, core.read_ply(tmp_path / "out.ply").splats(), source)
     assert max(found.values()) < 1e-6
@@ -523,32 +521,13 @@ def test_a_missing_or_wrong_attribute_of_a_point_cloud_is_named(addon, core, clo
         addon.mesh.layout.check(cloud)
 
 
-def test_points_are_as_large_as_those_of_the_mesh(addon, cloud, file, room_cameras):
-    """1.5 exp(mean of log scales) opacity, as of a mesh; with what goes hidden, half of them."""
-
-    def shown(obj):
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-        data = obj.evaluated_get(depsgraph).data
-        return addon.mesh.attributes.read_attribute(data, "radius")
-
-    assert room_cameras.objects
-    bpy.ops.refine.preview(mode="COLOR")
-    radii = shown(cloud)
-    splats = file.splats()
-    logs = splats.log_scales.astype(np.float64).mean(axis=1)
-    expected = 1.5 * np.exp(logs) * addon.core.splats.opacity(splats.opacity_logits)
-    bpy.ops.refine.score()
-    bpy.ops.refine.preview(mode="HEAT", hide_removed=True)
-
-    assert np.allclose(radii, expected, rtol=1e-4)
-    assert len(shown(cloud)) == 19878
-    bpy.ops.refine.preview(mode="OFF")
-    assert len(bpy.data.node_groups) == len(bpy.data.materials) == 0
+def test_a_point_cloud_is_not_shown_in_renders_as_splats(addon, cloud):
+    """The nodes read the attributes of a mesh."""
     with pytest.raises(addon.core.RefineError, match="convert it to a mesh"):
-        addon.ui.preview.show(cloud, "COLOR", style="SPLATS")
+        addon.ui.preview.show(cloud, "COLOR")
 
 
-def test_a_point_cloud_with_the_names_of_a_file_holds_splats(addon, room, file, tmp_path):
+def test_a_point_cloud_with_the_names_of_a_file_holds_splats(addon, room, tmp_path):
     """What geometry nodes make of a splat mesh: a file's values on points, byte for byte."""
     obj = point_cloud(len(room.data.vertices), "points")
     for attribute in room.data.attributes:
@@ -559,12 +538,9 @@ def test_a_point_cloud_with_the_names_of_a_file_holds_splats(addon, room, file, 
             )
     obj.data["refine_layout"] = room.data["refine_layout"]
     checked = addon.mesh.layout.check(obj)
-    addon.objects.splat_object.export_object(checked, tmp_path / "out.ply")
-    bpy.ops.refine.preview(mode="COLOR")
-    depsgraph = bpy.context.evaluated_depsgraph_get()
+    export(addon, checked, tmp_path / "out.ply")
 
     assert (tmp_path / "out.ply").read_bytes() == (ROOM / "point_cloud.ply").read_bytes()
-    assert len(obj.evaluated_get(depsgraph).data.points) == len(file)
     with pytest.raises(addon.core.RefineError, match="nothing to convert"):
         addon.mesh.convert.converted(checked)
 
@@ -574,7 +550,7 @@ def test_blenders_own_import_is_what_these_tests_build(addon, core, file, tmp_pa
     """Same attributes, types and values, and the type that a conversion sets."""
     bpy.ops.wm.ply_import(filepath=str(ROOM / "point_cloud.ply"), forward_axis="Y", up_axis="Z")
     native, built = bpy.context.object, as_blender_imports(file.rows)
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(native), tmp_path / "out.ply")
+    export(addon, addon.mesh.layout.check(native), tmp_path / "out.ply")
     found = differences(core, core.read_ply(tmp_path / "out.ply").splats(), file.splats())
     kinds = [
         {a.name: (a.data_type, a.domain) for a in o.data.attributes if "radiance" in a.name}

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 import pytest
 
-from .conftest import keep_mask
+from .conftest import export, keep_mask
 
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 
@@ -234,7 +234,7 @@ def test_a_plan_of_another_budget_is_not_shown(addon, room, room_cameras):  # no
     settings.ratio = 0.9
     stale = addon.ui.plans.stored(room, settings)
     bpy.context.view_layer.objects.active = room
-    bpy.ops.refine.plan()
+    addon.ui.plans.refresh(bpy.context)
 
     assert stale is None
     assert addon.ui.plans.stored(room, settings)["removed"] == 39755 * 9 // 10
@@ -283,7 +283,7 @@ def test_a_budget_that_means_nothing_to_the_scores_is_refused(  # noqa: PLR0917
     checked = addon.mesh.layout.check(room)
     asked = core.Settings(method, 4, core.ClosedForm(frustum=False))
     scores = core.score(addon.objects.splat_object.gather(checked), room_views, asked)
-    addon.mesh.scores.store(checked, scores, asked)
+    addon.mesh.scores.store(checked, scores, addon.mesh.scores.Provenance(asked))
     settings.budget = kind
     addon.ui.plans.refresh(bpy.context)
     unchanged.start()
@@ -501,7 +501,7 @@ def test_edit_mode_greys_the_buttons(room, room_cameras):  # noqa: ARG001
 @pytest.mark.parametrize("how", ["hide_set", "hide_viewport", "exclude"])
 def test_hidden_objects_are_scored_and_pruned_like_others(addon, room, room_cameras, score, how):
     """By the eye, by the monitor icon, by excluding the collection; the command reaches all."""
-    views = addon.cameras.sets.views_from_scene(bpy.context, "COLLECTION", collection=room_cameras)
+    views = addon.cameras.sets.CameraChoice("COLLECTION", room_cameras).views(bpy.context)
     expected = addon.core.prune(
         addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         views,
@@ -542,7 +542,7 @@ def test_linked_objects_are_refused(addon, room, room_cameras, score, tmp_path):
 
     with pytest.raises(addon.core.RefineError, match="is linked from"):
         score(room, views)
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
+    export(addon, addon.mesh.layout.check(room), tmp_path / "out.ply")
     assert _bytes(tmp_path / "out.ply") == _bytes(ROOM / "point_cloud.ply")
 
 
@@ -564,11 +564,11 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
 @pytest.mark.parametrize(
     ("module", "function", "operator", "arguments"),
     [
-        ("core.score_splats", "score", "score", {}),
+        ("core.pipeline", "score", "score", {}),
         ("core.pipeline", "decide", "apply", {}),
         ("ui.import_operators", "read_splats", "import_ply", {"filepath": "in.ply"}),
         ("ui.import_operators", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),
-        ("objects.splat_object", "write_export", "export_ply", {"filepath": "out.ply"}),
+        ("ui.export_operators", "as_written", "export_ply", {"filepath": "out.ply"}),
         ("ui.preview", "show", "preview", {}),
     ],
 )

@@ -19,28 +19,6 @@ def _evaluated(obj):
     ]
 
 
-def _point_count(obj):
-    clouds = [data for data in _evaluated(obj) if isinstance(data, bpy.types.PointCloud)]
-    return sum(len(cloud.points) for cloud in clouds)
-
-
-def test_points_show_every_splat_or_only_those_that_stay(addon, room, room_cameras):  # noqa: ARG001
-    """39755 points; at 75 % removed, 9939; the slider is followed at once."""
-    settings = bpy.context.scene.refine
-    bpy.ops.refine.score()
-    bpy.ops.refine.preview(mode="HEAT")
-    every = _point_count(room)
-    settings.ratio = 0.75
-    bpy.ops.refine.preview(mode="HEAT", hide_removed=True)
-    some = _point_count(room)
-    settings.ratio = 0.9
-    fewer = _point_count(room)
-
-    assert every == len(room.data.vertices) == 39755
-    assert some == 39755 - 39755 * 3 // 4
-    assert fewer == 39755 - 39755 * 9 // 10
-
-
 def test_turning_it_off_leaves_nothing_behind(addon, room, unchanged):
     """No modifier, no attribute, no node group, no material."""
     unchanged.start()
@@ -48,7 +26,7 @@ def test_turning_it_off_leaves_nothing_behind(addon, room, unchanged):
     shown = addon.ui.preview.shown(room)
     bpy.ops.refine.preview(mode="OFF")
 
-    assert shown == ("COLOR", False)
+    assert shown == "COLOR"
     unchanged()
 
 
@@ -76,23 +54,23 @@ def test_two_objects_share_one_preview_and_lose_it_one_by_one(addon, room):
 
 
 def test_the_preview_outlives_an_apply(addon, room, room_cameras):  # noqa: ARG001
-    """What is left is shown, none of it hidden."""
+    """What is left is shown: an instance for each of 19,878 splats."""
     bpy.ops.refine.score()
-    bpy.ops.refine.preview(mode="HEAT", hide_removed=True)
+    bpy.ops.refine.preview(mode="HEAT")
     bpy.ops.refine.apply()
+    instances = bpy.context.evaluated_depsgraph_get().object_instances
 
-    assert addon.ui.preview.shown(room) == ("HEAT", True)
-    assert _point_count(room) == len(room.data.vertices) == 19878
+    assert addon.ui.preview.shown(room) == "HEAT"
+    assert sum(instance.is_instance for instance in instances) == len(room.data.vertices) == 19878
 
 
-@pytest.mark.parametrize("style", ["POINTS", "SPLATS"])
-def test_a_preview_of_another_version_is_made_anew(addon, room, style):
+def test_a_preview_of_another_version_is_made_anew(addon, room):
     """As in an old .blend: emptied trees without a version, or of another, show splats again.
 
     An object that shows them already follows, as node group and material stay the same ones.
     """
-    modifier = addon.ui.preview.show(room, "COLOR", style=style)
-    tree, material = modifier.node_group, bpy.data.materials[f"REFINE color {style.lower()}"]
+    modifier = addon.ui.preview.show(room, "COLOR")
+    tree, material = modifier.node_group, bpy.data.materials["REFINE color splats"]
     nodes, drawn = (len(tree.nodes), len(material.node_tree.nodes)), len(_evaluated(room))
     for version in (None, "0.0.1"):
         for made in (tree, material):
@@ -102,7 +80,7 @@ def test_a_preview_of_another_version_is_made_anew(addon, room, style):
         tree.nodes.clear()
         tree.interface.clear()
         material.node_tree.nodes.clear()
-        again = addon.ui.preview.show(room, "COLOR", style=style)
+        again = addon.ui.preview.show(room, "COLOR")
 
         assert again.node_group == modifier.node_group == tree
         assert (len(tree.nodes), len(material.node_tree.nodes)) == nodes
@@ -152,7 +130,7 @@ def test_a_rendered_splat_is_a_gaussian(addon, core, tmp_path):
     scene = bpy.context.scene
     scene.camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
     scene.collection.objects.link(scene.camera)
-    addon.ui.preview.show(bpy.context.object, "COLOR", style="SPLATS")
+    addon.ui.preview.show(bpy.context.object, "COLOR")
     addon.ui.preview.set_up_render(scene)
     image = _render(tmp_path / "one.png")
 
@@ -164,7 +142,7 @@ def test_a_rendered_splat_is_a_gaussian(addon, core, tmp_path):
 
 def test_the_button_for_renders_sets_up_splats_and_scene(room):
     """The style of true Gaussians, Cycles, and colours as they are; *Off* takes the first back."""
-    bpy.ops.refine.preview(mode="COLOR", style="SPLATS")
+    bpy.ops.refine.preview(mode="COLOR")
     scene = bpy.context.scene
     shown = room.modifiers["REFINE preview"].node_group.name
     bpy.ops.refine.preview(mode="OFF")

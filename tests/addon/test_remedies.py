@@ -124,7 +124,7 @@ def test_one_upright_import_beside_one_that_is_not_is_told_and_put_right(
 def test_the_command_notes_what_the_panel_warns_of(addon, imported):
     """On an object of the scene, by the cameras that the panel chooses."""
     obj = imported(splats=True, cameras=False)
-    views = addon.cameras.sets.Choice.of_scene(bpy.context.scene).views(bpy.context, obj)
+    views = addon.cameras.sets.CameraChoice.of_scene(bpy.context.scene).views(bpy.context, obj)
     report = addon.objects.operation.prune_object(
         obj.name,
         addon.core.PruneRequest(

@@ -12,6 +12,8 @@ import pytest
 
 from tests.strategies import ply_of
 
+from .conftest import export
+
 ROOM = Path(__file__).parents[1] / "data" / "room_small"
 PLY = ROOM / "point_cloud.ply"
 
@@ -54,7 +56,7 @@ def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):  # n
     report = addon.objects.operation.prune_object(
         "room",
         addon.core.PruneRequest(
-            addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None),
+            addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context),
             addon.core.Budget(keep=1000),
             addon.core.Settings("closed-form"),
             dry_run=True,
@@ -71,7 +73,7 @@ def test_a_dry_run_changes_nothing(addon, scene_file, unchanged, tmp_path):  # n
 @pytest.mark.parametrize("options", [{}, {"save": True}])
 def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_file, options):  # noqa: ARG001
     """The message lists the splat objects of the scene."""
-    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
+    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     with pytest.raises(addon.core.RefineError, match=r"no object 'rooom'.*splat objects: room"):
         addon.objects.operation.prune_object(
             "rooom",
@@ -82,7 +84,7 @@ def test_an_object_that_is_not_there_is_named_with_those_that_are(addon, scene_f
 
 def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_cameras):  # noqa: ARG001
     """There is no file to save to."""
-    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
+    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     with pytest.raises(addon.core.RefineError, match="not saved in a"):
         addon.objects.operation.prune_object(
             "room",
@@ -93,7 +95,7 @@ def test_saving_an_unsaved_scene_is_refused_before_the_work(addon, room, room_ca
 
 
 def _ranked(addon, obj, score):
-    score(obj, addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None))
+    score(obj, addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context))
     return addon.mesh.attributes.read_attribute(obj.data, "refine_rank")
 
 
@@ -136,9 +138,7 @@ def test_an_unevenly_scaled_object_is_scored_as_it_stands_in_the_world(addon, co
         np.sort(splats.log_scales, axis=1), [-3.0, -3.0, math.log(2) - 3.0], atol=1e-5
     )
     with pytest.raises(core.RefineError, match="make the object's scale uniform"):
-        addon.objects.splat_object.export_object(
-            addon.mesh.layout.check(obj), tmp_path / "out.ply", apply_transform=True
-        )
+        export(addon, addon.mesh.layout.check(obj), tmp_path / "out.ply", apply_transform=True)
     assert not (tmp_path / "out.ply").exists()
 
 
@@ -150,10 +150,8 @@ def test_an_export_with_the_transform_is_the_moved_splats(addon, core, room, tmp
         @ mathutils.Matrix.Scale(2.0, 4)
     )
     bpy.context.view_layer.update()
-    addon.objects.splat_object.export_object(
-        addon.mesh.layout.check(room), tmp_path / "moved.ply", apply_transform=True
-    )
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "kept.ply")
+    export(addon, addon.mesh.layout.check(room), tmp_path / "moved.ply", apply_transform=True)
+    export(addon, addon.mesh.layout.check(room), tmp_path / "kept.ply")
     file = core.read_ply(PLY)
     expected = core.affine.transformed(
         file.splats(), np.array(room.matrix_world, np.float64), rotate_sh=True
@@ -177,9 +175,7 @@ def test_normals_turn_with_the_transform(addon, core, make_splats, tmp_path):
     obj = bpy.data.objects.new("turned", mesh)
     obj.rotation_euler.z = math.pi / 2
     bpy.context.scene.collection.objects.link(obj)
-    addon.objects.splat_object.export_object(
-        addon.mesh.layout.check(obj), tmp_path / "out.ply", apply_transform=True
-    )
+    export(addon, addon.mesh.layout.check(obj), tmp_path / "out.ply", apply_transform=True)
     rows = core.read_ply(tmp_path / "out.ply").rows
 
     assert [(row["nx"], row["ny"], row["nz"]) for row in rows] == [(0, 1, 0), (0, 0, 0)]
@@ -187,7 +183,7 @@ def test_normals_turn_with_the_transform(addon, core, make_splats, tmp_path):
 
 def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):  # noqa: ARG001
     """Someone deleted a vertex while the scoring ran."""
-    views = addon.cameras.sets.Choice("VISIBLE").views(bpy.context, None)
+    views = addon.cameras.sets.CameraChoice("VISIBLE").views(bpy.context)
     scores = addon.core.score(
         addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         views,
@@ -198,7 +194,11 @@ def test_scores_of_another_mesh_are_not_stored(addon, room, room_cameras):  # no
     addon.mesh.edit.delete_vertices(room, ~keep)
 
     with pytest.raises(addon.core.RefineError, match="39754 splats, was scored with 39755"):
-        addon.mesh.scores.store(addon.mesh.layout.check(room), scores, addon.core.Settings())
+        addon.mesh.scores.store(
+            addon.mesh.layout.check(room),
+            scores,
+            addon.mesh.scores.Provenance(addon.core.Settings()),
+        )
 
 
 def test_the_worker_scores_like_the_plain_call_and_can_be_cancelled(addon, quarter, room_views):
@@ -223,7 +223,7 @@ def test_a_pruned_object_is_imported_and_pruned_again(addon, room, room_cameras,
     for _ in range(2):
         bpy.ops.refine.score()
         bpy.ops.refine.apply()
-    addon.objects.splat_object.export_object(addon.mesh.layout.check(room), tmp_path / "out.ply")
+    export(addon, addon.mesh.layout.check(room), tmp_path / "out.ply")
 
     assert len(addon.core.read_ply(tmp_path / "out.ply")) == 39755 - 19877 - 9939
 

@@ -149,7 +149,7 @@ def test_each_operation_reads_the_layout_of_its_object_once(
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     for operation in (
         bpy.ops.refine.score,
-        bpy.ops.refine.plan,
+        lambda: addon.ui.plans.refresh(bpy.context),
         lambda: bpy.ops.refine.export_ply(filepath=str(tmp_path / "exported.ply")),
         bpy.ops.refine.apply,
         lambda: pruned(addon, room_views, tmp_path, absorb=True),
@@ -176,8 +176,8 @@ def noted(addon, monkeypatch):
         monkeypatch.setattr(module, name, noting)
 
     note(addon.objects.splat_object, "gather")
-    note(addon.core.score_splats, "score")
-    note(addon.core.absorb_splats, "absorb_removed")
+    note(addon.core.pipeline, "score")
+    note(addon.core.pipeline.absorb_splats, "absorb_removed")
     return references
 
 
@@ -218,7 +218,7 @@ def work(addon, monkeypatch):
 
         core = addon.core
         module, function = {
-            "score": (core.score_splats, "score"), "apply": (core.pipeline, "decide"),
+            "score": (core.pipeline, "score"), "apply": (core.pipeline, "decide"),
         }[name]  # fmt: skip
         monkeypatch.setattr(module, function, instead)
 

@@ -5,11 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from refine_addon.core.absorbing import merge_field, merge_graph, merging
-from refine_addon.core.absorbing.absorb import absorb, patience
+from refine_addon.core.absorbing.absorb import ALONE, STAGE, absorb, patience, stages
+from refine_addon.core.absorbing.merge_field import Field, ViewSums
 from refine_addon.core.absorbing.merge_graph import MergeGraph
-from refine_addon.core.absorbing.merging import Field, ViewSums
 from refine_addon.core.affine import transformed
 from refine_addon.core.rendering import ALPHA_MAX
 from refine_addon.core.seeing.scene import Scene, scene_of
@@ -49,7 +51,8 @@ def viewing(means, views):
 
 def field_of(splats, views, seen):
     scene = scene_of(splats.means, drawable(splats), views)
-    return merge_field.field(splats, np.arange(len(splats)), views, scene, seen)
+    measured = merge_field.measured_field(splats, np.arange(len(splats)), views, scene, seen)
+    return measured.with_allowance(measured.seen_and_whole())
 
 
 def merged_of(field, first=0, second=1):
@@ -188,7 +191,7 @@ def test_the_cost_is_the_squared_error_of_the_pictures():
     )
 
 
-def test_a_merge_along_the_line_of_sight_costs_what_views_from_aside_see():
+def test_a_merge_along_the_viewing_direction_costs_what_views_from_aside_see():
     """One behind the other: alike from the front; from the side as two that lie side by side."""
     field = flat([0.01, 0.01], [[0.0, 0, 0], [0, 0, 4]], [[1.0, 1, 1]] * 2)
     turned = flat([0.01, 0.01], [[0.0, 0, 0], [4, 0, 0]], [[1.0, 1, 1]] * 2)
@@ -671,16 +674,23 @@ def test_copies_of_a_splat_do_not_merge_one_by_one(monkeypatch, places, each, hi
     assert sum(priced) <= (8 + 2 * 2 * 8) * 2000
 
 
-def test_of_pairs_in_a_chain_as_many_are_chosen_as_share_no_splat():
-    """The first of all is chosen; of two that wait for each other one is, or both wait for one."""
-    first = np.arange(500)
+def test_of_pairs_in_a_chain_as_many_are_chosen_as_share_no_splat(monkeypatch):
+    """The first of all is chosen. In passes by the same order, 250 would choose one pair each."""
+    first, passes = np.arange(500), []
 
+    class Counting:
+        def __getattr__(self, name):
+            passes.extend([1] * (name == "full"))  # the array of ranks, new in each pass
+            return getattr(np, name)
+
+    monkeypatch.setattr(merge_graph, "np", Counting())
     chosen = merge_graph._disjoint(first, first + 1)
 
     taken = np.concatenate([chosen, chosen + 1])
     assert chosen[0] == 0
     assert len(np.unique(taken)) == len(taken)
     assert (np.isin(first, taken) | np.isin(first + 1, taken)).all()
+    assert 1 < len(passes) < 10
 
 
 @pytest.fixture
@@ -861,3 +871,11 @@ def test_what_absorbed_in_any_stage_is_said_to_have_changed():
     for name in FIELDS:
         found = getattr(result.splats, name)[same]
         np.testing.assert_array_equal(found, getattr(splats, name)[rows])
+
+
+@given(st.integers(1, 10**9), st.floats(0.0, 1.0), st.sampled_from([ALONE, STAGE]))
+def test_no_stage_removes_more_than_half(count, share, alone):
+    """Tiles count a merge as half a splat, and have no more to remove than that of a region."""
+    left = [count, *stages(count, max(int(share * count), 1), alone)]
+
+    assert all(after >= before // 2 for before, after in itertools.pairwise(left))

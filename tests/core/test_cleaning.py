@@ -202,7 +202,7 @@ def test_connected_parts_have_one_number():
 
 
 def test_cameras_that_see_nothing_are_refused():
-    """They look the other way: nothing can be judged, which is not the same as nothing to do."""
+    """They look the other way: nothing can be told, which is not the same as nothing to do."""
     turned = np.diag([-1.0, 1.0, -1.0])
     away = ViewSet(tuple(replace(view, rotation=turned) for view in cameras().views))
 

@@ -15,7 +15,15 @@ import numpy as np
 import pytest
 
 from refine_addon.command import main
-from refine_addon.core import Budget, RefineError, Settings, prune_tiles, read_cameras, read_ply
+from refine_addon.core import (
+    Budget,
+    PruneRequest,
+    RefineError,
+    Settings,
+    prune_tiles,
+    read_cameras,
+    read_ply,
+)
 from refine_addon.core.formats.ply_header import with_count
 from refine_addon.core.tiles import absorbing, cluster, units
 from refine_addon.core.tiles.folder import Folder, Interrupted
@@ -49,9 +57,10 @@ def tiles(tmp_path, monkeypatch):
     return paths
 
 
-def prune(tiles, folder, settings=CLOSED, **options):
+def prune(tiles, folder, settings=CLOSED, *, absorb=False, **options):
     """Prune the tiles into a folder, and return the bytes of the files."""
-    prune_tiles(tiles, folder, read_cameras(ROOM / "cameras.json"), BUDGET, settings, **options)
+    views = read_cameras(ROOM / "cameras.json")
+    prune_tiles(tiles, folder, PruneRequest(views, BUDGET, settings, absorb=absorb), **options)
     return [(folder / path.name).read_bytes() for path in tiles]
 
 
@@ -126,7 +135,11 @@ def test_workers_read_and_write_behind_urls(tmp_path, tiles, workers, monkeypatc
     urls = [f"file://{path}" for path in tiles]
     views = read_cameras(ROOM / "cameras.json")
     prune_tiles(
-        urls, f"file://{tmp_path}/out", views, BUDGET, CLOSED, workers=workers, progress=progress
+        urls,
+        f"file://{tmp_path}/out",
+        PruneRequest(views, BUDGET, CLOSED),
+        workers=workers,
+        progress=progress,
     )
 
     assert killed

@@ -20,7 +20,6 @@ from refine_addon.core import (
     Splats,
     View,
     ViewSet,
-    absorb_splats,
     lod,
     lod_file,
     prune,
@@ -34,6 +33,7 @@ from refine_addon.core.estimate.psnr import psnr_against
 from refine_addon.core.formats.ply import SplatFile
 from refine_addon.core.levels import distance
 from refine_addon.core.levels.distance import OriginalPictures
+from refine_addon.core.pipeline import absorb_splats
 
 from .test_cleaning import cameras, wall
 

@@ -25,8 +25,8 @@ from refine_addon.core import (
     score,
     select,
 )
-from refine_addon.core.absorb_splats import absorb_removed
 from refine_addon.core.absorbing import merge_field, merge_graph
+from refine_addon.core.pipeline import absorb_removed
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
 from refine_addon.core.seeing import points, projection
 from refine_addon.core.splats import drawable, opacity

@@ -457,9 +457,13 @@ def test_the_score_is_the_error_times_a_power_of_the_contribution():
 def test_a_view_of_thrice_the_weight_counts_thrice():
     """Weights are shares: 1/4 and 3/4 of what either says alone."""
     splats, (one, two) = cloud(), ring(2)
-    alone = [occlusion.measure(splats, ViewSet((view,))) for view in (one, two)]
 
-    both = occlusion.measure(splats, ViewSet((one, replace(two, weight=3.0))))
+    def measured(*views):
+        return occlusion.measure_part(splats, ViewSet(views), ONCE, 0, 1)[0]
+
+    alone = [measured(view) for view in (one, two)]
+
+    both = measured(one, replace(two, weight=3.0))
 
     for name in ("contribution", "error"):
         first, second = (getattr(sums, name) for sums in alone)
@@ -475,7 +479,7 @@ def test_parts_of_the_views_take_turns_and_make_up_the_whole():
 
     found = [occlusion.measure_part(splats, views, ONCE, turn, 3) for turn in range(4)]
 
-    whole = occlusion.measure(splats, views)
+    whole, _ = occlusion.measure_part(splats, views, ONCE, 0, 1)
     for name in ("contribution", "error", "seen"):
         total = sum(getattr(part, name) for part, _ in found[:3])
         np.testing.assert_allclose(total, getattr(whole, name), rtol=1e-12)
@@ -817,7 +821,7 @@ def test_a_view_of_many_splats_is_cancelled_within(monkeypatch):
                 steps.append(what)
             return len(steps) < last
 
-        occlusion.measure(cloud(300), ring(1), progress=progress, threads=1)
+        occlusion.measure_part(cloud(300), ring(1), Occlusion(), 0, 1, progress=progress, threads=1)
 
     scoring()
     total = len(steps)

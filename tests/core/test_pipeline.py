@@ -24,7 +24,6 @@ from refine_addon.core import (
     Splats,
     View,
     ViewSet,
-    absorb_splats,
     prune,
     prune_file,
     read_cameras,
@@ -32,7 +31,7 @@ from refine_addon.core import (
     score,
     select,
 )
-from refine_addon.core.pipeline import decide
+from refine_addon.core.pipeline import absorb_splats, decide
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
 from refine_addon.core.scoring.closed_form_block import LUMA
 from refine_addon.core.seeing import froxels, lattices, points, projection, ray_sums

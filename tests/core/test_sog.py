@@ -123,7 +123,7 @@ FAULTS = {
     "many": (_meta("count", 10**9), "meta.json count: expected a whole number from 1 to "),
     "none": (_meta("count", 0), "meta.json count: expected a whole number from 1 to "),
     "half": (_meta("count", 1.5), "meta.json count: expected a whole number from 1 to "),
-    "a few too many": (_meta("count", 100), "image 'means_l.webp': "),
+    "a few too many": (_meta("count", 100), "image 'shN_labels.webp': "),
     "no means": (_meta("means", []), "meta.json means: expected an object, got a list"),
     "two limits": (
         _meta("means", "mins", [0, 0]),

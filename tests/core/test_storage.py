@@ -14,7 +14,15 @@ import numpy as np
 import pytest
 
 from refine_addon.command import main
-from refine_addon.core import Budget, RefineError, Settings, prune_tiles, read_cameras, read_splats
+from refine_addon.core import (
+    Budget,
+    PruneRequest,
+    RefineError,
+    Settings,
+    prune_tiles,
+    read_cameras,
+    read_splats,
+)
 from refine_addon.core.tiles import storage, units, writing
 from refine_addon.core.urls import Url
 from tests.strategies import plain_header, plain_ply, splat_names
@@ -71,7 +79,7 @@ URLS = [f"memory://in/{name}" for name in NAMES]
 
 def here(folder, views, settings=CLOSED, **options):
     """Return the bytes of the tiles pruned on the disk."""
-    prune_tiles(NAMES, folder / "here", views, HALF, settings, **options)
+    prune_tiles(NAMES, folder / "here", PruneRequest(views, HALF, settings, **options))
     return [(folder / "here" / name).read_bytes() for name in NAMES]
 
 
@@ -80,7 +88,9 @@ def here(folder, views, settings=CLOSED, **options):
 def test_behind_urls_the_same_bytes_are_written(folder, memory, views, absorb):
     """Tiles and folder are in memory; nothing else is left there, nor here."""
     settings = Settings(method="occlusion", views=4) if absorb else CLOSED
-    report = prune_tiles(URLS, "memory://out/deep", views, HALF, settings, absorb=absorb)
+    report = prune_tiles(
+        URLS, "memory://out/deep", PruneRequest(views, HALF, settings, absorb=absorb)
+    )
 
     assert not list(folder.glob(".refine*"))
     assert sorted(memory.find("/out")) == [f"/out/deep/{name}" for name in NAMES]
@@ -97,8 +107,8 @@ def test_behind_urls_the_same_bytes_are_written(folder, memory, views, absorb):
 def test_paths_and_urls_go_together(folder, views):
     """One tile of each, written to the disk; the dry run tells the same bytes."""
     tiles = [NAMES[0], URLS[1]]
-    told = prune_tiles(tiles, None, views, HALF, CLOSED)
-    prune_tiles(tiles, folder / "out", views, HALF, CLOSED)
+    told = prune_tiles(tiles, None, PruneRequest(views, HALF, CLOSED))
+    prune_tiles(tiles, folder / "out", PruneRequest(views, HALF, CLOSED))
 
     found = [(folder / "out" / name).read_bytes() for name in NAMES]
     assert found == here(folder, views)
@@ -119,7 +129,7 @@ def test_of_a_tile_no_more_than_its_rows_are_read(folder, memory, views, monkeyp
 
     monkeypatch.setattr(type(memory), "cat_file", noting)
 
-    prune_tiles(URLS, folder / "out", views, HALF, CLOSED)
+    prune_tiles(URLS, folder / "out", PruneRequest(views, HALF, CLOSED))
 
     tiles = [units.tile_at(url) for url in URLS]
     rows = sum(tile.splats * tile.row_bytes for tile in tiles)
@@ -133,10 +143,10 @@ def test_files_there_are_replaced_only_when_told(memory, views):
     memory.pipe_file("/out/b.ply", b"old")
 
     with pytest.raises(RefineError, match=r"^memory://out/b\.ply: exists already"):
-        prune_tiles(URLS, "memory://out", views, HALF, CLOSED)
+        prune_tiles(URLS, "memory://out", PruneRequest(views, HALF, CLOSED))
     assert memory.find("/out") == ["/out/b.ply"]
 
-    prune_tiles(URLS, "memory://out", views, HALF, CLOSED, overwrite=True)
+    prune_tiles(URLS, "memory://out", PruneRequest(views, HALF, CLOSED, overwrite=True))
     assert memory.cat_file("/out/b.ply") != b"old"
     assert memory.find("/out") == ["/out/a.ply", "/out/b.ply"]
 
@@ -146,9 +156,11 @@ def test_what_is_read_is_not_replaced(folder, views):
     """However it is called: by the same URL, or as a path here and a URL of a link there."""
     (folder / "link").symlink_to(folder)
     with pytest.raises(RefineError, match=r"memory:///in/a\.ply: is read until all"):
-        prune_tiles(URLS, "memory:///in", views, HALF, CLOSED, overwrite=True)
+        prune_tiles(URLS, "memory:///in", PruneRequest(views, HALF, CLOSED, overwrite=True))
     with pytest.raises(RefineError, match=r"a\.ply: is read until all"):
-        prune_tiles(NAMES, f"file://{folder}/link", views, HALF, CLOSED, overwrite=True)
+        prune_tiles(
+            NAMES, f"file://{folder}/link", PruneRequest(views, HALF, CLOSED, overwrite=True)
+        )
 
 
 def test_a_tile_that_changes_meanwhile_stops_all(folder, memory, views):
@@ -159,7 +171,7 @@ def test_a_tile_that_changes_meanwhile_stops_all(folder, memory, views):
             memory.pipe_file("/in/b.ply", memory.cat_file("/in/b.ply"))
 
     with pytest.raises(RefineError, match=r"^memory://in/b\.ply: was changed while it was worked"):
-        prune_tiles(URLS, "memory://out", views, HALF, CLOSED, progress=progress)
+        prune_tiles(URLS, "memory://out", PruneRequest(views, HALF, CLOSED), progress=progress)
 
     assert memory.find("/out") == []
     assert not list(folder.glob(".refine*"))
@@ -180,12 +192,12 @@ def test_a_storage_that_fails_leaves_what_is_done(folder, memory, views, monkeyp
     with pytest.raises(
         RefineError, match=r"000001: cannot be written \(the line is dead\); the same command goes"
     ):
-        prune_tiles(URLS, "memory://out", views, HALF, CLOSED)
+        prune_tiles(URLS, "memory://out", PruneRequest(views, HALF, CLOSED))
     assert len(memory.find("/out")) == 1
 
     with monkeypatch.context() as patched:
         patched.setattr(writing, "rows_of", None)
-        prune_tiles(URLS, "memory://out", views, HALF, CLOSED)
+        prune_tiles(URLS, "memory://out", PruneRequest(views, HALF, CLOSED))
     assert [Path(path).name[-6:] for path in sent] == ["000000", "000001", "000001"]
     assert memory.find("/out") == ["/out/a.ply", "/out/b.ply"]
     assert [memory.cat_file(f"/out/{name}") for name in NAMES] == here(folder, views)
@@ -202,7 +214,7 @@ def test_a_storage_that_cannot_be_written_to_is_known_at_once(memory, views, mon
     monkeypatch.setattr(units.Unit, "take", None)
 
     with pytest.raises(RefineError, match=r"^memory://out: cannot be written to \(read-only\)$"):
-        prune_tiles(URLS, "memory://out", views, HALF, CLOSED)
+        prune_tiles(URLS, "memory://out", PruneRequest(views, HALF, CLOSED))
 
 
 ASCII = plain_header(1, splat_names(0), "ascii") + b"0 " * 17 + b"\n"
@@ -232,7 +244,7 @@ def test_what_is_no_tile_is_named_by_its_url(memory, views, content, words):
         memory.rm_file("/in/b.ply")
 
     with pytest.raises(RefineError, match=rf"^memory://in/b\.ply: {words}"):
-        prune_tiles(URLS, "memory://out", views, HALF, CLOSED)
+        prune_tiles(URLS, "memory://out", PruneRequest(views, HALF, CLOSED))
 
 
 def test_a_storage_that_only_sends_whole_files_is_refused(memory, monkeypatch):
@@ -286,9 +298,9 @@ def test_without_fsspec_the_extra_is_named(folder, views, monkeypatch):
 
     needed = r": URLs need fsspec: pip install 'refine-addon\[distributed\]'"
     with pytest.raises(RefineError, match=rf"^memory://in/a\.ply{needed}"):
-        prune_tiles(URLS, None, views, HALF, CLOSED)
+        prune_tiles(URLS, None, PruneRequest(views, HALF, CLOSED))
     with pytest.raises(RefineError, match=rf"^memory://out{needed}"):
-        prune_tiles(NAMES, "memory://out", views, HALF, CLOSED)
+        prune_tiles(NAMES, "memory://out", PruneRequest(views, HALF, CLOSED))
     assert here(folder, views)
 
 
@@ -373,11 +385,11 @@ def test_a_server_sends_ranges(folder, server, views):
     """The same bytes as from the disk; nobody can write there."""
     urls = [f"{server.address}/{name}" for name in NAMES]
 
-    prune_tiles(urls, folder / "out", views, HALF, CLOSED)
+    prune_tiles(urls, folder / "out", PruneRequest(views, HALF, CLOSED))
 
     assert [(folder / "out" / name).read_bytes() for name in NAMES] == here(folder, views)
     with pytest.raises(RefineError, match=r"^http://.*/out: cannot be written to \("):
-        prune_tiles(urls, f"{server.address}/out", views, HALF, CLOSED)
+        prune_tiles(urls, f"{server.address}/out", PruneRequest(views, HALF, CLOSED))
     tile = units.tile_at(urls[0])
     (folder / "a.ply").write_bytes(plain_ply(130, seed=2))
     with pytest.raises(RefineError, match=r"^http://.*/a\.ply: was changed"):

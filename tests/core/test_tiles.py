@@ -14,16 +14,20 @@ import numpy as np
 import pytest
 
 from refine_addon.core import (
+    Box,
     Budget,
+    Cleaning,
     PruneRequest,
     RefineError,
     Settings,
+    Zone,
     prune_file,
     prune_tiles,
     read_cameras,
     read_ply,
     score,
 )
+from refine_addon.core.picture_files import PictureFiles
 from refine_addon.core.scoring import closed_form
 from refine_addon.core.selection import select
 from refine_addon.core.tiles import folder as folder_module
@@ -74,7 +78,7 @@ def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budg
     For a size, the four headers take bytes that one does not: here the rows left are compared with
     those of as many in one file.
     """
-    report = prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+    report = prune_tiles(tiles, tmp_path / "out", PruneRequest(views, budget, CLOSED))
 
     if budget.max_mb:
         assert 0 <= 400_000 - report["files"]["output_bytes"] < 2 * 248
@@ -96,7 +100,7 @@ def test_splats_at_the_threshold_stay(tmp_path, tiles, views):
     values = score(splats, views, CLOSED).values
     threshold = float(values[900])
 
-    report = prune_tiles(tiles, None, views, Budget(threshold=threshold), CLOSED)
+    report = prune_tiles(tiles, None, PruneRequest(views, Budget(threshold=threshold), CLOSED))
 
     assert np.count_nonzero(values == values[900]) == 401
     assert report["splats"]["removed"] == np.count_nonzero(values < values[900])
@@ -104,7 +108,7 @@ def test_splats_at_the_threshold_stay(tmp_path, tiles, views):
 
 def test_a_report_says_what_stays_of_each_tile(tmp_path, tiles, views):
     """Counts and bytes add up to those of all, and bytes are those of the files."""
-    report = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+    report = prune_tiles(tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=0.5), CLOSED))
 
     each = report["tiles"]
     assert [tile["input"] for tile in each] == [str(path) for path in tiles]
@@ -123,10 +127,10 @@ def test_a_report_says_what_stays_of_each_tile(tmp_path, tiles, views):
 def test_without_a_folder_the_sizes_are_told_and_nothing_is_written(tmp_path, tiles, views):
     """The same sizes as those of a run that writes."""
     before = sorted(tmp_path.rglob("*"))
-    told = prune_tiles(tiles, None, views, Budget(ratio=0.5), CLOSED)
+    told = prune_tiles(tiles, None, PruneRequest(views, Budget(ratio=0.5), CLOSED))
 
     assert sorted(tmp_path.rglob("*")) == before
-    written = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+    written = prune_tiles(tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=0.5), CLOSED))
     assert [tile["output_bytes"] for tile in told["tiles"]] == [
         tile["output_bytes"] for tile in written["tiles"]
     ]
@@ -158,7 +162,9 @@ def test_tiles_of_other_degrees_go_by_their_bytes(tmp_path, views, rows, megabyt
         scores, Budget(max_mb=megabytes), row_bytes=np.concatenate(lengths), fixed_bytes=fixed
     )
 
-    report = prune_tiles(paths, tmp_path / "out", views, Budget(max_mb=megabytes), CLOSED)
+    report = prune_tiles(
+        paths, tmp_path / "out", PruneRequest(views, Budget(max_mb=megabytes), CLOSED)
+    )
 
     for path, part in zip(paths, np.split(keep, 3), strict=True):
         expected = read_ply(path).rows[part]
@@ -169,7 +175,7 @@ def test_tiles_of_other_degrees_go_by_their_bytes(tmp_path, views, rows, megabyt
 def test_a_size_that_no_splat_fits_in_is_refused(tmp_path, tiles, views):
     """The headers alone are longer than 1 kB."""
     with pytest.raises(RefineError, match="too small for one splat of 248 bytes"):
-        prune_tiles(tiles, tmp_path / "out", views, Budget(max_mb=0.001), CLOSED)
+        prune_tiles(tiles, tmp_path / "out", PruneRequest(views, Budget(max_mb=0.001), CLOSED))
 
 
 # What is refused.
@@ -187,7 +193,7 @@ def test_what_does_not_work_over_tiles_is_refused_and_leaves_nothing(
 ):
     """Before or after the work, the folder is as empty as it was."""
     with pytest.raises(RefineError, match=words):
-        prune_tiles(tiles, tmp_path / "out", views, budget, settings)
+        prune_tiles(tiles, tmp_path / "out", PruneRequest(views, budget, settings))
 
     assert not list((tmp_path / "out").glob("*"))
 
@@ -216,7 +222,7 @@ def test_a_tile_that_is_given_twice_is_refused(tmp_path, tiles, views, folder):
     """Also where nothing is written: its splats would count twice."""
     output = None if folder is None else tmp_path / folder
     with pytest.raises(RefineError, match=r"d\.ply: is given twice"):
-        prune_tiles([*tiles, tiles[2]], output, views, Budget(ratio=0.5), CLOSED)
+        prune_tiles([*tiles, tiles[2]], output, PruneRequest(views, Budget(ratio=0.5), CLOSED))
 
 
 @pytest.mark.parametrize("kind", ["missing", "short.ply", "text.ply", "same"])
@@ -225,7 +231,7 @@ def test_one_tile_at_fault_stops_all(tmp_path, tiles, views, kind):
     given, words = damaged(tmp_path / kind, tiles)
 
     with pytest.raises(RefineError, match=words):
-        prune_tiles(given, tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+        prune_tiles(given, tmp_path / "out", PruneRequest(views, Budget(ratio=0.5), CLOSED))
 
     assert not list((tmp_path / "out").glob("*"))
 
@@ -237,12 +243,14 @@ def test_files_that_exist_stay_until_they_may_be_replaced(tmp_path, tiles, views
     there.write_bytes(b"mine")
 
     with pytest.raises(RefineError, match="exists already"):
-        prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+        prune_tiles(tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=0.5), CLOSED))
 
     assert [*(tmp_path / "out").iterdir()] == [there]
     assert there.read_bytes() == b"mine"
     there.chmod(0o640)
-    prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED, overwrite=True)
+    prune_tiles(
+        tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=0.5), CLOSED, overwrite=True)
+    )
     assert len(list((tmp_path / "out").iterdir())) == 4
     assert there.stat().st_mode & 0o777 == 0o640
 
@@ -250,7 +258,7 @@ def test_files_that_exist_stay_until_they_may_be_replaced(tmp_path, tiles, views
 def test_tiles_are_not_replaced_while_they_are_read(tmp_path, tiles, views):
     """A run that goes on after a kill would prune again what was pruned already."""
     with pytest.raises(RefineError, match="is read until all tiles are written"):
-        prune_tiles(tiles, tmp_path, views, Budget(ratio=0.5), CLOSED, overwrite=True)
+        prune_tiles(tiles, tmp_path, PruneRequest(views, Budget(ratio=0.5), CLOSED, overwrite=True))
 
 
 def test_a_tile_that_changes_meanwhile_stops_all(tmp_path, tiles, views):
@@ -261,7 +269,12 @@ def test_a_tile_that_changes_meanwhile_stops_all(tmp_path, tiles, views):
             tiles[2].write_bytes(tiles[2].read_bytes())
 
     with pytest.raises(RefineError, match="was changed while it was worked on"):
-        prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED, progress=progress)
+        prune_tiles(
+            tiles,
+            tmp_path / "out",
+            PruneRequest(views, Budget(ratio=0.5), CLOSED),
+            progress=progress,
+        )
 
     assert not list((tmp_path / "out").glob("*"))
 
@@ -272,7 +285,7 @@ def test_tiles_without_a_splat_are_refused(tmp_path, views, count):
     empty = cut(tmp_path, room_rows()[:0], (0,) * (count + 1))
 
     with pytest.raises(RefineError, match=f"none of {count} tiles has a splat"):
-        prune_tiles(empty, tmp_path / "out", views, Budget(max_mb=1.0), CLOSED)
+        prune_tiles(empty, tmp_path / "out", PruneRequest(views, Budget(max_mb=1.0), CLOSED))
 
 
 @pytest.mark.parametrize("link", [Path.symlink_to, Path.hardlink_to], ids=["symbolic", "hard"])
@@ -282,7 +295,9 @@ def test_a_link_to_a_tile_is_that_tile_again(tmp_path, tiles, views, link):
     link(again, tiles[0])
 
     with pytest.raises(RefineError, match=r"again\.ply: is given twice, also as .*b\.ply"):
-        prune_tiles([*tiles, again], tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+        prune_tiles(
+            [*tiles, again], tmp_path / "out", PruneRequest(views, Budget(ratio=0.5), CLOSED)
+        )
 
 
 def test_a_failed_job_leaves_no_folder_that_it_made(tmp_path, tiles, views):
@@ -290,7 +305,9 @@ def test_a_failed_job_leaves_no_folder_that_it_made(tmp_path, tiles, views):
     (tmp_path / "there").mkdir()
     for folder in ("there", "new/deep"):
         with pytest.raises(RefineError, match="would remove all"):
-            prune_tiles(tiles, tmp_path / folder, views, Budget(threshold=1e30), CLOSED)
+            prune_tiles(
+                tiles, tmp_path / folder, PruneRequest(views, Budget(threshold=1e30), CLOSED)
+            )
 
     assert not list((tmp_path / "there").iterdir())
     assert not (tmp_path / "new").exists()
@@ -322,7 +339,8 @@ def counted_calls(folder, views, count):
 
     sys.setprofile(count_call)
     try:
-        prune_tiles(paths, folder / str(count), views, Budget(ratio=0.5), settings, threads=1)
+        request = PruneRequest(views, Budget(ratio=0.5), settings)
+        prune_tiles(paths, folder / str(count), request, threads=1)
     finally:
         sys.setprofile(None)
     return calls[0]
@@ -373,7 +391,7 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views,
     Stopped in the middle of every step, the second run ends with the same bytes as a run at once.
     """
     budget = Budget(ratio=0.5)
-    prune_tiles(tiles, tmp_path / "once", views, budget, CLOSED)
+    prune_tiles(tiles, tmp_path / "once", PruneRequest(views, budget, CLOSED))
     done = []
     take, write_rows = units.Unit.take, writing.write_rows
 
@@ -392,9 +410,11 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views,
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED, progress=interrupt)
+        prune_tiles(
+            tiles, tmp_path / "out", PruneRequest(views, budget, CLOSED), progress=interrupt
+        )
     assert not list((tmp_path / "out").glob("*.ply"))
-    prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+    prune_tiles(tiles, tmp_path / "out", PruneRequest(views, budget, CLOSED))
 
     for path in tiles:
         once, again = ((tmp_path / folder / path.name).read_bytes() for folder in ("once", "out"))
@@ -429,11 +449,11 @@ def test_a_job_that_was_stopped_while_it_renamed_goes_on(
     with monkeypatch.context() as patched:
         renaming_stops(patched, tiles[1].name, error)
         with pytest.raises(raised):
-            prune_tiles(tiles, out, views, budget, CLOSED)
+            prune_tiles(tiles, out, PruneRequest(views, budget, CLOSED))
     assert [path.name for path in out.glob("*.ply")] == [tiles[0].name]
 
     monkeypatch.setattr(writing, "rows_of", None)  # nothing is written again
-    report = prune_tiles(tiles, out, views, budget, CLOSED)
+    report = prune_tiles(tiles, out, PruneRequest(views, budget, CLOSED))
 
     assert {path.name for path in out.iterdir()} == {path.name for path in tiles}
     assert sum(len(read_ply(out / path.name)) for path in tiles) == COUNT // 2
@@ -454,7 +474,7 @@ def test_ctrl_c_after_the_last_tile_was_renamed_comes_too_late(tmp_path, tiles, 
 
     monkeypatch.setattr(shutil, "rmtree", stop_at_first)
 
-    report = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+    report = prune_tiles(tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=0.5), CLOSED))
 
     assert report["splats"]["written"] == COUNT // 2
     assert {path.name for path in (tmp_path / "out").iterdir()} == {path.name for path in tiles}
@@ -466,13 +486,13 @@ def test_a_file_in_the_place_of_a_renamed_tile_is_not_replaced(tmp_path, tiles, 
     with monkeypatch.context() as patched:
         renaming_stops(patched, tiles[1].name, KeyboardInterrupt())
         with pytest.raises(KeyboardInterrupt):
-            prune_tiles(tiles, out, views, budget, CLOSED)
+            prune_tiles(tiles, out, PruneRequest(views, budget, CLOSED))
     (out / tiles[0].name).write_bytes(b"mine")
 
     with pytest.raises(RefineError, match="exists already"):
-        prune_tiles(tiles, out, views, budget, CLOSED)
+        prune_tiles(tiles, out, PruneRequest(views, budget, CLOSED))
     assert (out / tiles[0].name).read_bytes() == b"mine"
-    prune_tiles(tiles, out, views, budget, CLOSED, overwrite=True)
+    prune_tiles(tiles, out, PruneRequest(views, budget, CLOSED, overwrite=True))
 
     assert sum(len(read_ply(out / path.name)) for path in tiles) == COUNT // 2
 
@@ -493,11 +513,11 @@ def test_what_appears_in_the_place_of_a_tile_meanwhile_stops_before_the_first(
 
     options = {"overwrite": overwrite}
     with pytest.raises(Interrupted, match=f"{words}.*; the same command goes on"):
-        prune_tiles(tiles, out, views, budget, CLOSED, progress=progress, **options)
+        prune_tiles(tiles, out, PruneRequest(views, budget, CLOSED, **options), progress=progress)
     assert [*out.glob("*.ply")] == [there]
     (Path.rmdir if overwrite else Path.unlink)(there)
     monkeypatch.setattr(writing, "rows_of", None)  # nothing is written again
-    prune_tiles(tiles, out, views, budget, CLOSED, **options)
+    prune_tiles(tiles, out, PruneRequest(views, budget, CLOSED, **options))
 
     assert {path.name for path in out.iterdir()} == {path.name for path in tiles}
 
@@ -506,7 +526,7 @@ def test_what_appears_in_the_place_of_a_tile_meanwhile_stops_before_the_first(
 def test_on_a_full_disk_what_is_done_stays(tmp_path, tiles, views, monkeypatch, calls):
     """Wherever it fills up, the file is named, and the same call goes on once there is room."""
     budget, done = Budget(ratio=0.5), []
-    prune_tiles(tiles, tmp_path / "once", views, budget, CLOSED)
+    prune_tiles(tiles, tmp_path / "once", PruneRequest(views, budget, CLOSED))
     open_file = Folder.writing
 
     @contextlib.contextmanager
@@ -520,13 +540,13 @@ def test_on_a_full_disk_what_is_done_stays(tmp_path, tiles, views, monkeypatch, 
     with monkeypatch.context() as patched:
         patched.setattr(Folder, "writing", filling)
         with pytest.raises(Interrupted) as stopped:
-            prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+            prune_tiles(tiles, tmp_path / "out", PruneRequest(views, budget, CLOSED))
     words = f"{done[-1]}: no space left on the disk; the same command goes on where this one was"
     assert str(stopped.value) == words
     assert len(done) == calls
     assert not done[-1].exists()
 
-    prune_tiles(tiles, tmp_path / "out", views, budget, CLOSED)
+    prune_tiles(tiles, tmp_path / "out", PruneRequest(views, budget, CLOSED))
     assert joined(tmp_path / "out" / path.name for path in tiles) == joined(
         tmp_path / "once" / path.name for path in tiles
     )
@@ -556,16 +576,16 @@ def interrupted_at(fraction):
 def test_an_array_that_a_power_cut_truncated_is_made_again(tmp_path, tiles, views, name):
     """It is named, what was not damaged stays, and the next run ends with the same bytes."""
     budget, out = Budget(ratio=0.5), tmp_path / "out"
-    prune_tiles(tiles, tmp_path / "once", views, budget, CLOSED)
+    prune_tiles(tiles, tmp_path / "once", PruneRequest(views, budget, CLOSED))
     stop = {"means.npy": 0.4, "plain.npy": 0.77, "values.npy": 0.82}[name]
     with pytest.raises(KeyboardInterrupt):
-        prune_tiles(tiles, out, views, budget, CLOSED, progress=interrupted_at(stop))
+        prune_tiles(tiles, out, PruneRequest(views, budget, CLOSED), progress=interrupted_at(stop))
     damaged = next(path for path in sorted(out.rglob(name)) if path.stat().st_size > 300)
     os.truncate(damaged, 300)
 
     with pytest.raises(Interrupted, match=f"{name}: is damaged; the same command goes on"):
-        prune_tiles(tiles, out, views, budget, CLOSED)
-    prune_tiles(tiles, out, views, budget, CLOSED)
+        prune_tiles(tiles, out, PruneRequest(views, budget, CLOSED))
+    prune_tiles(tiles, out, PruneRequest(views, budget, CLOSED))
 
     assert joined(out / path.name for path in tiles) == joined(
         tmp_path / "once" / path.name for path in tiles
@@ -594,12 +614,31 @@ def test_a_note_that_a_power_cut_truncated_counts_as_none(tmp_path):
                 assert folder.noted(name) == (False, None)
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"zones": (Zone("remove", "a box", Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))),)},
+        {"cleaning": Cleaning()},
+        {"pictures": PictureFiles(Path("shown"), "a")},
+    ],
+    ids=["volumes", "cleaning", "pictures"],
+)
+def test_what_needs_all_splats_in_memory_is_refused(tmp_path, tiles, views, asked):
+    """Before anything is read or made; it would be left out in silence otherwise."""
+    with pytest.raises(RefineError, match="need all splats in memory"):
+        prune_tiles(tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=0.5), **asked))
+
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_tile_with_the_longest_name_is_pruned(tmp_path, tiles, views):
     """255 bytes: what is noted of a tile does not have its name."""
     long = tmp_path / f"{'x' * 251}.ply"
     tiles[0].rename(long)
 
-    prune_tiles([long, *tiles[1:]], tmp_path / "out", views, Budget(ratio=0.5), CLOSED)
+    prune_tiles(
+        [long, *tiles[1:]], tmp_path / "out", PruneRequest(views, Budget(ratio=0.5), CLOSED)
+    )
 
     assert (tmp_path / "out" / long.name).exists()
 
@@ -639,8 +678,13 @@ def test_another_job_does_not_take_over_what_is_left(tmp_path, tiles, views):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), CLOSED, progress=interrupt)
-    report = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.25), CLOSED)
+        prune_tiles(
+            tiles,
+            tmp_path / "out",
+            PruneRequest(views, Budget(ratio=0.5), CLOSED),
+            progress=interrupt,
+        )
+    report = prune_tiles(tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=0.25), CLOSED))
 
     assert report["splats"]["removed"] == COUNT // 4
 

@@ -84,7 +84,7 @@ def read(folder, paths):
 )
 def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budget, settings):
     """To the byte, and the estimates are the same but for how rounding adds up."""
-    told = prune_tiles(tiles, tmp_path / "out", views, budget, settings)
+    told = prune_tiles(tiles, tmp_path / "out", PruneRequest(views, budget, settings))
     whole = prune_file(
         tmp_path / "whole.ply", tmp_path / "pruned.ply", PruneRequest(views, budget, settings)
     )
@@ -107,7 +107,7 @@ def test_views_of_nothing_are_refused_as_of_one_file(tmp_path, tiles, views):
         prune_file(tmp_path / "whole.ply", None, PruneRequest(away, Budget(ratio=0.5), OCCLUSION))
 
     with pytest.raises(RefineError) as together:
-        prune_tiles(tiles, tmp_path / "out", away, Budget(ratio=0.5), OCCLUSION)
+        prune_tiles(tiles, tmp_path / "out", PruneRequest(away, Budget(ratio=0.5), OCCLUSION))
 
     assert str(together.value) == str(alone.value)
     assert not list((tmp_path / "out").glob("*"))
@@ -138,7 +138,10 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(
 
         def run():
             prune_tiles(
-                tiles, tmp_path / folder, views, budget, settings, absorb=absorb, progress=interrupt
+                tiles,
+                tmp_path / folder,
+                PruneRequest(views, budget, settings, absorb=absorb),
+                progress=interrupt,
             )
 
         while stops:
@@ -170,7 +173,9 @@ def test_absorbing_tiles_is_as_good_as_absorbing_one_file(tmp_path, views, monke
     file = read_ply(ROOM / "point_cloud.ply")
     tiles = cut(tmp_path, file.rows, np.linspace(0, len(file), 9).astype(int).tolist())
     settings = Settings(method="occlusion")
-    told = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=ratio), settings, absorb=True)
+    told = prune_tiles(
+        tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=ratio), settings, absorb=True)
+    )
     splats = file.splats()
     whole = prune(splats, views, Budget(ratio=ratio), settings, absorb=True)
 
@@ -196,7 +201,9 @@ def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views,
     whole = prune(splats, few, Budget(ratio=0.5), OCCLUSION, absorb=True)
 
     prune_tiles(
-        [ROOM / "point_cloud.ply"], tmp_path, few, Budget(ratio=0.5), OCCLUSION, absorb=True
+        [ROOM / "point_cloud.ply"],
+        tmp_path,
+        PruneRequest(few, Budget(ratio=0.5), OCCLUSION, absorb=True),
     )
 
     made = read_ply(tmp_path / "point_cloud.ply").splats()
@@ -211,7 +218,9 @@ def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, rows, views)
 
     Stages divide along other planes, so regions of a stage are not those of the one before.
     """
-    told = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.8), OCCLUSION, absorb=True)
+    told = prune_tiles(
+        tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=0.8), OCCLUSION, absorb=True)
+    )
 
     made, counts = read(tmp_path / "out", tiles), told["absorbed"]
     assert len(made) == told["splats"]["kept"] == COUNT // 5
@@ -232,7 +241,7 @@ def test_absorbing_a_single_region_is_absorbing_one_file(
     """
     monkeypatch.setattr(absorbing, "REGION", COUNT)
     budget = Budget(ratio=ratio)
-    told = prune_tiles(tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=True)
+    told = prune_tiles(tiles, tmp_path / "out", PruneRequest(views, budget, OCCLUSION, absorb=True))
     request = PruneRequest(views, budget, OCCLUSION, absorb=True)
     whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", request)
 
@@ -263,7 +272,9 @@ def test_stored_rays_know_which_are_wanted(tmp_path, views):
 @pytest.mark.slow
 def test_what_is_deleted_alone_needs_no_merging(tmp_path, tiles, views):
     """Up to a tenth is deleted as in memory: the same rows, and nothing changes."""
-    told = prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.1), OCCLUSION, absorb=True)
+    told = prune_tiles(
+        tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=0.1), OCCLUSION, absorb=True)
+    )
     whole = prune_file(
         tmp_path / "whole.ply",
         tmp_path / "pruned.ply",
@@ -288,7 +299,9 @@ def test_tiles_of_other_degrees_absorb_one_another(tmp_path, rows, views):
     (tmp_path / "b.ply").write_bytes(plain_header(len(plain), names) + plain.tobytes())
     paths = [tmp_path / "a.ply", tmp_path / "b.ply"]
 
-    told = prune_tiles(paths, tmp_path / "out", views, Budget(ratio=0.6), OCCLUSION, absorb=True)
+    told = prune_tiles(
+        paths, tmp_path / "out", PruneRequest(views, Budget(ratio=0.6), OCCLUSION, absorb=True)
+    )
 
     made = [read_ply(tmp_path / "out" / path.name).splats() for path in paths]
     assert [splats.sh_rest.shape[1] for splats in made] == [15, 0]
@@ -306,7 +319,7 @@ def test_budgets_that_absorbing_tiles_cannot_meet_are_refused(
 ):
     """Before anything is read."""
     with pytest.raises(RefineError, match=words):
-        prune_tiles(tiles, tmp_path / "out", views, budget, OCCLUSION, absorb=True)
+        prune_tiles(tiles, tmp_path / "out", PruneRequest(views, budget, OCCLUSION, absorb=True))
     assert not (tmp_path / "out").exists()
 
 
@@ -350,7 +363,7 @@ def test_a_view_loads_no_chunk_behind_it(tmp_path, tiles, views, monkeypatch):
     )
     once = Settings(method="occlusion", views=12, occlusion=replace(OCCLUSION.occlusion, rounds=1))
 
-    prune_tiles(tiles, tmp_path / "out", views, Budget(ratio=0.5), once, threads=1)
+    prune_tiles(tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=0.5), once), threads=1)
 
     chunks = len(set(loaded))
     assert 90 < chunks <= 100

@@ -52,7 +52,7 @@ def test_a_point_cloud_is_pruned_saved_and_converted_back(
         "native", cloud=cloud, cameras=cameras, blend=blender.work / "native.blend", **files
     )
 
-    counts = {"points": 39_755, "shown": 39_755, "kept": 19_878, "back": 19_878}
+    counts = {"points": 39_755, "kept": 19_878, "back": 19_878}
     assert found == {"type": "POINTCLOUD", **counts}
     before, output, back = rows(cloud), rows(files["output"]), rows(files["back"])
     places = [np.stack([table[axis] for axis in "xyz"], axis=1) for table in (before, output)]

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 PICTURES = PROJECT / "build" / "e2e"
 
 
-def test_score_apply_undo_and_preview_by_hand(binary: Binary, blend: Path):
-    """39,755 splats; *Apply* leaves 19,878 of them, Ctrl+Z and *Heat Map* all.
+def test_score_apply_and_undo_by_hand(binary: Binary, blend: Path):
+    """39,755 splats; *Apply* leaves 19,878 of them, Ctrl+Z all.
 
     While the slider is dragged the sentence follows at once, the marks when it rests. The chart is
     no image of the file.
@@ -52,7 +52,6 @@ def test_score_apply_undo_and_preview_by_hand(binary: Binary, blend: Path):
     assert f"Keeps {39_755 - slid['marked']:,} of" in slid["sentence"]
     assert found["applied"] == {"vertices": 19_878, "scored": True}
     assert found["undone"] == found["scored"]
-    assert found["previewed"] == found["scored"]
 
 
 def test_the_viewport_shows_splats_as_the_reference_renderer(

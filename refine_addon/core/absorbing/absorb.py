@@ -57,15 +57,7 @@ _CHUNK = 1 << 14  # covariances turned into axes at a time: some MB of temporari
 
 
 class Counts:
-    """How many splats absorbing changed, merged and deleted.
-
-    Attributes
-    ----------
-    changed : (K,) bool
-        Which survivors absorbed others.
-    merged, deleted : int
-        How many splats were absorbed by a survivor, and how many were deleted.
-    """
+    """How many splats absorbing changed, merged and deleted; see `Absorbed`."""
 
     changed: NDArray[np.bool_]
     merged: int
@@ -162,10 +154,6 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
         See `refine_addon.core.work.Progress`.
     threads : int, optional
 
-    Returns
-    -------
-    Absorbed
-
     Raises
     ------
     Cancelled
@@ -197,7 +185,7 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
 
 
 def _in_float64(splats: Splats, progress: Progress) -> Splats:
-    """Return splats in float64: merged ones merge again, and rounding depends on the frame."""
+    """Return splats in float64: merged ones merge again, and rounding would depend on the frame."""
     columns = {}
     for name, values in vars(splats).items():
         report(progress, 0.0, "absorbing")
@@ -281,9 +269,10 @@ def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     report(progress, 0.0, "absorbing")
 
     def make_graph() -> MergeGraph:
-        field = merge_field.field(
+        measured = merge_field.measured_field(
             splats, rows, views, scene, sums, progress=part(progress, 0.0, 0.1), threads=threads
         )
+        field = measured.with_allowance(measured.seen_and_whole())
         return MergeGraph(field, scene, factor, threads=threads)
 
     return reduced(
@@ -349,17 +338,8 @@ def _with_merged(
 ) -> Stage:
     """Return what a stage makes of splats, with the merged splats in place of survivors.
 
-    Parameters
-    ----------
-    splats, sums : Splats, ViewSums
-        The N splats of the stage, and what the views see of them.
-    keep : (N,) bool
-        Which of them survive.
-    rows : (M,) int64
-        Rows of the splats that the graph holds.
-    graph : MergeGraph
-        Reduced; its field shrinks to the changed survivors.
-    progress : callable
+    `keep`, (N,) bool, says which of them survive; the reduced graph's field shrinks to the changed
+    survivors. The rest as `reduced`.
     """
     owner, share = _owners(graph.merges, len(rows))  # (M,) each
     changed = np.zeros(len(rows), np.bool_)  # (M,), survivors that absorbed others
@@ -385,15 +365,9 @@ def _with_merged(
 
 
 def _owners(merges: Sequence[tuple[Index, Index, Array]], count: int) -> tuple[Index, Array]:
-    """Return the splat that each of `count` went into, and its share of that one's colour.
+    """Return the splat that each of `count` went into, or is, and its share of that one's colour.
 
-    A splat that went into none is its own.
-
-    Parameters
-    ----------
-    merges : sequence of (survivor, absorbed, share)
-        See `MergeGraph.merges`.
-    count : int
+    `merges`: see `MergeGraph.merges`.
     """
     owner, share = np.arange(count), np.ones(count)
     # From the last round to the first: a survivor of one round may be absorbed in a later one.
@@ -421,16 +395,10 @@ def _put_shapes(
 
 
 class _Blend:
-    """Weighted means of rows in groups; the shares of a group sum to 1.
+    """Weighted means of rows in groups.
 
-    Parameters
-    ----------
-    members : (m,) int64
-        Rows to take means of.
-    targets : (m,) int64
-        The row that the mean of a member's group is written to.
-    share : (m,) float64
-        Weight of each member.
+    `members`, (m,), are the rows; `targets`, (m,), the row that the mean of a member's group is
+    written to; `share`, (m,), their weights, which sum to 1 in a group.
     """
 
     def __init__(self, members: Index, targets: Index, share: Array) -> None:

@@ -164,16 +164,9 @@ def viewing(
 
 
 def _viewing(points: Array, views: list[tuple[View, float]], closest: float) -> Viewing:
-    """Return from where views see M points.
+    """Return from where views, with their weights, see M points, (3, M).
 
-    Parameters
-    ----------
-    points : (3, M) float64
-        World units.
-    views : list of (View, float)
-        Views and their weights.
-    closest : float
-        Least distance of a camera.
+    A camera counts as at least `closest` away.
     """
     rows, columns = np.triu_indices(3)
     # Sums over views: of the weights, of pixels per squared world unit, of views; (M,) each.
@@ -210,13 +203,8 @@ def _seen_from(view: View, points: Array, closest: float) -> tuple[NDArray[np.bo
 def _deviation(direction: Array, second: Array) -> Array:
     """Return the largest standard deviation of viewing directions as a vector, (M, 3).
 
-    Parameters
-    ----------
-    direction : (M, 3) float64
-        Mean viewing direction, length 1.
-    second : (M, 6) float64
-        Mean products xx, xy, xz, yy, yz, zz of the directions. In the plane at right angles to the
-        mean direction these are variances.
+    Given their mean, (M, 3), and their mean products xx, xy, xz, yy, yz, zz, (M, 6). In the plane
+    at right angles to the mean these are variances.
     """
     u, v = across(direction)
     xx, xy, yy = footprint(second, (u, v), np.zeros(len(direction)))
@@ -227,7 +215,7 @@ def _deviation(direction: Array, second: Array) -> Array:
     return deviation.T
 
 
-def field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
+def measured_field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
     splats: Splats,
     rows: Index,
     views: ViewSet,
@@ -236,11 +224,8 @@ def field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
     *,
     progress: Progress = silent,
     threads: int | None = None,
-) -> Field:
-    """Return some splats as merging needs them.
-
-    A splat that these views do not show may be visible from elsewhere, so each splat gets an
-    allowance for what one more view may see of it (`Unallowed`).
+) -> MeasuredField:
+    """Return some splats as merging needs them, but for the allowance.
 
     Parameters
     ----------
@@ -262,21 +247,6 @@ def field(  # noqa: PLR0913 - which splats, seen by what, in which scene, how
     Cancelled
         If `progress` answers ``False``.
     """
-    bare = unallowed(splats, rows, views, scene, sums, progress=progress, threads=threads)
-    return bare.with_allowance(bare.seen_and_whole())
-
-
-def unallowed(  # noqa: PLR0913 - as `field`
-    splats: Splats,
-    rows: Index,
-    views: ViewSet,
-    scene: Scene,
-    sums: ViewSums,
-    *,
-    progress: Progress = silent,
-    threads: int | None = None,
-) -> Unallowed:
-    """Return some splats as merging needs them, but for the allowance; parameters as `field`."""
     viewed = viewing(
         splats.means[rows], views, scene, progress=part(progress, 0.0, 0.5), threads=threads
     )
@@ -308,7 +278,7 @@ def unallowed(  # noqa: PLR0913 - as `field`
         xx, xy, yy = footprint(covariances, across(field.direction), field.blur)  # (M,) each
         # In pixels of a view, over 2 pi; a constant factor does not matter here.
         mass = field.opacity * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / viewed.pixel
-    return Unallowed(field, mass, viewed.seen)
+    return MeasuredField(field, mass, viewed.seen)
 
 
 def _covariances(splats: Splats) -> Array:
@@ -320,7 +290,7 @@ def _covariances(splats: Splats) -> Array:
     return full[:, rows, columns]
 
 
-class Unallowed(NamedTuple):
+class MeasuredField(NamedTuple):
     """Splats as merging needs them, but without the allowance for views that were not given.
 
     If nothing were hidden, each view would see the whole mass of every splat whose centre lies in
@@ -392,12 +362,7 @@ def across(normal: Array) -> tuple[Array, Array]:
 def footprint(covariances: Array, plane: tuple[Array, Array], blur: Array) -> Footprint:
     """Return xx, xy, yy of ``(u, v)' C (u, v) + blur I``, (M,) each: C projected to a plane.
 
-    Parameters
-    ----------
-    covariances : (M, 6) float64
-    plane : (u, v)
-        Unit vectors, (3, M).
-    blur : (M,) float64
+    `plane` holds the unit vectors u and v, (3, M) each.
     """
     u, v = plane
     xx, xy, xz, yy, yz, zz = covariances.T

@@ -58,17 +58,9 @@ class MergeGraph:
     def __init__(
         self, field: Field, scene: Scene, patience: float, *, threads: int | None = None
     ) -> None:
-        """Take over a field.
+        """Take over a field, which is changed in place; neighbours are those in the scene's frame.
 
-        Parameters
-        ----------
-        field : Field
-            Changed in place.
-        scene : Scene
-            Neighbours are searched in its frame.
-        patience : float
-            Factor on the cost of merging.
-        threads : int, optional
+        `patience` is the factor on the cost of merging.
         """
         self.field, self.scene, self.patience, self.threads = field, scene, patience, threads
         # A splat of unknown error is not merged: without contribution it gets no pairs.
@@ -202,13 +194,7 @@ class MergeGraph:
     ) -> tuple[NDArray[np.bool_], Index]:
         """Return which splats cost least by deleting them, (N,), and which pairs by merging, (m,).
 
-        Parameters
-        ----------
-        error : (N,) float64
-            Costs of deleting.
-        edges : (e,) int64
-            Pairs whose cost is at most `limit`.
-        limit : float
+        `error`, (N,), is the cost of deleting; the pairs `edges`, (e,), cost at most `limit`.
         """
         first, second, cost = self.first[edges], self.second[edges], self.cost[edges]  # (e,) each
         best = error.copy()  # (N,), the cost of each splat's cheapest operation

@@ -33,12 +33,10 @@ import numpy as np
 
 from ..affine import quaternion
 from ..rendering import ALPHA_MAX
-from .merge_field import Field, ViewSums, across, footprint, normalized
+from .merge_field import Field, across, footprint, normalized
 
 if TYPE_CHECKING:
     from .merge_field import Array, Footprint, Index
-
-__all__ = ["Field", "Pairs", "ViewSums", "axes", "costs", "merge", "price"]
 
 FLATTEST = 1e-14
 """Least eigenvalue of a covariance over the sum of the three; rounding hides smaller ones."""
@@ -136,16 +134,8 @@ class _Ends(NamedTuple):
 
     def take(self, rows: Index) -> _Ends:
         """Return the ends of some pairs."""
-        return _Ends(
-            self.one.take(rows),
-            self.two.take(rows),
-            self.color[rows],
-            self.rest[rows],
-            self.direction[rows],
-            self.deviation[rows],
-            self.blur[rows],
-            self.apart[rows],
-        )
+        means = (values[rows] for values in self[2:])
+        return _Ends(self.one.take(rows), self.two.take(rows), *means)
 
 
 def _gather(splats: Field, first: Index, second: Index) -> _Ends:
@@ -173,154 +163,120 @@ def _gather(splats: Field, first: Index, second: Index) -> _Ends:
 def _price(ends: _Ends, tilt: float) -> Pairs:
     """Return costs and results of merges, viewed from one direction.
 
-    All masses and inner products here are divided by 2 pi, a factor that cancels. All arrays are
-    (M,).
+    Masses and inner products here are divided by 2 pi, a factor that cancels; they are named by the
+    signals i, j and m of the equations. All arrays are (M,).
     """
-    signals = _signals(ends, tilt)
-    products = _products(signals)
-    contrasts = _contrasts(ends, signals.masses, products)
-    tau = (ends.one.contribution + ends.two.contribution) / (signals.masses[0] + signals.masses[1])
+    plane, color, rest = _in_plane(ends, tilt), ends.color, ends.rest
+    one, two, merged, x, y = plane[:5]
+    ii, jj, mm = one.squared(), two.squared(), merged.squared()
+    # The merged centre lies between the two, away from each by the other's share of the step.
+    im = one.times(merged, plane.other * x, plane.other * y)
+    jm = two.times(merged, plane.position * x, plane.position * y)
+    pp = ii - 2.0 * color * im + color * color * mm
+    qq = jj - 2.0 * rest * jm + rest * rest * mm
+    pq = plane.overlap - rest * im - color * jm
+    pq += color * rest * mm
+    s_i, s_j, both = _contrasts(ends, ends.one.contribution / one.mass * ii,
+                                ends.two.contribution / two.mass * jj)  # fmt: skip
+    cost = s_i * pp + 2.0 * both * pq + s_j * qq
     # The contrast of the merged splat is l_i s_i + l_j s_j.
-    color, rest = ends.color, ends.rest
-    mixed = color * color * contrasts.one + 2.0 * color * rest * contrasts.both
-    mixed += rest * rest * contrasts.two
+    mixed = color * color * s_i + 2.0 * color * rest * both + rest * rest * s_j
+    tau = (ends.one.contribution + ends.two.contribution) / (one.mass + two.mass)
     return Pairs(
-        tau * np.maximum(_change(ends, contrasts, products), 0.0),
-        signals.position,
-        color,
-        signals.mass / signals.areas[2],
-        signals.growth,
-        tau * np.maximum(mixed, 0.0) * products.merged,
-    )
+        tau * np.maximum(cost, 0.0), plane.position, color, merged.mass / merged.area, plane.growth,
+        tau * np.maximum(mixed, 0.0) * mm,
+    )  # fmt: skip
 
 
-def _change(ends: _Ends, contrasts: _Contrasts, products: _Products) -> Array:
-    """Return the squared change of the picture by merges, unhidden: `cost` over tau, (M,)."""
-    color, rest = ends.color, ends.rest
-    pp = products.one - 2.0 * color * products.one_merged + color * color * products.merged
-    qq = products.two - 2.0 * rest * products.two_merged + rest * rest * products.merged
-    pq = products.overlap - rest * products.one_merged - color * products.two_merged
-    pq += color * rest * products.merged
-    change: Array = contrasts.one * pp + 2.0 * contrasts.both * pq + contrasts.two * qq
-    return change
-
-
-class _Signals(NamedTuple):
-    """Footprints and masses of M pairs and of the merged splats, in the plane viewed.
+class _Signal(NamedTuple):
+    """M splats in the plane viewed: f in the equations, but for their places.
 
     Attributes
     ----------
-    one, two, merged : Footprint
+    footprint : Footprint
         Covariances in the plane, low-pass included.
-    x, y : (M,) float64
+    area, mass : (M,) float64
+        See `_area`; opacity times area.
+    """
+
+    footprint: Footprint
+    area: Array
+    mass: Array
+
+    def squared(self) -> Array:
+        """Return ``<f, f>``, (M,)."""
+        return self.mass * self.mass / (2.0 * self.area)
+
+    def times(self, other: _Signal, x: Array, y: Array) -> Array:
+        """Return ``<f, g>``, (M,), given the step from f to the other."""
+        product = _product(self.footprint, other.footprint, x, y)
+        return self.mass * other.mass * product
+
+
+class _Plane(NamedTuple):
+    """M pairs and their merged splats in the plane viewed; arrays are (M,) float64.
+
+    Attributes
+    ----------
+    one, two, merged : _Signal
+    x, y
         Step from the centre of the first to that of the second.
-    areas : tuple of (M,) float64
-        Of the first, the second and the merged footprint; see `_area`.
-    masses : tuple of (M,) float64
-        Of the first and of the second.
-    mass : (M,) float64
-        Of the merged splat.
-    position, other : (M,) float64
+    position, other
         Shares of the first and of the second in the mass.
-    growth : (M,) float64
-        Factor that `merged` contains, so that its opacity is at most `ALPHA_MAX`.
-    overlap : (M,) float64
+    growth
+        Factor that the merged footprint contains, so that its opacity is at most `ALPHA_MAX`.
+    overlap
         Inner product of the two.
     """
 
-    one: Footprint
-    two: Footprint
-    merged: Footprint
+    one: _Signal
+    two: _Signal
+    merged: _Signal
     x: Array
     y: Array
-    areas: tuple[Array, Array, Array]
-    masses: tuple[Array, Array]
-    mass: Array
     position: Array
     other: Array
     growth: Array
     overlap: Array
 
 
-def _signals(ends: _Ends, tilt: float) -> _Signals:
-    """Return footprints and masses of pairs and of the merged splats."""
-    one, two, x, y = _plane(ends, tilt)
-    areas = _area(one), _area(two)
-    masses = ends.one.opacity * areas[0], ends.two.opacity * areas[1]
-    position, other = _shares(*masses)
-    overlap = masses[0] * masses[1] * _product(one, two, x, y)
+def _in_plane(ends: _Ends, tilt: float) -> _Plane:
+    """Return pairs and their merged splats in the plane viewed; `tilt`: see `price`."""
+    normal = normalized(ends.direction + tilt * ends.deviation) if tilt else ends.direction
+    plane = across(normal)
+    x, y = (np.einsum("ji,ji->i", (ends.two.means - ends.one.means).T, axis) for axis in plane)
+    one, two = (_signal(splats, plane, ends.blur) for splats in (ends.one, ends.two))
+    position, other = _shares(one.mass, two.mass)
+    overlap = one.times(two, x, y)
     between = position * other
-    merged = _mixed(one, two, position, (between * x * x, between * x * y, between * y * y))
-    # The estimated overlap of nearly opaque splats can exceed the smaller mass; the true one never.
-    mass = masses[0] + masses[1] - np.minimum(overlap, np.minimum(*masses))
-    growth = np.maximum(mass / (_area(merged) * ALPHA_MAX), 1.0)
-    merged = (merged[0] * growth, merged[1] * growth, merged[2] * growth)
-    return _Signals(
-        one, two, merged, x, y, (*areas, _area(merged)), masses, mass, position, other, growth,
-        overlap,
-    )  # fmt: skip
-
-
-class _Products(NamedTuple):
-    """Inner products of the signals of M pairs, (M,) float64 each.
-
-    Attributes
-    ----------
-    one, two, merged
-        ``<f_i, f_i>``, ``<f_j, f_j>``, ``<f_m, f_m>``.
-    overlap, one_merged, two_merged
-        ``<f_i, f_j>``, ``<f_i, f_m>``, ``<f_j, f_m>``.
-    """
-
-    one: Array
-    two: Array
-    merged: Array
-    overlap: Array
-    one_merged: Array
-    two_merged: Array
-
-
-def _products(signals: _Signals) -> _Products:
-    """Return the inner products of pairs and of the merged splats."""
-    merged, mass, x, y = signals.merged, signals.mass, signals.x, signals.y
-    mass_1, mass_2 = signals.masses
-    area_1, area_2, area = signals.areas
-    # The merged centre lies between the two, away from each by the other's share of the step.
-    away_1, away_2 = signals.other, signals.position
-    return _Products(
-        mass_1 * mass_1 / (2.0 * area_1),
-        mass_2 * mass_2 / (2.0 * area_2),
-        mass * mass / (2.0 * area),
-        signals.overlap,
-        mass_1 * mass * _product(signals.one, merged, away_1 * x, away_1 * y),
-        mass_2 * mass * _product(signals.two, merged, away_2 * x, away_2 * y),
+    mixed = _mixed(
+        one.footprint, two.footprint, position, (between * x * x, between * x * y, between * y * y)
     )
+    # The estimated overlap of nearly opaque splats can exceed the smaller mass; the true one never.
+    mass = one.mass + two.mass - np.minimum(overlap, np.minimum(one.mass, two.mass))
+    growth = np.maximum(mass / (_area(mixed) * ALPHA_MAX), 1.0)
+    mixed = (mixed[0] * growth, mixed[1] * growth, mixed[2] * growth)
+    merged = _Signal(mixed, _area(mixed), mass)
+    return _Plane(one, two, merged, x, y, position, other, growth, overlap)
 
 
-class _Contrasts(NamedTuple):
-    """Products of the contrasts of M pairs, (M,) float64 each.
+def _signal(splats: Field, plane: tuple[Array, Array], blur: Array) -> _Signal:
+    """Return splats in a plane, spanned by unit vectors, with a low-pass of variance `blur`."""
+    ellipse = footprint(splats.covariances, plane, blur)
+    area = _area(ellipse)
+    return _Signal(ellipse, area, splats.opacity * area)
 
-    Attributes
-    ----------
-    one, two, both
-        ``|s_i|^2``, ``|s_j|^2``, ``s_i.s_j``.
+
+def _contrasts(ends: _Ends, one: Array, two: Array) -> tuple[Array, Array, Array]:
+    """Return ``|s_i|^2``, ``|s_j|^2`` and ``s_i.s_j``, (M,) each, as the measured errors imply.
+
+    `one` and `two`, (M,), are what the errors would be for a contrast of 1.
     """
-
-    one: Array
-    two: Array
-    both: Array
-
-
-def _contrasts(ends: _Ends, masses: tuple[Array, Array], products: _Products) -> _Contrasts:
-    """Return the contrasts that the measured errors of pairs imply."""
-    first, second = ends.one, ends.two
-    one = _squared_contrast(first.error, first.contribution / masses[0] * products.one)
-    two = _squared_contrast(second.error, second.contribution / masses[1] * products.two)
-    both = 0.5 * (one + two - ends.apart)
+    s_i, s_j = _squared_contrast(ends.one.error, one), _squared_contrast(ends.two.error, two)
+    both = 0.5 * (s_i + s_j - ends.apart)
     # By Cauchy-Schwarz |s_i.s_j| is at most this; measured errors and colours can contradict it.
-    limit = np.sqrt(one * two)
-    both = np.clip(both, -limit, limit)
-    return _Contrasts(one, two, both)
+    limit = np.sqrt(s_i * s_j)
+    return s_i, s_j, np.clip(both, -limit, limit)
 
 
 def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
@@ -367,45 +323,12 @@ def _shares(one: Array, two: Array) -> tuple[Array, Array]:
 
 
 def _squared_contrast(error: Array, whole: Array) -> Array:
-    """Return |s|^2, (M,), the squared contrast that an error implies.
+    """Return the squared contrast that a measured error implies, (M,).
 
-    Colours are in 0..1, so |s|^2 is limited to 1 for each channel.
-
-    Parameters
-    ----------
-    error : (M,) float64
-        As measured.
-    whole : (M,) float64
-        What it would be for |s| = 1.
+    Colours are in 0..1, so it is at most 1 for each channel. `whole` is the error for |s| = 1.
     """
     squared: Array = np.minimum(error, CHANNELS * whole) / np.maximum(whole, _TINY)
     return squared
-
-
-def _plane(ends: _Ends, tilt: float) -> tuple[Footprint, Footprint, Array, Array]:
-    """Return both footprints and the step between them, in the plane that the pair is viewed in.
-
-    Parameters
-    ----------
-    ends : _Ends
-    tilt : float
-        How many standard deviations of the viewing directions to add to their mean.
-
-    Returns
-    -------
-    one, two : tuple of (M,) float64
-        xx, xy, yy, low-pass included; world units squared.
-    x, y : (M,) float64
-    """
-    normal = normalized(ends.direction + tilt * ends.deviation) if tilt else ends.direction
-    u, v = across(normal)
-    step = (ends.two.means - ends.one.means).T
-    return (
-        footprint(ends.one.covariances, (u, v), ends.blur),
-        footprint(ends.two.covariances, (u, v), ends.blur),
-        np.einsum("ji,ji->i", step, u),
-        np.einsum("ji,ji->i", step, v),
-    )
 
 
 def _mean_deviation(one: Array, two: Array, share: Array) -> Array:
@@ -416,15 +339,9 @@ def _mean_deviation(one: Array, two: Array, share: Array) -> Array:
 
 
 def _mixed(one: Footprint, two: Footprint, share: Array, between: Footprint) -> Footprint:
-    """Return the covariance of a mixture of two distributions.
+    """Return the covariance of a mixture of two distributions; `share`, (M,), is that of the first.
 
-    Parameters
-    ----------
-    one, two : Footprint
-    share : (M,) float64
-        Of the first.
-    between : Footprint
-        Covariance between the two centres, weighted by their shares.
+    `between` is the covariance of the two centres, weighted by their shares.
     """
     rest = 1.0 - share
     return (

@@ -13,7 +13,7 @@ PNG_START = b"\x89PNG\r\n\x1a\n"
 JPEG_START = b"\xff\xd8"
 
 MOST_SEGMENTS = 4096
-"""Most segments and fill bytes that are skipped; no camera writes as many."""
+"""Most segments and fill bytes that are skipped; no camera writes more."""
 
 FILL = 0xFF
 START_OF_SCAN = 0xDA

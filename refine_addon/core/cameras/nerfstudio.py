@@ -53,7 +53,7 @@ LEGACY_TRANSFORM = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]
 
 
 @dataclass(frozen=True, eq=False)
-class Similarity:
+class _Similarity:
     """``p -> scale * (rotation @ p + offset)``: from the world of the file to the splats'."""
 
     rotation: NDArray[np.float64] = field(default_factory=lambda: np.eye(3))
@@ -115,7 +115,7 @@ class _Entry:
     def at(self, key: str) -> CameraPlace:
         return self.place.at(repr(key))
 
-    def view(self, world: Similarity) -> View:
+    def view(self, world: _Similarity) -> View:
         axes, center = self.pose()
         width, height = self.size()
         fx, fy = self.focal(width, height)
@@ -137,7 +137,7 @@ class _Entry:
         matrix = place.matrix(self.frame["transform_matrix"], (3, 4), 4)
         if len(matrix) > 3 and np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:  # noqa: PLR2004
             place.at("row 3").fail(f"expected [0, 0, 0, 1], got {matrix[3].tolist()}")
-        axes, scale = without_scale(place, matrix[:3, :3])
+        axes, scale = _without_scale(place, matrix[:3, :3])
         if abs(scale - 1) > ORTHONORMAL:
             self.remarks.append("uniform scale taken out")
         if np.linalg.det(axes) < 0:
@@ -145,7 +145,7 @@ class _Entry:
         return axes * OPENGL_TO_OPENCV, matrix[:3, 3]
 
     def size(self) -> tuple[int, int]:
-        """Return width and height by their keys, or of the image if those are missing."""
+        """Return width and height from their keys, or from the image if a key is missing."""
         if self.has("w") and self.has("h"):
             width, height = (self.at(key).side(self.get(key)) for key in ("w", "h"))
             return width, height
@@ -203,22 +203,13 @@ class _Entry:
         return [model] if model.fisheye or distorted else []
 
 
-def without_scale(
+def _without_scale(
     place: CameraPlace, matrix: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
-    """Return an orthonormal matrix and the uniform scale that was removed from it.
+    """Return a matrix (3, 3) without its uniform scale, orthonormal, and that scale.
 
-    Parameters
-    ----------
-    place : CameraPlace
-        For the error.
-    matrix : (3, 3) float64
-        Finite numbers.
-
-    Raises
-    ------
-    RefineError
-        If the scale is not uniform or out of range, or the axes are not at right angles.
+    Raise `RefineError` if the scale is not uniform or out of range, or the axes are not at right
+    angles.
     """
     if np.abs(matrix).max() <= LARGEST_SCALE:
         scale = float(np.sqrt(np.sum(matrix * matrix) / 3))
@@ -227,12 +218,12 @@ def without_scale(
     return place.rotation(matrix), 1.0
 
 
-def _splat_world(place: CameraPlace, shared: Mapping[str, Any]) -> tuple[Similarity, list[str]]:
+def _splat_world(place: CameraPlace, shared: Mapping[str, Any]) -> tuple[_Similarity, list[str]]:
     """Return the transform from the file's world to the splats', and notes about it."""
     beside = place.path.parent / DATAPARSER_FILE
     if not is_file(beside):
         hint = f"splats of ns-export need {DATAPARSER_FILE} beside it"
-        return Similarity(), [hint] if "applied_transform" in shared else []
+        return _Similarity(), [hint] if "applied_transform" in shared else []
     source = CameraPlace(beside)
     parsed = source.members(read_json(beside), ("transform", "scale"))
     at = source.at("'transform'")
@@ -250,4 +241,4 @@ def _splat_world(place: CameraPlace, shared: Mapping[str, Any]) -> tuple[Similar
     turned = rotation @ at.rotation(applied[:3, :3]).T
     offset = matrix[:, 3] - turned @ applied[:3, 3]
     scale /= place.at("'applied_scale'").positive(shared.get("applied_scale", 1.0), "scale")
-    return Similarity(turned, offset, scale), [f"{DATAPARSER_FILE} applied"]
+    return _Similarity(turned, offset, scale), [f"{DATAPARSER_FILE} applied"]

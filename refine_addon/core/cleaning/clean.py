@@ -225,10 +225,6 @@ def clean(  # noqa: PLR0913 - as `pipeline.prune`
         See `refine_addon.core.work.Progress`.
     threads : int, optional
 
-    Returns
-    -------
-    Cleaned
-
     Raises
     ------
     RefineError

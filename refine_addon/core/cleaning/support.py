@@ -25,6 +25,8 @@ from ..seeing.cast import cast, depth_complexity, pixels
 from ..seeing.ray_sums import in_front
 
 if TYPE_CHECKING:
+    from typing import Self
+
     from numpy.typing import NDArray
 
     from ..seeing.projection import Footprints, Gaussians
@@ -62,14 +64,9 @@ _TINY = 1e-30  # replaces 0 as a divisor
 
 
 class Around(NamedTuple):
-    """What lies around r hits on their rays, as places among all hits, (r,) int64 each.
+    """What lies around r hits on their rays, as places among all hits.
 
-    Attributes
-    ----------
-    first, last : (r,) int64
-        The first hit that is near, and the one behind the last that is.
-    end : (r,) int64
-        The end of the ray.
+    Those from `first` up to `last` are near them, those from `last` up to `end` lie behind.
     """
 
     first: NDArray[np.int64]
@@ -137,11 +134,9 @@ def hits_of_view(
 
     Parameters
     ----------
-    gaussians : Gaussians
-    footprints : Footprints
-        Of these in the view.
-    scene : Scene
-    view : View
+    gaussians, footprints
+        The latter are those of the former in the view.
+    scene, view
     number : int
         Of the view: each has its rays in other pixels.
     absent : (M,) bool
@@ -200,14 +195,7 @@ def _depths(
     from its centre. That is the sum of ``(c.a / s^2) (d.a / s^2)`` over the footprint's axes a, of
     length s.
 
-    Parameters
-    ----------
-    gaussians, footprints : Gaussians, Footprints
-        The u that are hit.
-    scene, view
-    rays : Rays
-    reached : (h,) int64
-        Which of their hits.
+    `gaussians` and `footprints` are the u that are hit; `reached`, (h,), says which hits count.
     """
     means, covariances = (
         values.astype(np.float64) for values in projection.in_camera(gaussians, scene, view)
@@ -252,28 +240,38 @@ def own_support(hits: Hits) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 @dataclass(frozen=True, eq=False)
-class Support:
+class _Sums:
+    """Sums over views for M Gaussians; each attribute is an array, (M,) float64."""
+
+    @classmethod
+    def zero(cls, count: int) -> Self:
+        """Return the sums of no views, for `count` Gaussians."""
+        return cls(*np.zeros((len(fields(cls)), count)))
+
+    def merge(self, other: Self) -> None:
+        """Add the sums of other views."""
+        for item in fields(self):
+            getattr(self, item.name)[:] += getattr(other, item.name)
+
+
+@dataclass(frozen=True, eq=False)
+class Support(_Sums):
     """What views see of M Gaussians, all of them present.
 
     Attributes
     ----------
     weight, supported : (M,) float64
-        The light that each takes, and that times its support by others; sums over views.
+        The light that each takes, and that times its support by others.
     views : (M,) float64
         In how many views the centre lies.
     width : (M,) float64
-        The largest of `Hits.width`.
+        The largest of `Hits.width`, not a sum.
     """
 
     weight: NDArray[np.float64]
     supported: NDArray[np.float64]
     views: NDArray[np.float64]
     width: NDArray[np.float64]
-
-    @classmethod
-    def zero(cls, count: int) -> Support:
-        """Return what no views see."""
-        return cls(*np.zeros((4, count)))
 
     def add(self, footprints: Footprints, hits: Hits | None) -> None:
         """Add what one view sees."""
@@ -284,11 +282,11 @@ class Support:
             self.supported[hits.hit] += supported
             self.width[hits.hit] = np.maximum(self.width[hits.hit], hits.width)
 
-    def merge(self, other: Support) -> None:
+    def merge(self, other: Self) -> None:
         """Add what other views see."""
-        for name in ("weight", "supported", "views"):
-            getattr(self, name)[:] += getattr(other, name)
-        np.maximum(self.width, other.width, out=self.width)
+        width = np.maximum(self.width, other.width)
+        super().merge(other)
+        self.width[:] = width
 
     def shares(self) -> NDArray[np.float64]:
         """Return the share of its light that others support, (M,); 1 where no view sees it."""
@@ -297,8 +295,8 @@ class Support:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
-    """What views see of M Gaussians with all suspects gone; sums over views, for the suspects.
+class Evidence(_Sums):
+    """What views see of M Gaussians with all suspects gone; 0 but for the suspects.
 
     Attributes
     ----------
@@ -316,20 +314,10 @@ class Evidence:
     views: NDArray[np.float64]
     past: NDArray[np.float64]
 
-    @classmethod
-    def zero(cls, count: int) -> Evidence:
-        """Return the sums of no views."""
-        return cls(*np.zeros((5, count)))
-
     def add(self, hits: Hits, suspects: NDArray[np.bool_], colors: NDArray[np.float32]) -> None:
         """Add what one view sees.
 
-        Parameters
-        ----------
-        hits : Hits
-            With the suspects absent.
-        suspects : (M,) bool
-        colors : (M, 3) float32
+        The hits are those with the suspects, (M,) bool, absent; colours are (M, 3).
         """
         rows = np.flatnonzero(suspects[hits.hit].take(hits.owner))
         around = hits.around(rows)
@@ -348,11 +336,6 @@ class Evidence:
         self.views[hits.hit[sees]] += 1.0
         self.past[hits.hit[sees & (stops < PAST * (stops + passes))]] += 1.0
 
-    def merge(self, other: Evidence) -> None:
-        """Add the sums of other views."""
-        for item in fields(self):
-            getattr(self, item.name)[:] += getattr(other, item.name)
-
 
 def _contrast(
     hits: Hits,
@@ -361,18 +344,10 @@ def _contrast(
     behind: NDArray[np.float64],
     colors: NDArray[np.float32],
 ) -> NDArray[np.float64]:
-    """Return how much hits differ in colour from what lies behind them, (r,): root mean square.
+    """Return how much some hits differ in colour from what lies behind them, (r,).
 
-    Parameters
-    ----------
-    hits : Hits
-    rows : (r,) int64
-        Which of them.
-    around : Around
-        Of these.
-    behind : (r,) float64
-        Light that stops behind them.
-    colors : (M, 3) float32
+    It is the root mean square of the channels. `around` is theirs, and `behind`, (r,), the light
+    that stops behind them.
     """
     squared = np.zeros(len(rows))
     for channel in colors[hits.hit].T.astype(np.float64):

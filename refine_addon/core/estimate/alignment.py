@@ -1,4 +1,4 @@
-"""Whether cameras and splats can belong together, by how fine the pictures are; of a sample.
+"""Whether cameras and splats can belong together, by how fine the pictures of a sample are.
 
 Training made splats small where cameras looked at them, and left them large, or out, elsewhere. So
 pictures from where the capture was made are finer than from where it was not::
@@ -10,8 +10,8 @@ in pixels. Where nothing is, and where a splat fills the picture, it is 0. No th
 hold for all scenes. But if the pictures become much finer once all cameras are turned a quarter
 about x, cameras and splats came from files of which only one was turned upright.
 
-From far away all is fine. A view that sees many splats, all of them in a small part of its picture,
-is told by where the splats lie in it.
+From far away every picture is fine. So a distant view is found by where its splats lie: all of them
+in a small part of its picture.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ if TYPE_CHECKING:
     from ..views import View, ViewSet
 
 SAMPLE = 4096
-"""About so many splats stand for all, each as much larger as it stands for others."""
+"""About so many splats are a sample of all; each is enlarged to the area of those it stands for."""
 
 POINTS = 512
-"""Of about so many splats it is told where in the pictures they lie."""
+"""Distant views are found by where about so many splats lie in the pictures."""
 
 VIEWS = 12
 """So many views at most are turned."""
@@ -50,7 +50,7 @@ RAYS = 1024
 """How many rays all of them together have."""
 
 FINE = 0.015
-"""Standard deviation of a splat that is half as fine as one of no size, as a share of the image."""
+"""Standard deviation at which a splat is half as fine as a point, as a share of the image."""
 
 BETTER = 1.5
 """By which factor turned cameras must see finer pictures."""
@@ -63,15 +63,15 @@ ONE_WAY = 0.95
 them shows another part of the scene, and its fineness tells nothing."""
 
 WHOLE = 0.8
-"""Share of the splats that are in the picture, on average, from which on views are not judged: they
-look at all of it from outside, and turned they do so too."""
+"""Share of the splats that are in the picture, on average, from which on the turn is not measured:
+the views see all of the scene from outside, and would after a turn."""
 
 FEW = 8
-"""Of fewer splats of the sample in a picture it is not told how far away they are."""
+"""A view with fewer splats of the sample is never called distant."""
 
 SMALL = 0.02
-"""Share of a picture's width and of its height that the splats in it fill, but for a tenth of them
-to each side, below which they are far away."""
+"""A view is distant if its splats, but for a tenth of them to each side, fill less than this share
+of its picture's width and of its height."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class Alignment:
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any] | None) -> Alignment:
-        """Return what `facts` were made of; of what is none, that nothing is known."""
+        """Return the alignment that `facts` describe; of malformed ones, that nothing is known."""
         try:
             stored = facts or {}
             turn, known = int(stored.get("turn", 0)), bool(stored.get("known", False))
@@ -231,14 +231,7 @@ def _fineness(
 ) -> tuple[float, ...]:
     """Return the fineness of the pictures of views, turned by each of `QUARTERS`.
 
-    Parameters
-    ----------
-    splats : Splats
-    rows : (n,) int64
-        Those that stand for all.
-    views : ViewSet
-    progress : callable
-    threads : int, optional
+    Of the splats, `rows`, (n,), stand for all.
     """
     stand_for = len(splats) / len(rows)
     sample = splats.take(rows)
@@ -270,17 +263,9 @@ def _fineness_of(
     columns_and_rows: tuple[NDArray[np.int64], NDArray[np.int64]],
     stand_for: float,
 ) -> float:
-    """Return the fineness of one picture.
+    """Return the fineness of one picture, through the pixels in (C,) columns and (R,) rows.
 
-    Parameters
-    ----------
-    gaussians : Gaussians
-        Each stands for `stand_for` splats, and its footprint is as much larger.
-    scene : Scene
-    view : View
-    columns_and_rows : tuple of (C,) and (R,) int64
-        Of the pixels that the rays go through.
-    stand_for : float
+    Each Gaussian stands for `stand_for` splats, and its footprint is as much larger.
     """
     with np.errstate(under="ignore"):
         footprints = projection.project(gaussians, scene, view)

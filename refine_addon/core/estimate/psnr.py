@@ -120,7 +120,7 @@ def psnr_by_views(
     *,
     threads: int | None = None,
 ) -> NDArray[np.float64] | None:
-    """Return the PSNR that some views tell, (L,), dB; None if their rays see too little.
+    """Return the mean PSNR in some views, (L,), dB; None if their rays see too little.
 
     Parameters
     ----------
@@ -212,15 +212,10 @@ def mean_psnr(
 
 
 def _removing(sample: RaySample, place: NDArray[np.int64], counts: Sequence[int]) -> Compare:
-    """Return what compares a view with its picture after each of L removals: L values in dB.
+    """Return a function that gives the PSNR of one view after each of L removals, dB.
 
-    Parameters
-    ----------
-    sample : RaySample
-    place : (M,) int64
-        Of each of the Gaussians in the order of removal.
-    counts : sequence of int
-        Ascending: Gaussians whose place is lower are removed.
+    `place`, (M,), is that of each of the Gaussians in the order of removal: those whose place is
+    below one of the ascending `counts` are removed.
     """
 
     def compare(number: int, rays: Rays) -> list[float]:
@@ -236,7 +231,7 @@ def _removing(sample: RaySample, place: NDArray[np.int64], counts: Sequence[int]
 
 
 def _gaining(sample: RaySample, place: NDArray[np.int64], counts: Sequence[int]) -> Compare:
-    """Return what tells by how much the PSNR is higher if kept splats stand in for removed ones.
+    """Return a function that gives by how much the PSNR is higher if kept splats stand in.
 
     See `Rays.colors_by_nearest_kept`; parameters as `_removing`.
     """
@@ -305,8 +300,8 @@ def psnr_of(colors: NDArray[np.float64], truth: NDArray[np.float64], view: View)
     """Return the PSNR of a view, dB, given the colours of its rays with other and all splats.
 
     The logarithm of a mean over few rays is too low on average: by half the square of the mean's
-    relative error, to second order, which is put right. How much rays differ by chance, and not
-    from one part of the picture to the other, is told by neighbours.
+    relative error, to second order. This is corrected. The variance is that between neighbouring
+    rays, so that differences between parts of the picture do not count as chance.
 
     Parameters
     ----------

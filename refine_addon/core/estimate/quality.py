@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PSNR_CAP = 100.0
-"""What equal pictures count as, dB, and the most that any estimate says."""
+"""PSNR of equal pictures, dB, and the highest that an estimate may be."""
 
 SHARES = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
 """Shares of the splats removed at which the estimate is made; between them it is interpolated."""
@@ -31,7 +31,7 @@ GAIN = (3.0, 4.5, 4.5, 4.3), (0.5, 0.55, 0.7, 0.85)
 standing in gains on rays."""
 
 FULL_GAIN = 40_000
-"""So many splats have, and more, gain that much."""
+"""Scenes of at least so many splats gain that much."""
 
 FEWER = 0.2, 0.4, 0.8, 1.3
 """By how much less fewer splats gain at those shares, dB for each halving: they have fewer
@@ -62,7 +62,7 @@ class Quality:
     absorbed : (L,) float64
         About what absorbing reaches with as many survivors; dB, never rising.
     foretold : bool
-        Whether that is near enough to be told to anybody.
+        Whether `absorbed` is accurate enough to be shown.
     views : dict of str to (L,) float64
         As `psnr`, of single views by their names; those that no ray tells of are missing.
 
@@ -140,7 +140,7 @@ class Quality:
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, Any] | None) -> Quality | None:
-        """Return the curve that `facts` made; None of what is none."""
+        """Return the curve that `facts` describe; None if they are malformed."""
         names = ("shares", "psnr", "absorbed")
         try:
             shares, psnr, absorbed = (np.array((facts or {})[name], np.float64) for name in names)

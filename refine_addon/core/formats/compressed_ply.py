@@ -57,7 +57,7 @@ _PLACES = ((21, 0x7FF), (11, 0x3FF), (0, 0x7FF))
 """Of x, y and z in 32 bits: how far to shift, and the largest code."""
 
 _CHANNELS = ((24, 0xFF), (16, 0xFF), (8, 0xFF), (0, 0xFF))
-"""Of red, green, blue and opacity, likewise."""
+"""Of red, green, blue and opacity: how far to shift, and the largest code."""
 
 _TURNS = ((20, 0x3FF), (10, 0x3FF), (0, 0x3FF))
 """Of the three smaller components of a rotation; the two bits above say which is the largest."""
@@ -121,14 +121,14 @@ def _chunks_of(piece: slice) -> slice:
 
 
 def _elements(header: Header, body: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
-    """Return the rows of every element by its name; those of lists are refused."""
+    """Return the rows of every element by its name; elements with lists are refused."""
     elements, at = {}, 0
     for element, count in zip(header.elements, header.counts, strict=True):
         if any(isinstance(prop, plyfile.PlyListProperty) for prop in element.properties):
             msg = f"{header.path}: element {shown(element.name)} has a list, expected numbers"
             raise RefineError(msg)
         kind = np.dtype(element.dtype(header.order))
-        # There are as many bytes: without lists, `check_counts` counts them all.
+        # All these bytes are there: without lists, the size that `check_counts` tests is exact.
         end = at + count * kind.itemsize
         elements[element.name] = body[at:end].view(kind) if count else np.empty(0, kind)
         at = end
@@ -193,7 +193,7 @@ def _packed(shares: NDArray[Any], fields: tuple[tuple[int, int], ...]) -> NDArra
 def _between(
     values: NDArray[Any], chunks: NDArray[Any], names: tuple[str, ...]
 ) -> NDArray[np.float64]:
-    """Return vectors (n, 3) from their packed places between the ends of their chunks' ranges."""
+    """Return vectors (n, 3) from packed fractions of the ranges of their chunks."""
     return _lerp(_unpacked(values, _PLACES), chunks, names)
 
 
@@ -235,7 +235,7 @@ _REST = np.concatenate([[0.0], (np.arange(1, 255) + 0.5) / 256.0, [1.0]]) * REST
 
 
 def write(stream: BinaryIO, splats: Splats) -> None:
-    """Write splats as a compressed PLY, near ones together."""
+    """Write splats as a compressed PLY, sorted so that neighbours in space share a chunk."""
     count, rest = len(splats), 3 * splats.sh_rest.shape[1]
     order = near_ones_together(splats.means)
     stream.write(_header(count, rest))
@@ -270,7 +270,7 @@ def _harmonic_codes(sh_rest: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def _places(values: NDArray[Any], ranges: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return where values (n, 3) lie in the ranges of their chunks, 0..1; set `ranges` (C, 6)."""
+    """Return values (n, 3) as fractions of the ranges of their chunks; set `ranges` (C, 6)."""
     # Rounded once: of ends in float32, all values in between are in between.
     with np.errstate(under="ignore"):
         values = np.asarray(values, np.float32)

@@ -1,7 +1,7 @@
 """``.splat`` files: 32 bytes a splat and nothing else, as antimatter15/splat introduced them.
 
 Mean and linear scale are float32, colour, opacity and rotation 8 bits each. The files have no
-signature, so that their name alone tells.
+signature and are known by their name alone.
 """
 
 from __future__ import annotations
@@ -30,8 +30,7 @@ _ROW = np.dtype(
 )
 """Of one splat: colour is red, green, blue and opacity, rotation is w x y z."""
 
-_NO_TURN = 128.0
-"""Code of 0 in a rotation, and the step from 0 to 1."""
+_NO_TURN = 128.0  # code of 0 in a rotation, and the step from 0 to 1
 
 
 def matches(path: Path, head: bytes) -> bool:

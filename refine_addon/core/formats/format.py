@@ -127,7 +127,7 @@ def split_largest(q: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.
     largest : (N,) intp
         Which component is left out: the first of the largest.
     others : (N, 3) float64
-        The others in their order, with the sign that makes the largest positive.
+        The other three in their order, negated where the largest is negative.
     """
     largest = np.abs(q).argmax(axis=1)
     others = np.take_along_axis(q, _OTHERS[largest], axis=1)
@@ -149,7 +149,7 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def near_ones_together(means: NDArray[Any]) -> NDArray[np.int64]:
-    """Return an order of finite positions (N, 3) in which near ones are near, (N,)."""
+    """Return an order of finite positions (N, 3), (N,), in which neighbours in space follow."""
     sample = np.asarray(means[:: max(len(means) // _SAMPLE, 1)], np.float64)
     middle = np.median(sample, axis=0)
     size = float(np.median(np.abs(sample - middle))) or 1.0

@@ -93,10 +93,7 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
 def _shown(document: Document, most: int) -> list[_Mesh]:
     """Return the meshes with splats that the nodes of a scene show, and by which nodes.
 
-    Raises
-    ------
-    RefineError
-        If the nodes show more splats than `most`: one mesh may be shown by many of them.
+    Raise `RefineError` if they show more splats than `most`: one mesh may be shown by many of them.
     """
     meshes: dict[int, _Mesh] = {}
     count = 0
@@ -174,45 +171,19 @@ def _refuse_unread(extension: Any, place: Place) -> None:  # noqa: ANN401 - from
 
 @dataclass(frozen=True)
 class _Node:
-    """A node that shows a mesh.
+    """A node that shows a mesh."""
 
-    Attributes
-    ----------
-    start : int
-        Where its splats begin among those of the file.
-    place : Place
-    matrix : (4, 4) float64
-        From the frame of the mesh to that of the scene.
-    """
-
-    start: int
+    start: int  # row of the file's splats at which those of this node begin
     place: Place
-    matrix: NDArray[np.float64]
+    matrix: NDArray[np.float64]  # (4, 4), from the frame of the mesh to that of the scene
 
 
 class _Mesh:
-    """The splats of a mesh.
-
-    Parameters
-    ----------
-    document : Document
-    index : int
-        Of the mesh.
-    place : Place
-        Of the node that shows it first.
-
-    Attributes
-    ----------
-    parts : list of _Part
-        Its primitives of splats.
-    nodes : list of _Node
-        Those that show it, in the order of their splats; none if it has no splats.
-    degree : int
-        Highest of the harmonics.
-    """
+    """The splats of a mesh; `place` is that of the node that shows it first."""
 
     def __init__(self, document: Document, index: int, place: Place) -> None:
-        self.parts: list[_Part] = []
+        self.parts: list[_Part] = []  # its primitives of splats
+        # The nodes that show it, in the order of their splats; empty if it has no splats.
         self.nodes: list[_Node] = []
         mesh, place = document.item("meshes", index, place)
         for number, item in enumerate(_listed(mesh, "primitives", place)):
@@ -229,7 +200,7 @@ class _Mesh:
         return self._count
 
     def fill(self, splats: Splats) -> None:
-        """Set the values of all splats that its nodes show; `splats` are those of the file."""
+        """Set the values of all splats that its nodes show, among all `splats` of the file."""
         if not self.nodes:
             return
         first, *others = (splats.take(slice(n.start, n.start + len(self))) for n in self.nodes)
@@ -238,7 +209,7 @@ class _Mesh:
             for part in self.parts:
                 part.fill(first.take(slice(at, at + len(part))))
                 at += len(part)
-            # The first node's splats last, since the others are made of them as they stand.
+            # The first node last: the splats of the others are computed from its untouched ones.
             for node, target in reversed([*zip(self.nodes, (first, *others), strict=True)]):
                 for piece in pieces(len(self)):
                     shown_there = self._moved(first.take(piece), node)
@@ -256,14 +227,7 @@ class _Mesh:
 
 
 class _Part:
-    """The splats of one primitive.
-
-    Parameters
-    ----------
-    document : Document
-    primitive : dict
-    place : Place
-    """
+    """The splats of one primitive."""
 
     def __init__(self, document: Document, primitive: dict[str, Any], place: Place) -> None:
         self._document, self._place = document, place.at("attributes")
@@ -284,7 +248,7 @@ class _Part:
         return self._count
 
     def _values(self, name: str, width: int) -> Callable[[slice], NDArray[Any]]:
-        """Return a function that returns some of the values of an attribute, (n, width)."""
+        """Return a function that returns a slice of the values of an attribute, (n, width)."""
         if name not in self._attributes:
             self._place.fail(f"no {name}")
         index, place = self._attributes[name], self._place.at(name)
@@ -299,7 +263,7 @@ class _Part:
         return lambda piece: values[piece]
 
     def fill(self, splats: Splats) -> None:
-        """Set the values of as many splats, in the frame of the file; absent harmonics are 0."""
+        """Set the values of `splats`, one for each of these; harmonics that are absent are 0."""
         for piece in pieces(len(splats)):
             target = splats.take(piece)
             target.means[:] = self._means(piece)
@@ -345,21 +309,12 @@ def _harmonics(degree: int) -> list[str]:
 
 @dataclass(frozen=True)
 class _Attribute:
-    """An attribute as it is written.
-
-    Attributes
-    ----------
-    name : str
-    width, kind : int
-        Numbers of one splat, and their component type.
-    values : callable
-        Returns them, (n, width), of some splats that were turned.
-    """
+    """An attribute as it is written."""
 
     name: str
-    width: int
-    kind: int
-    values: Callable[[Splats], NDArray[Any]]
+    width: int  # numbers of one splat
+    kind: int  # their component type
+    values: Callable[[Splats], NDArray[Any]]  # (n, width), for splats in the frame of glTF
 
     @property
     def row(self) -> int:
@@ -429,7 +384,7 @@ def write(stream: BinaryIO, splats: Splats) -> None:
 
 
 def _json(attributes: list[_Attribute], count: int, low: list[float], high: list[float]) -> bytes:
-    """Return the JSON of a file, as many spaces behind it as its length in fours needs."""
+    """Return the JSON of a file, padded with spaces to a multiple of 4 bytes."""
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
     at = 0

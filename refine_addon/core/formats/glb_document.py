@@ -81,8 +81,8 @@ class Document:
         end = offset + stride * (count - 1) + size if count else 0
         if stride < size or end > length or start + length > len(self.binary):
             place.fail(
-                f"{count} values of {size} bytes from byte {offset} of {length}, which begin at "
-                f"byte {start} of {len(self.binary)}: expected as many"
+                f"{count} values of {size} bytes from byte {offset} of a view of {length} bytes "
+                f"at byte {start} of {len(self.binary)}, expected that they fit"
             )
         return np.ndarray(
             (count, width), dtype, self.binary.data, start + offset, (stride, dtype.itemsize)

@@ -1,4 +1,4 @@
-"""Lossless WebP images in and out, by whoever can: Blender's own library, or Pillow.
+"""Lossless WebP images, read and written by Blender's own library or by Pillow.
 
 Core has no codec of its own. `use` names one, as the extension does in Blender; without, Pillow is
 imported when an image is read or written.

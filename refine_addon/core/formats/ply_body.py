@@ -60,7 +60,7 @@ def _least_bytes(element: Any, *, text: bool) -> int:  # noqa: ANN401 - plyfile 
 
 
 def has_lists(element: Any) -> bool:  # noqa: ANN401 - plyfile has no types
-    """Return whether the rows of an element have lists, and so lengths of their own."""
+    """Return whether an element has lists, so that its rows differ in length."""
     return any(isinstance(prop, plyfile.PlyListProperty) for prop in element.properties)
 
 

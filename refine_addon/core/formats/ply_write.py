@@ -56,15 +56,9 @@ def write_rows(
 def _with_cells(
     chunk: NDArray[Any], dtype: np.dtype[Any], cells: Mapping[str, NDArray[Any]]
 ) -> NDArray[np.uint8]:
-    """Return rows as bytes, (n, bytes of a row), with some properties set and others appended.
+    """Return n rows as bytes, (n, bytes of a row), with some properties set and others appended.
 
-    Parameters
-    ----------
-    chunk : (n,) void
-    dtype : structured
-        Of a row.
-    cells : mapping of str to (n,)
-        Values of the properties.
+    `dtype` is that of a row; `cells` are values of the properties by name, (n,) each.
     """
     size, fields = dtype.itemsize, dict(dtype.fields or {})
     kinds = {name: _stored(dtype, name, values.dtype) for name, values in cells.items()}

@@ -45,8 +45,7 @@ _LONGEST_FIRST = sorted(SUFFIXES, key=len, reverse=True)
 NOT_WRITTEN = (".ksplat", ".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
 """Endings of other splat formats and of compressed files: a PLY of such a name would mislead."""
 
-_HEAD = 1 << 16
-"""Bytes by which a format is known; the header of a compressed PLY has fewer."""
+_HEAD = 1 << 16  # bytes by which a format is known; the header of a compressed PLY has fewer
 
 
 def read_splats(path: Path | str) -> SplatFile:
@@ -181,11 +180,6 @@ class Packed:
     """The splats of a file as another format than plain PLY holds them.
 
     It has what `SplatFile` has for writing.
-
-    Attributes
-    ----------
-    file : SplatFile
-    form : Format
     """
 
     file: SplatFile

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RefineError
-from ..foreign_files import foreign_kind
+from ..foreign_files import is_sog
 from ..place import Place, described
 from ..splats import above_constant, opacity, opacity_logits, unit_quaternions
 from .format import (
@@ -46,32 +46,20 @@ NAME = "SOG"
 _VERSION = 2
 _DEGREES = 3
 
-_ACROSS = 64
-"""Entries of the palette in a row of its image."""
-
-_LABEL_BITS = 16
-"""Of the number of an entry of the palette: two channels of an image."""
-
-_TABLE = 256
-"""Values of a table, whose places are a byte."""
-
-_COORDINATE = 65535.0
-"""Largest code of a coordinate: two bytes, in two images."""
-
-_ROTATIONS = 252
-"""In the alpha of a rotation: this, and which component is the largest."""
-
-_NO_SIZE = -20.0
-"""Log scale written for anything smaller, since tables hold finite numbers."""
+_ACROSS = 64  # entries of the palette in a row of its image
+_LABEL_BITS = 16  # of the number of an entry of the palette: two channels of an image
+_TABLE = 256  # values of a table, whose places are a byte
+_COORDINATE = 65535.0  # largest code of a coordinate: two bytes, in two images
+_ROTATIONS = 252  # in the alpha of a rotation: this, and which component is the largest
+_NO_SIZE = -20.0  # log scale written for anything smaller, since tables hold finite numbers
 
 _META_LIMIT = 1 << 20
 """Bytes of the longest ``meta.json`` that is read; with four tables it has some 20,000."""
 
-_MOST_PIXELS = 16383
-"""Of a side of a WebP image."""
+_MOST_PIXELS = 16383  # of a side of a WebP image
 
 _SPARE_PIXELS = 1 << 16
-"""An image may have so many pixels more than four times those needed, as images are padded."""
+"""An image has at most four times the pixels that are needed, and these: writers pad images."""
 
 _BROKEN = (
     zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, ValueError,
@@ -82,7 +70,7 @@ _BROKEN = (
 
 def matches(path: Path, head: bytes) -> bool:
     """Return whether a file is one: an archive that lists images and ``meta.json``."""
-    return foreign_kind(path, head).startswith("a SOG file")
+    return is_sog(path, head)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,17 +94,14 @@ class _Bundle:
         section, place = self.section(name)
         return np.array(place.at(key).numbers(section.get(key), count))
 
-    def pixels(self, name: str, index: int, count: int, width: int = 0) -> NDArray[np.uint8]:
-        """Return an image of at least `count` pixels, (height, width, 4).
+    def table(self, name: str) -> NDArray[np.float64]:
+        """Return the values that the pixels of an attribute are places of, (256,)."""
+        return self.numbers(name, "codebook", _TABLE)
 
-        Parameters
-        ----------
-        name, index
-            Which of the files of an attribute.
-        count : int
-            How many are needed; far more are refused.
-        width : int
-            What the width must be; 0 for any.
+    def pixels(self, name: str, index: int, count: int, width: int = 0) -> NDArray[np.uint8]:
+        """Return an image of at least `count` pixels, (height, width, 4): a file of an attribute.
+
+        Far more pixels are refused, and so is another width than `width`, unless that is 0.
         """
         section, place = self.section(name)
         files = place.at("files").items(section.get("files"))
@@ -198,47 +183,51 @@ def _bundle(path: Path, archive: zipfile.ZipFile, size: int) -> _Bundle:
 
 def _splats(bundle: _Bundle, count: int) -> SplatFile:
     """Return the splats of an archive."""
-    low, high = (bundle.numbers("means", key, 3) for key in ("mins", "maxs"))
-    lower, upper = bundle.rows("means", 0, count), bundle.rows("means", 1, count)
-    turns = bundle.rows("quats", 0, count)
-    scales, scale_table = bundle.rows("scales", 0, count), bundle.numbers("scales", *_CODEBOOK)
-    colors, color_table = bundle.rows("sh0", 0, count), bundle.numbers("sh0", *_CODEBOOK)
-    _check_rotations(bundle, turns)
     palette, labels = _palette(bundle, count)
     degree = math.isqrt(palette.shape[1] + 1) - 1
-    path = bundle.place.path
-    file, splats = new_file(path, Origin(f"{NAME} version 2", bundle.size), count, degree)
+    origin = Origin(f"{NAME} version 2", bundle.size)
+    file, splats = new_file(bundle.place.path, origin, count, degree)
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in meta.json
+        _fill_means(bundle, splats)
+        _fill_rotations(bundle, splats)
+        _fill_from_tables(bundle, splats)
         for piece in pieces(count):
-            code = lower[piece, :3] + upper[piece, :3] * 256.0
-            logs = low + (high - low) * (code / _COORDINATE)
-            splats.means[piece] = np.sign(logs) * np.expm1(np.abs(logs))
-            splats.quaternions[piece] = _quaternions(turns[piece])
-            splats.log_scales[piece] = scale_table[scales[piece, :3]]
-            splats.sh_dc[piece] = color_table[colors[piece, :3]]
-            splats.opacity_logits[piece] = opacity_logits(colors[piece, 3] / 255.0)
             splats.sh_rest[piece] = palette[labels[piece]]
     return file
 
 
-_CODEBOOK = ("codebook", _TABLE)
-"""In ``meta.json``: the key of a table, and how many numbers it has."""
+def _fill_means(bundle: _Bundle, splats: Splats) -> None:
+    low, high = (bundle.numbers("means", key, 3) for key in ("mins", "maxs"))
+    lower, upper = (bundle.rows("means", index, len(splats)) for index in (0, 1))
+    for piece in pieces(len(splats)):
+        code = lower[piece, :3] + upper[piece, :3] * 256.0
+        logs = low + (high - low) * (code / _COORDINATE)
+        splats.means[piece] = np.sign(logs) * np.expm1(np.abs(logs))
 
 
-def _check_rotations(bundle: _Bundle, turns: NDArray[np.uint8]) -> None:
-    """Refuse pixels of rotations that do not say which component is the largest."""
-    wrong = turns[:, 3] < _ROTATIONS
+def _fill_rotations(bundle: _Bundle, splats: Splats) -> None:
+    """Set quaternions from pixels; see `_rotation_pixels`."""
+    pixels = bundle.rows("quats", 0, len(splats))
+    wrong = pixels[:, 3] < _ROTATIONS
     if wrong.any():
         index = int(np.argmax(wrong))
         Place(bundle.place.path, f"rotation of splat {index}").fail(
-            f"alpha {turns[index, 3]}, expected {_ROTATIONS} to 255"
+            f"alpha {pixels[index, 3]}, expected {_ROTATIONS} to 255"
         )
+    for piece in pieces(len(splats)):
+        others = (pixels[piece, :3] / 127.5 - 1.0) / math.sqrt(2.0)
+        largest = (pixels[piece, 3] - _ROTATIONS).astype(np.intp)
+        splats.quaternions[piece] = join_largest(largest, others)
 
 
-def _quaternions(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return quaternions w x y z, (n, 4), of pixels; see `_rotation_pixels`."""
-    others = (pixels[:, :3] / 127.5 - 1.0) / math.sqrt(2.0)
-    return join_largest((pixels[:, 3] - _ROTATIONS).astype(np.intp), others)
+def _fill_from_tables(bundle: _Bundle, splats: Splats) -> None:
+    """Set scales, colours and, from the alpha of the colours' image, opacities."""
+    scales, scale_table = bundle.rows("scales", 0, len(splats)), bundle.table("scales")
+    colors, color_table = bundle.rows("sh0", 0, len(splats)), bundle.table("sh0")
+    for piece in pieces(len(splats)):
+        splats.log_scales[piece] = scale_table[scales[piece, :3]]
+        splats.sh_dc[piece] = color_table[colors[piece, :3]]
+        splats.opacity_logits[piece] = opacity_logits(colors[piece, 3] / 255.0)
 
 
 def _palette(bundle: _Bundle, count: int) -> tuple[NDArray[np.float32], NDArray[np.intp]]:
@@ -248,7 +237,7 @@ def _palette(bundle: _Bundle, count: int) -> tuple[NDArray[np.float32], NDArray[
     held, place = bundle.section("shN")
     bands = place.at("bands").whole(held.get("bands"), 1, _DEGREES)
     entries = place.at("count").whole(held.get("count"), 1, 1 << _LABEL_BITS)
-    table = bundle.numbers("shN", *_CODEBOOK)
+    table = bundle.table("shN")
     coefficients = above_constant(bands)
     width, height = _ACROSS * coefficients, -(-entries // _ACROSS)
     image = bundle.pixels("shN", 0, width * height, width)
@@ -265,7 +254,7 @@ def _palette(bundle: _Bundle, count: int) -> tuple[NDArray[np.float32], NDArray[
 
 
 def write(stream: BinaryIO, splats: Splats) -> None:
-    """Write splats as a SOG file, near ones together.
+    """Write splats as a SOG file, sorted so that neighbours in space are neighbours in images.
 
     Raises
     ------
@@ -312,7 +301,7 @@ def write(stream: BinaryIO, splats: Splats) -> None:
 
 
 def _image_size(count: int) -> tuple[int, int]:
-    """Return height and width of images of so many pixels: about a square, the width in fours."""
+    """Return height and width of images for `count` pixels: nearly square, width divisible by 4."""
     width = 4 * (-(-math.isqrt(max(count - 1, 0)) // 4) + 1)
     if width > _MOST_PIXELS:
         msg = f"{count} splats: {NAME} holds {(_MOST_PIXELS // 4 * 4) ** 2}"
@@ -323,12 +312,7 @@ def _image_size(count: int) -> tuple[int, int]:
 def _image(size: tuple[int, int], values: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return an image (height, width, 4) of a pixel for each splat, opaque where nothing is said.
 
-    Parameters
-    ----------
-    size : tuple of int
-        Height and width.
-    values : (N, C) uint8
-        The first C channels of each pixel.
+    `values`, (N, C) uint8, are the first C channels of each pixel.
     """
     image = np.zeros((*size, 4), np.uint8)
     image[..., 3] = 255
@@ -339,13 +323,9 @@ def _image(size: tuple[int, int], values: NDArray[np.uint8]) -> NDArray[np.uint8
 def _coordinates(
     means: NDArray[Any],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint8], NDArray[np.uint8]]:
-    """Return the range of the logarithms of positions (N, 3), and their places in it.
+    """Return the range of the logarithms of positions (N, 3), and their codes within it.
 
-    Returns
-    -------
-    low, high : (3,) float64
-    lower, upper : (N, 3) uint8
-        The two bytes of the places.
+    The range is two (3,) float64, the codes are two (N, 3) uint8: their lower and upper bytes.
     """
     means = np.asarray(means, np.float64)
     logs = np.sign(means) * np.log1p(np.abs(means))
@@ -384,21 +364,21 @@ def _grouped_harmonics(
 def _tabulated(values: NDArray[Any]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return a table of 256 values and the place of the nearest for each of `values`.
 
-    Half of the table are even steps from the least to the largest, so that no value is off by more
-    than half of one; the other half are where the values are, as many between any two.
+    Half of the table are equal steps from the least to the largest value, so that no value is off
+    by more than half a step; the other half are quantiles of the values.
     """
     flat = np.sort(values, axis=None)
     half = _TABLE // 2
-    spots = np.linspace(0.0, 1.0, half)
-    even = flat[0] + (float(flat[-1]) - float(flat[0])) * spots
-    often = flat[np.rint(spots * (len(flat) - 1)).astype(np.intp)]
-    table = np.sort(np.concatenate([even, often])).astype(np.float32)
+    shares = np.linspace(0.0, 1.0, half)
+    even = flat[0] + (float(flat[-1]) - float(flat[0])) * shares
+    quantiles = flat[np.rint(shares * (len(flat) - 1)).astype(np.intp)]
+    table = np.sort(np.concatenate([even, quantiles])).astype(np.float32)
     bounds = (table[1:].astype(np.float64) + table[:-1]) / 2.0
     return table, np.searchsorted(bounds, values).astype(np.uint8)
 
 
 def _grouped(rows: NDArray[Any]) -> NDArray[np.int64]:
-    """Return a group for each of N rows (N, D), near ones in one; groups are numbered from 0.
+    """Return a group for each of N rows (N, D): similar rows share one. Numbers start at 0.
 
     All rows are one group first; every group is halved at its mean along the axis in which it
     varies most, again and again, until there are 65,536 or as many as half of the rows.

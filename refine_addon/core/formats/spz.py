@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RefineError
-from ..foreign_files import GZIP, unpacked_beginning
+from ..foreign_files import GZIP, SPZ, is_spz
 from ..splats import above_constant, opacity, opacity_logits, unit_quaternions
 from .format import Format, codes, join_largest, new_file, pieces, refuse_short, split_largest
 from .ply import Origin, SplatFile
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from ..splats import Splats
 
 NAME = "SPZ"
-MAGIC = b"NGSP"
 
 _HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, splats, degree, fractional bits, flags; then 0, or in version 4 how many streams
@@ -40,8 +39,7 @@ there are."""
 _TABLE_AT = struct.Struct("<I12x")
 """Behind the header in version 4: the byte at which the table of streams begins."""
 
-_STREAM = struct.Struct("<QQ")
-"""In that table: bytes of a stream, and of what is in it."""
+_STREAM = struct.Struct("<QQ")  # in that table: bytes of a stream, and of what is in it
 
 _VERSIONS = (2, 3, 4)
 _ONE_TURN, _ZSTD = 2, 4  # versions: rotations without the smallest three, streams by zstd
@@ -52,15 +50,16 @@ _SCALE_STEPS, _LOWEST_SCALE = 16.0, -10.0
 _BUCKETS = (8, 16)
 """Harmonics are rounded to multiples of these, in 1/128: of degree 1, and of all others."""
 
-_LARGEST_CODE = (1 << 23) - 1
-"""Of a position: of its 24 bits, one is the sign."""
+_USUAL_FRACTION, _LEAST_STEPS = 12, 18
+"""Bits of a position behind the point in most files, and of the largest coordinate at least."""
+
+_LARGEST_CODE = (1 << 23) - 1  # of a position: of its 24 bits, one is the sign
 
 _INFLATION = 1032
 """A file holds no more than this many times its bytes: gzip makes nothing smaller. Zstd does, but
 not of splats that differ."""
 
-_PIECE = 1 << 20
-"""Bytes that a zstd stream is unpacked to at a time."""
+_PIECE = 1 << 20  # bytes that a zstd stream is unpacked to at a time
 
 _STEP = 1 << 12
 """Bytes of a gzip stream that are unpacked at a time where what they hold is not used."""
@@ -89,9 +88,7 @@ def matches(path: Path, head: bytes) -> bool:
 
     A gzip stream of its name is one that may be damaged at its beginning.
     """
-    if head.startswith(MAGIC) or unpacked_beginning(head).startswith(MAGIC):
-        return True
-    return path.suffix.lower() == FORMAT.suffix and head.startswith(GZIP)
+    return is_spz(head) or (path.suffix.lower() == FORMAT.suffix and head.startswith(GZIP))
 
 
 def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
@@ -103,7 +100,7 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         If it is truncated or damaged, of another version, or of version 4 and there is no module
         for zstd.
     """
-    packed = not data[: len(MAGIC)].tobytes().startswith(MAGIC)
+    packed = not data[: len(SPZ)].tobytes().startswith(SPZ)
     if packed:
         header, blocks = _unpacked(path, data)
     else:
@@ -130,8 +127,8 @@ def _parsed(path: Path, head: bytes) -> _Header:
     """Return what the first bytes say, or refuse them."""
     refuse_short(path, _HEADER.size, len(head), "the first bytes of an SPZ file")
     magic, version, count, degree, fraction, _, streams = _HEADER.unpack(head)
-    if magic != MAGIC:
-        msg = f"{path}: no SPZ file: its gzip stream begins with {magic!r}, expected {MAGIC!r}"
+    if magic != SPZ:
+        msg = f"{path}: no SPZ file: its gzip stream begins with {magic!r}, expected {SPZ!r}"
         raise RefineError(msg)
     if version not in _VERSIONS:
         msg = f"{path}: SPZ version {version}, expected {', '.join(map(str, _VERSIONS))}"
@@ -146,7 +143,7 @@ def _parsed(path: Path, head: bytes) -> _Header:
 
 
 def _refuse_many(path: Path, header: _Header, size: int) -> None:
-    """Raise `RefineError` if a file of `size` bytes cannot hold as many splats as it announces."""
+    """Raise `RefineError` if a file of `size` bytes cannot hold the splats that it announces."""
     needed, most = sum(header.blocks().values()), _INFLATION * size
     if needed > most:
         msg = (
@@ -331,7 +328,7 @@ def write(stream: BinaryIO, splats: Splats) -> None:
         if rest:
             blocks["rest"][piece] = _harmonic_codes(batch.sh_rest).reshape(-1, rest)
     engine = zlib.compressobj(wbits=16 + zlib.MAX_WBITS)
-    stream.write(engine.compress(_HEADER.pack(MAGIC, 3, count, header.degree, fraction, 0, 0)))
+    stream.write(engine.compress(_HEADER.pack(SPZ, 3, count, header.degree, fraction, 0, 0)))
     stream.writelines(engine.compress(block.data) for block in blocks.values())
     stream.write(engine.flush())
 
@@ -339,8 +336,8 @@ def write(stream: BinaryIO, splats: Splats) -> None:
 def _fraction(splats: Splats) -> int:
     """Return how many bits a position has behind the point.
 
-    12, as other writers have it, gives 4096 steps a unit. Scenes that are too large for it get
-    fewer, small ones as many as divide them into a quarter of a million steps.
+    Usually 12, as other writers have it: 4096 steps a unit. Fewer where coordinates are too large
+    for that, more where the largest is below 32, so that it is still some 2^17 steps.
     """
     farthest = float(np.abs(splats.means).max())
     _, bits = math.frexp(farthest)  # before the point
@@ -350,7 +347,7 @@ def _fraction(splats: Splats) -> int:
     if most < 0:
         msg = f"a coordinate is {farthest:.10g}: {NAME} holds coordinates up to {_LARGEST_CODE}"
         raise RefineError(msg)
-    return min(max(12, 18 - bits), most, _LARGEST_CODE.bit_length())
+    return min(max(_USUAL_FRACTION, _LEAST_STEPS - bits), most, _LARGEST_CODE.bit_length())
 
 
 def _packed_rotations(quaternions: NDArray[Any]) -> NDArray[np.uint32]:
@@ -364,7 +361,7 @@ def _packed_rotations(quaternions: NDArray[Any]) -> NDArray[np.uint32]:
 
 
 def _harmonic_codes(sh_rest: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return the codes of harmonics (n, K, 3): the middles of their buckets, 128 being 0."""
+    """Return the codes of harmonics (n, K, 3), where 128 is 0, rounded to `_BUCKETS`."""
     steps = np.rint(np.clip(sh_rest, -1.0, 1.0) * np.float32(128.0)).astype(np.int16) + 128
     for bucket, band in zip(_BUCKETS, (slice(3), slice(3, None)), strict=True):
         steps[:, band] = (steps[:, band] + bucket // 2) // bucket * bucket

@@ -163,16 +163,8 @@ class OriginalPictures:
 class _Picture:
     """What some pixels of one view show, and the u splats that it is made of.
 
-    Attributes
-    ----------
-    colors : (3, R, C) float64
-        Patches of the picture, side by side.
-    hitting : int
-        How many of their rays hit a splat.
-    distance : (u,) float64
-        Distance of each splat that is hit, world units.
-    contribution : (u,) float64
-        How many of the pixels it makes up.
+    Patches of the picture side by side, (3, R, C); how many of their rays hit a splat; of each
+    splat its distance, world units, and how many of the pixels it makes up.
     """
 
     colors: NDArray[np.float64]
@@ -195,13 +187,9 @@ def _patches(size: int) -> NDArray[np.int64]:
 
 
 def _psnr(change: NDArray[np.float64], size: int) -> float:
-    """Return the PSNR of a picture, dB, averaged over squares of `size` pixels; at most 100.
+    """Return the PSNR of pictures averaged over squares of `size` pixels, dB; at most 100.
 
-    Parameters
-    ----------
-    change : (3, R, C) float64
-        Difference of two pictures; what is left beside whole squares does not count.
-    size : int
+    `change` is their difference, (3, R, C); what is left beside whole squares does not count.
     """
     _, rows, columns = change.shape
     high, wide = min(size, rows), min(size, columns)

@@ -146,14 +146,14 @@ class LevelSink:
     folder : Path
         Made if it is not there.
     request : LevelsRequest
-    made : list of Path
-        The files that were written so far.
+    written : list of Path
+        The files that are written so far.
     """
 
     source: Path
     folder: Path
     request: LevelsRequest
-    made: list[Path] = field(default_factory=list)
+    written: list[Path] = field(default_factory=list)
     timing: str = "levels_s"
 
     @property
@@ -185,7 +185,7 @@ class LevelSink:
             try:
                 yield
             except BaseException:
-                for path in self.made:
+                for path in self.written:
                     if path not in old:
                         with contextlib.suppress(OSError):
                             path.unlink()
@@ -209,12 +209,12 @@ class LevelSink:
                 facts = self._facts(loaded, level)
                 notes += scoring_notes(level.scores)
             entry, more = _write(loaded, level, path, overwrite=request.overwrite)
-            self.made.append(path)
+            self.written.append(path)
             notes += [note for note in more if note not in notes]
             entries.append({**level.facts(request.goal), **entry})
             remarks[level.asked] = level.remark
         notes += request.levels.notes(remarks)
-        notes += _remove(set(before) - {*self.made}, self.source)
+        notes += _remove(set(before) - {*self.written}, self.source)
         facts["levels"] = entries
         with whole_file(self.folder / MANIFEST, overwrite=request.overwrite) as stream:
             stream.write(json.dumps(facts, indent=2, allow_nan=False).encode() + b"\n")
@@ -276,16 +276,16 @@ def _write(
     loaded: Loaded, level: Level, path: Path, *, overwrite: bool
 ) -> tuple[dict[str, Any], list[str]]:
     """Write the file of a level; return what the manifest says of it, and sentences."""
-    made = as_written(loaded.file(), path)
-    made.write(path, level.keep, columns=loaded.columns(level.absorbed), overwrite=overwrite)
-    counts = held(made, level.keep)
+    writer = as_written(loaded.file(), path)
+    writer.write(path, level.keep, columns=loaded.columns(level.absorbed), overwrite=overwrite)
+    counts = held(writer, level.keep)
     facts = {
         "splats": counts["written"],
         "left_out": counts["left_out"],
         "file": path.name,
         "bytes": path.stat().st_size,
     }
-    return facts, made.notes(level.keep)
+    return facts, writer.notes(level.keep)
 
 
 def _unlisted(folder: Path) -> list[Path]:
@@ -295,8 +295,8 @@ def _unlisted(folder: Path) -> list[Path]:
     """
     path = folder / MANIFEST
     try:
-        told = json.loads(path.read_bytes())
-        names = [str(entry["file"]) for entry in told["levels"]]
+        manifest = json.loads(path.read_bytes())
+        names = [str(entry["file"]) for entry in manifest["levels"]]
     except (OSError, ValueError, LookupError, TypeError, RecursionError):  # none that we wrote
         names = []
     path.unlink(missing_ok=True)

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from ..errors import RefineError
 from ..estimate.quality import PSNR_CAP
-from ..pipeline import decide
-from ..score_splats import score
+from ..pipeline import decide, score
 from ..selection import Budget
 from ..splats import among_all
 from ..task import DEFAULTS, Origin, Task
@@ -243,7 +242,7 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     Raises
     ------
     RefineError, Cancelled
-        See `score_splats.score`; also if no level would have fewer splats than the original.
+        See `pipeline.score`; also if no level would have fewer splats than the original.
 
     Examples
     --------
@@ -274,11 +273,11 @@ def each_level(
         *scene.scene(), progress=part(progress, 0.0, COMPARING), threads=threads
     )
     after = part(progress, COMPARING, 1.0)
-    made = (_absorbing if levels.absorb else _deleting)(
+    decided = (_absorbing if levels.absorb else _deleting)(
         scene, levels.budgets(total), after, threads
     )
     left_before, number = total, 0
-    for place, (keep, splats, result, absorbed) in enumerate(made):
+    for place, (keep, splats, result, absorbed) in enumerate(decided):
         if len(splats) == left_before:
             continue
         number, left_before = number + 1, len(splats)

@@ -3,29 +3,93 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from ..formats.registry import as_written, format_named, read_splats
-from ..report import Files, held
+from ..report import files_facts, held
 from ..volumes import forced
-from ..whole_file import refuse_existing, refuse_mapped
-from ..work import report
+from ..whole_file import expanded, refuse_existing, refuse_mapped
+from ..work import Progress, report, silent
 from .loaded import Loaded, RowSizes
-from .run import DECIDED, Written
+from .requests import Kept
+from .run import DECIDED, Written, run
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from numpy.typing import NDArray
-
-    from ..absorbing.absorb import Absorbed
     from ..formats.format import Format
+    from ..task import Result
     from ..volumes import Zone
-    from .run import Runtime
+    from .requests import PruneRequest
+    from .run import Request, Runtime
+
+
+ChoiceT = TypeVar("ChoiceT", bound="Result | Kept")
+
+
+def prune_file(
+    source: Path | str,
+    output: Path | str | None,
+    request: PruneRequest,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Result:
+    """Prune a file of splats, and write the result to another file; see `file_to_file`.
+
+    Examples
+    --------
+    To leave half of the splats, with what they absorbed::
+
+        prune_file("in.ply", "out.ply", PruneRequest(views, Budget(ratio=0.5), absorb=True))
+    """
+    return file_to_file(source, output, request, progress=progress, threads=threads)
+
+
+def file_to_file(
+    source: Path | str,
+    output: Path | str | None,
+    request: Request[Loaded, ChoiceT],
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> ChoiceT:
+    """Do what is asked with the splats of a file, and write what stays to another file.
+
+    Parameters
+    ----------
+    source : path-like
+        The file to read, of any format (`read_splats`).
+    output : path-like or None
+        The file to write, in the format that its suffix names; None decides without writing, as for
+        a plain PLY.
+    request : PruneRequest, CleanRequest, ScoreRequest or ConvertRequest
+        What is asked.
+    progress, threads
+        See `run`.
+
+    Returns
+    -------
+    Result or Kept
+        Its report also has the names and sizes of the files.
+
+    Raises
+    ------
+    RefineError, Cancelled
+        See `run`, `FileSource`, `FileSink` and the request. Nothing is written then, unless the
+        message says so.
+    """
+    sink = FileSink(
+        None if output is None else expanded(output),
+        source=expanded(source),
+        overwrite=request.overwrite,
+        dry_run=request.dry_run,
+    )
+    return run(FileSource(source, request.zones), request, sink, progress=progress, threads=threads)
 
 
 @dataclass(frozen=True)
@@ -62,44 +126,6 @@ class FileSource:
             file=lambda: file,
             matrix=np.eye(4),
         )
-
-
-class Choice(Protocol):
-    """Which splats stay, and as what."""
-
-    @property
-    def report(self) -> dict[str, Any]:
-        """What the report says of it."""
-        ...
-
-    @property
-    def keep(self) -> NDArray[np.bool_]:
-        """Which splats stay, (N,)."""
-        ...
-
-    @property
-    def absorbed(self) -> Absorbed | None:
-        """What survivors became, where they absorbed others."""
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class Kept:
-    """Which splats stay, all of them as they are.
-
-    Attributes
-    ----------
-    keep : (N,) bool
-    report : dict
-    """
-
-    keep: NDArray[np.bool_]
-    report: dict[str, Any]
-
-    @property
-    def absorbed(self) -> None:
-        """Nothing is absorbed."""
-        return
 
 
 @dataclass(frozen=True)
@@ -149,11 +175,7 @@ class FileSink:
                 refuse_mapped(self.written, self.source)
         yield
 
-    def columns(self, loaded: Loaded, choice: Choice) -> dict[str, NDArray[Any]]:
-        """Return the properties that are written otherwise than they are stored."""
-        return loaded.columns(choice.absorbed)
-
-    def write(self, loaded: Loaded, choice: Choice, runtime: Runtime) -> Written:
+    def write(self, loaded: Loaded, choice: Result | Kept, runtime: Runtime) -> Written:
         """Write what stays: all of it, or nothing.
 
         Raises
@@ -162,15 +184,15 @@ class FileSink:
             See `SplatFile.write`.
         """
         report(runtime.progress, DECIDED, "writing")
-        made = as_written(loaded.file(), self.path)
-        columns = self.columns(loaded, choice)
-        path, size = self.written, made.size(choice.keep, columns)
+        writer = as_written(loaded.file(), self.path)
+        columns = choice.columns if isinstance(choice, Kept) else loaded.columns(choice.absorbed)
+        path, size = self.written, writer.size(choice.keep, columns)
         if path is not None:
-            made.write(path, choice.keep, columns=columns, overwrite=self.overwrite)
+            writer.write(path, choice.keep, columns=columns, overwrite=self.overwrite)
             size = path.stat().st_size
         return Written(
-            files=asdict(Files(loaded.name, str(path) if path else None, loaded.bytes, size)),
+            files=files_facts(loaded.name, str(path) if path else None, loaded.bytes, size),
             path=path,
-            splats=held(made, choice.keep, written=path is not None),
-            notes=made.notes(choice.keep),
+            splats=held(writer, choice.keep, written=path is not None),
+            notes=[*writer.notes(choice.keep), *loaded.notes],
         )

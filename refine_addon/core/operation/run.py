@@ -4,14 +4,12 @@ A request says what is to be done, a source where the splats are, a sink where t
 
 | | source | request | sink | in |
 |---|---|---|---|---|
-| `prune_file` | `FileSource` | `PruneRequest` | `FileSink` | `core/operation/prune.py` |
-| `clean_file` | `FileSource` | `CleanRequest` | `FileSink` | `core/operation/clean.py` |
-| `score_file` | `FileSource` | `ScoreRequest` | `ScoreSink` | `core/operation/score.py` |
-| `convert_file` | `FileSource` | `ConvertRequest` | `FileSink` | `core/operation/convert.py` |
+| `prune_file` | `FileSource` | `PruneRequest` | `FileSink` | `core/operation/files.py` |
+| `file_to_file` | `FileSource` | any of `requests.py` | `FileSink` | `core/operation/files.py` |
 | `lod_file` | `FileSource` | `LevelsRequest` | `LevelSink` | `core/levels/files.py` |
 | `prune_object` | `ObjectSource` | `PruneRequest` | `ObjectSink` | `objects/operation.py` |
-| `score_object` | `ObjectSource` | `ScoreRequest` | `ScoreSink` | `objects/operation.py` |
-| `prune_tiles` | `TileSource` | `TilesRequest` | `TileSink` | `core/tiles/prune.py` |
+| `score_object` | `ObjectSource` | `ScoreRequest` | `FileSink` | `objects/operation.py` |
+| `prune_tiles` | `TileScene` | `TilesRequest` | `TileSink` | `core/tiles/prune.py` |
 """
 
 from __future__ import annotations
@@ -30,15 +28,16 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ..formats.format import Format
+    from ..volumes import Zone
 
 
 DECIDED = 0.8
-"""Part of the progress of a run after which it is decided what is written to a file."""
+"""The share of its progress that a run has made when it begins to write a file."""
 
 
 @dataclass(frozen=True, eq=False)
 class Runtime:
-    """What every step of one run is given besides its data.
+    """What every step of a run gets besides its data.
 
     Attributes
     ----------
@@ -71,7 +70,7 @@ class Written:
     splats : dict of str to int or None
         Counts to add to ``splats``: how many the files hold.
     notes : list of str
-        What the user should know about the files.
+        What the user should know about the source and the files.
     facts : dict
         Anything else.
     """
@@ -83,15 +82,6 @@ class Written:
     facts: dict[str, Any] = field(default_factory=dict)
 
 
-class Input(Protocol):
-    """What a source gives."""
-
-    @property
-    def notes(self) -> Sequence[str]:
-        """What the user should know about it, in sentences."""
-        ...
-
-
 class Decision(Protocol):
     """What a request decided of an input; `run` completes its report."""
 
@@ -101,47 +91,55 @@ class Decision(Protocol):
         ...
 
 
-InputT = TypeVar("InputT", bound=Input)
-InputT_co = TypeVar("InputT_co", bound=Input, covariant=True)
-InputT_contra = TypeVar("InputT_contra", bound=Input, contravariant=True)
+LoadedT = TypeVar("LoadedT")
+LoadedT_co = TypeVar("LoadedT_co", covariant=True)
+LoadedT_contra = TypeVar("LoadedT_contra", contravariant=True)
 DecisionT = TypeVar("DecisionT", bound=Decision)
 DecisionT_contra = TypeVar("DecisionT_contra", bound=Decision, contravariant=True)
 
 
-class Source(Protocol[InputT_co]):
+class Source(Protocol[LoadedT_co]):
     """Where splats are."""
 
-    def read(self, form: Format | None) -> InputT_co:
-        """Return them, with the bytes that each takes in a format; None is plain PLY."""
+    def read(self, form: Format | None) -> LoadedT_co:
+        """Return them, with the bytes that they take in a format; None is plain PLY."""
         ...
 
 
-class Request(ABC, Generic[InputT_contra, DecisionT]):
-    """What is to be done."""
+class Request(ABC, Generic[LoadedT_contra, DecisionT]):
+    """What is to be done.
+
+    Attributes
+    ----------
+    zones : sequence of Zone
+        Volumes that say which splats must stay and which must go, in the frame of the views.
+    overwrite : bool
+        Whether files may be replaced.
+    dry_run : bool
+        Whether to decide as for the output, and write no splats.
+    """
+
+    zones: Sequence[Zone] = ()
+    overwrite: bool = False
+    dry_run: bool = False
 
     @contextmanager
     def opened(self, _form: Format | None) -> Iterator[None]:
-        """Refuse what can be had of no splats, before any are read.
-
-        Parameters
-        ----------
-        form : Format or None
-            Of the output; None is plain PLY.
-        """
+        """Refuse, before splats are read, what none can give in the format of the output."""
         yield
 
     @abstractmethod
-    def decide(self, read: InputT_contra, runtime: Runtime) -> DecisionT:
+    def decide(self, loaded: LoadedT_contra, runtime: Runtime) -> DecisionT:
         """Decide; nothing is changed or written."""
 
     def compare(
-        self, _read: InputT_contra, _decision: DecisionT, _path: Path | None, _runtime: Runtime
+        self, _loaded: LoadedT_contra, _decision: DecisionT, _path: Path | None, _runtime: Runtime
     ) -> dict[str, Any]:
-        """Return what the report says of the pictures of the file that was written, if anything."""
+        """Return what the report says of the written file's pictures, if anything."""
         return {}
 
 
-class Sink(Protocol[InputT_contra, DecisionT_contra]):
+class Sink(Protocol[LoadedT_contra, DecisionT_contra]):
     """Where splats go."""
 
     @property
@@ -158,20 +156,22 @@ class Sink(Protocol[InputT_contra, DecisionT_contra]):
         """Refuse what could not be written; if the block fails, remove what was made for it."""
         ...
 
-    def write(self, read: InputT_contra, decision: DecisionT_contra, runtime: Runtime) -> Written:
+    def write(
+        self, loaded: LoadedT_contra, decision: DecisionT_contra, runtime: Runtime
+    ) -> Written:
         """Write all of what was decided, or nothing."""
         ...
 
 
 def run(
-    source: Source[InputT],
-    request: Request[InputT, DecisionT],
-    sink: Sink[InputT, DecisionT],
+    source: Source[LoadedT],
+    request: Request[LoadedT, DecisionT],
+    sink: Sink[LoadedT, DecisionT],
     *,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> DecisionT:
-    """Do what is requested with the splats of a source, and write the outcome to a sink.
+    """Do what is requested with the splats of a source, and write the result to a sink.
 
     Parameters
     ----------
@@ -194,16 +194,16 @@ def run(
     """
     runtime = Runtime(Clock(), progress, threads)
     with request.opened(sink.form), sink.opened():
-        read = source.read(sink.form)
+        loaded = source.read(sink.form)
         runtime.clock.lap("read_s")
-        decision = request.decide(read, runtime)
-        written = sink.write(read, decision, runtime)
+        decision = request.decide(loaded, runtime)
+        written = sink.write(loaded, decision, runtime)
         runtime.clock.lap(sink.timing)
-        compared = request.compare(read, decision, written.path, runtime)
+        compared = request.compare(loaded, decision, written.path, runtime)
     runtime.clock.stop()
     report = decision.report
     report |= written.facts | compared
     report["splats"] |= written.splats
-    report["notes"] += [*written.notes, *read.notes]
+    report["notes"] += written.notes
     report |= {"files": written.files, "timings": runtime.clock.timings}
     return decision

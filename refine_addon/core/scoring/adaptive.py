@@ -13,8 +13,7 @@ CALIBRATION = (10.73, 56.06, 100.67)
 RATIO_LIMIT = 1e6
 """Axis ratios above this count as this, so that one flat disk does not make the mean infinite."""
 
-_NOISE = 1e-12
-"""A smaller statistic counts as 0: rounding leaves about this much of a zero."""
+_NOISE = 1e-12  # a smaller statistic counts as 0: rounding leaves about this much of a zero
 
 
 @dataclass(frozen=True)

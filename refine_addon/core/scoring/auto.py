@@ -1,7 +1,7 @@
 """Method *auto*: occlusion with no more views than the pictures need.
 
 Half of the views, spread evenly, measure the splats first, then an eighth more. Others validate:
-their rays tell the PSNR of the pictures that each of the two rankings leaves. The error of a mean
+their rays tell the PSNR after removing splats by each of the two rankings. The error of a mean
 over k views falls as 1 / k, so the PSNR is about ``limit - slope / k``, and what the eighth has
 gained tells what the rest would gain. Where that is within the tolerance, the rest is not measured.
 All that is measured to find out is used, so finding out costs no more than two rankings and the
@@ -142,26 +142,10 @@ def groups_of(views: ViewSet) -> list[list[int]] | None:
 def _measure(
     scoring: OcclusionScoring, tolerance: float, progress: Progress, threads: int | None
 ) -> tuple[float, dict[str, list[float]]]:
-    """Measure the splats from as many views as are needed.
+    """Measure the splats from as many of the views of `groups_of` as are needed; see `score`.
 
-    Parameters
-    ----------
-    scoring : OcclusionScoring
-        With the groups of `groups_of`.
-    tolerance, progress, threads
-        See `score`.
-
-    Returns
-    -------
-    loss : float
-        What the views that were left out are estimated to gain, dB.
-    expected : dict of str to list of float
-        The PSNR that the validation views tell of the two rankings at `RATIOS`, dB.
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
+    Return what the views that were left out are estimated to gain, dB, and the PSNR that the
+    validation views tell of the two rankings at `RATIOS`, dB.
     """
     groups, rays = scoring.measuring.groups, scoring.validation_rays
     validating = [number for k in VALIDATING for number in groups[k]]

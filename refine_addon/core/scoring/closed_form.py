@@ -208,18 +208,9 @@ def _frame(
 ) -> tuple[NDArray[np.float64], float, float, float]:
     """Return what `Frame` takes, and the scene's size, of which eta and near plane are multiples.
 
-    The size is a median over splats, so a few far splats hardly change it.
-
-    Parameters
-    ----------
-    each : callable
-    good : int
-        How many splats can be drawn.
-    moments : (4, 3) float64
-        As `RowBlock.read` returns them, of all splats.
-    highest : (1, 65536) int64
-        What the step "count" would return of the highest digit, of all splats.
-    settings : ClosedForm
+    The size is a median over splats, so a few far splats hardly change it. Of the splats `good` can
+    be drawn, `moments` is what `RowBlock.read` returns of all, (4, 3), and `highest` what the step
+    "count" would return of the highest digit, (1, 65536).
     """
 
     def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:
@@ -260,13 +251,7 @@ def _powers(
 
 
 def _statistics(tallies: NDArray[np.float64]) -> adaptive.Statistics:
-    """Return the statistics of a scene.
-
-    Parameters
-    ----------
-    tallies : (chunks, 5) float64
-        What `RowBlock.read` returns.
-    """
+    """Return the statistics of a scene; for `tallies`, (chunks, 5), see `RowBlock.read`."""
     count, ratios, translucency, luma, squares = tallies.T  # (chunks,) each
     total = count.sum()
     # Variance within the chunks plus variance of their means: sums of squares do not cancel.

@@ -42,7 +42,7 @@ REACH = 2.0
 """Standard deviations along its longest axis that a splat reaches into an image from outside."""
 
 CROWDED = 0.05
-"""Score, over the mean of all, from which on a splat's neighbourhood counts half."""
+"""Score, in units of the mean, at which w is 1/2; see `closed_form`."""
 
 CELLS = 64
 """Cells of the neighbourhoods along each axis."""
@@ -55,8 +55,8 @@ HIGHEST = 64 - radix.DIGIT
 
 _CHUNK = 4096
 _RUN = 2000
-"""Splats that are looked at together: so few that what is known of them in 64 views stays in the
-second cache, and no multiple of a page, at which a processor takes reads for writes."""
+"""Splats processed together: so few that their projections into 64 views stay in the L2 cache, and
+not a multiple of the page size, at which loads and stores alias."""
 
 _VIEW_BLOCK = 64
 _SMALLEST_AREA = -300.0  # natural logarithm
@@ -100,22 +100,12 @@ class NeighbourhoodSums(NamedTuple):
 
 
 class _Fringe(NamedTuple):
-    """Pairs of a splat and a view whose image it reaches into from outside, k of them.
+    """Pairs of a splat and a view whose image it reaches into from outside, (k,) each."""
 
-    Attributes
-    ----------
-    view, splat : (k,) int64
-        Places in a block.
-    share : (k,) float64
-        1 at the edge of the image, falling to 0 at `REACH` standard deviations.
-    across : (k,) float64
-        The depth at which the image is wide enough to show its centre, world units.
-    """
-
-    view: NDArray[np.int64]
+    view: NDArray[np.int64]  # place in a block, as `splat`
     splat: NDArray[np.int64]
-    share: NDArray[np.float64]
-    across: NDArray[np.float64]
+    share: NDArray[np.float64]  # 1 at the edge of the image, 0 at `REACH` standard deviations
+    across: NDArray[np.float64]  # depth where the image is wide enough for its centre, world units
 
 
 STEPS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = {
@@ -141,13 +131,13 @@ STEPS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = 
 
 
 class Source(Protocol):
-    """Splats, be they in memory or read when they are taken."""
+    """Splats in memory, or read when a slice is taken."""
 
     def __len__(self) -> int:
         """Return how many there are."""
 
     def take(self, piece: slice, /) -> Splats:
-        """Return some of them; of an empty slice too the types are those of all."""
+        """Return some of them; an empty slice has the dtypes of all."""
 
 
 class RowBlock:
@@ -387,13 +377,8 @@ class RowBlock:
     ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
         """Return H before alpha of n splats, and in how many views each lies, (n,) each.
 
-        Parameters
-        ----------
-        points : (4, n) float64
-        reach : (n,) float64
-        views : (v,) int64
-            Those that see some of them; of these, the first `partly` may not see all.
-        partly : int
+        `points` is (4, n), `reach` (n,). Only `views`, (v,), see some of them; of these, the first
+        `partly` may not see all.
         """
         total = np.zeros(points.shape[1])  # (n,), H before alpha
         seen = np.full(points.shape[1], len(views) - partly, np.int32)
@@ -478,7 +463,7 @@ class RowBlock:
         """Return which splats reach into which views from outside, and how far."""
         limit = reach * self.frustums.steepness[views]  # (c, n)
         outside &= beyond < limit  # (c, n)
-        index = np.flatnonzero(outside)  # of few; everything else is done for all of them
+        index = np.flatnonzero(outside)  # few pairs: what follows is computed for these alone
         view = index // outside.shape[1]
         splat = index - view * outside.shape[1]
         away = beyond.ravel()[index]

@@ -172,12 +172,8 @@ def _unit(values: NDArray[np.float64]) -> NDArray[np.float64]:
 def _losses(scores: NDArray[np.float64], errors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the logarithm of the share of each view's error that is removed, (v, shares).
 
-    Parameters
-    ----------
-    scores : (n,) float64
-        The lowest are removed first, equal ones together.
-    errors : (v, n) float64
-        Of each splat in each of v views.
+    The lowest scores, (n,), are removed first, equal ones together; the errors of each splat in
+    each of v views are (v, n).
     """
     places = [max(int(share * len(scores)) - 1, 0) for share in SHARES]
     last = np.partition(scores, places)[places]  # (shares,), the highest score that is removed

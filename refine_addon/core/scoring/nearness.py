@@ -13,8 +13,7 @@ if TYPE_CHECKING:
 _BITS = 5
 """Of a cell's number along each axis: three of them fit into 16 bits, which sort by counting."""
 
-_SAMPLE = 4096
-"""Splats that tell where most of them lie."""
+_SAMPLE = 4096  # splats that tell where most of them lie
 
 _MOST = (0.02, 0.98)
 """Those of the sample between these shares along each axis lie in the grid, others at its faces."""

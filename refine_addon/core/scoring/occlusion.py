@@ -179,35 +179,7 @@ def score_once(
     return scoring.rank(silent), measured.for_all(scoring.gaussians.index, len(splats))
 
 
-def measure(
-    splats: Splats,
-    views: ViewSet,
-    settings: Occlusion = Occlusion(),
-    *,
-    progress: Progress = silent,
-    threads: int | None = None,
-) -> Measured:
-    """Measure what the views see of each splat, hidden by all others.
-
-    Parameters
-    ----------
-    splats, views, settings, progress, threads
-        See `score`; `settings.rounds` is ignored.
-
-    Returns
-    -------
-    Measured
-        Of all N splats; 0 for splats that no view shows or that cannot be drawn.
-
-    Raises
-    ------
-    Cancelled
-        If `progress` answers ``False``.
-    """
-    return measure_part(splats, views, settings, 0, 1, progress=progress, threads=threads)[0]
-
-
-def measure_part(  # noqa: PLR0913 - as `measure`, and which part
+def measure_part(  # noqa: PLR0913 - as `score`, and which part
     splats: Splats,
     views: ViewSet,
     settings: Occlusion,
@@ -217,12 +189,12 @@ def measure_part(  # noqa: PLR0913 - as `measure`, and which part
     progress: Progress = silent,
     threads: int | None = None,
 ) -> tuple[Measured, float]:
-    """Measure what one part of the views sees of each splat.
+    """Measure what one part of the views sees of each splat, hidden by all others.
 
     Parameters
     ----------
     splats, views, settings, progress, threads
-        See `measure`.
+        See `score`; `settings.rounds` is ignored.
     turn, parts : int
         The views are divided into so many parts, or into fewer if there are fewer views; each part
         is spread over all of them. Turn 0 measures the first, and so on, and then the first again.
@@ -230,7 +202,7 @@ def measure_part(  # noqa: PLR0913 - as `measure`, and which part
     Returns
     -------
     Measured
-        See `measure`.
+        Of all N splats; 0 for splats that no view shows or that cannot be drawn.
     share : float
         Of the weights of all views, those of this part.
 
@@ -270,7 +242,8 @@ class OcclusionScoring:
     validation_rays : RaySample or None
         Those of the views that have measured all splats.
     scoring_rays : RaySample or None
-        The same of the rays that order splats; None in a single round, and once it ranks.
+        The rays that order splats after the first round; None if there is but one, and once `rank`
+        has taken them.
     prior : (N,) float32
         Orders the splats that are not among the Gaussians, and is the floor of all others.
     undrawable : (N,) bool
@@ -398,20 +371,11 @@ class OcclusionScoring:
         removal: _Removal,
         go: int,
     ) -> NDArray[np.int64]:
-        """Return the places in `left` of the n splats left, in the order of removal.
+        """Return the places in `left`, (n,) rows of Gaussians, in the order of removal.
 
-        Parameters
-        ----------
-        left : (n,) int64
-            Rows of the Gaussians.
-        measured : Measured
-            What these are worth now.
-        weights : sequence of float
-            Of the floor, up to each of `coverage.SHARES`.
-        removal : _Removal
-            What was removed before.
-        go : int
-            How many are removed in this round; the order of the others is not exact.
+        `measured` is what these are worth now, `weights` are of the floor, up to each of
+        `coverage.SHARES`, and `removal` is what was removed before. In this round `go` are removed;
+        the order of the others is not exact.
         """
         prior = self.prior[self.gaussians.index[left]]  # (n,)
         count, gone = len(removal.values), removal.gone
@@ -426,12 +390,7 @@ class OcclusionScoring:
     ) -> list[float]:
         """Choose the weights of the floor by leaving out each of some groups of views.
 
-        Parameters
-        ----------
-        measured : Measured
-            Sums over these groups, (M,).
-        groups : sequence of int
-        progress : callable
+        `measured` has the sums over these groups, (M,).
         """
         chosen, sample = tuple(sorted(groups)), self._sample
         worth = self.prior[self.gaussians.index[sample]].astype(np.float64)  # (m,)
@@ -506,12 +465,8 @@ class MemoryScoring(OcclusionScoring):
 class _Removal:
     """The order in which splats are removed.
 
-    Attributes
-    ----------
-    values : (N,) float32
-        For each splat that was added: the share of all N removed once this one is.
-    gone : int
-        How many were added.
+    `values`, (N,) float32, are for each splat that was added the share of all N removed once it is;
+    `gone` splats were added.
     """
 
     def __init__(self, count: int) -> None:

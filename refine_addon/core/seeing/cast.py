@@ -25,7 +25,7 @@ MIN_RAYS_OF_VIEW = 16
 """A view has at least this many rays, if it has as many pixels."""
 
 _PAIRS = 1 << 17  # pairs of footprint and pixel at a time, which limits temporary memory
-_MAX_TABLE = 1 << 14  # pixels; up to here a table says how many rays lie before each
+_MAX_TABLE = 1 << 14  # pixels; images up to this size are looked up in a table, see `_before`
 
 _STEPS = (0.7548776662466927, 0.5698402909980532)
 """1 / p and 1 / p^2 of the plastic number p: their multiples modulo 1 spread evenly over the unit
@@ -33,13 +33,13 @@ square (the R2 sequence, Roberts 2018)."""
 
 
 def pixels(view: View, number: int, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the columns and rows of a view in which about `count` rays lie, spread evenly.
+    """Return the columns and rows of a view through which about `count` rays go, spread evenly.
 
     Parameters
     ----------
     view : View
     number : int
-        Each number gives other pixels.
+        Different numbers give different pixels.
     count : float
 
     Returns
@@ -66,7 +66,7 @@ def spread(size: int, count: int, start: float) -> NDArray[np.int64]:
 def depth_complexity(footprints: Footprints, view: View) -> float:
     """Return about how many footprints a ray of a view hits on average, at most all of them."""
     size = float(view.width * view.height)
-    area = squared_reach(footprints.alphas)  # (n,), px^2
+    area = _squared_reach(footprints.alphas)  # (n,), px^2
     area *= np.float32(math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
     return float(np.minimum(area, np.float32(size)).sum(dtype=np.float64)) / size
 
@@ -124,7 +124,7 @@ def hits(
     alpha : (h,) float32
         Of the footprint there, at most `ALPHA_MAX`.
     """
-    reach = squared_reach(footprints.alphas)  # (n,)
+    reach = _squared_reach(footprints.alphas)  # (n,)
     # Of each footprint: the first column and row in its bounding box, and how many lie in it.
     across, down = (
         boxes(footprints, reach, axis, places) for axis, places in enumerate((columns, rows))
@@ -132,13 +132,13 @@ def hits(
     boxed = np.flatnonzero(across[1] * down[1] > 0)  # (r,)
     for start, end in _slices((across[1] * down[1])[boxed], limit):
         checkpoint()
-        owner, column, row = boxed_pixels(boxed[start:end], across, down)
+        owner, column, row = _boxed_pixels(boxed[start:end], across, down)
         pixel = row * np.int32(len(columns)) + column
         if see_through is not None:
             left = np.flatnonzero(see_through(pixel))
             owner, pixel = owner[left], pixel[left]
             column, row = column[left], row[left]
-        squared = mahalanobis(footprints, owner, columns.take(column), rows.take(row))
+        squared = _mahalanobis(footprints, owner, columns.take(column), rows.take(row))
         inside = np.flatnonzero(squared < reach.take(owner))
         owner = owner[inside]
         alpha = footprints.alphas.take(owner) * np.exp(squared[inside] / np.float32(-2.0))
@@ -164,26 +164,15 @@ def _slices(sizes: NDArray[np.int64], limit: int) -> list[tuple[int, int]]:
     return [*pairwise([*cuts, len(sizes)])]
 
 
-def boxed_pixels(
+def _boxed_pixels(
     chosen: NDArray[np.int64],
     across: tuple[NDArray[np.int64], NDArray[np.int64]],
     down: tuple[NDArray[np.int64], NDArray[np.int64]],
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
-    """Return all p pairs of some footprints and the pixels in their bounding boxes.
+    """Return all p pairs of some of n footprints, (b,), and the pixels in their bounding boxes.
 
-    Parameters
-    ----------
-    chosen : (b,) int64
-        Which footprints.
-    across, down : tuple of (n,) and (n,) int64
-        The boxes of all n, see `boxes`.
-
-    Returns
-    -------
-    owner : (p,) int64
-        The footprint.
-    column, row : (p,) int32
-        Places of the pixel among the columns and rows.
+    For the boxes of all n see `boxes`. Of each pair these are the footprint, and the places of the
+    pixel among the columns and rows, (p,) each.
     """
     (left, wide), (top, tall) = ([each[chosen] for each in box] for box in (across, down))
     count = wide * tall
@@ -201,12 +190,8 @@ def _members(
 ) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
     """Return the u Gaussians that are hit, ascending, and for each hit its place among them.
 
-    Parameters
-    ----------
-    index : (n,) int64
-        The Gaussian of each footprint, each once.
-    footprint : (h,) int32
-        Of each hit.
+    `index`, (n,), is the Gaussian of each footprint, each once, `footprint`, (h,), that of each
+    hit.
     """
     used = np.zeros(len(index), np.bool_)
     used[footprint] = True
@@ -230,7 +215,7 @@ def boxes(
     axis : int
         0 for columns, 1 for rows.
     places : (C,) int64
-        Numbers of the columns or rows, ascending; their centres are half a pixel on.
+        Numbers of the columns or rows, ascending; their centres are at + 0.5.
     """
     center = footprints.centers[axis] - np.float32(0.5)
     half = np.sqrt(reach * (footprints.major[axis] ** 2 + footprints.minor[axis] ** 2))
@@ -247,7 +232,7 @@ def _before(places: NDArray[np.int64], edges: NDArray[np.float32]) -> NDArray[np
     return np.asarray(table.take(edges.clip(0.0, size).astype(np.int64)))
 
 
-def mahalanobis(
+def _mahalanobis(
     footprints: Footprints,
     owner: NDArray[np.int64],
     column: NDArray[np.integer[Any]],
@@ -255,13 +240,7 @@ def mahalanobis(
 ) -> NDArray[np.float32]:
     """Return the squared Mahalanobis distance of pixels to footprints, (p,).
 
-    Parameters
-    ----------
-    footprints : Footprints
-    owner : (p,) int64
-        Row of the footprint.
-    column, row : (p,) integer
-        Of the pixel, whose centre is half a pixel on.
+    `owner`, (p,), is the row of the footprint; the centre of a pixel is at + 0.5.
     """
     across = column.astype(np.float32) + np.float32(0.5) - footprints.centers[0].take(owner)
     down = row.astype(np.float32) + np.float32(0.5) - footprints.centers[1].take(owner)
@@ -273,7 +252,7 @@ def mahalanobis(
     return squared
 
 
-def squared_reach(alphas: NDArray[np.float32]) -> NDArray[np.float32]:
+def _squared_reach(alphas: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the squared Mahalanobis distance at which alpha falls to `ALPHA_CUT`, (n,)."""
     ratio = alphas * np.float32(1.0 / ALPHA_CUT)
     return np.asarray(np.float32(2.0) * np.log(np.maximum(ratio, np.float32(1.0))))

@@ -28,13 +28,14 @@ _STACK = 16
 """Rows of one matrix product: so few that BLAS starts no threads, which would slow down ours."""
 
 _POINTS = 4096
-"""Points that are counted at a time: what is known of them in all views stays in the caches."""
+"""Points processed at a time: so few that their projections into all views stay in the caches."""
 
 _ROUNDING = 1e-14
-"""More than a sum of four products rounds, over the sum of their sizes."""
+"""Bound of the rounding error of a sum of four products, over the sum of their absolute values."""
 
 _STEEPEST = 1e100
-"""Limit of a focal length over half the image: its product with any length can be squared."""
+"""Limit of a focal length over half the image, so that its product with any length can be squared
+without overflow."""
 
 
 class Side(NamedTuple):
@@ -103,8 +104,8 @@ class Frustums:
     centers : (V, 3) float64
         Of the views, relative to the origin.
     steepness : (V, 1) float64
-        By how much `beyond` of `project` grows with a step straight away from a side, for an image
-        as high as wide and of the same area.
+        Growth of `beyond` (see `project`) for each world unit that a point moves straight away from
+        a side of the frustum; as if the image were square, of the same area.
     """
 
     def __init__(self, views: ViewSet, origin: NDArray[np.float64], near: float) -> None:
@@ -141,12 +142,12 @@ class Frustums:
         """
         middle, half = (low + high) / 2.0, (high - low) / 2.0
         x, y, z = self._rows
-        # Of x' - z and so on, all linear, the least and the most in a box.
+        # x' - z and the like are linear: their extremes in a box follow from middle and half size.
         least, most = [], []
         for row in (x - z, -x - z, y - z, -y - z, z):  # (V, 4) each
             steep = np.abs(row)
             at = row[:, :3] @ middle + row[:, 3:]  # (V, k)
-            # Neither these sums nor those of `project` are exact.
+            # Widened by what these sums and those of `project` may round.
             around = steep[:, :3] @ (half + _ROUNDING * (np.abs(middle) + half))
             around += _ROUNDING * steep[:, 3:]
             least.append(at - around)
@@ -169,7 +170,7 @@ class Frustums:
         views : (b,) int64
             Which.
         count : int
-            Of how many of them, the first c, the latter two are wanted.
+            For the first c of them, `beyond` and `between` are returned too.
 
         Returns
         -------
@@ -254,14 +255,10 @@ def census(
 
 
 def _rows(views: ViewSet, centers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return rows whose products with ``(p, 1)`` are x', y' and z of every view.
+    """Return rows, (3, V, 4), whose products with ``(p, 1)`` are x', y' and z of every view.
 
     x' and y' contain the principal point and the half image size, so a point p lies in the image
     where ``|x'| <= z`` and ``|y'| <= z``.
-
-    Returns
-    -------
-    (3, V, 4) float64
     """
     rows = np.empty((3, len(views), 4))
     for index, (view, center) in enumerate(zip(views, centers, strict=True)):

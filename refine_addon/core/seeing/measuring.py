@@ -5,7 +5,7 @@
 
 T is the transmittance in front of the splat, c_i its colour and B_i the colour behind it; T and B
 come from `froxels`. The error is the squared change of the pictures when this one splat is removed,
-which is what REFINE's Hessian stands for.
+which REFINE's Hessian approximates.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Measured:
         for other in parts:
             total = total or cls.zero(len(other.seen))
             total.add(other)
-        assert total is not None  # noqa: S101 - as promised
+        assert total is not None  # noqa: S101 - callers pass at least one
         return total
 
     def for_all(self, index: NDArray[np.int64], count: int) -> Measured:
@@ -188,12 +188,12 @@ class Measuring:
         return len(self.groups)
 
     def groups_of_part(self, turn: int, parts: int) -> range:
-        """Return the groups of one of `parts` parts of the views; see `occlusion.measure_part`."""
+        """Return the groups of one of `parts` parts, by turns; see `occlusion.measure_part`."""
         parts = min(parts, self.count)
         return range(turn % parts, self.count, parts)
 
     def weight_share(self, groups: Sequence[int]) -> float:
-        """Return the share of the weights of all views that some groups have."""
+        """Return the sum of the weights of some groups over that of all views."""
         weights = [weight for _, weight in self.views]
         chosen = (weights[number] for k in groups for number in self.groups[k])
         return math.fsum(chosen) / math.fsum(weights)
@@ -224,7 +224,7 @@ class Measuring:
             Rows of the Gaussians.
         progress : callable
         ray_samples : sequence of RaySample
-            Get the rays that they want of these views.
+            They are given those rays of these views that they lack.
 
         Returns
         -------
@@ -262,27 +262,17 @@ class Measuring:
 
 @dataclass(frozen=True, eq=False)
 class _MeasureAndCast:
-    """Measures some views and casts their rays; any process can.
+    """Measures some views and casts their rays; picklable, so that any process can run it.
 
-    Attributes
-    ----------
-    gaussians : Gaussians
-    scene : Scene
-    views : list of (View, float)
-        All of them.
-    sampling : Sampling
-    numbers : list of int
-        Of those that measure.
-    wanted : list of (bool, set of int)
-        Of several samples of rays: whether they are scoring rays, and the numbers of the views
-        whose rays are wanted.
+    `wanted` says of several samples of rays whether they are scoring rays, and the numbers of the
+    views whose rays are wanted.
     """
 
     gaussians: Gaussians
     scene: Scene
-    views: list[tuple[View, float]]
+    views: list[tuple[View, float]]  # all of them
     sampling: Sampling
-    numbers: list[int]
+    numbers: list[int]  # of the views to measure
     wanted: list[tuple[bool, set[int]]]
 
     def __call__(self, place: int) -> tuple[ViewMeasurement, list[Rays | None]]:

@@ -27,22 +27,22 @@ if TYPE_CHECKING:
     from .projection import Footprints
 
 FEW_CELLS = 10_000
-"""An image may have this many cells however few footprints it has."""
+"""An image may always have this many cells, even with few footprints."""
 
 FOOTPRINTS = 4.0
-"""An image of more than `FEW_CELLS` cells has at least this many footprints for each of them. So
-the cells follow the splats, not the pixels: finer ones show nothing that the splats have."""
+"""Beyond `FEW_CELLS` cells, an image has at most one cell for this many footprints: cells that are
+much smaller than the splats only cost points."""
 
 MAX_CELLS = 65535
 """Most cells of an image: NumPy sorts numbers of 16 bits by radix, in linear time."""
 
 MAX_POINTS = 1 << 22
-"""Most points of a view, as estimated: cells grow until it is met. A point takes about 100 bytes.
-"""
+"""Limit of the estimated number of points of a view: cells grow until it holds. A point takes about
+100 bytes."""
 
 LEAST_POINTS = 1.25
-"""A view has this many points a footprint where `MAX_POINTS` would be fewer: a footprint has at
-least one point, however large the cells are."""
+"""Point limit of a view: ``max(MAX_POINTS, LEAST_POINTS x footprints)``. A footprint has at least
+one point, however large the cells are."""
 
 _GROWTH = 2.0**0.25  # factor by which the side of a cell grows in a step
 _SLACK = 1.01  # on the side of a cell: a column of cells may lie partly outside the image
@@ -89,16 +89,9 @@ class Points:
 
 
 def _runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
-    """Yield runs of consecutive groups with about `_BLOCK` members: slices of both.
+    """Yield runs of consecutive groups with about `_BLOCK` members: slices of groups and members.
 
-    Parameters
-    ----------
-    sizes : (G,) int64
-        How many members each group has.
-
-    Yields
-    ------
-    groups, members : slice
+    `sizes`, (G,), is how many members each group has.
     """
     ends = np.cumsum(sizes)
     cuts = np.searchsorted(ends, np.arange(_BLOCK, int(sizes.sum()), _BLOCK)) + 1
@@ -148,7 +141,7 @@ def scatter(footprints: Footprints, view: View, side: float, density: float) -> 
     kinds = _kinds(footprints, view, density / side)  # (n,)
     frame = _in_cells(footprints, view, side)
     vast = kinds == len(lattices()) - 1  # (n,), the few footprints much larger than the image
-    frame.axes[:, vast] = 0.0  # in the image; `_flat_points` replaces their points
+    frame.axes[:, vast] = 0.0  # nothing is cut off; `_flat_points` replaces their points
     rows, patches, whole = _patches(frame, kinds)  # (q,) each
     sizes = lattice_table().sizes.take(patches)  # (q,)
     owners = np.repeat(rows.astype(np.int32), sizes)  # (p,)
@@ -177,18 +170,10 @@ def _kinds(footprints: Footprints, view: View, scale: float) -> NDArray[np.uint8
 
 
 class _CellFrame(NamedTuple):
-    """Footprints in units of a cell.
+    """Footprints in units of a cell."""
 
-    Attributes
-    ----------
-    axes : (6, n) float32
-        Half axes, major then minor, and centre: each across and down.
-    size : tuple of float
-        Of the image, across and down.
-    """
-
-    axes: NDArray[np.float32]
-    size: tuple[float, float]
+    axes: NDArray[np.float32]  # (6, n): half axes, major, minor, and centre, each across and down
+    size: tuple[float, float]  # of the image, across and down
 
 
 def _in_cells(footprints: Footprints, view: View, side: float) -> _CellFrame:
@@ -201,20 +186,10 @@ def _in_cells(footprints: Footprints, view: View, side: float) -> _CellFrame:
 def _patches(
     frame: _CellFrame, kinds: NDArray[np.uint8]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Return the patches that may reach into the image, footprint by footprint.
+    """Return the q patches that may reach into the image, footprint by footprint.
 
-    Parameters
-    ----------
-    frame : _CellFrame
-    kinds : (n,) uint8
-        Which lattice each footprint gets.
-
-    Returns
-    -------
-    rows, patches : (q,) int64
-        Of the footprints, and of the table.
-    whole : (q,) bool
-        Which lie in the image with all of their points.
+    `kinds`, (n,), is which lattice each footprint gets. Return the rows of their footprints and of
+    the table, (q,) int64 each, and which lie in the image with all of their points, (q,).
     """
     table = lattice_table()
     count = table.patches.take(kinds)  # (n,)
@@ -242,29 +217,18 @@ def _lay_out(
     patches: NDArray[np.int64],
     whole: NDArray[np.bool_],
 ) -> tuple[NDArray[np.uint16], NDArray[np.float32], NDArray[np.float32]]:
-    """Return the points of q patches, one after the other.
+    """Return the points of q patches of `_patches`, one after the other.
 
-    Parameters
-    ----------
-    frame : _CellFrame
-    rows, patches, whole : (q,) array
-        See `_patches`.
-
-    Returns
-    -------
-    cells : (p,) uint16
-        `_OUTSIDE` for points beside the image.
-    shares : (p,) float32
-        Of the mass.
-    sums : (2, q) float32
-        Of the shares of each patch's points inside the image, and of their squares.
+    Of p points these are the cells, (p,) uint16, `_OUTSIDE` outside the image, and their shares of
+    the mass, (p,) float32; of each patch the sums of the shares of its points inside the image, and
+    of their squares, (2, q).
     """
     table = lattice_table()
     sizes = table.sizes.take(patches)  # (q,)
     first = np.cumsum(sizes) - sizes  # (q,), number of each patch's first point
     cells = np.empty(int(sizes.sum()), np.uint16)
     shares, sums = np.empty(len(cells), np.float32), table.sums.take(patches, axis=1)
-    # Patches alike are laid out together, which needs no look-up for each point.
+    # Equal patches are laid out together: they have the same points, so none needs an index.
     inner = np.flatnonzero(whole)
     inner = inner.take(np.argsort(patches.take(inner).astype(np.uint16), kind="stable"))  # (s,)
     axes, begin = frame.axes.take(rows.take(inner), axis=1), first.take(inner)
@@ -284,13 +248,7 @@ def _lay_out(
 
 
 def _equal_runs(patches: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
-    """Yield runs of equal numbers that have about `_BLOCK` points at most: number and slice.
-
-    Parameters
-    ----------
-    patches : (s,) int64
-        Ascending.
-    """
+    """Yield runs of equal numbers, which ascend, of about `_BLOCK` points: number and slice."""
     sizes = lattice_table().sizes
     stops = np.cumsum(np.bincount(patches, minlength=len(sizes))).tolist()
     for patch, (start, stop) in enumerate(pairwise([0, *stops])):
@@ -306,24 +264,11 @@ def _lay_out_at_edge(
     patches: NDArray[np.int64],
     first: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[Any], NDArray[np.float32], NDArray[np.float32]]:
-    """Return the points of q patches that lie across the edge of the image, one after the other.
+    """Return the points of q patches of `_patches` that lie across the edge of the image.
 
-    Parameters
-    ----------
-    frame : _CellFrame
-    rows, patches : (q,) int64
-        See `_patches`.
-    first : (q,) int64
-        The number of each patch's first point.
-
-    Returns
-    -------
-    at : (p,) int64
-        Numbers of the points.
-    cells, shares : (p,) array
-        `_OUTSIDE` and 0 for points beside the image.
-    sums : (2, q) float32
-        Of the shares of each patch, and of their squares.
+    `first`, (q,), is the number of each patch's first point. Return the numbers, cells and shares
+    of the points, (p,) each, `_OUTSIDE` and 0 for those outside the image, and of each patch the
+    sums of its shares and of their squares, (2, q).
     """
     table = lattice_table()
     sizes = table.sizes.take(patches)  # (q,)
@@ -346,12 +291,8 @@ def _positions(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return where points of lattices lie, across and down, in cells.
 
-    Parameters
-    ----------
-    axes : (6, ...) float32
-        See `_CellFrame`.
-    points : (2, ...) float32
-        Of the lattice, along the major and the minor axis.
+    `axes`, (6, ...), are those of `_CellFrame`; the points, (2, ...), lie along the major and the
+    minor axis of the lattice.
     """
     across = axes[0] * points[0]
     across += axes[2] * points[1]
@@ -365,14 +306,9 @@ def _positions(
 def _cell_numbers(
     place: tuple[NDArray[np.float32], NDArray[np.float32]], size: tuple[float, float]
 ) -> NDArray[np.uint16]:
-    """Return the number of each point's cell; it means nothing beside the image.
+    """Return the number of each point's cell; meaningless for points outside the image.
 
-    Parameters
-    ----------
-    place : tuple of float32 arrays
-        Across and down, in cells.
-    size : tuple of float
-        Of the image, in cells.
+    The place of each point and the size of the image are across and down, in cells.
     """
     number = place[1].astype(np.int32)
     number *= math.ceil(size[0])
@@ -413,16 +349,9 @@ def _sort_into_cells(
 ) -> Points:
     """Sort p points into cells, and merge those of one splat in one cell.
 
-    Parameters
-    ----------
-    cells : (p,) uint16
-        Points of the cell `_OUTSIDE` are dropped.
-    owners : (p,) int32
-        Ascending, that is, front to back.
-    shares : (p,) float32
-    inside, squares : (n,) float64
-        See `Points`; `squares` before merging, and changed in place.
-    area : float
+    Points of the cell `_OUTSIDE` are dropped. Owners ascend, that is, come front to back. For
+    `inside` and `squares`, (n,), see `Points`; `squares` are those before merging, and changed in
+    place.
     """
     filled = np.bincount(cells, minlength=_OUTSIDE)[:_OUTSIDE]
     counts = filled[filled > 0]  # (C,)

@@ -26,7 +26,7 @@ REACH = 3.3
 """Standard deviations to which a footprint is followed; alpha = 1 falls to `ALPHA_CUT` at 3.33."""
 
 BRIGHTEST = 16.0
-"""Brightest colour that is told apart, where white is 1; keeps sums finite."""
+"""Colours are clipped to this, white being 1; keeps sums finite."""
 
 LOG_SCALE_RANGE = (-16.0, 5.0)
 """Logarithms of scales over the size of the scene; beyond them float32 would overflow."""
@@ -343,7 +343,7 @@ def _touches(
     view: View,
     planes: tuple[float, float],
 ) -> NDArray[np.bool_]:
-    """Return which footprints may reach into the image, (M,); some that do not are included.
+    """Return which footprints may reach into the image, (M,); on the safe side.
 
     It is `frustum.contains` with the image widened by the reach of each footprint.
     """
@@ -388,7 +388,7 @@ def boxes_touch(boxes: NDArray[np.float32], scene: Scene, view: View) -> NDArray
 
 def _reach(side: frustum.Side) -> float:
     """Return how far a footprint reaches, px times depth, for a longest standard deviation of 1."""
-    # A footprint is longest where the ray is steepest; the projection is linearised no further.
+    # A footprint is longest where its ray is most oblique; beyond `_BEYOND` it grows no further.
     slope = (abs(side.offset) + (1.0 + 2.0 * _BEYOND) * side.half) / side.focal
     return REACH * side.focal * float(np.hypot(1.0, slope))
 
@@ -410,13 +410,8 @@ def _ellipses(
 ) -> tuple[NDArray[np.float32], ...]:
     """Return centres, major and minor half axes and their lengths, each (2, n), pixels.
 
-    Parameters
-    ----------
-    local : (3, n) float32
-        Camera coordinates of the centres, scene sizes.
-    shape : (6, n) float32
-        Covariances in camera coordinates, squared scene sizes.
-    view : View
+    `local`, (3, n), are the camera coordinates of the centres, scene sizes, and `shape`, (6, n),
+    the covariances in camera coordinates, squared scene sizes.
     """
     x, y, z = local
     across, down = x / z, y / z
@@ -430,16 +425,9 @@ def _image_covariance(
     """Return xx, xy, yy, (n,) each, of ``J S J'`` in pixels, without the low-pass.
 
     J is the Jacobian of the projection at ``(x, y, z)``: rows ``(fx / z, 0, -fx x / z^2)`` and
-    ``(0, fy / z, -fy y / z^2)``.
-
-    Parameters
-    ----------
-    ray : (across, down, z)
-        ``x / z``, ``y / z`` and z of the centres, (n,) each. For a centre far outside the image, J
-        is computed at the edge that `_BEYOND` sets, because J grows without bound.
-    shape : (6, n) float32
-        S: xx, xy, xz, yy, yz, zz.
-    view : View
+    ``(0, fy / z, -fy y / z^2)``. `ray` has ``x / z``, ``y / z`` and z of the centres, (n,) each.
+    For a centre far outside the image, J is computed at the edge that `_BEYOND` sets, because J
+    grows without bound. `shape` is S: xx, xy, xz, yy, yz, zz, (6, n).
     """
     z = ray[2]
     across, down = _near_image(ray[0], ray[1], view)

@@ -49,7 +49,8 @@ MAX_RAYS_OF_VIEW = 60_000
 """A view has at most so many rays: their numbers fit into 16 bits, see `cast`."""
 
 VALIDATION_VIEWS = 24
-"""At most about so many views validate what takes longer than deleting splats does."""
+"""What takes longer to compare than deleted splats (absorbed ones, written files) is compared in at
+most about so many views."""
 
 
 class RaySample:
@@ -98,7 +99,7 @@ class RaySample:
         return colors_from(self.splats, self.rows[rays.hit], self.views[number][0])
 
     def load(self) -> None:
-        """Make ready what the rays hit, where that does not lie in memory."""
+        """Load the hits, in a subclass that keeps them on disk."""
 
     def wants(self, number: int) -> bool:
         """Return whether the rays of a view are wanted and have not been cast yet."""
@@ -132,7 +133,7 @@ class RaySample:
         return [k for k, rays in enumerate(self.rays) if rays is not None and len(rays.ray)]
 
     def validating(self) -> list[int]:
-        """Return the numbers of the views that validate where not all can."""
+        """Return the numbers of the views that validate where comparing in all would take long."""
         seeing = self.seeing()
         return seeing[:: max(math.ceil(len(seeing) / VALIDATION_VIEWS), 1)]
 
@@ -201,8 +202,8 @@ def cast_view(
 def colors_from(splats: Splats, rows: NDArray[np.int64], view: View) -> NDArray[np.float64]:
     """Return the colours in which a view sees some splats, (3, n), at least 0.
 
-    By all harmonics: by their constant alone, as the rest of scoring takes colours, the estimated
-    PSNR was 1.2 dB too high on an outdoor scene.
+    All harmonics count. By the constant alone, which the rest of scoring uses, the estimated PSNR
+    was 1.2 dB too high on an outdoor scene.
 
     Parameters
     ----------

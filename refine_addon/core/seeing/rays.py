@@ -168,15 +168,10 @@ class Rays:
         return replace(self, owner=owner).colors(np.append(colors, black, axis=1))
 
     def _nearest_kept(self, keep: NDArray[np.bool_], nobody: int) -> NDArray[np.int32]:
-        """Return for each hit the owner of the nearest kept hit of the same ray, (h,).
+        """Return for each hit the owner of the nearest kept hit of the same ray, (h,), or `nobody`.
 
         Nearest in the number of hits between; of two, the one in front. A kept hit is its own.
-
-        Parameters
-        ----------
-        keep : (u,) bool
-        nobody : int
-            Stands where no hit of the ray is kept.
+        `keep` is of the (u,) splats that are hit.
         """
         kept, here = keep.take(self.owner), np.arange(len(self.owner))
         none = len(here)  # farther than any hit
@@ -212,18 +207,9 @@ def _removal_errors(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return for each hit of some rays how much its ray would change without it.
 
-    Parameters
-    ----------
-    alpha, log_passed : (h,) float32
-        See `Rays`.
-    colors : (3, h) float32
-    counts : (n,) int64
-        How many hits each ray has, at least one.
-
-    Returns
-    -------
-    error, contribution : (h,) float32
-        See `Rays.removal_errors`; 0 where the hit is hidden.
+    For `alpha` and `log_passed`, (h,), see `Rays`; colours are (3, h), and `counts`, (n,), is how
+    many hits each ray has, at least one. Errors and contributions, (h,) each, are those of
+    `Rays.removal_errors`, and 0 where the hit is hidden.
     """
     log_front = in_front(log_passed.astype(np.float64), counts)
     transmittance = np.exp(log_front.astype(np.float32))

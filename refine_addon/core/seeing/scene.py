@@ -71,15 +71,11 @@ class Scene:
         return np.asarray((means - self.origin) @ (self.axes.T / self.size))
 
 
-def median_size(squared: NDArray[np.float64], drawable: NDArray[np.bool_]) -> float:
-    """Return the size of a scene, or 1 if the whole scene is one point.
+def _median_size(squared: NDArray[np.float64], drawable: NDArray[np.bool_]) -> float:
+    """Return the size of a scene of drawable splats, or 1 if the whole scene is one point.
 
-    Parameters
-    ----------
-    squared : (N,) float64
-        Squared distance of each splat to the scene's origin, plus the median over views of theirs.
-    drawable : (N,) bool
-        Which splats count.
+    `squared`, (N,), is the squared distance of each splat to the scene's origin, plus the median
+    over views of theirs.
     """
     if not drawable.any():
         return 1.0
@@ -87,7 +83,7 @@ def median_size(squared: NDArray[np.float64], drawable: NDArray[np.bool_]) -> fl
 
 
 def size_of(median: float) -> float:
-    """Return the size of a scene from the median that `median_size` takes."""
+    """Return the size of a scene from the median that `_median_size` takes."""
     return float(np.sqrt(median)) or 1.0
 
 
@@ -113,7 +109,7 @@ def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -
             # Undrawable splats may hold any number, such as infinity.
             offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
             squared[piece] = np.einsum("ij,ij->i", offset, offset) + views_squared
-        unturned = Scene(origin, median_size(squared, drawable), np.eye(3))
+        unturned = Scene(origin, _median_size(squared, drawable), np.eye(3))
         return replace(unturned, axes=_principal_axes(means, drawable, unturned))
 
 
@@ -124,13 +120,7 @@ def _principal_axes(
 
     A position at distance r has the weight 1 / (1 + r^2)^2, so that a few far ones hardly matter.
     Axes point to where more of the splats lie. If two variances are equal, two axes are arbitrary.
-
-    Parameters
-    ----------
-    means, drawable
-        See `scene_of`.
-    scene : Scene
-        Its origin and size are used.
+    Of `scene` the origin and the size are used; for the others see `scene_of`.
     """
     total = np.zeros((4, 3))
     for sums in moments(means, drawable, scene):
@@ -202,7 +192,7 @@ def spatial_order(
     place: NDArray[np.float64],
     ties: Callable[[NDArray[np.int64]], NDArray[np.uint64]] | None = None,
 ) -> NDArray[np.int64]:
-    """Return the order of positions along a Z-shaped curve, near ones together (Morton, 1966).
+    """Return the order of positions along a Z-shaped curve: neighbours follow (Morton, 1966).
 
     Parameters
     ----------

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..absorb_splats import FIRST, PARTS
 from ..absorbing.absorb import STAGE, Counts, patience, stages
+from ..pipeline.absorb_splats import FIRST, PARTS
 from ..seeing.measuring import Measured
 from ..selection import Budget, select
 from .gaussians import store_gaussians
@@ -37,7 +37,6 @@ from .workers import Runner
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from typing import Any
 
     from numpy.typing import NDArray
 
@@ -57,7 +56,7 @@ _ASKEW = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]], np.float32) / np.float32
 
 @dataclass(frozen=True, eq=False)
 class Survivors(Counts):
-    """What is left of N splats.
+    """What is left of N splats: K of them; for the counts see `absorb.Absorbed`.
 
     Attributes
     ----------
@@ -67,8 +66,6 @@ class Survivors(Counts):
         Rows of the survivors among the N, region by region, in no order.
     changed : (K,) bool
         Which of them absorbed others.
-    merged, deleted : int
-        See `absorb.Absorbed`.
     """
 
     regions: Sequence[Region]
@@ -80,20 +77,10 @@ class Survivors(Counts):
 
 @dataclass(frozen=True, eq=False)
 class _Left:
-    """The n splats that are left before a stage.
-
-    Attributes
-    ----------
-    sources : sequence of Source
-        Where they are.
-    rows : (n,) int64
-        Which rows of all sources together, ascending.
-    measured : Measured
-        What the views see of them, or are expected to see.
-    """
+    """The n splats that are left before a stage, and what views see of them or are expected to."""
 
     sources: Sequence[Source]
-    rows: NDArray[np.int64]
+    rows: NDArray[np.int64]  # (n,), of all sources together, ascending
     measured: Measured
 
 
@@ -131,7 +118,8 @@ def absorb(tiles: MeasuredTiles, goal: int, settings: Settings, runner: Runner) 
     for number, count in enumerate(counts):
         stage_runner = runner.part(number / len(counts), (number + 1) / len(counts))
         regions, left = _stage(tiles.context, number, left, count, factor, stage_runner)
-    origin, members = (_of_all(regions, name) for name in ("origin", "members"))
+    folder, numbers = regions[0].folder, range(len(regions))
+    origin, members = (folder.joined(numbers, name) for name in ("origin", "members"))
     merged = int(members.sum()) - goal
     return Survivors(regions, origin, members > 1, merged, total - goal - merged)
 
@@ -162,17 +150,8 @@ def _stage(
 ) -> tuple[list[Region], _Left]:
     """Reduce the splats that are left to `count`, region by region.
 
-    Parameters
-    ----------
-    scene : SceneContext
-        In which all splats were measured.
-    number : int
-        Of the stage; before all but the first, the splats are measured anew.
-    left : _Left
-    count : int
-    factor : float
-        See `StageContext`.
-    runner : Runner
+    Before all stages but the first, `number` 0, they are measured anew. For `factor` see
+    `StageContext`.
     """
     folder = scene.folder.inner(f"stage-{number}")
     if number:
@@ -184,7 +163,7 @@ def _stage(
     steps = [AbsorbRegion(index, survivors) for index, survivors in enumerate(stay)]
     survivors = runner.part(0.8, 1.0).run(stage, steps, "absorbing", sizes)
     regions = [Region(index, size, folder) for index, size in enumerate(survivors)]
-    contribution, error = _of_all(regions, "expected", axis=1)
+    contribution, error = folder.joined(range(len(regions)), "expected", axis=1)
     rows = np.arange(len(error))
     measured = Measured(contribution, error, np.zeros(len(rows), np.int32))
     return regions, _Left(regions, rows, measured)
@@ -194,8 +173,8 @@ def _save_regions(stage: StageContext, left: _Left, number: int, runner: Runner)
     """Divide the splats that are left; return how many each region has."""
     steps = [SaveMeans(source) for source in left.sources]
     Runner(runner.workers).run_all(stage, steps, "absorbing")
-    means = [stage.folder.map(source.index, "means") for source in left.sources]
-    boxes = divided(np.concatenate(means)[left.rows], REGION, number)
+    means = stage.folder.joined((source.index for source in left.sources), "means")
+    boxes = divided(means[left.rows], REGION, number)
     for index, places in enumerate(boxes):
         _save_region(stage.folder, index, left, places)
     return [*map(len, boxes)]
@@ -207,24 +186,11 @@ def _save_region(folder: Folder, index: int, left: _Left, places: NDArray[np.int
     folder.save(index, {"rows": left.rows[places], "sums": sums})
 
 
-def _of_all(regions: Sequence[Region], name: str, axis: int = 0) -> NDArray[Any]:
-    """Return an array of all regions as one."""
-    arrays = [region.folder.load(region.index, [name])[name] for region in regions]
-    return np.concatenate(arrays, axis)
-
-
 def _measured_again(scene: SceneContext, left: _Left, turn: int, runner: Runner) -> _Left:
     """Measure all splats in a part of the views, and add what the others are expected to see.
 
-    Parameters
-    ----------
-    scene : SceneContext
-        With a folder of its own.
-    left : _Left
-        All rows of its sources.
-    turn : int
-        See `occlusion.measure_part`.
-    runner : Runner
+    Left are all rows of the sources. The scene has a folder of its own. For `turn` see
+    `occlusion.measure_part`.
     """
     gaussians, good = store_gaussians(scene, left.sources, runner.part(0.0, 0.2))
     measuring = TileMeasuring(scene, runner)
@@ -239,28 +205,18 @@ def _measured_again(scene: SceneContext, left: _Left, turn: int, runner: Runner)
 
 
 def _staying(stage: StageContext, sizes: Sequence[int], left: int, runner: Runner) -> list[int]:
-    """Return how many splats of each region stay, of `left` that do of all.
+    """Return how many of the `sizes` splats of each region stay, of `left` that do of all.
 
     As many go as a region has among the cheapest merges and deletions of all. A merge counts half,
     since of two splats that merge one goes; so all of them together may count half of the splats,
     and `STAGE` has to be .5 or more, or there would not be enough to go.
-
-    Parameters
-    ----------
-    stage : StageContext
-    sizes : sequence of int
-        Splats of each region.
-    left : int
-    runner : Runner
     """
     numbers = range(len(sizes))
     gather = [GatherRegion(index) for index in numbers]
     whole = np.sum([*runner.part(0.0, 0.4).run(stage, gather, "absorbing", sizes)], axis=0)
     price = [PriceRegion(index, whole) for index in numbers]
     runner.part(0.4, 1.0).run_all(stage, price, "absorbing", sizes)
-    priced = [stage.folder.load(index, ("costs", "weights")) for index in numbers]
-    costs = np.concatenate([arrays["costs"] for arrays in priced])
-    weights = np.concatenate([arrays["weights"] for arrays in priced])
+    costs, weights = (stage.folder.joined(numbers, name) for name in ("costs", "weights"))
     return _shared_out(costs, weights, sizes, left)
 
 
@@ -269,14 +225,8 @@ def _shared_out(
 ) -> list[int]:
     """Return how many splats of each region stay; see `_staying`.
 
-    Parameters
-    ----------
-    costs : (n,) float64
-        Of each splat's cheapest operation, region by region.
-    weights : (n,) float32
-        How many splats go by it, 1 or .5.
-    sizes : sequence of int
-    left : int
+    Of each splat's cheapest operation, region by region: its cost, (n,), and how many splats go by
+    it, 1 or .5.
     """
     order, goal = np.argsort(costs, kind="stable"), len(costs) - left
     last = int(np.searchsorted(np.cumsum(weights[order], dtype=np.float64), goal))

@@ -37,35 +37,18 @@ _NAMES = {"read": "reading", "count": "reading"}  # of steps; the others are "sc
 _REPEATED = ("count",)
 """Steps of `STEPS` that are done with several arguments: their results are not noted."""
 
-_SMALL = 1 << 16
-"""Bytes of an argument that travels with each step; larger ones lie in the folder."""
+_SMALL = 1 << 16  # bytes of an argument that travels with each step; larger ones lie in the folder
 
 
-class Stored(NamedTuple):
-    """An argument that lies in the folder, since it is large.
-
-    Attributes
-    ----------
-    name : str
-        Under which it was noted.
-    """
+class _Stored(NamedTuple):
+    """An argument that was noted under this name, since it is large."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class ClosedFormContext:
-    """What all steps of the closed form need.
-
-    Attributes
-    ----------
-    folder : Folder
-    views : ViewSet
-        Those that are used.
-    settings : ClosedForm
-    middle : (3,) float64, float
-        Of the views, as `ViewSet.middle` returns it.
-    """
+    """What all steps of the closed form need; the views are those used, with `ViewSet.middle`."""
 
     folder: Folder
     views: ViewSet
@@ -75,15 +58,7 @@ class ClosedFormContext:
 
 @dataclass(frozen=True)
 class ComputeRows:
-    """A step of the closed form with the rows of a unit.
-
-    Attributes
-    ----------
-    unit : Unit
-    step : str
-        One of `closed_form_block.STEPS`.
-    arguments : tuple
-    """
+    """A step of the closed form with the rows of a unit: one of `closed_form_block.STEPS`."""
 
     unit: Unit
     step: str
@@ -111,7 +86,7 @@ class ComputeRows:
         del splats
         block.progress = progress
         arguments = [
-            folder.noted(each.name)[1] if isinstance(each, Stored) else each
+            folder.noted(each.name)[1] if isinstance(each, _Stored) else each
             for each in self.arguments
         ]
         result = getattr(block, self.step)(*arguments)
@@ -121,21 +96,12 @@ class ComputeRows:
 
 @dataclass
 class _Steps:
-    """Does the steps of the closed form with each unit.
-
-    Attributes
-    ----------
-    context : ClosedFormContext
-    units : sequence of Unit
-    runner : Runner
-    stored : int
-        How many arguments lie in the folder.
-    """
+    """Does the steps of the closed form with each unit."""
 
     context: ClosedFormContext
     units: Sequence[Unit]
     runner: Runner
-    stored: int = 0
+    stored: int = 0  # arguments that lie in the folder
 
     def each(self, step: str, *arguments: Any) -> Iterator[Any]:  # noqa: ANN401 - of each step its own
         """Do a step with each unit."""
@@ -151,7 +117,7 @@ class _Steps:
         self.stored += 1
         name = f"argument-{self.stored}"
         self.context.folder.note(name, argument)
-        return Stored(name)
+        return _Stored(name)
 
 
 def by_closed_form(
@@ -179,7 +145,7 @@ def by_closed_form(
     """
     views, settings = context.views, context.settings
     steps = _Steps(context, units, runner)
-    with np.errstate(under="ignore"):  # as in `score_splats.score`
+    with np.errstate(under="ignore"):  # as in `pipeline.score`
         results = closed_form.steps(
             steps.each, sum(map(len, units)), views, settings, remember=context.folder.once
         )

@@ -7,6 +7,7 @@ together, as in memory: what it finds is the same to the bit, wherever the tiles
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,6 @@ from ..splats import drawable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from typing import Any
 
     from numpy.typing import NDArray
 
@@ -40,16 +40,7 @@ _MEANS, _COVARIANCES, _LARGEST, _ALPHAS, _COLORS = slice(3), slice(3, 9), 9, 10,
 
 @dataclass(frozen=True)
 class SceneContext:
-    """What all steps need that find out what views see of all splats.
-
-    Attributes
-    ----------
-    folder : Folder
-        Of these splats alone.
-    views : ViewSet
-    sampling : Sampling
-    scene : Scene
-    """
+    """What all steps need that find out what views see; the folder is of these splats alone."""
 
     folder: Folder
     views: ViewSet
@@ -82,12 +73,7 @@ class SceneContext:
 
 @dataclass(frozen=True)
 class SumMoments:
-    """Sums what the axes of the scene are made of over a source.
-
-    Attributes
-    ----------
-    source : Source
-    """
+    """Sums what the axes of the scene are made of over a source."""
 
     source: Source
 
@@ -103,22 +89,16 @@ class SumMoments:
 
 @dataclass(frozen=True)
 class ActivateSplats:
-    """Activates the splats of a source.
-
-    Attributes
-    ----------
-    source : Source
-    """
+    """Activates the splats of a source."""
 
     source: Source
 
     def run(self, context: SceneContext, progress: Progress, threads: int | None) -> int:
         """Save the Gaussians, unless that is done; return how many there are."""
         name = f"{self.source.index:06d}.activated"
-        count = context.folder.once(name, lambda: self._activated(context, progress, threads))
-        return int(count)
+        return int(context.folder.once(name, lambda: self._activate(context, progress, threads)))
 
-    def _activated(
+    def _activate(
         self, context: SceneContext, progress: Progress, threads: int | None
     ) -> NDArray[np.int64]:
         splats, scene = self.source.splats(), context.scene
@@ -139,18 +119,10 @@ class ActivateSplats:
 
 @dataclass(frozen=True)
 class GatherChunk:
-    """Gathers the Gaussians of a chunk from those of all sources.
-
-    Attributes
-    ----------
-    number : int
-        Which chunk.
-    starts : (sources + 1,) int64
-        How many Gaussians the sources before each have, and all.
-    """
+    """Gathers the Gaussians of a chunk from those of all sources."""
 
     number: int
-    starts: NDArray[np.int64]
+    starts: NDArray[np.int64]  # (sources + 1,): Gaussians of the sources before each, and of all
 
     def run(
         self, context: SceneContext, _progress: Progress, _threads: int | None
@@ -180,11 +152,7 @@ class StoredGaussians:
     ----------
     folder : Folder
     index : (M,) int64
-        Rows of the splats, see `Gaussians`.
-
-    Attributes
-    ----------
-    index : (M,) int64
+        Rows of the splats, see `Gaussians`; also an attribute.
     """
 
     def __init__(self, folder: Folder, index: NDArray[np.int64]) -> None:
@@ -225,10 +193,7 @@ def store_gaussians(
     folder, sizes = context.folder, [*map(len, sources)]
     activate = [ActivateSplats(source) for source in sources]
     counts = [*runner.part(0.0, 0.6).run(context, activate, "reading", sizes)]
-
-    def of_all(name: str) -> NDArray[Any]:
-        return np.concatenate([folder.map(source.index, name) for source in sources])
-
+    of_all = functools.partial(folder.joined, [source.index for source in sources])
     order = folder.once(
         "order", lambda: code_order(of_all("code"), lambda rows: of_all("ties")[rows])
     )

@@ -28,21 +28,11 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MeasureViews:
-    """Measures what a group of views sees of all splats, and casts rays of these views.
-
-    Attributes
-    ----------
-    group : int
-        Its number.
-    numbers : list of int
-        Of its views, in the order of `ViewSet.by_distance`.
-    kinds : list of bool
-        Of the rays to cast: whether they are scoring rays, see `RaySample`.
-    """
+    """Measures what a group of views sees of all splats, and casts rays of these views."""
 
     group: int
-    numbers: list[int]
-    kinds: list[bool]
+    numbers: list[int]  # of its views, in the order of `ViewSet.by_distance`
+    kinds: list[bool]  # of the rays to cast: whether they are scoring rays, see `RaySample`
 
     def run(self, context: SceneContext, progress: Progress, threads: int | None) -> None:
         """Note the sums and the rays, unless that is done."""
@@ -65,15 +55,7 @@ class MeasureViews:
 
 @dataclass(frozen=True)
 class _OneView:
-    """Measures one of some views and notes its rays; any process can.
-
-    Attributes
-    ----------
-    context : SceneContext
-    numbers : list of int
-    kinds : list of bool
-        See `MeasureViews`.
-    """
+    """Measures one of some views and notes its rays; any process can. See `MeasureViews`."""
 
     context: SceneContext
     numbers: list[int]
@@ -148,7 +130,7 @@ class TileMeasuring(Measuring):
         steps = [MeasureViews(group, self.groups[group], kinds) for group in groups]
         replace(self._runner, progress=progress).run_all(self._context, steps, "scoring")
         for rays in ray_samples:
-            assert isinstance(rays, StoredRays)  # noqa: S101 - as those of `TileScoring` are
+            assert isinstance(rays, StoredRays)  # noqa: S101 - as those of `_TileScoring` are
             rays.noted.update(itertools.chain(*(self.groups[group] for group in groups)))
         errors = {group: folder.noted(_name(group))[1][3] for group in groups}
         return StoredSums(folder, groups), errors

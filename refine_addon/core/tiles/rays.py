@@ -13,7 +13,7 @@ from ..seeing.cast import cast
 from ..seeing.ray_sample import RaySample, cast_view
 from ..seeing.rays import Rays
 from ..splats import joined
-from .splat_table import unpacked
+from .units import unpacked
 from .workers import Runner
 
 if TYPE_CHECKING:
@@ -33,15 +33,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class CastRays:
-    """Casts the validation rays of a view.
-
-    Attributes
-    ----------
-    number : int
-        Of the view, in the order of `ViewSet.by_distance`.
-    pixels : (C,), (R,) int64, or None
-        Columns and rows that the rays go through; None chooses them as in memory.
-    """
+    """Casts the validation rays of a view; for what it holds see `note_rays`."""
 
     number: int
     pixels: Pixels | None = None
@@ -54,13 +46,7 @@ class CastRays:
 
 @dataclass(frozen=True)
 class TakeSplats:
-    """Reads some splats of a source.
-
-    Attributes
-    ----------
-    source : Source
-    rows : (n,) int64
-    """
+    """Reads some splats of a source."""
 
     source: Source
     rows: NDArray[np.int64]
@@ -87,7 +73,7 @@ def note_rays(
         Of the view, in the order of `ViewSet.by_distance`.
     footprints : Footprints
     pixels : (C,), (R,) int64, optional
-        Columns and rows that the rays go through, if they are not to be chosen.
+        Columns and rows that the rays go through; by default they are chosen as in memory.
     scoring : bool
         Whether these are scoring rays, see `RaySample`.
     """

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..absorb_splats import absorb_removed
 from ..absorbing import merge_field
 from ..absorbing.absorb import mergeable, reduced
 from ..absorbing.merge_field import Field, ViewSums
 from ..absorbing.merge_graph import MergeGraph
+from ..pipeline.absorb_splats import absorb_removed
 from ..scores import Scores
 from ..seeing.measuring import Measured
 from ..splats import joined
 from .selecting import save_kept
-from .splat_table import packed, unpacked
+from .units import packed, unpacked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,16 +44,7 @@ _NEEDED_NO_MORE = (*_FIELD, *_PRICED, *_GATHERED, "mass", "seen_by")
 
 @dataclass(frozen=True)
 class Region:
-    """The splats that are left in a region after a stage: a `Source` of the next.
-
-    Attributes
-    ----------
-    index : int
-        Which one of all.
-    count : int
-    folder : Folder
-        Of the stage.
-    """
+    """The splats that are left in a region after a stage: a `Source` of the next."""
 
     index: int
     count: int
@@ -76,24 +67,15 @@ class Region:
 class StageContext:
     """What all steps of a stage need.
 
-    Attributes
-    ----------
-    folder : Folder
-        Of the stage. It has for each region ``rows``, those of its splats among the rows of all
-        sources, ascending, and ``sums``, what the views see of them: see `ViewSums`.
-    views : ViewSet
-    scene : Scene
-    sources : sequence of Source
-        What the stage before left.
-    factor : float
-        On the cost of merging where it is priced by regions, see `absorb.patience`.
+    The folder is that of the stage. It has for each region ``rows``, those of its splats among the
+    rows of all sources, ascending, and ``sums``, what the views see of them: see `ViewSums`.
     """
 
     folder: Folder
     views: ViewSet
     scene: Scene
-    sources: Sequence[Source]
-    factor: float = 1.0
+    sources: Sequence[Source]  # what the stage before left
+    factor: float = 1.0  # on the cost of merging, priced by regions: see `absorb.patience`
 
     def gathered(
         self, rows: NDArray[np.int64]
@@ -122,12 +104,7 @@ class StageContext:
 
 @dataclass(frozen=True)
 class SaveMeans:
-    """Saves where the splats of a source are.
-
-    Attributes
-    ----------
-    source : Source
-    """
+    """Saves where the splats of a source are."""
 
     source: Source
 
@@ -139,20 +116,14 @@ class SaveMeans:
 
 @dataclass(frozen=True)
 class GatherRegion:
-    """Gets a region ready to merge, but for the allowance.
-
-    Attributes
-    ----------
-    index : int
-        Which region.
-    """
+    """Gets a region ready to merge, but for the allowance."""
 
     index: int
 
     def run(
         self, context: StageContext, progress: Progress, threads: int | None
     ) -> NDArray[np.float64]:
-        """Save the region; return `merge_field.Unallowed.seen_and_whole`, (2, 2)."""
+        """Save the region; return `merge_field.MeasuredField.seen_and_whole`, (2, 2)."""
         name = f"{self.index:06d}.gathered"
         sums = context.folder.once(name, lambda: self._gathered(context, progress, threads))
         return np.asarray(sums)
@@ -164,44 +135,35 @@ class GatherRegion:
         table, origin, members = context.gathered(rows)
         splats = unpacked(table)
         places = mergeable(splats, context.scene, np.zeros(len(rows), np.bool_))
-        unallowed = merge_field.unallowed(
+        measured = merge_field.measured_field(
             splats, places, context.views, context.scene, ViewSums(*sums),
             progress=progress, threads=threads,
         )  # fmt: skip
         arrays = dict(zip(_GATHERED, (table, origin, members, places), strict=True))
-        arrays |= {"mass": unallowed.mass, "seen_by": unallowed.seen}
-        context.folder.save(self.index, arrays | vars(unallowed.field))
-        return unallowed.seen_and_whole()
+        arrays |= {"mass": measured.mass, "seen_by": measured.seen}
+        context.folder.save(self.index, arrays | vars(measured.field))
+        return measured.seen_and_whole()
 
 
 @dataclass(frozen=True)
 class PriceRegion:
-    """Finds what merging and deleting the splats of a region costs.
-
-    Attributes
-    ----------
-    index : int
-        Which region.
-    whole : (2, 2) float64
-        What `GatherRegion` returns, of all regions together.
-    """
+    """Finds what merging and deleting the splats of a region costs."""
 
     index: int
-    whole: NDArray[np.float64]
+    whole: NDArray[np.float64]  # what `GatherRegion` returns, of all regions together
 
     def run(self, context: StageContext, progress: Progress, threads: int | None) -> None:
         """Save the graph, and of each splat the cost of its cheapest operation and its weight."""
-        context.folder.once(
-            f"{self.index:06d}.priced", lambda: self._price(context, progress, threads)
-        )
+        name = f"{self.index:06d}.priced"
+        context.folder.once(name, lambda: self._price(context, progress, threads))
 
     def _price(self, context: StageContext, progress: Progress, threads: int | None) -> None:
         folder = context.folder
         arrays = folder.load(self.index, (*_FIELD, "mass", "seen_by", "rows", "mergeable"))
         field = Field(*(arrays[name] for name in _FIELD))
-        bare = merge_field.Unallowed(field, arrays["mass"], arrays["seen_by"])
+        measured = merge_field.MeasuredField(field, arrays["mass"], arrays["seen_by"])
         graph = MergeGraph(
-            bare.with_allowance(self.whole), context.scene, context.factor, threads=threads
+            measured.with_allowance(self.whole), context.scene, context.factor, threads=threads
         )
         graph.connect(progress)
         best, merges = graph.best()
@@ -219,15 +181,7 @@ class PriceRegion:
 
 @dataclass(frozen=True)
 class AbsorbRegion:
-    """Absorbs a region down to some splats.
-
-    Attributes
-    ----------
-    index : int
-        Which region.
-    count : int
-        How many survive.
-    """
+    """Absorbs a region down to `count` splats."""
 
     index: int
     count: int
@@ -254,15 +208,10 @@ class AbsorbRegion:
         # A survivor now also stands for all that the splats it absorbed stood for.
         stays = taken >= 0
         members = np.bincount(taken[stays], arrays["gathered_members"][stays], len(left))
-        folder.save(
-            self.index,
-            {
-                "splats": packed(left),
-                "origin": arrays["gathered_origin"][keep],
-                "members": members.astype(np.int64),
-                "expected": np.array([expected.contribution, expected.error]),
-            },
-        )
+        survivors = {"splats": packed(left), "origin": arrays["gathered_origin"][keep]}
+        survivors["members"] = members.astype(np.int64)
+        survivors["expected"] = np.array([expected.contribution, expected.error])
+        folder.save(self.index, survivors)
         return np.array(len(left))
 
     def _graph(self, context: StageContext, threads: int | None) -> MergeGraph:
@@ -277,30 +226,19 @@ class AbsorbRegion:
 
 @dataclass(frozen=True)
 class AbsorbAtOnce:
-    """Absorbs all splats that are left, of which there is one region, as in memory.
-
-    Attributes
-    ----------
-    goal : int
-        How many survive.
-    total : int
-        How many splats there were before some of them were deleted.
-    settings : Settings
-    """
+    """Absorbs all splats that are left, of which there is one region, as in memory."""
 
     goal: int
-    total: int
+    total: int  # before some of them were deleted
     settings: Settings
 
     def run(
         self, context: StageContext, progress: Progress, threads: int | None
     ) -> tuple[int, int]:
         """Save the survivors, unless that is done; return how many there are, and were merged."""
-        counts = context.folder.once(
-            "000000.absorbed", lambda: self._absorbed(context, progress, threads)
-        )
-        left, merged = counts.tolist()
-        return left, merged
+        once = context.folder.once
+        left, merged = once("000000.absorbed", lambda: self._absorbed(context, progress, threads))
+        return int(left), int(merged)
 
     def _absorbed(
         self, context: StageContext, progress: Progress, threads: int | None
@@ -316,33 +254,18 @@ class AbsorbAtOnce:
             known=(scores, Measured(sums[0], sums[1], none)), began=self.total,
             progress=progress, threads=threads,
         )  # fmt: skip
-        context.folder.save(
-            0,
-            {
-                "splats": packed(absorbed.splats),
-                "origin": rows[absorbed.keep],
-                "changed": absorbed.changed,
-            },
-        )
+        arrays = {"splats": packed(absorbed.splats), "origin": rows[absorbed.keep]}
+        context.folder.save(0, arrays | {"changed": absorbed.changed})
         return np.array([len(absorbed.splats), absorbed.merged])
 
 
 @dataclass(frozen=True)
 class SettleUnit:
-    """Notes which splats of a unit survive absorbing, and what those became that changed.
-
-    Attributes
-    ----------
-    unit : Unit
-    begin : int
-        How many splats lie before it.
-    regions : sequence of Region
-        Where the survivors are.
-    """
+    """Notes which splats of a unit survive absorbing, and what those became that changed."""
 
     unit: Unit
-    begin: int
-    regions: Sequence[Region]
+    begin: int  # how many splats lie before it
+    regions: Sequence[Region]  # where the survivors are
 
     def run(self, folder: Folder, _progress: Progress, _threads: int | None) -> NDArray[np.int64]:
         """Note them; return what `save_kept` returns."""
@@ -352,10 +275,8 @@ class SettleUnit:
         rows, changed_here = origin[here] - self.begin, changed[here]
         keep = np.zeros(len(self.unit), np.bool_)
         keep[rows] = True
-        folder.save(
-            self.unit.index,
-            {"changed": rows[changed_here], "became": self._table(place[here][changed_here])},
-        )
+        became = self._table(place[here][changed_here])
+        folder.save(self.unit.index, {"changed": rows[changed_here], "became": became})
         return save_kept(self.unit, folder, keep)
 
     def _table(self, places: NDArray[np.int64]) -> NDArray[np.float64]:

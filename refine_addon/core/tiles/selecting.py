@@ -51,14 +51,7 @@ class Rule(NamedTuple):
 
 
 class Removals(NamedTuple):
-    """How much a budget removes.
-
-    Attributes
-    ----------
-    amount : int
-        So many splats, or bytes of them.
-    by_bytes : bool
-    """
+    """How much a budget removes: so many splats, or bytes of them."""
 
     amount: int
     by_bytes: bool = False
@@ -66,16 +59,7 @@ class Removals(NamedTuple):
 
 @dataclass(frozen=True)
 class CountScores:
-    """Counts the scores of a unit by a digit of their keys; see `radix.counts`.
-
-    Attributes
-    ----------
-    unit : Unit
-    prefixes : list of int
-    shift : int
-    by_bytes : bool
-        See `Rule`.
-    """
+    """Counts the scores of a unit by a digit of their keys; see `radix.counts` and `Rule`."""
 
     unit: Unit
     prefixes: list[int]
@@ -93,12 +77,7 @@ class CountScores:
 class CountTied:
     """Counts the splats of a unit, or their bytes, that score as much as the last that goes.
 
-    Attributes
-    ----------
-    unit : Unit
-    edge : int
-    by_bytes : bool
-        See `Rule`.
+    See `Rule`.
     """
 
     unit: Unit
@@ -113,13 +92,7 @@ class CountTied:
 
 @dataclass(frozen=True)
 class ChooseByScore:
-    """Decides which splats of a unit stay.
-
-    Attributes
-    ----------
-    unit : Unit
-    rule : Rule
-    """
+    """Decides which splats of a unit stay."""
 
     unit: Unit
     rule: Rule

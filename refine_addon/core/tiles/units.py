@@ -16,7 +16,7 @@ from ..formats.ply_columns import splats_from_columns
 from ..formats.ply_header import HEADER_LIMIT, TEXT, format_of
 from ..formats.registry import read_splats
 from ..scoring.closed_form_block import ROWS
-from ..splats import joined
+from ..splats import Splats, joined
 from ..urls import Url
 from . import storage
 
@@ -27,13 +27,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..splats import Splats
 
 _HEADER = 1 << 16
 """Bytes that are fetched of a tile behind a URL for its header, which hardly ever has more."""
 
-_PIECE = 1 << 24
-"""Bytes beside the rows that are copied at a time."""
+_PIECE = 1 << 24  # bytes beside the rows that are copied at a time
 
 
 class Source(Protocol):
@@ -54,33 +52,15 @@ class Source(Protocol):
 
 
 class Tile(NamedTuple):
-    """A file of splats, as it was when the job began.
+    """A file of splats, as it was when the job began."""
 
-    Attributes
-    ----------
-    path : str
-        Absolute, or a URL.
-    splats : int
-        How many it holds.
-    dtype : structured
-        Of a row.
-    header : int
-        Bytes of the header.
-    begin : int
-        Bytes before the first row.
-    size : int
-        Bytes of the file.
-    changed : int or str
-        See `storage.state`.
-    """
-
-    path: str
-    splats: int
-    dtype: np.dtype[Any]
-    header: int
-    begin: int
-    size: int
-    changed: int | str
+    path: str  # absolute, or a URL
+    splats: int  # how many it holds
+    dtype: np.dtype[Any]  # of a row
+    header: int  # bytes of the header
+    begin: int  # bytes before the first row
+    size: int  # bytes of the file
+    changed: int | str  # see `storage.state`
 
     @property
     def place(self) -> Path | Url:
@@ -109,13 +89,7 @@ class Tile(NamedTuple):
 
 
 class Part(NamedTuple):
-    """Rows ``start`` to ``stop`` of a tile.
-
-    Attributes
-    ----------
-    tile : Tile
-    start, stop : int
-    """
+    """Rows ``start`` to ``stop`` of a tile."""
 
     tile: Tile
     start: int
@@ -129,18 +103,10 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Unit:
-    """A run of the rows of all tiles together, which may begin in one tile and end in another.
-
-    Attributes
-    ----------
-    index : int
-        Which one of all.
-    parts : tuple of Part
-        Of the tiles that it lies in, in their order; none is empty.
-    """
+    """A run of the rows of all tiles together, which may begin in one tile and end in another."""
 
     index: int
-    parts: tuple[Part, ...]
+    parts: tuple[Part, ...]  # of the tiles that it lies in, in their order; none is empty
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -197,19 +163,9 @@ class Unit:
 
 
 class Piece(NamedTuple):
-    """Rows of a tile that lie in one unit.
+    """Rows of a tile that lie in one unit: which of the unit, `place`, and of the tile, `part`."""
 
-    Attributes
-    ----------
-    unit : int
-        Index of the unit.
-    place : slice
-        Which rows of the unit they are.
-    part : Part
-        Which rows of the tile they are.
-    """
-
-    unit: int
+    unit: int  # its index
     place: slice
     part: Part
 
@@ -361,3 +317,19 @@ def pieces_of(tiles: Sequence[Tile], units: Sequence[Unit]) -> list[list[Piece]]
         for part, place in zip(unit.parts, unit.slices(), strict=True):
             pieces[numbers[part.tile]].append(Piece(unit.index, place, part))
     return pieces
+
+
+def packed(splats: Splats) -> NDArray[np.float64]:
+    """Return splats as one table, (n, 14 + 3 K), for harmonics of K coefficients a channel."""
+    count = len(splats)
+    columns = [splats.means, splats.log_scales, splats.quaternions]
+    columns += [splats.opacity_logits[:, None], splats.sh_dc, splats.sh_rest.reshape(count, -1)]
+    with np.errstate(invalid="ignore"):  # signalling NaN
+        return np.concatenate([np.asarray(values, np.float64) for values in columns], axis=1)
+
+
+def unpacked(table: NDArray[np.float64]) -> Splats:
+    """Return the splats of a table, in float64."""
+    means, scales, quaternions, logits, constant, rest = np.split(table, [3, 6, 10, 11, 14], axis=1)
+    harmonics = rest.reshape(len(table), rest.shape[1] // 3, 3)
+    return Splats(means, scales, quaternions, logits[:, 0], constant, harmonics)

@@ -16,8 +16,7 @@ from ..survivors import columns_with
 from ..urls import Url
 from . import storage
 from .folder import Interrupted
-from .splat_table import unpacked
-from .units import bytes_of, header_of, rows_of
+from .units import bytes_of, header_of, rows_of, unpacked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,29 +33,14 @@ RENAMED = "renamed"
 
 @dataclass(frozen=True)
 class WriteTile:
-    """Writes what stays of a tile into the folder of the job.
-
-    Attributes
-    ----------
-    number : int
-        Which one of all.
-    tile : Tile
-    pieces : list of Piece
-        All of its rows, in their order.
-    kept : int
-        How many of its splats stay.
-    changed : bool
-        Whether some of them absorbed others.
-    url : Url or None
-        Where to copy the file.
-    """
+    """Writes what stays of a tile into the folder of the job."""
 
     number: int
     tile: Tile
-    pieces: list[Piece]
-    kept: int
-    changed: bool
-    url: Url | None
+    pieces: list[Piece]  # all of its rows, in their order
+    kept: int  # how many of its splats stay
+    changed: bool  # whether some of them absorbed others
+    url: Url | None  # where to copy the file
 
     def run(self, folder: Folder, _progress: Progress, _threads: int | None) -> int:
         """Write the file, unless it is there; return its bytes."""
@@ -95,23 +79,12 @@ class WriteTile:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Where the tiles of a job go.
-
-    Attributes
-    ----------
-    job : Folder
-    targets : sequence of Path or Url
-        The names that all tiles get in the end.
-    waiting : sequence of Path or Url
-        Where each waits, in the same storage, until all are written.
-    overwrite : bool
-        Whether files may be replaced.
-    """
+    """Where the tiles of a job go."""
 
     job: Folder
-    targets: Sequence[Path | Url]
-    waiting: Sequence[Path | Url]
-    overwrite: bool
+    targets: Sequence[Path | Url]  # the names that all tiles get in the end
+    waiting: Sequence[Path | Url]  # where each waits, in the same storage, until all are written
+    overwrite: bool  # whether files may be replaced
 
     @classmethod
     def of(

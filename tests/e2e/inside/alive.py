@@ -194,7 +194,7 @@ class Gate:
 
     def __init__(self) -> None:
         self.running = importlib.import_module(f"{extension.MODULE}.ui.running")
-        scoring = importlib.import_module(f"{extension.MODULE}.core.score_splats")
+        scoring = importlib.import_module(f"{extension.MODULE}.core.pipeline")
         work = importlib.import_module(f"{extension.MODULE}.core.work")
         self.opened, score = threading.Event(), scoring.score
 

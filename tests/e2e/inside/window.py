@@ -1,4 +1,4 @@
-"""Use the panel as a person does: its tab, *Score*, a slider, *Apply*, Ctrl+Z, *Heat Map*."""
+"""Use the panel as a person does: its tab, *Score*, a slider, *Apply*, Ctrl+Z."""
 
 from __future__ import annotations
 
@@ -72,13 +72,6 @@ def main(name: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
     yield from until(lambda: state(name) != found["applied"], "they are back")
     yield from picture(pictures, "5-undone")
     found["undone"] = state(name)
-
-    # Last, since every frame is slow from here on: the view now draws materials.
-    yield from hand.scroll(down=False)
-    yield from hand.click("refine.preview(mode='HEAT'")
-    yield from until(lambda: bpy.data.objects[name].modifiers, "there is a preview")
-    yield from picture(pictures, "6-heat", settle=20.0)  # EEVEE compiles its shaders
-    found["previewed"] = state(name)
     return found
 
 

@@ -1,33 +1,30 @@
-"""Pruning where all splats are in memory: what is asked, and how it is decided."""
+"""What may be asked of splats in memory, and how it is decided."""
 
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..affine import is_uniform, transformed
-from ..cleaning.clean import clean
-from ..formats.registry import read_written, refuse_unknown_size
-from ..pipeline import decide
+from ..cleaning.clean import Cleaning, clean
+from ..formats.registry import refuse_unknown_size
+from ..pipeline import decide, score
+from ..report import kept_and_removed, scoring_notes, seen_by, what_was_seen
 from ..task import DEFAULTS, Settings, Task
-from ..whole_file import expanded
-from ..work import Progress, silent
-from .files import FileSink, FileSource
-from .run import DECIDED, Request, run
-from .written import written_facts
+from .run import DECIDED, Request
+from .written import written_facts, written_splats
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
-    from ..cleaning.clean import Cleaning
+    from numpy.typing import NDArray
+
     from ..formats.format import Format
     from ..picture_files import PictureFiles
     from ..selection import Budget
-    from ..splats import Splats
     from ..task import Result
     from ..views import ViewSet
     from ..volumes import Zone
@@ -36,6 +33,9 @@ if TYPE_CHECKING:
 
 CLEANED, COMPARED = 0.4, 0.85
 """Where in the progress of a prune cleaning ends, and where pictures begin."""
+
+PROPERTY = "refine_score"
+"""The property of a PLY that holds the scores."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,18 +50,14 @@ class PruneRequest(Request["Loaded", "Result"]):
         How much goes.
     settings : Settings
         How to score.
-    zones : sequence of Zone
-        Volumes that say which splats must stay and which must go, in the frame of the views.
+    zones, overwrite, dry_run
+        See `Request`.
     absorb : bool
         Whether survivors absorb the splats that are removed; see `Task`.
     cleaning : Cleaning or None
         What to clean away first. The budget then counts what is left.
     pictures : PictureFiles or None
         Where pictures before and after go; none are drawn without it.
-    overwrite : bool
-        Whether files may be replaced.
-    dry_run : bool
-        Whether to decide as for the output, and write no splats.
     """
 
     views: ViewSet
@@ -170,72 +166,141 @@ class PruneRequest(Request["Loaded", "Result"]):
                 path, result.scores, used, matrix=loaded.matrix, threads=runtime.threads
             )
         if self.pictures is not None:
+            after = None if path is None else written_splats(path, loaded.matrix)
+            after = result.survivors(loaded.splats) if after is None else after
             facts["pictures"] = self.pictures.write(
-                loaded.splats, _as_written(loaded, result, path), self.views,
+                loaded.splats, after, self.views,
                 progress=runtime.part(COMPARED, 1.0).progress, threads=runtime.threads,
             )  # fmt: skip
             runtime.clock.lap("pictures_s")
         return facts
 
 
-def _as_written(loaded: Loaded, result: Result, path: Path | None) -> Splats:
-    """Return what stays as the file holds it, in the frame of the views.
+@dataclass(frozen=True, eq=False)
+class Kept:
+    """Which splats stay, none of which absorbs others.
 
-    Where the matrix scales directions differently, harmonics cannot follow it: nothing that a
-    format rounds is seen then.
-    """
-    matrix = loaded.matrix
-    if path is None or not is_uniform(matrix):
-        return result.survivors(loaded.splats)
-    rounded = read_written(path)
-    if rounded is None:
-        return result.survivors(loaded.splats)
-    return rounded if np.array_equal(matrix, np.eye(4)) else transformed(rounded, matrix)
-
-
-def prune_file(
-    source: Path | str,
-    output: Path | str | None,
-    request: PruneRequest,
-    *,
-    progress: Progress = silent,
-    threads: int | None = None,
-) -> Result:
-    """Prune a file of splats, and write the result to another file.
-
-    Parameters
+    Attributes
     ----------
-    source : path-like
-        The file to read, of any format (`read_splats`).
-    output : path-like or None
-        The file to write, in the format that its suffix names; None decides without writing, as for
-        a plain PLY.
-    request : PruneRequest
-        What is asked.
-    progress, threads
-        See `run`.
-
-    Returns
-    -------
-    Result
-        Its report also has the names and sizes of the files.
-
-    Raises
-    ------
-    RefineError, Cancelled
-        See `run`, `FileSource`, `FileSink` and `PruneRequest`. Nothing is written then, unless the
-        message says so.
-
-    Examples
-    --------
-    To leave half of the splats, with what they absorbed::
-
-        prune_file("in.ply", "out.ply", PruneRequest(views, Budget(ratio=0.5), absorb=True))
+    keep : (N,) bool
+    report : dict
+    columns : dict of str to (N,)
+        Properties that are written otherwise than they are stored.
     """
-    sink = FileSink(
-        None if output is None else expanded(output),
-        source=expanded(source),
-        overwrite=request.overwrite,
-        dry_run=request.dry_run,
-    )
-    return run(FileSource(source, request.zones), request, sink, progress=progress, threads=threads)
+
+    keep: NDArray[np.bool_]
+    report: dict[str, Any]
+    columns: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class CleanRequest(Request["Loaded", Kept]):
+    """What is asked of a cleaning.
+
+    Attributes
+    ----------
+    views : ViewSet
+        Those that decide.
+    cleaning : Cleaning
+        What to clean away.
+    zones, overwrite
+        See `Request`.
+    """
+
+    views: ViewSet
+    cleaning: Cleaning = field(default_factory=Cleaning)
+    zones: Sequence[Zone] = ()
+    overwrite: bool = False
+
+    def decide(self, loaded: Loaded, runtime: Runtime) -> Kept:
+        """Return what `clean` leaves.
+
+        Raises
+        ------
+        RefineError, Cancelled
+            See `clean`.
+        """
+        forced = loaded.forced
+        cleaned = clean(
+            loaded.splats, self.views, self.cleaning,
+            protected=forced.protected, removed=forced.removed,
+            progress=runtime.part(0.0, DECIDED).progress, threads=runtime.threads,
+        )  # fmt: skip
+        runtime.clock.lap("clean_s")
+        facts: dict[str, Any] = what_was_seen(
+            cleaned.seen, cleaned.undrawable, cleaned.views_given, cleaned.views_used
+        )
+        facts["splats"] |= kept_and_removed(cleaned.keep) | forced.counts()
+        facts["splats"]["unseen"] -= facts["splats"]["forced"]
+        facts |= {
+            "settings": asdict(self.cleaning),
+            "volumes": loaded.volumes,
+            "cleaned": cleaned.facts(),
+            "notes": cleaned.notes(),
+        }
+        return Kept(cleaned.keep, facts)
+
+
+@dataclass(frozen=True, eq=False)
+class ScoreRequest(Request["Loaded", Kept]):
+    """What is asked of a scoring.
+
+    Attributes
+    ----------
+    views : ViewSet
+        Those that decide.
+    settings : Settings
+        How to score.
+    zones, overwrite
+        See `Request`. What must go scores 0.
+    """
+
+    views: ViewSet
+    settings: Settings = DEFAULTS
+    zones: Sequence[Zone] = ()
+    overwrite: bool = False
+
+    def decide(self, loaded: Loaded, runtime: Runtime) -> Kept:
+        """Return all splats, with their scores as a property.
+
+        Raises
+        ------
+        RefineError, Cancelled
+            See `pipeline.score`.
+        """
+        forced = loaded.forced
+        scores = score(
+            loaded.splats, self.views, self.settings,
+            protected=forced.protected, removed=forced.removed,
+            progress=runtime.part(0.0, DECIDED).progress, threads=runtime.threads,
+        )  # fmt: skip
+        runtime.clock.lap("score_s")
+        facts: dict[str, Any] = seen_by(scores)
+        facts["splats"]["forced"] = forced.counts()["forced"]
+        facts["splats"]["unseen"] -= facts["splats"]["forced"]
+        facts |= {
+            "settings": asdict(self.settings),
+            "volumes": loaded.volumes,
+            "weights": scores.facts,
+            "notes": scoring_notes(scores),
+        }
+        keep = np.ones(len(loaded.splats), np.bool_)
+        return Kept(keep, facts, {PROPERTY: scores.values})
+
+
+@dataclass(frozen=True)
+class ConvertRequest(Request["Loaded", Kept]):
+    """That all splats stay, in the format of the output.
+
+    Attributes
+    ----------
+    overwrite
+        See `Request`.
+    """
+
+    overwrite: bool = False
+
+    def decide(self, loaded: Loaded, _runtime: Runtime) -> Kept:
+        """Return all splats."""
+        count = len(loaded.splats)
+        return Kept(np.ones(count, np.bool_), {"splats": {"before": count}, "notes": []})

@@ -7,21 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .estimate.alignment import alignment
-from .estimate.psnr import quality_curve
-from .scoring import auto, closed_form, occlusion
-from .seeing.ray_sample import validation_rays
-from .task import DEFAULTS, Settings
-from .volumes import refuse_all
-from .work import Progress, part, silent
+from ..estimate.alignment import alignment
+from ..estimate.psnr import quality_curve
+from ..scoring import auto, closed_form, occlusion
+from ..seeing.ray_sample import validation_rays
+from ..task import DEFAULTS, Settings
+from ..volumes import refuse_all
+from ..work import Progress, part, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .scores import Scores
-    from .seeing.measuring import Measured
-    from .splats import Splats
-    from .views import ViewSet
+    from ..scores import Scores
+    from ..seeing.measuring import Measured
+    from ..splats import Splats
+    from ..views import ViewSet
 
 
 def score(  # noqa: PLR0913 - as `pipeline.prune`
@@ -74,12 +74,12 @@ def score(  # noqa: PLR0913 - as `pipeline.prune`
     if removed is not None and removed.any():
         refuse_all(removed)
         rest = ~removed
-        found = score(
+        scores = score(
             splats.take(rest), views, settings,
             protected=None if protected is None else protected[rest],
             quality=quality, settled=settled, progress=progress, threads=threads,
         )  # fmt: skip
-        return found.for_all(rest)
+        return scores.for_all(rest)
     whole, estimates = progress, quality or settings.estimates
     progress = part(progress, 0.0, 0.9 if estimates else 1.0)
     # Numbers that underflow to 0 are negligible in all sums.
@@ -103,8 +103,8 @@ def score(  # noqa: PLR0913 - as `pipeline.prune`
             rays = validation_rays(splats, used, progress=part(whole, 0.9, 0.95), threads=threads)
             scores = replace(scores, ray_sample=rays)
     scores = _with_views(scores, splats, views, used, part(whole, 0.95, 0.95), threads)
-    ahead = part(whole, 0.95, 1.0)
-    return with_quality(scores, protected=protected, progress=ahead, threads=threads)
+    progress = part(whole, 0.95, 1.0)
+    return with_quality(scores, protected=protected, progress=progress, threads=threads)
 
 
 def with_quality(
@@ -154,9 +154,9 @@ def _with_views(
     """
     notes = (*scores.notes, views.note) if views.note else scores.notes
     # Beside the closed form, measuring would take as long as scoring.
-    some = None if scores.ray_sample is None else used
-    found = alignment(splats, views, some, progress=progress, threads=threads)
-    return replace(scores, views_given=len(views), notes=notes, alignment=found)
+    measured = None if scores.ray_sample is None else used
+    aligned = alignment(splats, views, measured, progress=progress, threads=threads)
+    return replace(scores, views_given=len(views), notes=notes, alignment=aligned)
 
 
 def score_once(
@@ -184,5 +184,5 @@ def score_once(
             splats, used, settings.occlusion, few_views=not curve,
             progress=part(progress, 0.0, 0.99), threads=threads,
         )  # fmt: skip
-    ahead = part(progress, 0.99, 1.0)
-    return _with_views(scores, splats, views, used, ahead, threads), measured
+    progress = part(progress, 0.99, 1.0)
+    return _with_views(scores, splats, views, used, progress, threads), measured

@@ -1,8 +1,8 @@
 """The way from splats, views and a budget to the splats that stay.
 
 The panel, the command and Python code all call `decide`, so all of them keep the same splats. It
-has two steps: the splats are scored and the budget selects by score; then, if survivors are to
-absorb the others, as many survivors are found again, by merging.
+has two steps: splats are scored, and the budget selects by score; then, to absorb, splats are
+merged until as many are left as were selected.
 """
 
 from __future__ import annotations
@@ -11,23 +11,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import selection
+from .. import selection
+from ..estimate.psnr import psnr_kept
+from ..estimate.quality import needed
+from ..report import MEASURES, Clock, conclude, make_report, remark
+from ..task import DEFAULTS, Result, Settings, Task
+from ..work import Progress, part, report, silent
 from .absorb_splats import absorb_task
-from .estimate.psnr import psnr_kept
-from .estimate.quality import needed
-from .report import MEASURES, Clock, conclude, make_report, remark
 from .score_splats import score, score_once, with_quality
-from .task import DEFAULTS, Result, Settings, Task
-from .work import Progress, part, report, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .scores import Scores
-    from .seeing.measuring import Measured
-    from .selection import Budget, RowBytes
-    from .splats import Splats
-    from .views import ViewSet
+    from ..scores import Scores
+    from ..seeing.measuring import Measured
+    from ..selection import Budget, RowBytes
+    from ..splats import Splats
+    from ..views import ViewSet
 
 
 def prune(  # noqa: PLR0913 - the main function of core; all but three are optional
@@ -149,8 +149,7 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     absorbed = None
     if task.absorb:
         count = int(np.count_nonzero(keep))
-        ahead = part(progress, 0.2, 1.0)
-        absorbed, psnr = absorb_task(task, count, known, ahead, threads)
+        absorbed, psnr = absorb_task(task, count, known, part(progress, 0.2, 1.0), threads)
         keep = absorbed.keep
         clock.lap("absorb_s")
     else:
@@ -216,7 +215,7 @@ def _settled(task: Task) -> int | None:
     if task.reusable:
         return None
     total = len(task.scene()[0])
-    held = 0 if task.protected is None else int(np.count_nonzero(task.protected))
-    found = needed(task.budget.removals(total, task.row_bytes, task.fixed_bytes), total)
+    spared = 0 if task.protected is None else int(np.count_nonzero(task.protected))
+    removed = needed(task.budget.removals(total, task.row_bytes, task.fixed_bytes), total)
     # Those that are protected stay, wherever in the order they are.
-    return None if found is None or found + held >= total else found + held
+    return None if removed is None or removed + spared >= total else removed + spared

@@ -9,25 +9,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .absorbing import absorb as absorbing
-from .absorbing.merging import ViewSums
-from .estimate.psnr import psnr_against
-from .estimate.quality import left_to_lose
+from ..absorbing import absorb as absorbing
+from ..absorbing.merge_field import ViewSums
+from ..estimate.psnr import psnr_against
+from ..estimate.quality import left_to_lose
+from ..scoring import occlusion
+from ..selection import Budget, quality_of, select
+from ..task import DEFAULTS, Settings
+from ..work import Progress, part, silent
 from .score_splats import score_once, with_quality
-from .scoring import occlusion
-from .selection import Budget, quality_of, select
-from .task import DEFAULTS, Settings
-from .work import Progress, part, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from .absorbing.absorb import Absorbed
-    from .scores import Scores
-    from .seeing.measuring import Measured
-    from .splats import Splats
-    from .task import Task
-    from .views import ViewSet
+    from ..absorbing.absorb import Absorbed
+    from ..scores import Scores
+    from ..seeing.measuring import Measured
+    from ..splats import Splats
+    from ..task import Task
+    from ..views import ViewSet
 
 TRIES = 3
 """How often absorbing is done at most to reach a PSNR."""
@@ -101,8 +101,8 @@ def _absorb_to_count(
     if truth is None:
         return absorbed, None
     used = views.spread(task.settings.views)
-    ahead = part(progress, 0.95, 1.0)
-    return absorbed, psnr_against(truth, absorbed.splats, used, progress=ahead, threads=threads)
+    progress = part(progress, 0.95, 1.0)
+    return absorbed, psnr_against(truth, absorbed.splats, used, progress=progress, threads=threads)
 
 
 def _absorb_to_psnr(
@@ -126,8 +126,8 @@ def _absorb_to_psnr(
     best: tuple[Absorbed, float] | None = None
     for number in range(TRIES):
         count = total - math.floor(curve.share(goal - offset, absorb=True) * total)
-        ahead = part(progress, number / TRIES, (number + 1) / TRIES)
-        absorbed, psnr = _absorb_to_count(task, count, known, ahead, threads)
+        try_progress = part(progress, number / TRIES, (number + 1) / TRIES)
+        absorbed, psnr = _absorb_to_count(task, count, known, try_progress, threads)
         if psnr is None:
             return absorbed, None
         if best is None or abs(psnr - goal) < abs(best[1] - goal):
@@ -162,8 +162,8 @@ def absorb_removed(  # noqa: PLR0913 - as `pipeline.prune`
     known : tuple of Scores and Measured, optional
         The results of `occlusion.score_once` for these splats and views, if known.
     began : int, optional
-        How many splats there were before some of them became these by absorbing. What is deleted
-        first, and how patient merging is, go by the share that has gone of those.
+        How many splats there were before these absorbed others. What is deleted first, and how
+        patient merging is, go by the share of them that has gone.
     protected : (N,) bool, optional
         Splats that are neither removed nor changed.
 
@@ -191,15 +191,16 @@ def absorb_removed(  # noqa: PLR0913 - as `pipeline.prune`
     del known, scores, measured
     turns = itertools.count()
 
-    def measure(now: Splats, expected: ViewSums | None, ahead: Progress) -> ViewSums:
+    def measure(now: Splats, expected: ViewSums | None, stage_progress: Progress) -> ViewSums:
         if expected is None:
             return at_first.pop()
-        found, share = occlusion.measure_part(
-            now, used, settings.occlusion, next(turns), PARTS, progress=ahead, threads=threads
-        )
+        measured, share = occlusion.measure_part(
+            now, used, settings.occlusion, next(turns), PARTS,
+            progress=stage_progress, threads=threads,
+        )  # fmt: skip
         return ViewSums(
-            found.contribution + (1.0 - share) * expected.contribution,
-            found.error + (1.0 - share) * expected.error,
+            measured.contribution + (1.0 - share) * expected.contribution,
+            measured.error + (1.0 - share) * expected.error,
         )
 
     with np.errstate(under="ignore"):  # as in `score_splats.score`

@@ -1,0 +1,72 @@
+"""Imports in the package have no circles, those for types included (docs/architecture.md)."""
+
+from __future__ import annotations
+
+import ast
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[2] / "refine_addon"
+MODULES = {
+    ".".join(path.relative_to(PACKAGE).with_suffix("").parts).removesuffix("__init__").strip("."): (
+        path
+    )
+    for path in PACKAGE.rglob("*.py")
+}
+
+
+def imported(name, path):
+    """Return the modules of the package that one imports, anywhere in it."""
+    parts = name.split(".") if name else []
+    package = parts if path.name == "__init__.py" else parts[:-1]
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.level:
+            start = package[: len(package) - node.level + 1]
+            module = ".".join([*start, *(node.module or "").split(".")]).strip(".")
+            for alias in node.names:
+                inner = f"{module}.{alias.name}".strip(".")
+                found.add(inner if inner in MODULES else module)
+    return found & set(MODULES) - {name}
+
+
+IMPORTS = {name: imported(name, path) for name, path in MODULES.items()}
+
+
+def room(name):
+    """Return the folder of a module, or the module where it lies in no room of its own."""
+    parts = name.split(".")
+    depth = 2 if parts[0] == "core" else 1
+    return ".".join(parts[:depth])
+
+
+def between_rooms():
+    """Return the imports between rooms."""
+    graph = {room(name): set() for name in IMPORTS}
+    for name, others in IMPORTS.items():
+        graph[room(name)] |= {room(other) for other in others} - {room(name)}
+    return graph
+
+
+@pytest.mark.parametrize("graph", [IMPORTS, between_rooms()], ids=["modules", "rooms"])
+def test_imports_have_no_circle(graph):
+    """So each module, and each room, is understood from those below it alone."""
+    assert len(graph) > 1
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" -> ".join(reversed(error.args[1])))
+
+
+def test_nothing_in_core_imports_what_needs_blender():
+    """`ui`, `objects`, `mesh` and the others stand on core, not beside it."""
+    outside = {
+        (name, other)
+        for name, others in IMPORTS.items()
+        for other in others
+        if room(name).startswith("core") and not room(other).startswith("core")
+    }
+
+    assert {other for _, other in outside} <= {"version"}
