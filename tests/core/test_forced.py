@@ -134,6 +134,21 @@ def test_scores_of_what_is_left_decide_as_well_as_a_pruning_that_scores(
         assert np.array_equal(decide(replace(task, scores=given)).keep, expected.keep)
 
 
+def test_the_curve_has_protected_splats_last_though_others_must_go(splats, views, removed):
+    """As where these have gone before; without protection it is another curve."""
+    settings, rest = Settings("occlusion"), ~removed
+    protected = rest & (np.arange(COUNT) % 2 == 0)
+
+    found, free = (
+        score(splats, views, settings, removed=removed, protected=stays).quality.psnr
+        for stays in (protected, None)
+    )
+
+    left = score(splats.take(rest), views, settings, protected=protected[rest])
+    np.testing.assert_array_equal(found, left.quality.psnr)
+    assert not np.array_equal(found, free)
+
+
 def test_what_was_forced_out_when_scored_and_is_no_more_has_no_score(splats, views, removed):
     """It might be worth most: nothing tells."""
     scores = score(splats, views, removed=removed)

@@ -176,14 +176,7 @@ def _estimated(scores: Scores, keep: NDArray[np.bool_], threads: int | None) -> 
 def _scores_of(
     task: Task, progress: Progress, threads: int | None
 ) -> tuple[Scores, tuple[Scores, Measured] | None]:
-    """Return the scores of a task.
-
-    Returns
-    -------
-    scores : Scores
-    known : tuple of Scores and Measured, or None
-        See `absorb_removed`.
-    """
+    """Return the scores of a task, and `known` of `absorb_removed` if that came with them."""
     if task.scores is not None:
         return task.scores, None
     splats, views = task.scene()
