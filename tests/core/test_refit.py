@@ -119,6 +119,7 @@ def test_backward_is_the_transpose_of_forward():
     )
 
 
+@pytest.mark.slow
 def test_refitted_survivors_are_nearer_to_what_the_views_see():
     """Half of a cloud, colours and all: some dB on rays that nothing was fitted to."""
     splats, views = cloud(400), ring()
@@ -134,6 +135,7 @@ def test_refitted_survivors_are_nearer_to_what_the_views_see():
     assert every.splats.sh_rest is survivors.sh_rest
 
 
+@pytest.mark.slow
 def test_protected_and_unseen_survivors_keep_their_bits():
     """Also where their quaternions are not of length 1."""
     splats = cloud(400)
@@ -177,6 +179,7 @@ def test_threads_change_no_bit(threads):
     np.testing.assert_array_equal(found.splats.means, expected.splats.means)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-6, 1e6])
 def test_the_unit_of_the_scene_changes_nothing(size):
     """Positions, sizes and cameras by a factor: the same gain to rounding."""
