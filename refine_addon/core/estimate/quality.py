@@ -196,9 +196,9 @@ def absorbed_from(
     """
     constant, part, fewer = np.array([*GAIN, FEWER])[:, : len(gains)]
     halvings = max(math.log2(FULL_GAIN / max(count, 1)), 0.0)
-    found = (constant + part * gains - halvings * fewer).clip(0.0)
+    foretold = (constant + part * gains - halvings * fewer).clip(0.0)
     known = (PLAIN, *ABSORBED_SHARES[: len(gains)])
-    gain = np.interp(SHARES[: len(psnr)], known, np.concatenate([[0.0], found]))
+    gain = np.interp(SHARES[: len(psnr)], known, np.concatenate([[0.0], foretold]))
     return np.minimum.accumulate(np.minimum(psnr + gain, PSNR_CAP))
 
 

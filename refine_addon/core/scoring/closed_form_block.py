@@ -41,7 +41,7 @@ ordered by distance, and nearly always below all that are seen."""
 REACH = 2.0
 """Standard deviations along its longest axis that a splat reaches into an image from outside."""
 
-CROWDED = 0.05
+LOCAL_HALF = 0.05
 """Score, in units of the mean, at which w is 1/2; see `closed_form`."""
 
 CELLS = 64
@@ -530,7 +530,7 @@ class RowBlock:
 
     def _compare(self, powers: NDArray[np.float64], overall: float, piece: slice) -> None:
         values = self.plain[piece].astype(np.float64)
-        weight = values / (values + CROWDED * overall)
+        weight = values / (values + LOCAL_HALF * overall)
         with np.errstate(under="ignore"):
             values *= np.exp(weight * powers[self.cells[piece]])
             self._store(self.values, values, piece)
