@@ -205,10 +205,10 @@ def _strip(
     pixels = len(columns) * len(rows)
     log_left, image = np.zeros(pixels), np.zeros((3, pixels))  # logarithm of the transmittance
 
-    def see_through(pixel: NDArray[np.int32]) -> NDArray[np.bool_]:
+    def unfinished(pixel: NDArray[np.int32]) -> NDArray[np.bool_]:
         return np.asarray((log_left > LOG_OPAQUE).take(pixel))
 
-    for owner, pixel, alpha in hits(footprints, columns, rows, _PAIRS, see_through):
+    for owner, pixel, alpha in hits(footprints, columns, rows, _PAIRS, unfinished):
         order = np.argsort(pixel.astype(np.min_scalar_type(pixels)), kind="stable")
         sorted_owner, sorted_pixel = owner[order], pixel[order]
         weight = _weights(sorted_pixel, alpha[order], log_left)

@@ -957,7 +957,7 @@ def test_points_lie_where_their_lattices_put_them_in_and_across_the_image():
         inside[row] += share
         squares[row] += share**2
     assert 0.1 < np.mean(inside < 0.99) < 0.9
-    np.testing.assert_allclose(points.inside, inside, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(points.share_inside, inside, rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(points.squares, squares, rtol=1e-4, atol=1e-6)
     of_cells = np.add.reduceat(points.shares, np.cumsum(points.counts) - points.counts)
     cells = sorted({cell for _, cell in expected})

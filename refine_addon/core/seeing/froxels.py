@@ -35,7 +35,8 @@ _MAX_THICKNESS = 60.0
 
 _LEAST_LEFT = 1e-4
 """The colour behind a point is divided by the transmittance behind it, and at least by this: less
-cannot be seen."""
+cannot be seen. Thicknesses of cells are means, so hidden points are not left out before as those of
+rays are."""
 
 
 def traits(
@@ -170,7 +171,7 @@ def squared_contrast(
     return squared
 
 
-def mean_visible(
+def means_over_footprints(
     points: Points, visible: NDArray[np.float64], errors: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the means over each footprint of T and of ``T^2 |c - B|^2``, both (n,).
@@ -184,12 +185,12 @@ def mean_visible(
         Of each point: its share times T, and the square of that times ``|c - B|^2``.
     """
     checkpoint()
-    count = len(points.inside)
+    count = len(points.share_inside)
     owners = points.owners.astype(np.int64)
     total = np.asarray(np.bincount(owners, errors, count), np.float64)
     # The factors alpha^2 do not sum to 1: divide by their sum, and multiply by the share of the
     # footprint that lies in the image.
-    total *= points.inside / np.maximum(points.squares, 1e-30)
+    total *= points.share_inside / np.maximum(points.squares, 1e-30)
     return np.asarray(np.bincount(owners, visible, count), np.float64), total
 
 

@@ -233,7 +233,7 @@ class Measuring:
         """
         numbers = [number for k in groups for number in self.groups[k]]
         wanted = [
-            (rays.scoring, {number for number in numbers if rays.wants(number)})
+            WantedRays(rays.scoring, {number for number in numbers if rays.wants(number)})
             for rays in ray_samples
         ]
         measurements = for_each(
@@ -251,13 +251,20 @@ class Measuring:
                 before = total.error[sample]  # (m,)
                 total.add_view(measurement, self.views[number][1])
                 errors_of_views.append(total.error[sample] - before)
-                for rays, rays_of_view in zip(ray_samples, cast, strict=True):
-                    if rays_of_view is not None:
-                        rays.rays[number] = rays_of_view
+                for ray_sample, rays in zip(ray_samples, cast, strict=True):
+                    if rays is not None:
+                        ray_sample.rays[number] = rays
             errors[k] = np.array(errors_of_views)
         for _ in measurements:
             pass  # lets it end
         return sums, errors
+
+
+class WantedRays(NamedTuple):
+    """The numbers of the views whose rays a sample lacks, and whether they are scoring rays."""
+
+    scoring: bool
+    numbers: set[int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,7 +280,7 @@ class _MeasureAndCast:
     views: list[tuple[View, float]]  # all of them
     sampling: Sampling
     numbers: list[int]  # of the views to measure
-    wanted: list[tuple[bool, set[int]]]
+    wanted: list[WantedRays]
 
     def __call__(self, place: int) -> tuple[ViewMeasurement, list[Rays | None]]:
         """Return what a view sees of the splats, and its rays."""
@@ -331,5 +338,5 @@ def measure_footprints(
             visible[place] = weight
             weight *= weight
             errors[place] = weight * squared_contrast
-        visible, errors = froxels.mean_visible(points, visible, errors)
+        visible, errors = froxels.means_over_footprints(points, visible, errors)
         return ViewMeasurement(rows, inside, mass * visible, mass_squared * errors)

@@ -68,8 +68,9 @@ class Points:
         Of the splat's mass.
     counts : (C,) int64
         How many points lie in each of the C cells that are not empty: the columns of points.
-    inside, squares : (n,) float64
-        Of each footprint: the sum of its shares, and of their squares.
+    share_inside, squares : (n,) float64
+        Of each footprint: the sum of its shares, that is the share of its mass in the image, and
+        the sum of their squares.
     area : float
         Of a cell, px^2.
     """
@@ -77,7 +78,7 @@ class Points:
     owners: NDArray[np.int32]
     shares: NDArray[np.float32]
     counts: NDArray[np.int64]
-    inside: NDArray[np.float64]
+    share_inside: NDArray[np.float64]
     squares: NDArray[np.float64]
     area: float
 

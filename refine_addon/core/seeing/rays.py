@@ -26,7 +26,8 @@ LOG_OPAQUE = -9.3
 """Logarithm of the transmittance below which nothing is seen, 1e-4."""
 
 LEAST_LEFT = 1e-8
-"""The colour behind a hit is divided by the transmittance behind it, and at least by this."""
+"""The colour behind a hit is divided by the transmittance behind it, and at least by this. What is
+hidden is left out before (`LOG_OPAQUE`), so it only guards against a division by 0."""
 
 _PIECE = 1 << 15  # hits processed at a time: what stays in the second-level cache
 
@@ -162,13 +163,12 @@ class Rays:
         keep : (u,) bool
             Which of them are kept.
         """
-        nobody = colors.shape[1]
-        owner = self._nearest_kept(keep, nobody)
-        black = np.zeros((3, 1))
-        return replace(self, owner=owner).colors(np.append(colors, black, axis=1))
+        black = colors.shape[1]  # the column behind all splats
+        owner = self._nearest_kept(keep, black)
+        return replace(self, owner=owner).colors(np.append(colors, np.zeros((3, 1)), axis=1))
 
-    def _nearest_kept(self, keep: NDArray[np.bool_], nobody: int) -> NDArray[np.int32]:
-        """Return for each hit the owner of the nearest kept hit of the same ray, (h,), or `nobody`.
+    def _nearest_kept(self, keep: NDArray[np.bool_], none_kept: int) -> NDArray[np.int32]:
+        """Return for each hit the owner of its ray's nearest kept hit, (h,), or `none_kept`.
 
         Nearest in the number of hits between; of two, the one in front. A kept hit is its own.
         `keep` is of the (u,) splats that are hit.
@@ -185,7 +185,7 @@ class Rays:
         nearest = np.where(steps_front < steps_back, before, after)
         alone = np.minimum(steps_front, steps_back) == none
         owner = self.owner.take(np.where(alone, here, nearest))
-        owner[alone] = nobody
+        owner[alone] = none_kept
         return owner
 
     def _first_hits(self) -> NDArray[np.int64]:
@@ -219,8 +219,8 @@ def _removal_errors(
     red_green = behind(paired(weight * colors[0], weight * colors[1]), counts)
     blue = behind((weight * colors[2]).astype(np.float64), counts)
     error = np.zeros(len(alpha), np.float32)
-    for own, light in zip(colors, (red_green.real, red_green.imag, blue), strict=True):
-        change = light.astype(np.float32)
+    for own, sum_behind in zip(colors, (red_green.real, red_green.imag, blue), strict=True):
+        change = sum_behind.astype(np.float32)
         change /= left  # the colour behind
         change -= own
         change *= weight
