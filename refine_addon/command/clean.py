@@ -26,7 +26,7 @@ def _clean(run: Run, source: Path, output: Path | None, views: ViewSet) -> dict[
     request = CleanRequest(views, cleaning(options), zones.of_files(options), options.overwrite)
     done = file_to_file(source, output, request, progress=run.progress(source.name)).report
     run.terminal.clear()
-    splats, to = done["splats"], f" -> {output}" if output else ""
+    splats, to = done["splats"], f" -> {output}" if output else "; nothing is written without -o"
     run.terminal.say(
         f"{run.named(str(source))}: {done['cleaned']['words']}; {splats['kept']:,} of "
         f"{splats['before']:,} splats stay{written(splats)}, {by(done['views'])}{to}"
