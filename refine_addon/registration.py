@@ -18,7 +18,6 @@ from .ui.operators import (
     REFINE_OT_apply,
     REFINE_OT_convert,
     REFINE_OT_levels,
-    REFINE_OT_plan,
     REFINE_OT_score,
 )
 from .ui.panel import (
@@ -65,7 +64,6 @@ CLASSES = (
     REFINE_OT_drop_volume,
     REFINE_OT_crop,
     REFINE_OT_score,
-    REFINE_OT_plan,
     REFINE_OT_apply,
     REFINE_OT_compare,
     REFINE_OT_preview,

@@ -4,9 +4,9 @@ Both parse the same arguments and run the same pipeline. Only ``--object``, and 
 open scene (`scene_cameras`), need Blender; they are imported where they are used.
 
 In the order in which they work: `signals` listens for Ctrl-C, `flow` goes from arguments to exit
-code, `options` parses, `checks` refuses what cannot go together, `runs` does the work (for ``info``
-with `info`) by the views that `cameras` returns, `report` writes down what was done. `terminal` is
-all that prints, in `words` where several subcommands say the same.
+code, `options` parses, `checks` refuses what cannot go together, `runs` calls the module of the
+subcommand, such as `prune`. That goes from input to input by `run`; `report` writes down what was
+done. `terminal` is all that prints, in `words` where several subcommands say the same.
 """
 
 from __future__ import annotations

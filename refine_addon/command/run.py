@@ -7,13 +7,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core import RefineError
+from ..core import RefineError, read_cameras
 from ..core.errors import printable
 from ..core.pace import Pace
 from ..core.urls import Url
 from ..core.whole_file import new_folder
 from . import report
-from .cameras import deciding
 from .terminal import Terminal, complain, described
 from .zones import words
 
@@ -55,7 +54,13 @@ class Run:
 
     def views(self) -> ViewSet:
         """Return the views that decide, and note where they are from for the report."""
-        views, facts = deciding(self.options)
+        path = self.options.cameras
+        if path is not None:
+            views, facts = read_cameras(path), {"source": "file", "file": str(path)}
+        else:
+            from . import scene_cameras  # noqa: PLC0415 - needs Blender
+
+            views, facts = scene_cameras.chosen(self.options)
         self._cameras = {"cameras": facts}
         return views
 

@@ -17,6 +17,7 @@ from .levels.lod import Level, Levels, lod
 from .operation.files import file_to_file, prune_file
 from .operation.requests import CleanRequest, ConvertRequest, PruneRequest, ScoreRequest
 from .pipeline import prune, score
+from .refitting.refit import Refit, Refitted, refit, refit_rounds
 from .scores import Scores
 from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
@@ -48,6 +49,8 @@ __all__ = [
     "Occlusion",
     "PruneRequest",
     "RefineError",
+    "Refit",
+    "Refitted",
     "Result",
     "ScoreRequest",
     "Scores",
@@ -72,6 +75,8 @@ __all__ = [
     "read_cameras",
     "read_ply",
     "read_splats",
+    "refit",
+    "refit_rounds",
     "score",
     "select",
     "survivor_columns",

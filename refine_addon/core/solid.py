@@ -173,20 +173,10 @@ class Solid:
     def _apexes(
         self, triangles: Index, height: NDArray[np.float64]
     ) -> tuple[Index, Index, Index, NDArray[np.bool_]]:
-        """Return the corners of triangles by the side of a line along x on which they lie.
+        """Return the corners of triangles, (C,), by the side of a line along x on which they lie.
 
-        Parameters
-        ----------
-        triangles : (C,) int64
-        height : (C,) float64
-            y of the line.
-
-        Returns
-        -------
-        apex, after, before : (C,) int64
-            The vertex that is alone on its side, the next in the triangle, and the one before it.
-        one_below : (C,) bool
-            Whether that side is below.
+        `height`, (C,), is y of the line. These are the vertex that is alone on its side, the next
+        in the triangle, the one before it, and whether that side is below, (C,) each.
         """
         corners = self.triangles[triangles]  # (C, 3)
         below = self.vertices[corners, 1] <= height[:, None]

@@ -208,14 +208,8 @@ def _new_temporary(target: Path, cleanup: contextlib.ExitStack) -> tuple[Path, i
     """Create a file beside `target` that only its owner may read.
 
     When `cleanup` is closed, the file is removed. It is locked until then, or until this process
-    dies.
-
-    Returns
-    -------
-    path : Path
-    mode : int
-        The permissions that the user wants new files to have.
-    stream : binary file, open for writing
+    dies. Return its path, the permissions that the user wants new files to have, and a binary
+    stream that writes it.
     """
     while True:
         temporary = target.with_name(f"{_prefix(target)}{secrets.token_hex(8)}.tmp")

@@ -92,10 +92,6 @@ def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
         Whether to read the view-dependent coefficients. Without them, `Splats.sh_rest` has one
         coefficient: NaN where any is not finite, else 0, which is all that scoring looks at, and
         at 3 M splats of degree 3 spares 0.5 GB.
-
-    Returns
-    -------
-    Splats
     """
     read = _Reader(checked)
     rest = [f"f_rest_{index}" for index in range(rest_count(checked.mesh))]

@@ -164,10 +164,7 @@ def _fill(checked: SplatObject, obj: bpy.types.Object) -> None:
 def _copy_attributes(checked: SplatObject, data: bpy.types.ID) -> None:
     """Copy the point attributes that both forms hold alike.
 
-    Raises
-    ------
-    RefineError
-        If one has a name that the new form needs for another.
+    Raise `RefineError` if one has a name that the new form needs for another.
     """
     moved = {column.attribute for column in _moved(checked)} | {heat_map.COLOR}  # of a preview
     needed = set(data.attributes.keys())

@@ -181,10 +181,6 @@ def looks_like_splats(obj: bpy.types.Object | None) -> bool:
 def check(obj: bpy.types.Object) -> SplatObject:
     """Find out that an object holds splats, and in which attributes.
 
-    Parameters
-    ----------
-    obj : bpy.types.Object
-
     Returns
     -------
     SplatObject

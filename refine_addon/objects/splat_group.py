@@ -349,10 +349,7 @@ def _scores(group: Members, parts: list[Scores], masks: dict[str, Any]) -> Score
 def _protecting(group: Members, name: str) -> list[bool]:
     """Return which objects have a vertex group or an attribute of that name that protects.
 
-    Raises
-    ------
-    RefineError
-        If none has.
+    Raise `RefineError` if none has.
     """
     protecting, errors = [], []
     for member in group:

@@ -171,10 +171,6 @@ def apply_object(checked: SplatObject, result: Result | Level) -> Outcome:
     result : Result or Level
         What was decided of the object's splats.
 
-    Returns
-    -------
-    Outcome
-
     Raises
     ------
     RefineError

@@ -120,13 +120,7 @@ def _image(name: str, pixels: NDArray[np.uint8]) -> bpy.types.Image:
 
 
 def _show(context: bpy.types.Context, images: list[bpy.types.Image]) -> None:
-    """Show images side by side in a window of their own, as renders are; or where they are shown.
-
-    Parameters
-    ----------
-    context : bpy.types.Context
-    images : list of bpy.types.Image
-    """
+    """Show images side by side in a window of their own, unless all are shown already."""
     manager = context.window_manager
     shown = [
         area.spaces.active.image

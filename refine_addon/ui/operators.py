@@ -33,11 +33,8 @@ from .on_thread import OnThread
 from .operator_bases import (
     Answer,
     AtOnce,
-    Needing,
     OnSplats,
     in_object_mode,
-    on_splats,
-    out_of_edit_mode,
     scored,
 )
 from .running import Sketch
@@ -196,20 +193,6 @@ def _sketch(job: _Scoring, progress: Progress) -> Scores:
     return pipeline.score(
         job.splats, job.views, _by_closed_form(job), removed=job.forced.removed, progress=progress
     )
-
-
-class REFINE_OT_plan(Needing, bpy.types.Operator):
-    """Work out again how many splats stay and go"""
-
-    bl_idname = "refine.plan"
-    bl_label = "Update"
-    bl_options = {"INTERNAL"}
-    needs = (on_splats, out_of_edit_mode, scored)
-
-    def execute(self, context: bpy.types.Context) -> Answer:
-        """Work it out."""
-        plans.refresh(context)
-        return {"FINISHED"}
 
 
 @dataclass(frozen=True, eq=False)

@@ -355,8 +355,7 @@ def _draw_plan(
     obj, settings = context.object, context.scene.refine
     plan = plans.stored(obj, settings)
     if plan is None:
-        layout.operator("refine.plan", icon="FILE_REFRESH")
-        return
+        return  # it is being made
     if "error" in plan:
         waits = mesh_scores.unrefined(record) and settings.budget == "psnr"
         text = plans.remark(plan, record) if waits else plan["error"]

@@ -425,10 +425,7 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
 def _removed(known: _Known, budget: Budget, *, absorb: bool) -> tuple[int, bool]:
     """Return how many splats a budget removes beside those forced out, and whether it is a guess.
 
-    Raises
-    ------
-    RefineError
-        If the budget means nothing to the scores.
+    Raise `RefineError` if the budget means nothing to the scores.
     """
     if budget.psnr is not None and absorb:
         share = quality_of(known.tally.scores).share(budget.psnr, absorb=True)

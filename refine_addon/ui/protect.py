@@ -78,13 +78,7 @@ def _mark(obj: bpy.types.Object, mode: str) -> None:
 
 
 def _selection(obj: bpy.types.Object) -> NDArray[np.bool_]:
-    """Return which splats are selected, (N,).
-
-    Raises
-    ------
-    RefineError
-        If none is.
-    """
+    """Return which splats are selected, (N,), or raise `RefineError` if none is."""
     name = ".selection" if obj.type == "POINTCLOUD" else ".select_vert"
     attribute = obj.data.attributes.get(name)
     if attribute and attribute.domain == "POINT" and attribute.data_type in {"BOOLEAN", "FLOAT"}:
@@ -100,10 +94,7 @@ def _selection(obj: bpy.types.Object) -> NDArray[np.bool_]:
 def _mark_in_edit_mode(obj: bpy.types.Object, mode: str) -> None:
     """Change the marks of a mesh in edit mode, where Blender itself has to write them.
 
-    Raises
-    ------
-    RefineError
-        If no splat is selected, or Blender fails.
+    Raise `RefineError` if no splat is selected, or Blender fails.
     """
     mesh = obj.data
     if mode == "CLEAR":

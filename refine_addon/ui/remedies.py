@@ -159,13 +159,7 @@ def _unseen(checked: SplatObject, forced: Forced) -> NDArray[np.bool_]:
 
 
 def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Return the cameras that decide; of a shot all that take part in it.
-
-    Raises
-    ------
-    RefineError
-        If there is none.
-    """
+    """Return the cameras that decide, of a shot all of it, or raise `RefineError` without one."""
     scene, choice = context.scene, CameraChoice.of_scene(context.scene)
     cameras = choice.cameras(context)
     if choice.source == "FRAMES":
@@ -185,13 +179,7 @@ def _refuse_libraries(objects: Iterable[bpy.types.Object]) -> None:
 
 
 def _roots(cameras: Sequence[bpy.types.Object], splats: bpy.types.Object) -> list[bpy.types.Object]:
-    """Return what is to be turned so that cameras turn, and the splats do not.
-
-    Raises
-    ------
-    RefineError
-        If that cannot be.
-    """
+    """Return what to turn for cameras to turn without the splats, or raise `RefineError`."""
     ancestors = [splats]  # of the splats, with themselves
     while ancestors[-1].parent:
         ancestors.append(ancestors[-1].parent)
@@ -225,13 +213,7 @@ def _turn_animated(
 
 
 def _bounds(context: bpy.types.Context) -> _Bounds:
-    """Return the ball around most of the active object's splats.
-
-    Raises
-    ------
-    RefineError
-        If it holds none that are finite.
-    """
+    """Return the ball around most of the active object's splats, or raise `RefineError`."""
     checked = mesh_layout.check(context.object)
     matrix = world_matrix(checked.obj, context.evaluated_depsgraph_get())
     means = mesh_attributes.read_attribute(checked.mesh, "position").astype(np.float64)

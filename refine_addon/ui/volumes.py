@@ -98,13 +98,7 @@ class REFINE_OT_add_volume(AtOnce, Needing, bpy.types.Operator):
 
 
 def _selected_volumes(context: bpy.types.Context) -> list[bpy.types.Object]:
-    """Return the objects that are selected beside the splats, and not listed yet.
-
-    Raises
-    ------
-    RefineError
-        If there are none, or one can be no volume.
-    """
+    """Return the selected objects that are not listed yet, or raise `RefineError` if none fits."""
     listed = {item.object for item in context.scene.refine.volumes}
     objects = [o for o in context.selected_objects if not mesh_layout.looks_like_splats(o)]
     objects = [obj for obj in objects if obj not in listed]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(eq=False)
-class Held:
+class MeshSplats:
     """The splats of a mesh.
 
     Attributes
@@ -35,23 +35,25 @@ class Held:
     signature : tuple
         What they were packed from.
     future : Future or None
-        While they are packed.
+        While the M drawable splats are packed.
     packed : Packed or None
         Once they are.
     ranks : (N,) floating or None
-        Of their scores, of all vertices there were when they were packed.
-    scored : int
-        Rises where these have changed.
+        Of the scores of all vertices, by which `important` was made.
     important : (M,) int32 or None
-        Those packed, the ones that matter most first.
+        The packed splats, the ones that matter most first.
     going : (M,) bool or None
-        What the plan removes, of those packed.
+        What the plan removes.
+    degree : int
+        Of the harmonics.
+    scored, marked : int
+        Rise where `ranks` and `forced` have changed.
     forced : (M,) int32 or None
-        What stays and what goes in any case, of those packed.
-    marked : int
-        Rises where this has changed.
+        What stays and what goes in any case.
     marks : tuple of int
-        Which of `arrays.MARKS` are in it.
+        Which of `arrays.MARKS` are in `forced`.
+    read_remove, read_ranks, read_force : (N,) or None
+        Attributes of the mesh as they were last read.
     """
 
     signature: tuple[Any, ...] = ()
@@ -65,16 +67,16 @@ class Held:
     forced: NDArray[np.int32] | None = None
     marked: int = 0
     marks: tuple[int, ...] = ()
-    remove: NDArray[np.bool_] | None = field(default=None, repr=False)
-    rank: NDArray[Any] | None = field(default=None, repr=False)
-    force: NDArray[np.int32] | None = field(default=None, repr=False)
+    read_remove: NDArray[np.bool_] | None = field(default=None, repr=False)
+    read_ranks: NDArray[Any] | None = field(default=None, repr=False)
+    read_force: NDArray[np.int32] | None = field(default=None, repr=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Slot:
     """The place of an object in the textures: rows ``start`` to ``start + count``."""
 
-    held: Held
+    held: MeshSplats
     packed: Packed
     number: int
     start: int
@@ -119,7 +121,7 @@ class Content:
     def __init__(self) -> None:
         self.atlas: Atlas | None = None
         self.changes = 0
-        self._held: dict[int, Held] = {}
+        self._held: dict[int, MeshSplats] = {}
         self._stale: set[int] = set()
         self.refused: set[int] = set()
 
@@ -182,11 +184,11 @@ class Content:
     def _read(self, checked: SplatObject) -> None:
         """Read of a mesh what has changed."""
         mesh = checked.mesh
-        held = self._held.setdefault(mesh.session_uid, Held())
+        held = self._held.setdefault(mesh.session_uid, MeshSplats())
         held.degree = sh_degree(mesh)
-        held.rank = _attribute(mesh, mesh_scores.RANK, "FLOAT")
-        held.remove = _attribute(mesh, mesh_edit.REMOVE, "BOOLEAN")
-        held.force = _attribute(mesh, mesh_edit.FORCE, "INT")
+        held.read_ranks = _attribute(mesh, mesh_scores.RANK, "FLOAT")
+        held.read_remove = _attribute(mesh, mesh_edit.REMOVE, "BOOLEAN")
+        held.read_force = _attribute(mesh, mesh_edit.FORCE, "INT")
         signature = (len(checked), held.degree, mesh_attributes.digest(checked))
         if signature != held.signature:
             held.signature = signature
@@ -194,19 +196,19 @@ class Content:
         elif held.future is None:
             self._mark(held)
 
-    def _mark(self, held: Held) -> None:
+    def _mark(self, held: MeshSplats) -> None:
         """Note which of the splats that are drawn matter, and which the plan removes."""
         packed = held.packed
         if packed is None:
             return
-        held.going = None if held.remove is None else held.remove[packed.vertices]
-        forced = None if held.force is None else held.force[packed.vertices]
+        held.going = None if held.read_remove is None else held.read_remove[packed.vertices]
+        forced = None if held.read_force is None else held.read_force[packed.vertices]
         if not same(held.forced, forced):
             held.forced = forced
             held.marked += 1
             held.marks = tuple(mark for mark in MARKS if forced is not None and mark in forced)
-        if not same(held.ranks, held.rank):
-            held.ranks, held.important = held.rank, None
+        if not same(held.ranks, held.read_ranks):
+            held.ranks, held.important = held.read_ranks, None
             held.scored += 1
         if held.important is None:
             held.important = most_important_first(packed, held.ranks)
@@ -231,7 +233,7 @@ class Content:
         self.atlas = _atlas(keys, self._held)
 
 
-def _atlas(keys: list[tuple[int, int]], held: dict[int, Held]) -> Atlas:
+def _atlas(keys: list[tuple[int, int]], held: dict[int, MeshSplats]) -> Atlas:
     """Make the textures of some objects, by the identities of objects and meshes."""
     slots = _slots(keys, held)
     total = sum(slot.count for slot in slots.values())
@@ -250,7 +252,7 @@ def _atlas(keys: list[tuple[int, int]], held: dict[int, Held]) -> Atlas:
     )
 
 
-def _slots(keys: list[tuple[int, int]], held: dict[int, Held]) -> dict[tuple[int, int], Slot]:
+def _slots(keys: list[tuple[int, int]], held: dict[int, MeshSplats]) -> dict[tuple[int, int], Slot]:
     """Place objects one after another, with at most `MOST` splats in all."""
     packs = [packed for _, mesh in keys if (packed := held[mesh].packed) is not None]
     counts = first_of_each([len(packed) for packed in packs], MOST)

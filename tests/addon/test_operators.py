@@ -234,7 +234,7 @@ def test_a_plan_of_another_budget_is_not_shown(addon, room, room_cameras):  # no
     settings.ratio = 0.9
     stale = addon.ui.plans.stored(room, settings)
     bpy.context.view_layer.objects.active = room
-    bpy.ops.refine.plan()
+    addon.ui.plans.refresh(bpy.context)
 
     assert stale is None
     assert addon.ui.plans.stored(room, settings)["removed"] == 39755 * 9 // 10

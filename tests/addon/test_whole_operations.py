@@ -149,7 +149,7 @@ def test_each_operation_reads_the_layout_of_its_object_once(
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     for operation in (
         bpy.ops.refine.score,
-        bpy.ops.refine.plan,
+        lambda: addon.ui.plans.refresh(bpy.context),
         lambda: bpy.ops.refine.export_ply(filepath=str(tmp_path / "exported.ply")),
         bpy.ops.refine.apply,
         lambda: pruned(addon, room_views, tmp_path, absorb=True),

@@ -64,6 +64,18 @@ def test_every_name_that_is_given_with_its_file_is_defined_there(text):
     assert missing == []
 
 
+def test_every_class_that_the_architecture_names_is_defined():
+    """In backquotes, as ``RowBlock`` or ``ViewSet.middle``."""
+    text = (ROOT / "docs/architecture.md").read_text(encoding="utf-8")
+    sources = "\n".join(path.read_text("utf-8") for path in (ROOT / "refine_addon").rglob("*.py"))
+    defined = set(re.findall(r"^(?:class )?(\w+)(?: = |[(:\[])", sources, re.MULTILINE))
+
+    named = set(re.findall(r"`([A-Z][a-z]+[A-Za-z]*)(?:\.\w+)?`", text))
+
+    assert named - defined == set()
+    assert named
+
+
 def _names(name: str, file: str) -> bool:
     return file.endswith("/" + name) or (not name.endswith(".py") and file.startswith("/" + name))
 

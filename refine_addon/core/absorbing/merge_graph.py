@@ -263,10 +263,7 @@ class MergeGraph:
 def _disjoint(first: Index, second: Index) -> Index:
     """Return the indices of pairs that share no splat, ascending, (k,); each other pair shares one.
 
-    Parameters
-    ----------
-    first, second : (m,) int
-        Rows of the pairs.
+    The rows of the pairs are `first` and `second`, (m,) each.
     """
     count = len(first)
     chosen = np.zeros(count, np.bool_)

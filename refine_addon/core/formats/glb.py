@@ -171,43 +171,19 @@ def _refuse_unread(extension: Any, place: Place) -> None:  # noqa: ANN401 - from
 
 @dataclass(frozen=True)
 class _Node:
-    """A node that shows a mesh.
+    """A node that shows a mesh."""
 
-    Attributes
-    ----------
-    start : int
-        Row of the file's splats at which those of this node begin.
-    matrix : (4, 4) float64
-        From the frame of the mesh to that of the scene.
-    """
-
-    start: int
+    start: int  # row of the file's splats at which those of this node begin
     place: Place
-    matrix: NDArray[np.float64]
+    matrix: NDArray[np.float64]  # (4, 4), from the frame of the mesh to that of the scene
 
 
 class _Mesh:
-    """The splats of a mesh.
-
-    Parameters
-    ----------
-    index : int
-        Of the mesh.
-    place : Place
-        Of the node that shows it first.
-
-    Attributes
-    ----------
-    parts : list of _Part
-        Its primitives of splats.
-    nodes : list of _Node
-        The nodes that show it, in the order of their splats; empty if it has no splats.
-    degree : int
-        Highest of the harmonics.
-    """
+    """The splats of a mesh; `place` is that of the node that shows it first."""
 
     def __init__(self, document: Document, index: int, place: Place) -> None:
-        self.parts: list[_Part] = []
+        self.parts: list[_Part] = []  # its primitives of splats
+        # The nodes that show it, in the order of their splats; empty if it has no splats.
         self.nodes: list[_Node] = []
         mesh, place = document.item("meshes", index, place)
         for number, item in enumerate(_listed(mesh, "primitives", place)):
@@ -333,20 +309,12 @@ def _harmonics(degree: int) -> list[str]:
 
 @dataclass(frozen=True)
 class _Attribute:
-    """An attribute as it is written.
-
-    Attributes
-    ----------
-    width, kind : int
-        Numbers of one splat, and their component type.
-    values : callable
-        Returns them, (n, width), for splats in the frame of glTF.
-    """
+    """An attribute as it is written."""
 
     name: str
-    width: int
-    kind: int
-    values: Callable[[Splats], NDArray[Any]]
+    width: int  # numbers of one splat
+    kind: int  # their component type
+    values: Callable[[Splats], NDArray[Any]]  # (n, width), for splats in the frame of glTF
 
     @property
     def row(self) -> int:

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..affine import is_uniform, transformed
 from ..cleaning.clean import Cleaning, clean
-from ..formats.registry import read_written, refuse_unknown_size
+from ..formats.registry import refuse_unknown_size
 from ..pipeline import decide, score
 from ..report import kept_and_removed, scoring_notes, seen_by, what_was_seen
 from ..task import DEFAULTS, Settings, Task
 from .run import DECIDED, Request
-from .written import written_facts
+from .written import written_facts, written_splats
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from ..formats.format import Format
     from ..picture_files import PictureFiles
     from ..selection import Budget
-    from ..splats import Splats
     from ..task import Result
     from ..views import ViewSet
     from ..volumes import Zone
@@ -168,27 +166,14 @@ class PruneRequest(Request["Loaded", "Result"]):
                 path, result.scores, used, matrix=loaded.matrix, threads=runtime.threads
             )
         if self.pictures is not None:
+            after = None if path is None else written_splats(path, loaded.matrix)
+            after = result.survivors(loaded.splats) if after is None else after
             facts["pictures"] = self.pictures.write(
-                loaded.splats, _as_written(loaded, result, path), self.views,
+                loaded.splats, after, self.views,
                 progress=runtime.part(COMPARED, 1.0).progress, threads=runtime.threads,
             )  # fmt: skip
             runtime.clock.lap("pictures_s")
         return facts
-
-
-def _as_written(loaded: Loaded, result: Result, path: Path | None) -> Splats:
-    """Return what stays as the file holds it, in the frame of the views.
-
-    Where the matrix scales directions differently, harmonics cannot follow it: nothing that a
-    format rounds is seen then.
-    """
-    matrix = loaded.matrix
-    if path is None or not is_uniform(matrix):
-        return result.survivors(loaded.splats)
-    rounded = read_written(path)
-    if rounded is None:
-        return result.survivors(loaded.splats)
-    return rounded if np.array_equal(matrix, np.eye(4)) else transformed(rounded, matrix)
 
 
 @dataclass(frozen=True, eq=False)

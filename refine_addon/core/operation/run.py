@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
 
 DECIDED = 0.8
-"""Part of the progress of a run after which it is decided what is written to a file."""
+"""The share of its progress that a run has made when it begins to write a file."""
 
 
 @dataclass(frozen=True, eq=False)
 class Runtime:
-    """What every step of one run is given besides its data.
+    """What every step of a run gets besides its data.
 
     Attributes
     ----------
@@ -91,22 +91,22 @@ class Decision(Protocol):
         ...
 
 
-InputT = TypeVar("InputT")
-InputT_co = TypeVar("InputT_co", covariant=True)
-InputT_contra = TypeVar("InputT_contra", contravariant=True)
+LoadedT = TypeVar("LoadedT")
+LoadedT_co = TypeVar("LoadedT_co", covariant=True)
+LoadedT_contra = TypeVar("LoadedT_contra", contravariant=True)
 DecisionT = TypeVar("DecisionT", bound=Decision)
 DecisionT_contra = TypeVar("DecisionT_contra", bound=Decision, contravariant=True)
 
 
-class Source(Protocol[InputT_co]):
+class Source(Protocol[LoadedT_co]):
     """Where splats are."""
 
-    def read(self, form: Format | None) -> InputT_co:
-        """Return them, with the bytes that each takes in a format; None is plain PLY."""
+    def read(self, form: Format | None) -> LoadedT_co:
+        """Return them, with the bytes that they take in a format; None is plain PLY."""
         ...
 
 
-class Request(ABC, Generic[InputT_contra, DecisionT]):
+class Request(ABC, Generic[LoadedT_contra, DecisionT]):
     """What is to be done.
 
     Attributes
@@ -125,21 +125,21 @@ class Request(ABC, Generic[InputT_contra, DecisionT]):
 
     @contextmanager
     def opened(self, _form: Format | None) -> Iterator[None]:
-        """Refuse what can be had of no splats in the format of the output, before any are read."""
+        """Refuse, before splats are read, what none can give in the format of the output."""
         yield
 
     @abstractmethod
-    def decide(self, read: InputT_contra, runtime: Runtime) -> DecisionT:
+    def decide(self, loaded: LoadedT_contra, runtime: Runtime) -> DecisionT:
         """Decide; nothing is changed or written."""
 
     def compare(
-        self, _read: InputT_contra, _decision: DecisionT, _path: Path | None, _runtime: Runtime
+        self, _loaded: LoadedT_contra, _decision: DecisionT, _path: Path | None, _runtime: Runtime
     ) -> dict[str, Any]:
-        """Return what the report says of the pictures of the file that was written, if anything."""
+        """Return what the report says of the written file's pictures, if anything."""
         return {}
 
 
-class Sink(Protocol[InputT_contra, DecisionT_contra]):
+class Sink(Protocol[LoadedT_contra, DecisionT_contra]):
     """Where splats go."""
 
     @property
@@ -156,20 +156,22 @@ class Sink(Protocol[InputT_contra, DecisionT_contra]):
         """Refuse what could not be written; if the block fails, remove what was made for it."""
         ...
 
-    def write(self, read: InputT_contra, decision: DecisionT_contra, runtime: Runtime) -> Written:
+    def write(
+        self, loaded: LoadedT_contra, decision: DecisionT_contra, runtime: Runtime
+    ) -> Written:
         """Write all of what was decided, or nothing."""
         ...
 
 
 def run(
-    source: Source[InputT],
-    request: Request[InputT, DecisionT],
-    sink: Sink[InputT, DecisionT],
+    source: Source[LoadedT],
+    request: Request[LoadedT, DecisionT],
+    sink: Sink[LoadedT, DecisionT],
     *,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> DecisionT:
-    """Do what is requested with the splats of a source, and write the outcome to a sink.
+    """Do what is requested with the splats of a source, and write the result to a sink.
 
     Parameters
     ----------
@@ -192,12 +194,12 @@ def run(
     """
     runtime = Runtime(Clock(), progress, threads)
     with request.opened(sink.form), sink.opened():
-        read = source.read(sink.form)
+        loaded = source.read(sink.form)
         runtime.clock.lap("read_s")
-        decision = request.decide(read, runtime)
-        written = sink.write(read, decision, runtime)
+        decision = request.decide(loaded, runtime)
+        written = sink.write(loaded, decision, runtime)
         runtime.clock.lap(sink.timing)
-        compared = request.compare(read, decision, written.path, runtime)
+        compared = request.compare(loaded, decision, written.path, runtime)
     runtime.clock.stop()
     report = decision.report
     report |= written.facts | compared

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..scores import Scores
+    from ..splats import Splats
     from ..views import ViewSet
 
 
@@ -56,13 +57,20 @@ def written_facts(
     """
     if format_named(path) is None:
         return {}
-    matrix = np.eye(4) if matrix is None else matrix
-    if scores.ray_sample is None or not is_uniform(matrix):
+    splats = None if scores.ray_sample is None else written_splats(path, matrix)
+    if scores.ray_sample is None or splats is None:
         return {"written_psnr": None}
-    splats = read_written(path)
-    if splats is None:
-        return {"written_psnr": None}
-    if not np.array_equal(matrix, np.eye(4)):
-        splats = transformed(splats, matrix)
     psnr = psnr_against(scores.ray_sample, splats, views, threads=threads)
     return {"written_psnr": None if psnr is None else round(psnr, 2)}
+
+
+def written_splats(path: Path, matrix: NDArray[np.float64] | None = None) -> Splats | None:
+    """Return what a file of a lossy format holds, in the frame of the views.
+
+    None where `read_written` has none, or `matrix` scales directions differently; see
+    `written_facts`.
+    """
+    if matrix is None or np.array_equal(matrix, np.eye(4)):
+        return read_written(path)
+    splats = read_written(path) if is_uniform(matrix) else None
+    return None if splats is None else transformed(splats, matrix)

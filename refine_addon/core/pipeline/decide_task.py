@@ -1,8 +1,8 @@
 """The way from splats, views and a budget to the splats that stay.
 
 The panel, the command and Python code all call `decide`, so all of them keep the same splats. It
-has two steps: the splats are scored and the budget selects by score; then, if survivors are to
-absorb the others, as many survivors are found again, by merging.
+has two steps: splats are scored, and the budget selects by score; then, to absorb, splats are
+merged until as many are left as were selected.
 """
 
 from __future__ import annotations
@@ -176,14 +176,7 @@ def _estimated(scores: Scores, keep: NDArray[np.bool_], threads: int | None) -> 
 def _scores_of(
     task: Task, progress: Progress, threads: int | None
 ) -> tuple[Scores, tuple[Scores, Measured] | None]:
-    """Return the scores of a task.
-
-    Returns
-    -------
-    scores : Scores
-    known : tuple of Scores and Measured, or None
-        See `absorb_removed`.
-    """
+    """Return the scores of a task, and `known` of `absorb_removed` if that came with them."""
     if task.scores is not None:
         return task.scores, None
     splats, views = task.scene()
@@ -215,7 +208,7 @@ def _settled(task: Task) -> int | None:
     if task.reusable:
         return None
     total = len(task.scene()[0])
-    held = 0 if task.protected is None else int(np.count_nonzero(task.protected))
+    spared = 0 if task.protected is None else int(np.count_nonzero(task.protected))
     removed = needed(task.budget.removals(total, task.row_bytes, task.fixed_bytes), total)
     # Those that are protected stay, wherever in the order they are.
-    return None if removed is None or removed + held >= total else removed + held
+    return None if removed is None or removed + spared >= total else removed + spared

@@ -141,17 +141,7 @@ def _with_views(
     progress: Progress,
     threads: int | None,
 ) -> Scores:
-    """Return scores with what there is to say of all views, not only of those used.
-
-    Parameters
-    ----------
-    scores : Scores
-    splats : Splats
-    views, used : ViewSet
-        Those given, and those chosen from them.
-    progress : callable
-    threads : int, optional
-    """
+    """Return scores with what there is to say of all views given, not only of those used."""
     notes = (*scores.notes, views.note) if views.note else scores.notes
     # Beside the closed form, measuring would take as long as scoring.
     measured = None if scores.ray_sample is None else used

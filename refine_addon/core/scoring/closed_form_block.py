@@ -100,22 +100,12 @@ class NeighbourhoodSums(NamedTuple):
 
 
 class _Fringe(NamedTuple):
-    """Pairs of a splat and a view whose image it reaches into from outside, k of them.
+    """Pairs of a splat and a view whose image it reaches into from outside, (k,) each."""
 
-    Attributes
-    ----------
-    view, splat : (k,) int64
-        Places in a block.
-    share : (k,) float64
-        1 at the edge of the image, falling to 0 at `REACH` standard deviations.
-    across : (k,) float64
-        The depth at which the image is wide enough to show its centre, world units.
-    """
-
-    view: NDArray[np.int64]
+    view: NDArray[np.int64]  # place in a block, as `splat`
     splat: NDArray[np.int64]
-    share: NDArray[np.float64]
-    across: NDArray[np.float64]
+    share: NDArray[np.float64]  # 1 at the edge of the image, 0 at `REACH` standard deviations
+    across: NDArray[np.float64]  # depth where the image is wide enough for its centre, world units
 
 
 STEPS: Mapping[str, tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]] = {

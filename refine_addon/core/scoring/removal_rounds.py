@@ -38,19 +38,11 @@ _LOADING = 0.3  # share of the time that getting colours takes, to show progress
 
 @dataclass(frozen=True, eq=False)
 class _ViewRays:
-    """The scoring rays of one view.
-
-    Attributes
-    ----------
-    colors : (3, u) float32
-        Of the splats that they hit.
-    area : float
-        Of the image for each ray, px^2, times the view's weight.
-    """
+    """The scoring rays of one view."""
 
     rays: Rays
-    colors: NDArray[np.float32]
-    area: float
+    colors: NDArray[np.float32]  # (3, u), of the splats that they hit
+    area: float  # of the image for each ray, px^2, times the view's weight
 
     def keeping(self, keep: NDArray[np.bool_]) -> _ViewRays:
         """Return them with their hits on some of all M Gaussians alone."""
@@ -177,14 +169,9 @@ def _grown(
 
         growth = (now + scene growth  prior) / (before + prior),    prior = known  measured
 
-    Parameters
-    ----------
-    measured : (n,) float64
-        Before any splat had gone.
-    before, now : (n,) float64
-        What the rays told then, and what they tell now.
-    known : (n,) float64
-        Weight of the scene's growth, over the measured sum: large for a splat that few rays hit.
+    `measured` is from before any splat had gone, `before` and `now` are what the rays told then and
+    what they tell now. `known` is the weight of the scene's growth, over the measured sum: large
+    for a splat that few rays hit. All are (n,).
     """
     total = float(before.sum())
     scene_growth = float(now.sum()) / total if total > 0.0 else 1.0

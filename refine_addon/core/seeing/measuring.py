@@ -264,22 +264,15 @@ class Measuring:
 class _MeasureAndCast:
     """Measures some views and casts their rays; picklable, so that any process can run it.
 
-    Attributes
-    ----------
-    views : list of (View, float)
-        All of them.
-    numbers : list of int
-        Of the views to measure.
-    wanted : list of (bool, set of int)
-        Of several samples of rays: whether they are scoring rays, and the numbers of the views
-        whose rays are wanted.
+    `wanted` says of several samples of rays whether they are scoring rays, and the numbers of the
+    views whose rays are wanted.
     """
 
     gaussians: Gaussians
     scene: Scene
-    views: list[tuple[View, float]]
+    views: list[tuple[View, float]]  # all of them
     sampling: Sampling
-    numbers: list[int]
+    numbers: list[int]  # of the views to measure
     wanted: list[tuple[bool, set[int]]]
 
     def __call__(self, place: int) -> tuple[ViewMeasurement, list[Rays | None]]:

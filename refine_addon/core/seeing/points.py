@@ -170,18 +170,10 @@ def _kinds(footprints: Footprints, view: View, scale: float) -> NDArray[np.uint8
 
 
 class _CellFrame(NamedTuple):
-    """Footprints in units of a cell.
+    """Footprints in units of a cell."""
 
-    Attributes
-    ----------
-    axes : (6, n) float32
-        Half axes, major then minor, and centre: each across and down.
-    size : tuple of float
-        Of the image, across and down.
-    """
-
-    axes: NDArray[np.float32]
-    size: tuple[float, float]
+    axes: NDArray[np.float32]  # (6, n): half axes, major, minor, and centre, each across and down
+    size: tuple[float, float]  # of the image, across and down
 
 
 def _in_cells(footprints: Footprints, view: View, side: float) -> _CellFrame:

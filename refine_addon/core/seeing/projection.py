@@ -28,9 +28,11 @@ REACH = 3.3
 BRIGHTEST = 16.0
 """Colours are clipped to this, white being 1; keeps sums finite."""
 
+LOG_SCALE_RANGE = (-16.0, 5.0)
+"""Logarithms of scales over the size of the scene; beyond them float32 would overflow."""
+
 _CHUNK = 1 << 14
 _FARTHEST = 1e6  # scene sizes; splats farther from the middle are in no view
-_LOG_SCALE_RANGE = (-16.0, 5.0)  # relative to the size of the scene; keeps float32 in range
 _LARGEST_VARIANCE = 1e12  # px^2; a footprint a million pixels wide is flat over any image
 _FARTHEST_VIEW = 1e18  # scene sizes; a view farther away sees the scene as one point
 _LARGEST_LENS = 1e9  # px; beyond this or `_FARTHEST_VIEW` float32 would overflow
@@ -116,9 +118,24 @@ class Footprints:
 
 
 def prepare(
-    splats: Splats, views: ViewSet, *, progress: Progress = silent, threads: int | None = None
+    splats: Splats,
+    views: ViewSet,
+    scene: Scene | None = None,
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
 ) -> tuple[Gaussians, Scene, NDArray[np.bool_]]:
     """Activate the splats once for all views.
+
+    Parameters
+    ----------
+    splats : Splats
+        In the frame and unit of the views.
+    views : ViewSet
+    scene : Scene, optional
+        The frame to use; by default that of these splats and views.
+    progress : callable, optional
+    threads : int, optional
 
     Returns
     -------
@@ -129,7 +146,7 @@ def prepare(
         Which splats can be drawn.
     """
     good, opaque = classify(splats, progress=part(progress, 0.0, 0.4), threads=threads)
-    scene = scene_of(splats.means, good, views)
+    scene = scene or scene_of(splats.means, good, views)
     report(progress, 0.4, "reading")
     index, place = near_scene(splats, opaque, scene)
     report(progress, 0.4, "reading")
@@ -205,7 +222,7 @@ def activate(
     def fill(piece: slice) -> None:
         chunk = splats.take(index[piece])
         relative = np.asarray(chunk.log_scales, np.float64) - np.log(scene.size)
-        scales = np.exp(relative.clip(*_LOG_SCALE_RANGE))
+        scales = np.exp(relative.clip(*LOG_SCALE_RANGE))
         axes = scene.axes @ rotation_matrices(chunk.quaternions) * scales[:, None, :]  # (n, 3, 3)
         for row, (a, b) in enumerate(_PAIRS):
             result.covariances[row, piece] = np.einsum("ij,ij->i", axes[:, a], axes[:, b])
@@ -393,12 +410,8 @@ def _ellipses(
 ) -> tuple[NDArray[np.float32], ...]:
     """Return centres, major and minor half axes and their lengths, each (2, n), pixels.
 
-    Parameters
-    ----------
-    local : (3, n) float32
-        Camera coordinates of the centres, scene sizes.
-    shape : (6, n) float32
-        Covariances in camera coordinates, squared scene sizes.
+    `local`, (3, n), are the camera coordinates of the centres, scene sizes, and `shape`, (6, n),
+    the covariances in camera coordinates, squared scene sizes.
     """
     x, y, z = local
     across, down = x / z, y / z
@@ -412,28 +425,46 @@ def _image_covariance(
     """Return xx, xy, yy, (n,) each, of ``J S J'`` in pixels, without the low-pass.
 
     J is the Jacobian of the projection at ``(x, y, z)``: rows ``(fx / z, 0, -fx x / z^2)`` and
-    ``(0, fy / z, -fy y / z^2)``.
-
-    Parameters
-    ----------
-    ray : (across, down, z)
-        ``x / z``, ``y / z`` and z of the centres, (n,) each. For a centre far outside the image, J
-        is computed at the edge that `_BEYOND` sets, because J grows without bound.
-    shape : (6, n) float32
-        S: xx, xy, xz, yy, yz, zz.
+    ``(0, fy / z, -fy y / z^2)``. `ray` has ``x / z``, ``y / z`` and z of the centres, (n,) each.
+    For a centre far outside the image, J is computed at the edge that `_BEYOND` sets, because J
+    grows without bound. `shape` is S: xx, xy, xz, yy, yz, zz, (6, n).
     """
-    across, down, z = ray
-    beyond = _BEYOND * view.width / view.fx, _BEYOND * view.height / view.fy
-    across = across.clip(
-        -view.cx / view.fx - beyond[0], (view.width - view.cx) / view.fx + beyond[0]
-    )
-    down = down.clip(-view.cy / view.fy - beyond[1], (view.height - view.cy) / view.fy + beyond[1])
+    z = ray[2]
+    across, down = _near_image(ray[0], ray[1], view)
     fx, fy = view.fx / z, view.fy / z
     xx = fx * fx * (shape[0] + across * (across * shape[5] - 2 * shape[2]))
     yy = fy * fy * (shape[3] + down * (down * shape[5] - 2 * shape[4]))
     xy = fx * fy * (shape[1] + across * (down * shape[5] - shape[4]) - down * shape[2])
     factor = np.minimum(1.0, _LARGEST_VARIANCE / np.maximum(xx + yy, 1.0))
     return xx * factor, xy * factor, yy * factor
+
+
+def _near_image(
+    across: NDArray[Any], down: NDArray[Any], view: View
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Return ``x / z`` and ``y / z`` of centres, (n,) each, no farther out than `_BEYOND` says."""
+    beyond = _BEYOND * view.width / view.fx, _BEYOND * view.height / view.fy
+    return (
+        across.clip(-view.cx / view.fx - beyond[0], (view.width - view.cx) / view.fx + beyond[0]),
+        down.clip(-view.cy / view.fy - beyond[1], (view.height - view.cy) / view.fy + beyond[1]),
+    )
+
+
+def jacobian(
+    gaussians: Gaussians, scene: Scene, view: View
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return J W of Gaussians in a view: how column and row change with the mean, (M, 3) each.
+
+    In pixels for a step of one scene size along each axis of the scene's frame; see
+    `_image_covariance` for J.
+    """
+    x, y, z = _local(gaussians.means, scene, view).astype(np.float64)
+    across, down = _near_image(x / z, y / z, view)
+    turned = view.rotation @ scene.axes.T  # W
+    return (
+        (view.fx / z)[:, None] * (turned[0] - across[:, None] * turned[2]),
+        (view.fy / z)[:, None] * (turned[1] - down[:, None] * turned[2]),
+    )
 
 
 def _half_axes(

@@ -94,7 +94,7 @@ class Rays:
         weight : (r,) float32
             Transmittance times alpha: the share of the pixel that the splat makes up.
         """
-        log_front = in_front(self.log_passed.astype(np.float64), self._counts())
+        log_front = in_front(self.log_passed.astype(np.float64), self.counts())
         seen = np.flatnonzero(log_front > LOG_OPAQUE)
         weight = self.alpha.take(seen) * np.exp(log_front.take(seen).astype(np.float32))
         return self.ray.take(seen), self.owner.take(seen), weight
@@ -175,7 +175,7 @@ class Rays:
         """
         kept, here = keep.take(self.owner), np.arange(len(self.owner))
         none = len(here)  # farther than any hit
-        counts = self._counts()
+        counts = self.counts()
         first = np.repeat(self._first_hits(), counts)  # (h,), the first hit of the same ray
         end = first + np.repeat(counts, counts)  # (h,), behind the last one
         before = np.maximum.accumulate(np.where(kept, here, -1))
@@ -194,8 +194,8 @@ class Rays:
         np.not_equal(self.ray[1:], self.ray[:-1], out=new[1:])
         return np.flatnonzero(new)
 
-    def _counts(self) -> NDArray[np.int64]:
-        """Return how many hits each ray has that has any."""
+    def counts(self) -> NDArray[np.int64]:
+        """Return how many hits each ray has, of those that hit a splat."""
         return np.diff(np.append(self._first_hits(), len(self.ray)))
 
 

@@ -37,7 +37,6 @@ from .workers import Runner
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from typing import Any
 
     from numpy.typing import NDArray
 
@@ -119,7 +118,8 @@ def absorb(tiles: MeasuredTiles, goal: int, settings: Settings, runner: Runner) 
     for number, count in enumerate(counts):
         stage_runner = runner.part(number / len(counts), (number + 1) / len(counts))
         regions, left = _stage(tiles.context, number, left, count, factor, stage_runner)
-    origin, members = (_of_all(regions, name) for name in ("origin", "members"))
+    folder, numbers = regions[0].folder, range(len(regions))
+    origin, members = (folder.joined(numbers, name) for name in ("origin", "members"))
     merged = int(members.sum()) - goal
     return Survivors(regions, origin, members > 1, merged, total - goal - merged)
 
@@ -163,7 +163,7 @@ def _stage(
     steps = [AbsorbRegion(index, survivors) for index, survivors in enumerate(stay)]
     survivors = runner.part(0.8, 1.0).run(stage, steps, "absorbing", sizes)
     regions = [Region(index, size, folder) for index, size in enumerate(survivors)]
-    contribution, error = _of_all(regions, "expected", axis=1)
+    contribution, error = folder.joined(range(len(regions)), "expected", axis=1)
     rows = np.arange(len(error))
     measured = Measured(contribution, error, np.zeros(len(rows), np.int32))
     return regions, _Left(regions, rows, measured)
@@ -173,8 +173,8 @@ def _save_regions(stage: StageContext, left: _Left, number: int, runner: Runner)
     """Divide the splats that are left; return how many each region has."""
     steps = [SaveMeans(source) for source in left.sources]
     Runner(runner.workers).run_all(stage, steps, "absorbing")
-    means = [stage.folder.map(source.index, "means") for source in left.sources]
-    boxes = divided(np.concatenate(means)[left.rows], REGION, number)
+    means = stage.folder.joined((source.index for source in left.sources), "means")
+    boxes = divided(means[left.rows], REGION, number)
     for index, places in enumerate(boxes):
         _save_region(stage.folder, index, left, places)
     return [*map(len, boxes)]
@@ -184,12 +184,6 @@ def _save_region(folder: Folder, index: int, left: _Left, places: NDArray[np.int
     """Save which of the splats that are left are in a region; see `StageContext`."""
     sums = np.array([left.measured.contribution[places], left.measured.error[places]])
     folder.save(index, {"rows": left.rows[places], "sums": sums})
-
-
-def _of_all(regions: Sequence[Region], name: str, axis: int = 0) -> NDArray[Any]:
-    """Return an array of all regions as one."""
-    arrays = [region.folder.load(region.index, [name])[name] for region in regions]
-    return np.concatenate(arrays, axis)
 
 
 def _measured_again(scene: SceneContext, left: _Left, turn: int, runner: Runner) -> _Left:
@@ -222,9 +216,7 @@ def _staying(stage: StageContext, sizes: Sequence[int], left: int, runner: Runne
     whole = np.sum([*runner.part(0.0, 0.4).run(stage, gather, "absorbing", sizes)], axis=0)
     price = [PriceRegion(index, whole) for index in numbers]
     runner.part(0.4, 1.0).run_all(stage, price, "absorbing", sizes)
-    priced = [stage.folder.load(index, ("costs", "weights")) for index in numbers]
-    costs = np.concatenate([arrays["costs"] for arrays in priced])
-    weights = np.concatenate([arrays["weights"] for arrays in priced])
+    costs, weights = (stage.folder.joined(numbers, name) for name in ("costs", "weights"))
     return _shared_out(costs, weights, sizes, left)
 
 

@@ -21,17 +21,16 @@ from typing import TYPE_CHECKING, Any
 
 from ...version import VERSION
 from ..errors import RefineError
-from ..work import Progress, report, silent
+from ..work import report, silent
 from .folder import Interrupted
 from .units import header_of
-from .workers import shares_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from .folder import Folder
     from .units import Tile
-    from .workers import Context, Result, Step
+    from .workers import Batch, Context, Result
 
 _AHEAD = 3
 """Groups of steps a thread of a worker that are handed out ahead: so many wait here at most."""
@@ -184,14 +183,7 @@ class Cluster:
         msg = "the workers were lost again and again"
         raise Interrupted(msg)
 
-    def run(
-        self,
-        context: Context,
-        steps: Sequence[Step[Context, Result]],
-        progress: Progress,
-        what: str,
-        sizes: Sequence[int] = (),
-    ) -> Iterator[Result]:
+    def run(self, batch: Batch[Context, Result]) -> Iterator[Result]:
         """Do steps; see `Workers.run`.
 
         Raises
@@ -202,18 +194,19 @@ class Cluster:
         from distributed import CancelledError, KilledWorker  # noqa: PLC0415 - as above
         from distributed.comm import CommClosedError  # noqa: PLC0415
 
-        packed = pickle.dumps(context)  # once: the arrays of all views take Dask some milliseconds
-        threads = max(sum(self._client.nthreads().values()), 1)
+        # Once: the arrays of all views take Dask some milliseconds.
+        packed = pickle.dumps(batch.context)
+        steps, threads = batch.steps, max(sum(self._client.nthreads().values()), 1)
         size = max(1, min(_TOGETHER, len(steps) // (_TURNS * threads)))
         groups = [steps[start : start + size] for start in range(0, len(steps), size)]
-        shares = iter(shares_of(steps, sizes))
+        shares = iter(batch.shares())
         waiting: deque[Any] = deque()
         left, done = deque(groups), 0.0
         try:
             for _ in groups:
                 while left and len(waiting) < _AHEAD * threads:
                     waiting.append(self._submit(packed, left.popleft()))
-                results = self._result(waiting[0], progress, done, what)
+                results = self._result(waiting[0], batch, done)
                 waiting.popleft()
                 for result in results:
                     done += next(shares)
@@ -228,13 +221,13 @@ class Cluster:
         key = f"{type(group[0]).__name__}-{uuid.uuid4().hex}"
         return self._client.submit(_run, packed, [*group], key=key)
 
-    def _result(self, future: Any, progress: Progress, done: float, what: str) -> Any:  # noqa: ANN401
+    def _result(self, future: Any, batch: Batch[Any, Any], done: float) -> Any:  # noqa: ANN401
         """Return the result of a future, and ask meanwhile whether to go on."""
         ended = threading.Event()
         future.add_done_callback(lambda _: ended.set())
-        report(progress, done, what)
+        report(batch.progress, done, batch.what)
         while not ended.wait(_PATIENCE):
-            report(progress, done, what)
+            report(batch.progress, done, batch.what)
         return future.result()
 
 

@@ -39,12 +39,11 @@ class Interrupted(RefineError):  # noqa: N818 - the input is not at fault
 
 @dataclass(frozen=True)
 class Folder:
-    """A folder on a disk that every process that works on the job sees.
+    """A folder on a disk that every process that works on the job sees; its path is absolute.
 
-    Attributes
-    ----------
-    path : Path
-        Absolute.
+    What writes raises `Interrupted` if the disk is full or fails; what reads raises it if a file is
+    damaged, and forgets what keeps it from being made again (see `once`), and `FileNotFoundError`
+    if there is none.
     """
 
     path: Path
@@ -55,30 +54,21 @@ class Folder:
         return self.path / "tiles"
 
     def save(self, index: int, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Store arrays by name, of the unit, chunk or region of that number.
-
-        Raises
-        ------
-        Interrupted
-            If the disk is full or fails.
-        """
+        """Store arrays by name, of the unit, chunk or region of that number."""
         for name, array in arrays.items():
             with self.writing(self._array(index, name)) as stream:
                 _write(stream, array)
 
     def load(self, index: int, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-        """Return arrays that were saved, by name.
-
-        Raises
-        ------
-        FileNotFoundError
-        Interrupted
-            If a file is damaged; see `once`.
-        """
+        """Return arrays that were saved, by name."""
         return {name: self._loaded(index, name) for name in names}
 
+    def joined(self, indices: Iterable[int], name: str, axis: int = 0) -> NDArray[Any]:
+        """Return the arrays of several units, chunks or regions as one."""
+        return np.concatenate([self.map(index, name) for index in indices], axis)
+
     def map(self, index: int, name: str) -> NDArray[Any]:
-        """Return an array that was saved, without reading it yet; see `load` for errors."""
+        """Return an array that was saved, without reading it yet."""
         return self._loaded(index, name, mode="r")
 
     def drop(self, index: int, names: Iterable[str]) -> None:
@@ -121,13 +111,7 @@ class Folder:
         return folder
 
     def note(self, name: str, result: Any) -> None:  # noqa: ANN401 - an array, a tuple of some, None
-        """Note a result: from then on it is done.
-
-        Raises
-        ------
-        Interrupted
-            If the disk is full or fails.
-        """
+        """Note a result: from then on it is done."""
         alone = isinstance(result, np.ndarray)
         arrays = [result] if alone else [np.asarray(each) for each in result or ()]
         path = self.path / "done" / f"{name}{'' if alone else '.tuple'}"
@@ -152,7 +136,7 @@ class Folder:
         return False, None
 
     def mapped(self, name: str) -> NDArray[Any]:
-        """Return an array that was noted, without reading it yet; see `load` for errors."""
+        """Return an array that was noted, without reading it yet."""
         return self._read_or_forget(self.path / "done" / name, name, "r")
 
     @contextlib.contextmanager
@@ -160,12 +144,7 @@ class Folder:
         """Open a file of the job to write it whole; the folder that it lies in is made if need be.
 
         `whole_file` would look through that folder each time for what killed runs have left; here
-        that goes with the folder.
-
-        Raises
-        ------
-        Interrupted
-            If it cannot be written, as on a full disk. What else the block raises passes.
+        that goes with the folder. What else the block raises passes.
         """
         temporary = path.with_name(f"{secrets.token_hex(8)}.tmp")
         try:

@@ -7,6 +7,7 @@ together, as in memory: what it finds is the same to the bit, wherever the tiles
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,6 @@ from ..splats import drawable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from typing import Any
 
     from numpy.typing import NDArray
 
@@ -193,10 +193,7 @@ def store_gaussians(
     folder, sizes = context.folder, [*map(len, sources)]
     activate = [ActivateSplats(source) for source in sources]
     counts = [*runner.part(0.0, 0.6).run(context, activate, "reading", sizes)]
-
-    def of_all(name: str) -> NDArray[Any]:
-        return np.concatenate([folder.map(source.index, name) for source in sources])
-
+    of_all = functools.partial(folder.joined, [source.index for source in sources])
     order = folder.once(
         "order", lambda: code_order(of_all("code"), lambda rows: of_all("ties")[rows])
     )

@@ -130,7 +130,7 @@ class TileMeasuring(Measuring):
         steps = [MeasureViews(group, self.groups[group], kinds) for group in groups]
         replace(self._runner, progress=progress).run_all(self._context, steps, "scoring")
         for rays in ray_samples:
-            assert isinstance(rays, StoredRays)  # noqa: S101 - as those of `TileScoring` are
+            assert isinstance(rays, StoredRays)  # noqa: S101 - as those of `_TileScoring` are
             rays.noted.update(itertools.chain(*(self.groups[group] for group in groups)))
         errors = {group: folder.noted(_name(group))[1][3] for group in groups}
         return StoredSums(folder, groups), errors

@@ -67,24 +67,15 @@ class Region:
 class StageContext:
     """What all steps of a stage need.
 
-    Attributes
-    ----------
-    folder : Folder
-        Of the stage. It has for each region ``rows``, those of its splats among the rows of all
-        sources, ascending, and ``sums``, what the views see of them: see `ViewSums`.
-    views : ViewSet
-    scene : Scene
-    sources : sequence of Source
-        What the stage before left.
-    factor : float
-        On the cost of merging where it is priced by regions, see `absorb.patience`.
+    The folder is that of the stage. It has for each region ``rows``, those of its splats among the
+    rows of all sources, ascending, and ``sums``, what the views see of them: see `ViewSums`.
     """
 
     folder: Folder
     views: ViewSet
     scene: Scene
-    sources: Sequence[Source]
-    factor: float = 1.0
+    sources: Sequence[Source]  # what the stage before left
+    factor: float = 1.0  # on the cost of merging, priced by regions: see `absorb.patience`
 
     def gathered(
         self, rows: NDArray[np.int64]
@@ -163,9 +154,8 @@ class PriceRegion:
 
     def run(self, context: StageContext, progress: Progress, threads: int | None) -> None:
         """Save the graph, and of each splat the cost of its cheapest operation and its weight."""
-        context.folder.once(
-            f"{self.index:06d}.priced", lambda: self._price(context, progress, threads)
-        )
+        name = f"{self.index:06d}.priced"
+        context.folder.once(name, lambda: self._price(context, progress, threads))
 
     def _price(self, context: StageContext, progress: Progress, threads: int | None) -> None:
         folder = context.folder
@@ -218,15 +208,10 @@ class AbsorbRegion:
         # A survivor now also stands for all that the splats it absorbed stood for.
         stays = taken >= 0
         members = np.bincount(taken[stays], arrays["gathered_members"][stays], len(left))
-        folder.save(
-            self.index,
-            {
-                "splats": packed(left),
-                "origin": arrays["gathered_origin"][keep],
-                "members": members.astype(np.int64),
-                "expected": np.array([expected.contribution, expected.error]),
-            },
-        )
+        survivors = {"splats": packed(left), "origin": arrays["gathered_origin"][keep]}
+        survivors["members"] = members.astype(np.int64)
+        survivors["expected"] = np.array([expected.contribution, expected.error])
+        folder.save(self.index, survivors)
         return np.array(len(left))
 
     def _graph(self, context: StageContext, threads: int | None) -> MergeGraph:
@@ -251,11 +236,9 @@ class AbsorbAtOnce:
         self, context: StageContext, progress: Progress, threads: int | None
     ) -> tuple[int, int]:
         """Save the survivors, unless that is done; return how many there are, and were merged."""
-        counts = context.folder.once(
-            "000000.absorbed", lambda: self._absorbed(context, progress, threads)
-        )
-        left, merged = counts.tolist()
-        return left, merged
+        once = context.folder.once
+        left, merged = once("000000.absorbed", lambda: self._absorbed(context, progress, threads))
+        return int(left), int(merged)
 
     def _absorbed(
         self, context: StageContext, progress: Progress, threads: int | None
@@ -271,14 +254,8 @@ class AbsorbAtOnce:
             known=(scores, Measured(sums[0], sums[1], none)), began=self.total,
             progress=progress, threads=threads,
         )  # fmt: skip
-        context.folder.save(
-            0,
-            {
-                "splats": packed(absorbed.splats),
-                "origin": rows[absorbed.keep],
-                "changed": absorbed.changed,
-            },
-        )
+        arrays = {"splats": packed(absorbed.splats), "origin": rows[absorbed.keep]}
+        context.folder.save(0, arrays | {"changed": absorbed.changed})
         return np.array([len(absorbed.splats), absorbed.merged])
 
 
@@ -298,10 +275,8 @@ class SettleUnit:
         rows, changed_here = origin[here] - self.begin, changed[here]
         keep = np.zeros(len(self.unit), np.bool_)
         keep[rows] = True
-        folder.save(
-            self.unit.index,
-            {"changed": rows[changed_here], "became": self._table(place[here][changed_here])},
-        )
+        became = self._table(place[here][changed_here])
+        folder.save(self.unit.index, {"changed": rows[changed_here], "became": became})
         return save_kept(self.unit, folder, keep)
 
     def _table(self, places: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -74,7 +74,7 @@ def by_occlusion(
     """
     by_auto = settings.method == "auto"
     groups = auto.groups_of(closed_form.views) if by_auto else None
-    scoring = TileScoring(closed_form, units, settings.occlusion, groups, runner.part(0.0, 0.2))
+    scoring = _TileScoring(closed_form, units, settings.occlusion, groups, runner.part(0.0, 0.2))
     progress = runner.part(0.2, 0.98).progress
     with np.errstate(under="ignore"):
         if by_auto:
@@ -92,7 +92,7 @@ def measured_once(
 ) -> MeasuredTiles:
     """Score units by occlusion in one round; parameters as `by_occlusion`."""
     how = replace(settings.occlusion, rounds=1)
-    scoring = TileScoring(closed_form, units, how, None, runner.part(0.0, 0.2))
+    scoring = _TileScoring(closed_form, units, how, None, runner.part(0.0, 0.2))
     with np.errstate(under="ignore"):
         scores = scoring.finish(runner.part(0.2, 0.98).progress)
         measured = scoring.measured().for_all(scoring.gaussians.index, len(scoring.prior))
@@ -100,24 +100,10 @@ def measured_once(
     return MeasuredTiles(scoring.context, units, scores, measured, scoring.validation_rays)
 
 
-class TileScoring(OcclusionScoring):
-    """A scoring of units.
+class _TileScoring(OcclusionScoring):
+    """A scoring of units, got ready by the runner; the folder of `closed_form` is that of the job.
 
-    Parameters
-    ----------
-    closed_form : ClosedFormContext
-        For the prior; its folder is that of the job.
-    units : sequence of Unit
-    settings : Occlusion
-    groups : list of list of int, optional
-        See `measuring.Measuring`.
-    runner : Runner
-        For getting ready to measure.
-
-    Attributes
-    ----------
-    context : SceneContext
-        What the views measure in.
+    For `groups` see `measuring.Measuring`.
     """
 
     validation_rays: StoredRays
@@ -133,17 +119,11 @@ class TileScoring(OcclusionScoring):
         self._job, self._units = closed_form.folder, units
         prior = replace(closed_form, folder=self._job.inner("prior"), settings=PRIOR)
         _, size = by_closed_form(prior, units, runner.part(0.0, 0.5))
-        values = np.concatenate(
-            [prior.folder.load(unit.index, ["values"])["values"] for unit in units]
-        )
-        unturned = SceneContext(
-            self._job.inner("seen"),
-            prior.views,
-            settings,
-            Scene(prior.middle[0], size, np.eye(3)),
-        )
-        scene = _turned(unturned, units, runner.part(0.5, 0.6))
-        self.context = context = replace(unturned, scene=scene)
+        values = prior.folder.joined((unit.index for unit in units), "values")
+        unturned = Scene(prior.middle[0], size, np.eye(3))
+        context = SceneContext(self._job.inner("seen"), prior.views, settings, unturned)
+        context = replace(context, scene=_turned(context, units, runner.part(0.5, 0.6)))
+        self.context = context
         gaussians, good = store_gaussians(context, units, runner.part(0.6, 1.0))
         # They have what `OcclusionScoring` asks of Gaussians in memory.
         super().__init__(

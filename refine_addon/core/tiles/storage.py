@@ -1,4 +1,8 @@
-"""Where tiles lie: on disks that this machine sees, or behind URLs, which fsspec opens."""
+"""Where tiles lie: on disks that this machine sees, or behind URLs, which fsspec opens.
+
+All functions raise `RefineError` where a file cannot be looked for, read or written; behind a URL
+`Interrupted`, since that may pass.
+"""
 
 from __future__ import annotations
 
@@ -46,13 +50,7 @@ def identity(path: Path | Url) -> str:
 
 
 def file_key(path: Path | Url) -> Hashable:
-    """Return what is the same for all names of a file that exists, hard links included.
-
-    Raises
-    ------
-    RefineError
-        If it cannot be read.
-    """
+    """Return what is the same for all names of a file that exists, hard links included."""
     name = identity(path)
     if not name.startswith(_LOCAL):
         return name
@@ -62,13 +60,7 @@ def file_key(path: Path | Url) -> Hashable:
 
 
 def state(path: Path | Url) -> tuple[int, int | str]:
-    """Return the bytes of a file and what changes with its content: a time in ns, or facts.
-
-    Raises
-    ------
-    RefineError
-        If it cannot be read.
-    """
+    """Return the bytes of a file and what changes with its content: a time in ns, or facts."""
     with _explained(path, "cannot be read"):
         if not isinstance(path, Url):
             status = path.stat()
@@ -93,10 +85,7 @@ def state(path: Path | Url) -> tuple[int, int | str]:
 def beginning(url: Url, size: int, whole: int) -> bytes:
     """Return the first `size` bytes of a file of `whole` bytes, or all.
 
-    Raises
-    ------
-    RefineError
-        If it cannot be read, or only from its beginning: `array` would be sent all of it.
+    A file that can only be read from its beginning is refused: `array` would be sent all of it.
     """
     with _explained(url, "cannot be read"):
         system, inner = _opened(url)
@@ -118,11 +107,6 @@ def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDA
         How many elements.
     begin : int
         Bytes before the first.
-
-    Raises
-    ------
-    RefineError
-        If it cannot be read.
     """
     with _explained(path, "cannot be read"):
         if not isinstance(path, Url):
@@ -141,11 +125,6 @@ def new_folder(folder: Path | Url) -> Iterator[None]:
 
     Behind a URL an empty file is written there, moved and removed, so that a storage that does not
     let us is known before long work starts.
-
-    Raises
-    ------
-    RefineError
-        If it cannot be made, or no file be written there.
     """
     if not isinstance(folder, Url):
         with whole_file.new_folder(folder):
@@ -179,13 +158,7 @@ def refuse_existing(path: Path | Url, *, overwrite: bool) -> None:
 
 
 def upload(made: Path, url: Url) -> None:
-    """Copy a file to a URL, unless one of that size is there.
-
-    Raises
-    ------
-    RefineError
-        If it cannot be written.
-    """
+    """Copy a file to a URL, unless one of that size is there."""
     with _explained(url, "cannot be written"):
         system, inner = _opened(url)
         system.invalidate_cache()
@@ -196,10 +169,7 @@ def upload(made: Path, url: Url) -> None:
 def publish(made: Path | Url, path: Path | Url, *, overwrite: bool) -> None:
     """Rename a finished file in the same storage, as `whole_file.publish` does.
 
-    Raises
-    ------
-    RefineError
-        If it cannot be renamed, or there is a file of that name that may not be replaced.
+    A file of that name that may not be replaced is refused.
     """
     if isinstance(made, Path) and isinstance(path, Path):
         whole_file.publish(made, path, overwrite=overwrite)

@@ -52,33 +52,15 @@ class Source(Protocol):
 
 
 class Tile(NamedTuple):
-    """A file of splats, as it was when the job began.
+    """A file of splats, as it was when the job began."""
 
-    Attributes
-    ----------
-    path : str
-        Absolute, or a URL.
-    splats : int
-        How many it holds.
-    dtype : structured
-        Of a row.
-    header : int
-        Bytes of the header.
-    begin : int
-        Bytes before the first row.
-    size : int
-        Bytes of the file.
-    changed : int or str
-        See `storage.state`.
-    """
-
-    path: str
-    splats: int
-    dtype: np.dtype[Any]
-    header: int
-    begin: int
-    size: int
-    changed: int | str
+    path: str  # absolute, or a URL
+    splats: int  # how many it holds
+    dtype: np.dtype[Any]  # of a row
+    header: int  # bytes of the header
+    begin: int  # bytes before the first row
+    size: int  # bytes of the file
+    changed: int | str  # see `storage.state`
 
     @property
     def place(self) -> Path | Url:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 from ..work import Progress, part, report, silent
 
@@ -41,33 +41,32 @@ class Step(Protocol[_Context_contra, _Result_co]):
         """
 
 
+@dataclass(frozen=True)
+class Batch(Generic[Context, Result]):
+    """Steps that are done together, and what is told of them meanwhile."""
+
+    context: Context  # see `Step`; it is sent once
+    steps: Sequence[Step[Context, Result]]
+    progress: Progress
+    what: str  # is being done, for `progress`
+    sizes: Sequence[int] = ()  # how much work each step is, in any unit; by default all the same
+
+    def shares(self) -> list[float]:
+        """Return how much of the work of all steps each is."""
+        if not self.sizes:
+            return [1 / max(len(self.steps), 1)] * len(self.steps)
+        total = max(sum(self.sizes), 1)
+        return [size / total for size in self.sizes]
+
+
 class Workers(Protocol):
     """Whoever does the steps."""
 
     def check(self, folder: Folder, tiles: Sequence[Tile]) -> None:
         """Raise `RefineError` if a worker does not see the folder of the job, or a tile."""
 
-    def run(
-        self,
-        context: Context,
-        steps: Sequence[Step[Context, Result]],
-        progress: Progress,
-        what: str,
-        sizes: Sequence[int] = (),
-    ) -> Iterator[Result]:
-        """Do steps; yield what each returns, in their order.
-
-        Parameters
-        ----------
-        context : object
-            See `Step`; it is sent once.
-        steps : sequence of Step
-        progress : callable
-        what : str
-            What is being done, for `progress`.
-        sizes : sequence of int, optional
-            How much work each step is, in any unit; by default all are the same.
-        """
+    def run(self, batch: Batch[Context, Result]) -> Iterator[Result]:
+        """Do steps; yield what each returns, in their order."""
 
 
 class InProcess:
@@ -85,19 +84,13 @@ class InProcess:
     def check(self, folder: Folder, tiles: Sequence[Tile]) -> None:
         """Do nothing: this process sees what it sees."""
 
-    def run(
-        self,
-        context: Context,
-        steps: Sequence[Step[Context, Result]],
-        progress: Progress,
-        what: str,
-        sizes: Sequence[int] = (),
-    ) -> Iterator[Result]:
+    def run(self, batch: Batch[Context, Result]) -> Iterator[Result]:
         """Do steps one after the other; see `Workers.run`."""
         done = 0.0
-        for step, share in zip(steps, shares_of(steps, sizes), strict=True):
-            report(progress, done, what)
-            yield step.run(context, part(progress, done, done + share), self._threads)
+        for step, share in zip(batch.steps, batch.shares(), strict=True):
+            report(batch.progress, done, batch.what)
+            ahead = part(batch.progress, done, done + share)
+            yield step.run(batch.context, ahead, self._threads)
             done += share
 
 
@@ -119,8 +112,8 @@ class Runner:
         what: str,
         sizes: Sequence[int] = (),
     ) -> Iterator[Result]:
-        """Do steps; yield what each returns, in their order. See `Workers.run`."""
-        return self.workers.run(context, steps, self.progress, what, sizes)
+        """Do steps; yield what each returns, in their order. See `Batch`."""
+        return self.workers.run(Batch(context, steps, self.progress, what, sizes))
 
     def run_all(
         self,
@@ -129,12 +122,6 @@ class Runner:
         what: str,
         sizes: Sequence[int] = (),
     ) -> None:
-        """Do steps that return nothing. See `Workers.run`."""
+        """Do steps that return nothing. See `Batch`."""
         for _ in self.run(context, steps, what, sizes):
             pass
-
-
-def shares_of(steps: Sequence[object], sizes: Sequence[int]) -> list[float]:
-    """Return how much of the work of all steps each is; see `Workers.run`."""
-    total = max(sum(sizes), 1)
-    return [size / total for size in sizes] if sizes else [1 / max(len(steps), 1)] * len(steps)

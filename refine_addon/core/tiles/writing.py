@@ -79,23 +79,12 @@ class WriteTile:
 
 @dataclass(frozen=True)
 class Outputs:
-    """Where the tiles of a job go.
-
-    Attributes
-    ----------
-    job : Folder
-    targets : sequence of Path or Url
-        The names that all tiles get in the end.
-    waiting : sequence of Path or Url
-        Where each waits, in the same storage, until all are written.
-    overwrite : bool
-        Whether files may be replaced.
-    """
+    """Where the tiles of a job go."""
 
     job: Folder
-    targets: Sequence[Path | Url]
-    waiting: Sequence[Path | Url]
-    overwrite: bool
+    targets: Sequence[Path | Url]  # the names that all tiles get in the end
+    waiting: Sequence[Path | Url]  # where each waits, in the same storage, until all are written
+    overwrite: bool  # whether files may be replaced
 
     @classmethod
     def of(

@@ -1,0 +1,509 @@
+"""Refitting: survivors learn the colours that the unpruned splats have on rays.
+
+Deleting and absorbing leave survivors with the numbers that they had, or that one merge at a time
+gave them. On rays it is known what the unpruned splats look like, and how the colours change with
+every parameter of the survivors (`linear`). So in rounds, each on rays through other pixels, the
+squared difference of colours is made small by damped least squares (Levenberg, Marquardt)::
+
+    minimise over x   |J x - r|^2  +  sum over parameters p of  (DAMPING D_p + PRIOR m_p) x_p^2
+
+r is the difference on all rays, D the diagonal of J'J and m_p the median of D over all splats that
+are hit, for each kind of parameter. So what few rays tell of a splat moves it little. The sum is
+made small by a few steps of conjugate gradients, preconditioned by the diagonal.
+
+The rays of a round, before anything is learned from them, are a measurement that nothing was fitted
+to: on them, survivors before and after the round before are compared. Rounds end where little is
+gained, and a round that loses is undone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+
+from ..errors import RefineError
+from ..seeing import projection
+from ..seeing.cast import cast, depth_complexity, pixels
+from ..seeing.ray_sample import colors_from
+from ..splats import rotation_matrices, unit_quaternions
+from ..work import Progress, for_chunks, part, silent
+from .linear import COLOR, COUNT, MEAN, OPACITY, SCALE, TURN, LinearView, Shapes, linear_view
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
+
+    from ..seeing.projection import Gaussians
+    from ..splats import Splats
+    from ..views import ViewSet
+
+Found = TypeVar("Found")
+
+RAYS_OF_SPLAT = 4.0
+"""Rays of a round for each survivor: with fewer, survivors learn them by heart."""
+
+MIN_RAYS = 1 << 16
+"""Rays of a round where that would be fewer."""
+
+MAX_HITS = 1 << 25
+"""About how many hits the rays of a round may have on the unpruned splats. Survivors have fewer,
+and those that hardly show are left out: some 80 bytes are taken for every third."""
+
+MAX_RAYS_OF_VIEW = 60_000
+"""See `ray_sample.MAX_RAYS_OF_VIEW`."""
+
+STEPS = 4
+"""Steps of conjugate gradients in a round."""
+
+DAMPING, PRIOR = 1.0, 1.0
+"""Of the diagonal, and of its median over splats; see the top of this file."""
+
+LEAST_GAIN = 0.05
+"""Rounds end where the PSNR of fresh rays rises by less, dB."""
+
+MAX_STEP = {"color": 0.5, "opacity": 1.0, "mean": 0.5, "scale": 0.3, "turn": 0.3}
+"""How far a parameter moves in a round: as `linear` has them, means by the longest scale."""
+
+_OTHER_PIXELS = 2  # numbers of pixels that validation and scoring rays take, see `cast.pixels`
+_CAP = 1e-10  # mean squared error that counts as none: 100 dB
+
+
+@dataclass(frozen=True)
+class Refit:
+    """Settings of refitting.
+
+    Attributes
+    ----------
+    rounds : int
+        At most so many.
+    geometry : bool
+        Whether means, scales and rotations are refitted too, or colours and opacities alone.
+    """
+
+    rounds: int = 6
+    geometry: bool = True
+
+    def __post_init__(self) -> None:
+        """Check the values.
+
+        Raises
+        ------
+        RefineError
+            If a value is out of range.
+        """
+        if self.rounds < 1:
+            msg = f"rounds is {self.rounds}, expected 1 or more"
+            raise RefineError(msg)
+
+
+@dataclass(frozen=True, eq=False)
+class Refitted:
+    """What some rounds have made of survivors.
+
+    Attributes
+    ----------
+    splats : Splats
+        As they are now.
+    changed : (N,) bool
+        Which of them are not what they were.
+    rounds : int
+        How many rounds made them so.
+    psnr_before, psnr : float
+        Of the survivors as given, and as they are now, dB: each round's gain is measured on rays
+        that nothing was fitted to, and added.
+    """
+
+    splats: Splats
+    changed: NDArray[np.bool_]
+    rounds: int
+    psnr_before: float
+    psnr: float
+
+
+def refit(  # noqa: PLR0913 - all but three are optional
+    survivors: Splats,
+    original: Splats,
+    views: ViewSet,
+    settings: Refit = Refit(),
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Refitted:
+    """Refit survivors to what the views see of the unpruned splats.
+
+    Parameters
+    ----------
+    survivors : Splats
+        N splats, in the frame and unit of the views.
+    original : Splats
+        The unpruned splats, in the same frame.
+    views : ViewSet
+        All of them are used.
+    settings : Refit
+    protected : (N,) bool, optional
+        Survivors that do not change.
+    progress : callable, optional
+        See `refine_addon.core.work.Progress`.
+    threads : int, optional
+
+    Returns
+    -------
+    Refitted
+        Never below what it began with, on rays that nothing was fitted to.
+
+    Raises
+    ------
+    Cancelled
+        If `progress` answers ``False``; `refit_rounds` gives what was reached by then.
+
+    Notes
+    -----
+    Memory: about 200 bytes a survivor, 12 bytes for each ray of all rounds, and 80 bytes for each
+    hit of a round, see `MAX_HITS`.
+    """
+    *_, last = refit_rounds(
+        survivors, original, views, settings,
+        protected=protected, progress=progress, threads=threads,
+    )  # fmt: skip
+    return last
+
+
+def refit_rounds(  # noqa: PLR0913 - as `refit`
+    survivors: Splats,
+    original: Splats,
+    views: ViewSet,
+    settings: Refit = Refit(),
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Iterator[Refitted]:
+    """Yield what survivors are before the first round, and after each that gains.
+
+    Parameters and errors are those of `refit`.
+    """
+    moving = np.zeros(COUNT, np.bool_)
+    moving[: COUNT if settings.geometry else MEAN.start] = True
+    movable = moving[:, None] & ~(
+        np.zeros(len(survivors), np.bool_) if protected is None else protected
+    )
+    rays = _Rounds(survivors, original, views, settings.rounds, part(progress, 0.0, 0.3), threads)
+    best = Refitted(survivors, np.zeros(len(survivors), np.bool_), 0, 0.0, 0.0)
+    trial = survivors
+    for number in range(settings.rounds + 1):
+        share = 0.7 / (settings.rounds + 1)
+        begin = 0.3 + share * number
+        linear = rays.linear(trial, number, part(progress, begin, begin + share / 2))
+        psnr = rays.psnr([view.colors for view in linear], number)
+        if not number:
+            best = replace(best, psnr_before=psnr, psnr=psnr)
+        else:
+            gain = psnr - rays.psnr(rays.colors(best.splats, number), number)
+            if gain <= 0.0:
+                return
+            changed = ~_same(survivors, trial)
+            best = Refitted(trial, changed, number, best.psnr_before, best.psnr + gain)
+        yield best
+        if number == settings.rounds or (number and gain < LEAST_GAIN):
+            return
+        change = rays.solve(
+            linear, number, movable, part(progress, begin + share / 2, begin + share)
+        )
+        trial = _moved(trial, change)
+
+
+class _Rounds:
+    """The rays of all rounds, with the colours that the unpruned splats have on them.
+
+    Parameters
+    ----------
+    survivors, original, views
+        See `refit`.
+    rounds : int
+    progress : callable
+    threads : int, optional
+
+    Attributes
+    ----------
+    scene : Scene
+        Of the unpruned splats.
+    """
+
+    def __init__(
+        self,
+        survivors: Splats,
+        original: Splats,
+        views: ViewSet,
+        rounds: int,
+        progress: Progress,
+        threads: int | None,
+    ) -> None:
+        self._chosen, self._threads, self._count = views, threads, len(survivors)
+        self._views = views.by_distance()
+        gaussians, self.scene, _ = projection.prepare(
+            original, views, progress=part(progress, 0.0, 0.2), threads=threads
+        )
+        rays = max(RAYS_OF_SPLAT * len(survivors), MIN_RAYS) / len(self._views)
+        hits = MAX_HITS / len(self._views)
+
+        def truth(piece: slice) -> list[_Truth]:
+            number = piece.start
+            view = self._views[number][0]
+            with np.errstate(under="ignore"):
+                footprints = projection.project(gaussians, self.scene, view)
+                depth = max(depth_complexity(footprints, view), 1.0)
+                count = min(rays, hits / depth, MAX_RAYS_OF_VIEW)
+                return [
+                    self._truth(gaussians, original, number, footprints, count, k)
+                    for k in range(rounds + 1)
+                ]
+
+        self._truths: list[list[_Truth]] = for_chunks(
+            truth, len(self._views), 1,
+            progress=part(progress, 0.2, 1.0), what="casting rays", threads=threads,
+        )  # fmt: skip
+
+    def _truth(
+        self,
+        gaussians: Gaussians,
+        original: Splats,
+        number: int,
+        footprints: projection.Footprints,
+        count: float,
+        round_: int,
+    ) -> _Truth:
+        view = self._views[number][0]
+        place = number + (_OTHER_PIXELS + round_) * len(self._views)
+        columns, rows = pixels(view, place, count)
+        rays = cast(footprints, columns, rows)
+        colors = rays.colors(colors_from(original, gaussians.index[rays.hit], view))
+        return _Truth(columns, rows, colors.astype(np.float32))
+
+    def linear(self, splats: Splats, round_: int, progress: Progress) -> list[LinearView]:
+        """Return how the colours of each view's rays change with survivors as they are now."""
+        gaussians, _, _ = projection.prepare(
+            splats, self._chosen, self.scene,
+            progress=part(progress, 0.0, 0.1), threads=self._threads,
+        )  # fmt: skip
+        shapes = Shapes.of(splats, gaussians, self.scene)
+
+        def linear_of(piece: slice) -> LinearView:
+            view, truth = self._views[piece.start][0], self._truths[piece.start][round_]
+            with np.errstate(under="ignore"):
+                footprints = projection.project(gaussians, self.scene, view)
+                rays = cast(footprints, truth.columns, truth.rows)
+                colors = colors_from(splats, gaussians.index[rays.hit], view)
+                return linear_view(rays, footprints, colors, shapes, view)
+
+        return self._each(linear_of, part(progress, 0.1, 1.0))
+
+    def colors(self, splats: Splats, round_: int) -> list[NDArray[np.float64]]:
+        """Return what the rays of each view see of survivors, (3, P)."""
+        gaussians, _, _ = projection.prepare(
+            splats, self._chosen, self.scene, threads=self._threads
+        )
+
+        def colors_of(piece: slice) -> NDArray[np.float64]:
+            view, truth = self._views[piece.start][0], self._truths[piece.start][round_]
+            with np.errstate(under="ignore"):
+                footprints = projection.project(gaussians, self.scene, view)
+                rays = cast(footprints, truth.columns, truth.rows)
+                return rays.colors(colors_from(splats, gaussians.index[rays.hit], view))
+
+        return self._each(colors_of, silent)
+
+    def psnr(self, colors: list[NDArray[np.float64]], round_: int) -> float:
+        """Return the mean PSNR of what the rays of each view see, weighted as the views are, dB."""
+        errors = [
+            max(float(np.mean(np.square(truths[round_].colors - seen))), _CAP)
+            for truths, seen in zip(self._truths, colors, strict=True)
+        ]
+        weights = [weight for _, weight in self._views]
+        return float(np.average(-10.0 * np.log10(errors), weights=weights))
+
+    def solve(
+        self,
+        linear: list[LinearView],
+        round_: int,
+        movable: NDArray[np.bool_],
+        progress: Progress,
+    ) -> NDArray[np.float64]:
+        """Return by how much to change the parameters of all survivors, (13, N).
+
+        Parameters
+        ----------
+        linear : list of LinearView
+        round_ : int
+        movable : (13, N) bool
+            Which parameters may change.
+        progress : callable
+        """
+        steps = [part(progress, k / (STEPS + 2), (k + 1) / (STEPS + 2)) for k in range(STEPS + 2)]
+
+        def errors(number: int) -> NDArray[np.float64]:
+            view = linear[number]
+            return view.backward(
+                self._truths[number][round_].colors - view.colors.astype(np.float32)
+            )
+
+        residual = self._sum(linear, errors, steps[0]) * movable
+        diagonal = self._sum(linear, lambda number: linear[number].diagonal(), steps[1]) * movable
+        damping = DAMPING * diagonal + PRIOR * _medians(diagonal)[:, None]
+        inverse = np.divide(
+            1.0, diagonal + damping, out=np.zeros_like(diagonal), where=movable & (diagonal > 0.0)
+        )
+
+        def product(direction: NDArray[np.float64], step: Progress) -> NDArray[np.float64]:
+            small = direction.astype(np.float32)
+
+            def of_view(number: int) -> NDArray[np.float64]:
+                return linear[number].backward(linear[number].forward(small))
+
+            return self._sum(linear, of_view, step) * movable + damping * direction
+
+        return _conjugate_gradients(product, residual, inverse, steps[2:])
+
+    def _sum(
+        self,
+        linear: list[LinearView],
+        work: Callable[[int], NDArray[np.float64]],
+        progress: Progress,
+    ) -> NDArray[np.float64]:
+        """Return the sum over views, one after the other, of values of the splats hit, (13, N)."""
+        total = np.zeros((COUNT, self._count))
+        with np.errstate(under="ignore"):
+            of_views = self._each(lambda piece: work(piece.start), progress)
+            for view, values in zip(linear, of_views, strict=True):
+                total[:, view.rows] += values
+        return total
+
+    def _each(self, work: Callable[[slice], Found], progress: Progress) -> list[Found]:
+        return for_chunks(
+            work, len(self._views), 1, progress=progress, what="refitting", threads=self._threads
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Truth:
+    """Rays of one view and round: their columns and rows of pixels, and their colours, (3, P)."""
+
+    columns: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    colors: NDArray[np.float32]
+
+
+def _medians(diagonal: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the median over splats of what rays tell, 1 where they tell nothing, (13,)."""
+    return np.array([np.median(row[row > 0.0]) if row.any() else 1.0 for row in diagonal])
+
+
+def _conjugate_gradients(
+    product: Callable[[NDArray[np.float64], Progress], NDArray[np.float64]],
+    residual: NDArray[np.float64],
+    inverse: NDArray[np.float64],
+    steps: list[Progress],
+) -> NDArray[np.float64]:
+    """Return about the solution x of ``product(x) = residual``, by a few steps from 0.
+
+    Parameters
+    ----------
+    product : callable
+    residual, inverse : (13, N) float64
+        The right side, and the preconditioner: 0 where x stays 0.
+    steps : list of callable
+        The progress of each step.
+    """
+    solution = np.zeros_like(residual)
+    direction = inverse * residual
+    before = float(np.vdot(residual, direction))
+    for step in steps:
+        if before <= 0.0:
+            break
+        image = product(direction, step)
+        length = before / float(np.vdot(direction, image))
+        solution += length * direction
+        residual = residual - length * image
+        preconditioned = inverse * residual
+        after = float(np.vdot(residual, preconditioned))
+        direction = preconditioned + after / before * direction
+        before = after
+    return solution
+
+
+def _moved(splats: Splats, change: NDArray[np.float64]) -> Splats:
+    """Return splats with changed parameters; those that do not change keep their bits.
+
+    Parameters
+    ----------
+    splats : Splats
+    change : (13, N) float64
+    """
+    moving = change.any(axis=0)
+    rows = np.flatnonzero(moving)
+    some, change = splats.take(rows), change[:, rows]
+    quaternions = unit_quaternions(some.quaternions)
+    logs = some.log_scales.astype(np.float64)
+    longest = np.exp(logs.max(axis=1))
+    step = _turned(quaternions, _limited(change[MEAN], MAX_STEP["mean"]).T) * longest[:, None]
+    limit = MAX_STEP["color"]
+    values = {
+        "means": some.means + step,
+        "log_scales": logs + change[SCALE].T.clip(-MAX_STEP["scale"], MAX_STEP["scale"]),
+        "quaternions": _product(quaternions, _limited(change[TURN], MAX_STEP["turn"])),
+        "opacity_logits": some.opacity_logits
+        + change[OPACITY][0].clip(-MAX_STEP["opacity"], MAX_STEP["opacity"]),
+        "sh_dc": some.sh_dc + change[COLOR].T.clip(-limit, limit),
+    }
+    arrays = {}
+    for name, new in values.items():
+        arrays[name] = getattr(splats, name).copy()
+        arrays[name][rows] = new
+    return replace(splats, **arrays)
+
+
+def _limited(vectors: NDArray[np.float64], longest: float) -> NDArray[np.float64]:
+    """Return vectors, (3, n), no longer than a length."""
+    lengths = np.linalg.norm(vectors, axis=0)
+    return np.asarray(vectors * np.minimum(1.0, longest / np.maximum(lengths, longest)))
+
+
+def _turned(quaternions: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return vectors along the axes of splats, (n, 3), in the world."""
+    return np.asarray(np.einsum("nij,nj->ni", rotation_matrices(quaternions), vectors))
+
+
+def _product(quaternions: NDArray[np.float64], turns: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return unit quaternions, (n, 4), of splats that are turned about their own axes first.
+
+    Parameters
+    ----------
+    quaternions : (n, 4) float64
+        w x y z, of length 1.
+    turns : (3, n) float64
+        Rotation vectors, radians.
+    """
+    angle = np.linalg.norm(turns, axis=0)
+    sine = 0.5 * np.sinc(angle / (2.0 * np.pi))  # sin(angle / 2) / angle
+    w, x, y, z = quaternions.T
+    a, (b, c, d) = np.cos(angle / 2.0), sine * turns
+    return np.stack(
+        [
+            w * a - x * b - y * c - z * d,
+            w * b + x * a + y * d - z * c,
+            w * c - x * d + y * a + z * b,
+            w * d + x * c - y * b + z * a,
+        ],
+        axis=1,
+    )
+
+
+def _same(one: Splats, other: Splats) -> NDArray[np.bool_]:
+    """Return which rows of two arrays of splats are equal, (N,)."""
+    same = one.opacity_logits == other.opacity_logits
+    for name in ("means", "log_scales", "quaternions", "sh_dc"):
+        same &= (getattr(one, name) == getattr(other, name)).all(axis=1)
+    return np.asarray(same)

@@ -1,0 +1,258 @@
+"""Refitting, against differences of a plain renderer in float64, and its laws."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from refine_addon.core import ViewSet
+from refine_addon.core.refitting import linear, refit
+from refine_addon.core.rendering import LOW_PASS
+from refine_addon.core.seeing import projection
+from refine_addon.core.seeing.cast import cast
+from refine_addon.core.seeing.ray_sample import colors_from
+from refine_addon.core.splats import SH_C0, rotation_matrices
+from refine_addon.core.work import Cancelled
+from tests.core.test_occlusion import cloud, ring
+
+COLUMNS, ROWS = np.arange(3, 78, 6), np.arange(4, 58, 6)
+
+
+def few():
+    """Return 12 splats of unlike sizes, turned, half transparent, in doubles."""
+    splats = cloud(12)
+    random = np.random.default_rng(4)
+    return replace(
+        splats,
+        means=splats.means.astype(np.float64),
+        log_scales=random.uniform(-2.5, -0.7, (12, 3)),
+        quaternions=random.normal(size=(12, 4)),
+        opacity_logits=random.uniform(-1.0, 1.5, 12),
+        sh_dc=random.uniform(-1.0, 1.0, (12, 3)),
+        sh_rest=np.zeros((12, 0, 3)),
+    )
+
+
+def drawn(splats, view, fixed):
+    """Return the colours of the rays, (3, P), in float64, with J and the order of depth of `fixed`.
+
+    The footprint ends nowhere, so that nothing jumps.
+    """
+    depth = ((fixed.means - view.center) @ view.rotation.T)[:, 2]
+    x, y, z = ((fixed.means - view.center) @ view.rotation.T).T
+    moved = (splats.means - fixed.means) @ view.rotation.T  # (n, 3)
+    image, left = np.zeros((3, len(ROWS) * len(COLUMNS))), np.ones(len(ROWS) * len(COLUMNS))
+    down, across = (axis.ravel() + 0.5 for axis in np.meshgrid(ROWS, COLUMNS, indexing="ij"))
+    for k in np.argsort(depth):
+        jacobian = np.array(
+            [
+                [view.fx / z[k], 0.0, -view.fx * x[k] / z[k] ** 2],
+                [0.0, view.fy / z[k], -view.fy * y[k] / z[k] ** 2],
+            ]
+        )
+        axes = (
+            view.rotation @ rotation_matrices(splats.quaternions[k]) * np.exp(splats.log_scales[k])
+        )
+        shape = jacobian @ axes @ axes.T @ jacobian.T + LOW_PASS * np.eye(2)
+        center = np.array([view.fx * x[k] / z[k] + view.cx, view.fy * y[k] / z[k] + view.cy])
+        center = center + jacobian @ moved[k]
+        d = np.stack([across, down]) - center[:, None]
+        squared = np.einsum("ip,ij,jp->p", d, np.linalg.inv(shape), d)
+        alpha = np.exp(-squared / 2.0) / (1.0 + np.exp(-splats.opacity_logits[k]))
+        color = np.maximum(0.5 + SH_C0 * splats.sh_dc[k], 0.0)
+        image += color[:, None] * left * alpha
+        left *= 1.0 - alpha
+    return image
+
+
+def linear_of(splats, view):
+    """Return what `linear` says of a view."""
+    gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)))
+    footprints = projection.project(gaussians, scene, view)
+    rays = cast(footprints, COLUMNS, ROWS)
+    colors = colors_from(splats, gaussians.index[rays.hit], view)
+    shapes = linear.Shapes.of(splats, gaussians, scene)
+    return linear.linear_view(rays, footprints, colors, shapes, view)
+
+
+@pytest.mark.parametrize("parameter", range(linear.COUNT))
+def test_derivatives_are_those_of_differences_in_float64(monkeypatch, parameter):
+    """Central differences of each parameter of each splat, with steps of 1e-5.
+
+    At the pixels that the splat hits: beyond, footprints are cut off. What is cut off of those
+    behind changes the colour behind by up to 1 / 255 each.
+    """
+    for name, limit in refit.MAX_STEP.items():
+        monkeypatch.setitem(refit.MAX_STEP, name, max(limit, 1.0))
+    splats, view = few(), ring()[0]
+    found = linear_of(splats, view)
+
+    for place, row in enumerate(found.rows):
+        change, step = np.zeros((linear.COUNT, 12)), 1e-5
+        change[parameter, row] = step
+        ahead, behind = (drawn(refit._moved(splats, way * change), view, splats) for way in (1, -1))
+        expected = (ahead - behind) / (2.0 * step)
+        told = found.forward((change / step).astype(np.float32))
+        hit = found.ray[found.owner == place]
+        scale = np.abs(expected).max()
+        assert len(hit) > 2
+        np.testing.assert_allclose(told[:, hit], expected[:, hit], atol=0.02 * scale + 1e-4)
+
+
+def test_backward_is_the_transpose_of_forward():
+    """The inner products of J x with r and of x with J'r are the same number."""
+    found = linear_of(few(), ring()[0])
+    random = np.random.default_rng(1)
+    change = random.normal(size=(linear.COUNT, 12)).astype(np.float32)
+    errors = random.normal(size=found.colors.shape).astype(np.float32)
+
+    one = float(np.vdot(found.forward(change), errors))
+    other = float(np.vdot(found.backward(errors), change[:, found.rows]))
+
+    assert one == pytest.approx(other, rel=1e-4)
+    unit = np.zeros((linear.COUNT, 12), np.float32)
+    unit[5, found.rows[3]] = 1.0
+    assert found.diagonal()[5, 3] == pytest.approx(
+        float((found.forward(unit) ** 2).sum()), rel=1e-4
+    )
+
+
+@pytest.mark.slow
+def test_refitted_survivors_are_nearer_to_what_the_views_see():
+    """Half of a cloud, colours and all: some dB on rays that nothing was fitted to."""
+    splats, views = cloud(400), ring()
+    survivors = splats.take(np.arange(0, 400, 2))
+
+    colors = refit.refit(survivors, splats, views, refit.Refit(geometry=False))
+    every = refit.refit(survivors, splats, views)
+
+    assert colors.psnr > colors.psnr_before + 2.0
+    assert every.psnr > colors.psnr + 1.0
+    assert every.psnr_before == colors.psnr_before
+    np.testing.assert_array_equal(colors.splats.means, survivors.means)
+    assert every.splats.sh_rest is survivors.sh_rest
+
+
+@pytest.mark.slow
+def test_protected_and_unseen_survivors_keep_their_bits():
+    """Also where their quaternions are not of length 1."""
+    splats = cloud(400)
+    survivors = splats.take(np.arange(0, 400, 2))
+    means = survivors.means.copy()
+    means[100:120] += 1e4  # no view sees them
+    survivors = replace(survivors, means=means, quaternions=survivors.quaternions * np.float32(3.0))
+    protected = np.arange(200) < 50
+
+    found = refit.refit(survivors, splats, ring(), protected=protected)
+
+    still = protected.copy()
+    still[100:120] = True
+    assert not found.changed[still].any()
+    assert found.changed[~still].mean() > 0.9
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc"):
+        old, new = getattr(survivors, name), getattr(found.splats, name)
+        np.testing.assert_array_equal(new[~found.changed], old[~found.changed])
+        assert new.dtype == old.dtype
+
+
+def test_what_is_the_same_already_is_not_made_worse():
+    """All splats, refitted to themselves: nothing is to be gained."""
+    splats = cloud(200)
+
+    found = refit.refit(splats, splats, ring())
+
+    assert found.psnr == found.psnr_before == 100.0
+    assert not found.changed.any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("threads", [1, 3])
+def test_threads_change_no_bit(threads):
+    splats = cloud(300)
+    expected = refit.refit(splats.take(np.arange(100)), splats, ring(), threads=2)
+
+    found = refit.refit(splats.take(np.arange(100)), splats, ring(), threads=threads)
+
+    assert found.psnr == expected.psnr
+    np.testing.assert_array_equal(found.splats.means, expected.splats.means)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [1e-6, 1e6])
+def test_the_unit_of_the_scene_changes_nothing(size):
+    """Positions, sizes and cameras by a factor: the same gain to rounding."""
+    splats, views = cloud(300), ring()
+    here = refit.refit(splats.take(np.arange(150)), splats, views, refit.Refit(rounds=2))
+    scaled = replace(
+        splats,
+        means=splats.means.astype(np.float64) * size,
+        log_scales=splats.log_scales.astype(np.float64) + np.log(size),
+    )
+    there = refit.refit(
+        scaled.take(np.arange(150)),
+        scaled,
+        ViewSet(tuple(replace(view, center=view.center * size) for view in views)),
+        refit.Refit(rounds=2),
+    )
+
+    assert there.psnr == pytest.approx(here.psnr, abs=0.1)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", ["opaque", "clear", "flat", "together", "undrawable", "vast"])
+def test_extreme_splats_make_no_warning_and_nothing_worse(value):
+    splats = cloud(200)
+    logits, logs, means = (
+        array.copy() for array in (splats.opacity_logits, splats.log_scales, splats.means)
+    )
+    if value == "opaque":
+        logits[::2] = np.inf
+    elif value == "clear":
+        logits[::2] = -np.inf
+    elif value == "flat":
+        logs[::2, 0] = -100.0
+    elif value == "together":
+        means[::2] = means[0]
+    elif value == "undrawable":
+        means[::2] = np.nan
+    else:
+        logs[::2] = 30.0
+    strange = replace(splats, opacity_logits=logits, log_scales=logs, means=means)
+
+    found = refit.refit(strange.take(np.arange(100)), splats, ring(), refit.Refit(rounds=2))
+
+    assert found.psnr >= found.psnr_before
+    drawn_before = projection.classify(strange.take(np.arange(100)))[0]
+    np.testing.assert_array_equal(projection.classify(found.splats)[0], drawn_before)
+
+
+def test_one_splat_one_view_and_one_pixel_are_enough():
+    splats = cloud(5)
+    view = replace(ring()[0], width=1, height=1, cx=0.5, cy=0.5)
+
+    found = refit.refit(splats.take(np.arange(1)), splats, ViewSet((view,)))
+
+    assert found.psnr >= found.psnr_before
+
+
+def test_rounds_can_be_cancelled_and_what_was_reached_is_kept():
+    splats = cloud(300)
+    asked = []
+
+    def stop(fraction, _what):
+        asked.append(fraction)
+        return fraction < 0.6
+
+    reached = []
+    with pytest.raises(Cancelled):
+        reached.extend(
+            refit.refit_rounds(splats.take(np.arange(150)), splats, ring(), progress=stop)
+        )
+    rounds = refit.refit_rounds(splats.take(np.arange(150)), splats, ring())
+    first, second = next(rounds), next(rounds)
+
+    assert max(asked) < 0.7
+    assert (first.rounds, second.rounds) == (0, 1)
+    assert second.psnr > first.psnr
