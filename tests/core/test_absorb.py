@@ -649,6 +649,7 @@ def heaps(places, each, hidden):
     return replace(field, contribution=field.contribution * seen, error=field.error * seen)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("hidden", [0.0, 0.001])
 @pytest.mark.parametrize(("places", "each"), [(1, 2000), (20, 100), (1000, 2)])
 def test_copies_of_a_splat_do_not_merge_one_by_one(monkeypatch, places, each, hidden):

@@ -140,6 +140,7 @@ def test_the_room_has_72_cameras_in_the_order_of_the_file():
     np.testing.assert_array_equal(views[0].center, [1.7000000476837158, 0.0, 1.25])
 
 
+@pytest.mark.slow
 def test_the_room_is_in_the_picture_of_every_camera():
     """A camera that looks away (a flipped axis) would have hardly a splat in its picture."""
     means = read_ply(ROOM / "point_cloud.ply").splats().means.astype(np.float64)

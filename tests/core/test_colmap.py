@@ -266,6 +266,7 @@ def test_the_line_of_points_may_be_empty_or_absent(tmp_path, images):
     assert view.name == "a.png"
 
 
+@pytest.mark.slow
 def test_empty_lines_take_no_memory(tmp_path):
     """A place was made for each and kept: 250 bytes of memory for one of the file."""
     text = b"\n" * 100_000 + b"1 0.5 0.5 0.5 -0.5 -2 3 1 1 a.png"

@@ -134,6 +134,7 @@ def test_the_room_is_pruned_to_the_same_file_from_python_and_from_the_command(fo
     assert (folder / "api.ply").read_bytes() == (folder / "out.ply").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("folder")
 def test_scores_are_written_bit_for_bit():
     """The file is the input with one more property, and nothing else."""
@@ -151,6 +152,7 @@ def test_scores_are_written_bit_for_bit():
     assert file.header.replace(b"end_header\n", added) == written.header
 
 
+@pytest.mark.slow
 def test_scoring_twice_writes_the_same_file(folder):
     """The property that is there is set, not added again; scores do not depend on it."""
     assert command.main([*SCORE, "-o", "once.ply"]) == 0
@@ -330,6 +332,7 @@ def test_the_report_of_a_prune_is_complete_and_plain(folder):
     assert all(map(math.isfinite, numbers(report)))
 
 
+@pytest.mark.slow
 def test_the_report_of_scores_is_plain_too(folder):
     """Counts, weights and the files' names; unseen is what no view counts as seen."""
     seen = score(read_ply("in.ply").splats(), read_cameras("cameras.json"), Settings()).seen
@@ -374,6 +377,7 @@ def test_the_summary_says_how_close_the_pictures_stay(capsys):
         assert re.search(pattern, capsys.readouterr().out, re.MULTILINE)
 
 
+@pytest.mark.slow
 def test_a_psnr_is_kept_by_every_method(folder):
     """By the estimate in the report, to the next of 60 splats; the closed form makes one too."""
     for options in ([], CLOSED, ["--method", "occlusion"]):
@@ -414,6 +418,7 @@ def test_a_dry_run_says_the_same_and_writes_nothing(folder, capsys):
     assert capsys.readouterr().out.count("in.ply: would keep 30 of 60 splats (50.0% removed)") == 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [["--dry-run"], ["-o", "out.ply"], ["-o", "out.splat", "--absorb"]],

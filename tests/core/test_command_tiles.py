@@ -58,6 +58,7 @@ def test_one_budget_counts_over_all_files(folder, capsys):
     assert f"b.ply: {kept[1]} of 40 splats" in said
 
 
+@pytest.mark.slow
 def test_a_dry_run_says_the_same_and_writes_nothing(folder, capsys):
     """Only the verb differs."""
     before = sorted(folder.rglob("*"))

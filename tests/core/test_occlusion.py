@@ -746,6 +746,7 @@ def test_what_cannot_be_drawn_scores_zero_and_all_else_more():
     assert found.undrawable == 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("focal", [1.0, 30.0, 1e3, 1e6])
 @pytest.mark.parametrize("spread", [1e-3, 1.0, 30.0])
 def test_no_scene_makes_numpy_complain(focal, spread):

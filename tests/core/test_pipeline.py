@@ -652,6 +652,7 @@ def test_scoring_for_one_budget_decides_what_scores_for_all_would(scored_for_all
         assert (known == 10) == (ratio > 0.9)
 
 
+@pytest.mark.slow
 def test_scores_of_one_budget_are_refused_for_a_larger_one(small, views):
     """What they say of the splats that stayed is not final; views seen are."""
     splats = read_ply(small).splats()

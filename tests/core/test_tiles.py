@@ -522,6 +522,7 @@ def test_what_appears_in_the_place_of_a_tile_meanwhile_stops_before_the_first(
     assert {path.name for path in out.iterdir()} == {path.name for path in tiles}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("calls", [1, 30, 60, 77], ids=["begin", "scores", "selected", "tiles"])
 def test_on_a_full_disk_what_is_done_stays(tmp_path, tiles, views, monkeypatch, calls):
     """Wherever it fills up, the file is named, and the same call goes on once there is room."""
@@ -572,6 +573,7 @@ def interrupted_at(fraction):
     return progress
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["means.npy", "plain.npy", "values.npy"])
 def test_an_array_that_a_power_cut_truncated_is_made_again(tmp_path, tiles, views, name):
     """It is named, what was not damaged stays, and the next run ends with the same bytes."""

@@ -231,6 +231,7 @@ def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, rows, views)
     assert np.isfinite([made[name] for name in made.dtype.names]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.5, 0.8])
 def test_absorbing_a_single_region_is_absorbing_one_file(
     tmp_path, tiles, views, monkeypatch, ratio
