@@ -403,6 +403,7 @@ def test_quiet_is_silent(folder, capsys, arguments):
     assert ("", expected) == capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_a_dry_run_says_the_same_and_writes_nothing(folder, capsys):
     """Not even the folder of the outputs; a report is written where asked for."""
     assert command.main([*PRUNE, "--dry-run"]) == 0

@@ -200,6 +200,7 @@ def test_the_unit_of_the_scene_changes_nothing(size):
     assert there.psnr == pytest.approx(here.psnr, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("value", ["opaque", "clear", "flat", "together", "undrawable", "vast"])
 def test_extreme_splats_make_no_warning_and_nothing_worse(value):
@@ -237,6 +238,7 @@ def test_one_splat_one_view_and_one_pixel_are_enough():
     assert found.psnr >= found.psnr_before
 
 
+@pytest.mark.slow
 def test_rounds_can_be_cancelled_and_what_was_reached_is_kept():
     splats = cloud(300)
     asked = []
