@@ -114,6 +114,9 @@ def _check_report(parser: argparse.ArgumentParser, options: argparse.Namespace) 
         # Unlike pathlib's, these two never fail, whatever the name.
         if os.path.realpath(os.path.expanduser(other)) == path:  # noqa: PTH111
             parser.error(f"--report {options.report} is {other}, expected a file of its own")
+    pictures = getattr(options, "pictures", None)
+    if pictures and path.endswith(".png") and os.path.dirname(path) == os.path.realpath(pictures):  # noqa: PTH120
+        parser.error(f"--report {options.report} may be one of the pictures; choose another name")
     beginning = _beginning(options.report) if options.overwrite else None
     if beginning is not None and not is_report(beginning):
         parser.error(f"{options.report} exists and is no report: write to another name")
@@ -227,6 +230,8 @@ def _check_files(parser: argparse.ArgumentParser, options: argparse.Namespace) -
         if getattr(options, "together", False):
             advice = "rename one of them"
         _refuse_doubles(parser, options.inputs, lambda path: options.output_dir / path.name, advice)
+        if not getattr(options, "together", False):
+            _refuse_replaced(parser, options.inputs, options.output_dir)
     if getattr(options, "pictures", None):
         if options.together:
             parser.error("--pictures draws each input by itself, not --together")
@@ -245,8 +250,18 @@ def _refuse_doubles(
     advice: str,
 ) -> None:
     """Refuse two inputs of which the same file would be made."""
-    first: dict[Path, Path] = {}
+    first: dict[str, Path] = {}
     for path in inputs:
-        other = first.setdefault(output_of(path), path)
+        output = output_of(path)
+        other = first.setdefault(os.path.realpath(str(output)), path)
         if other is not path:
-            parser.error(f"{other} and {path} would both be {output_of(path)}: {advice}")
+            parser.error(f"{other} and {path} would both be {output}: {advice}")
+
+
+def _refuse_replaced(parser: argparse.ArgumentParser, inputs: Sequence[Path], folder: Path) -> None:
+    """Refuse an output that is another input by a link: it would be replaced before it is read."""
+    read = {os.path.realpath(path): path for path in inputs}
+    for path in inputs:
+        other = read.get(os.path.realpath(str(folder / path.name)), path)
+        if other is not path:
+            parser.error(f"{folder / path.name} is {other} by a link, which is read too")

@@ -24,7 +24,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
 
 def expanded(path: Path | str) -> Path:
@@ -49,7 +49,8 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
     Call it before long work starts, so that a mistyped output is noticed at once.
     """
     try:
-        mode, folder = mode_of(path), mode_of(path.parent)
+        behind = Path(os.path.realpath(path)).parent  # of a link, where it leads
+        mode, folder = mode_of(path), mode_of(behind)
     except (OSError, ValueError) as error:  # a name too long, a folder that may not be entered
         raise RefineError(_explain(path, error)) from error
     if stat.S_ISDIR(mode):
@@ -62,8 +63,19 @@ def refuse_existing(path: Path, *, overwrite: bool) -> None:
         msg = f"{path}: exists already; choose another name or overwrite it (--overwrite)"
         raise RefineError(msg)
     if not stat.S_ISDIR(folder):
-        msg = f"{path}: cannot be written, there is no folder {path.parent}"
+        missing = path.parent if mode_of(path.parent) == 0 else behind
+        msg = f"{path}: cannot be written, there is no folder {missing}"
         raise RefineError(msg)
+
+
+def refuse_one_file(paths: Iterable[Path]) -> None:
+    """Raise `RefineError` if two of some outputs lead to one file, by links."""
+    first: dict[str, Path] = {}
+    for path in paths:
+        other = first.setdefault(os.path.realpath(path), path)
+        if other is not path:
+            msg = f"{path}: is the same file as {other}, by a link; remove the link"
+            raise RefineError(msg)
 
 
 def mode_of(path: Path) -> int:

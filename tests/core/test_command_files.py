@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from refine_addon import command
+from refine_addon.command import main
 from refine_addon.core import read_ply
 from tests.strategies import plain_ply
 
@@ -293,3 +294,29 @@ def test_a_stream_that_takes_nothing_changes_no_exit_code(arguments, stream, cod
     assert done.returncode == code
     assert b"Traceback" not in (getattr(done, other) or b"")
     assert b"Exception ignored" not in (getattr(done, other) or b"")
+
+
+def test_an_output_that_is_another_input_by_a_link_is_refused(tmp_path, capsys):
+    """It would be replaced before it is read."""
+    inputs = [tmp_path / "in" / name for name in ("a.ply", "b.ply")]
+    (tmp_path / "in").mkdir()
+    (tmp_path / "out").mkdir()
+    for path in inputs:
+        path.write_bytes(b"ply\n")
+    (tmp_path / "out/a.ply").symlink_to(inputs[1])
+    words = ["--cameras", str(tmp_path / "c.json"), "--output-dir", str(tmp_path / "out")]
+
+    code = main(["prune", *map(str, inputs), *words, "--ratio", ".5", "--overwrite"])
+
+    assert code == 2
+    assert "by a link, which is read too" in capsys.readouterr().err
+    assert inputs[1].read_bytes() == b"ply\n"
+
+
+def test_a_report_is_none_of_the_pictures(tmp_path, capsys):
+    words = ["--pictures", str(tmp_path), "--report", str(tmp_path / "a-000-after.png")]
+
+    code = main(["prune", "a.ply", "-o", "b.ply", "--cameras", "c.json", "--ratio", ".5", *words])
+
+    assert code == 2
+    assert "may be one of the pictures" in capsys.readouterr().err

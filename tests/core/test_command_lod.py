@@ -254,3 +254,28 @@ def test_no_manifest_names_a_file_that_is_not_there(files, monkeypatch, stop):  
 
     assert process.exitcode == 9
     assert not (out / "lod.json").exists()
+
+
+def test_levels_that_are_one_file_by_a_link_are_refused(files, capsys):  # noqa: F811
+    out = files / "out"
+    out.mkdir()
+    (out / "scene.lod2.ply").symlink_to("scene.lod1.ply")
+
+    assert call(files, "lod", "-o", str(out), "--overwrite", *QUICK) == 1
+    assert "by a link" in capsys.readouterr().err
+
+
+def test_a_killed_run_leaves_no_level_that_no_list_names(files, monkeypatch):  # noqa: F811
+    """Five levels before, two now: the other three go with the list, before a level is written."""
+    out = files / "out"
+    assert call(files, "lod", "-o", str(out), "--levels", ".5,.4,.3,.2,.1", *QUICK) == 0
+
+    def killed(*_, **__):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(levels_files, "_write", killed)
+
+    with pytest.raises(ZeroDivisionError):
+        call(files, "lod", "-o", str(out), "--levels", ".5,.1", "--overwrite", *QUICK)
+
+    assert sorted(path.name for path in out.iterdir()) == ["scene.lod1.ply", "scene.lod2.ply"]

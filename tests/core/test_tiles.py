@@ -9,6 +9,7 @@ import shutil
 import sys
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -710,3 +711,35 @@ def test_what_is_noted_is_read_back(tmp_path):
     assert folder.noted("one")[1].tolist() == [0, 1, 2]
     assert [each.tolist() for each in folder.noted("two")[1]] == [[[1, 0], [0, 1]], 0.1]
     assert folder.noted("three") == (False, None)
+
+
+def test_tiles_that_would_be_one_file_by_links_are_refused(tmp_path, tiles, views):
+    """One of them would be lost: also where the file is not there yet."""
+    out = tmp_path / "out"
+    out.mkdir()
+    for tile in tiles[:2]:
+        (out / tile.name).symlink_to("real.ply")
+
+    with pytest.raises(RefineError, match=r"is the same file as .*, by a link"):
+        prune_tiles(tiles, out, PruneRequest(views, Budget(ratio=0.5), CLOSED))
+    assert sorted(path.name for path in out.iterdir()) == sorted(tile.name for tile in tiles[:2])
+
+
+def test_a_link_to_another_disk_is_refused_before_the_work(tmp_path, tiles, views, monkeypatch):
+    """Tiles wait beside their targets and are renamed: not from disk to disk."""
+    out, other = tmp_path / "out", tmp_path / "other"
+    for folder in (out, other):
+        folder.mkdir()
+    (out / tiles[1].name).symlink_to(other / "far.ply")
+    stat = Path.stat
+
+    def elsewhere(self, **options):
+        found = stat(self, **options)
+        if self != other:
+            return found
+        return SimpleNamespace(st_dev=found.st_dev + 1, st_mode=found.st_mode)
+
+    monkeypatch.setattr(Path, "stat", elsewhere)
+
+    with pytest.raises(RefineError, match="is a link to another disk"):
+        prune_tiles(tiles, out, PruneRequest(views, Budget(ratio=0.5), CLOSED))

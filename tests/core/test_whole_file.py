@@ -659,3 +659,11 @@ def test_a_file_whose_writing_was_cancelled_is_not_put_in_place(tmp_path):
         stream.write(b"new")
 
     assert contents(tmp_path) == {"out.bin": b"old"}
+
+
+def test_a_link_into_a_folder_that_is_not_there_is_refused_before_the_work(tmp_path):
+    link = tmp_path / "out.ply"
+    link.symlink_to(tmp_path / "no/out.ply")
+
+    with pytest.raises(RefineError, match=r"out\.ply: cannot be written, there is no folder .*no"):
+        whole_files.refuse_existing(link, overwrite=True)

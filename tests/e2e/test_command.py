@@ -194,7 +194,7 @@ sys.exit(code if code >= 0 else f"killed by {-code}")
 def test_stopped_at_work_it_leaves_nothing_and_says_so(
     binary: Binary, cloud: Path, cameras: Path, number: int, reason: str
 ):
-    """The folder of the outputs is made first, and goes again; scoring by occlusion takes seconds."""
+    """The folder of the outputs is made first and goes again; scoring then takes seconds."""
     made = binary.work / "made"
     words = ("prune", cloud, "--cameras", cameras, "--method", "occlusion", "--views", "0")
 

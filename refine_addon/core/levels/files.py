@@ -22,6 +22,7 @@ from ..whole_file import (
     new_folder,
     refuse_existing,
     refuse_mapped,
+    refuse_one_file,
     whole_file,
 )
 from ..work import Progress, silent
@@ -178,6 +179,7 @@ class LevelSink:
         """
         paths = [*self.paths, self.folder / MANIFEST]
         with new_folder(self.folder):
+            refuse_one_file(paths)
             for path in paths:
                 refuse_existing(path, overwrite=self.request.overwrite)
                 refuse_mapped(path, self.source)
@@ -206,6 +208,9 @@ class LevelSink:
             if level.number == 1:
                 # From here on files of an earlier run are replaced, so its manifest goes first.
                 before = _unlisted(self.folder) if request.overwrite else []
+                # Those that this run does not replace go while they are known: a killed run has
+                # no list of them.
+                notes += _remove(set(before) - {*self.paths}, self.source)
                 facts = self._facts(loaded, level)
                 notes += scoring_notes(level.scores)
             entry, more = _write(loaded, level, path, overwrite=request.overwrite)
@@ -214,7 +219,7 @@ class LevelSink:
             entries.append({**level.facts(request.goal), **entry})
             remarks[level.asked] = level.remark
         notes += request.levels.notes(remarks)
-        notes += _remove(set(before) - {*self.written}, self.source)
+        notes += _remove({*before} & {*self.paths} - {*self.written}, self.source)
         facts["levels"] = entries
         with whole_file(self.folder / MANIFEST, overwrite=request.overwrite) as stream:
             stream.write(json.dumps(facts, indent=2, allow_nan=False).encode() + b"\n")

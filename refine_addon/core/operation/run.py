@@ -190,7 +190,8 @@ def run(
     Raises
     ------
     RefineError, Cancelled
-        See the steps. Nothing is written then, unless the message says so.
+        See the steps. Nothing is written then; but where comparing fails or is cancelled, after
+        writing, the file that was written stays.
     """
     runtime = Runtime(Clock(), progress, threads)
     with request.opened(sink.form), sink.opened():

@@ -106,8 +106,11 @@ class Folder:
     def inner(self, name: str) -> Folder:
         """Return a folder in this one, and make it if it is not there."""
         folder = Folder(self.path / name)
-        for path in (folder.path / "done", folder.path / "arrays"):
-            path.mkdir(parents=True, exist_ok=True)
+        try:
+            for path in (folder.path / "done", folder.path / "arrays"):
+                path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise Interrupted(_not_written(folder.path, error)) from error
         return folder
 
     def note(self, name: str, result: Any) -> None:  # noqa: ANN401 - an array, a tuple of some, None
@@ -153,10 +156,7 @@ class Folder:
                 yield stream
             temporary.replace(path)
         except OSError as error:
-            full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-            reason = f"cannot be written ({error.strerror})"
-            msg = f"{path}: {'no space left on the disk' if full else reason}"
-            raise Interrupted(msg) from error
+            raise Interrupted(_not_written(path, error)) from error
         finally:
             with contextlib.suppress(OSError):
                 temporary.unlink(missing_ok=True)
@@ -240,3 +240,10 @@ def _write(stream: BinaryIO, array: NDArray[Any]) -> None:
 def _read(path: Path, mode: Any = None) -> NDArray[Any]:  # noqa: ANN401 - as `numpy.load`
     """Return an array, mapped if `mode` is "r"."""
     return np.asarray(np.load(path, mmap_mode=mode, allow_pickle=False))
+
+
+def _not_written(path: Path, error: OSError) -> str:
+    """Return the message for what the system refuses to write."""
+    full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+    reason = f"cannot be written ({error.strerror})"
+    return f"{path}: {'no space left on the disk' if full else reason}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from ..formats.ply_header import with_count
 from ..formats.ply_write import write_rows
 from ..survivors import columns_with
 from ..urls import Url
+from ..whole_file import refuse_one_file
 from . import storage
 from .folder import Interrupted
 from .units import bytes_of, header_of, rows_of, unpacked
@@ -108,6 +110,7 @@ class Outputs:
             else job.tiles / tile.name
             for number, tile in enumerate(tiles)
         ]
+        refuse_one_file(target for target in targets if isinstance(target, Path))
         outputs = cls(job, [*targets], waiting, overwrite)
         read = {storage.identity(tile.place) for tile in tiles}
         for target in targets:
@@ -139,6 +142,7 @@ class Outputs:
         for number, target in enumerate(self.targets):
             if number not in there:
                 storage.refuse_existing(target, overwrite=self.overwrite)
+                _refuse_other_disk(target)
 
     def publish(self) -> None:
         """Rename all tiles that are not in their places yet.
@@ -182,6 +186,15 @@ class Outputs:
             return target.is_file() and _state(target) == (size, changed)
         waiting = self.waiting[number]
         return storage.size_of(waiting) is None and storage.size_of(target) == size
+
+
+def _refuse_other_disk(target: Path | Url) -> None:
+    """Raise `RefineError` if a target is a link to another disk: nothing is renamed there."""
+    if isinstance(target, Path):
+        behind = Path(os.path.realpath(target)).parent
+        if behind.stat().st_dev != target.parent.stat().st_dev:
+            msg = f"{target}: is a link to another disk, {behind}; remove the link"
+            raise RefineError(msg)
 
 
 def _state(path: Path | Url) -> tuple[int, int]:
