@@ -17,7 +17,7 @@ from refine_addon.core.splats import SH_C0, rotation_matrices
 from refine_addon.core.work import Cancelled
 from tests.core.test_occlusion import cloud, ring
 
-COLUMNS, ROWS = np.arange(3, 78, 6), np.arange(4, 58, 6)
+COLUMNS, ROWS = np.arange(3, 78, 8), np.arange(4, 58, 8)
 
 
 def few():
@@ -79,7 +79,7 @@ def linear_of(splats, view):
 
 @pytest.mark.parametrize("parameter", range(linear.COUNT))
 def test_derivatives_are_those_of_differences_in_float64(monkeypatch, parameter):
-    """Central differences of each parameter of each splat, with steps of 1e-5.
+    """Central differences of each parameter of four splats, with steps of 1e-5.
 
     At the pixels that the splat hits: beyond, footprints are cut off. What is cut off of those
     behind changes the colour behind by up to 1 / 255 each.
@@ -89,7 +89,7 @@ def test_derivatives_are_those_of_differences_in_float64(monkeypatch, parameter)
     splats, view = few(), ring()[0]
     found = linear_of(splats, view)
 
-    for place, row in enumerate(found.rows):
+    for place, row in enumerate(found.rows[:4]):
         change, step = np.zeros((linear.COUNT, 12)), 1e-5
         change[parameter, row] = step
         ahead, behind = (drawn(refit._moved(splats, way * change), view, splats) for way in (1, -1))
