@@ -22,6 +22,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 PROJECT = Path(__file__).resolve().parent.parent
+ROOT_FILES = ("pyproject.toml", "blender_manifest.toml", "Makefile", "README.md", "CONTRIBUTING.md")
+"""What tests read in the project's folder; without one of them they would fail by themselves."""
+
 SECONDS = 900
 """A fault that makes the tests take longer is caught: something hangs."""
 
@@ -84,7 +87,7 @@ def outcome(fault: Fault | None, module: str, text: str) -> str:
         copy = Path(folder)
         for name in ("refine_addon", "tests", "benchmarks", ".ci", "docs"):
             shutil.copytree(PROJECT / name, copy / name, ignore=shutil.ignore_patterns("e2e"))
-        for name in ("pyproject.toml", "blender_manifest.toml", "README.md", "CONTRIBUTING.md"):
+        for name in ROOT_FILES:
             shutil.copy(PROJECT / name, copy / name)
         if fault:
             (copy / module).write_text(text.replace(fault.old, fault.new), "utf-8")
@@ -94,8 +97,8 @@ def outcome(fault: Fault | None, module: str, text: str) -> str:
 
 def _stages(test: str) -> list[list[str]]:
     """Return what pytest is to run, stage by stage: one file, all quick tests, all slow ones."""
-    # What the documents name does not depend on any line of core.
-    apart = {f"test_{test}.py", "test_documents.py"}
+    # What documents and words name does not depend on any line of core.
+    apart = {f"test_{test}.py", "test_documents.py", "test_words.py"}
     paths = [path.relative_to(PROJECT) for path in sorted(PROJECT.glob("tests/core/test_*.py"))]
     others = [str(path) for path in paths if path.name not in apart]
     first = [[f"tests/core/test_{test}.py"]] if test else []

@@ -30,6 +30,7 @@ from refine_addon.core.volumes import forced as forced_by
 from tests.core.test_cleaning import FLOATER, cameras, joined, wall
 from tests.core.test_levels import cameras as level_cameras
 from tests.core.test_levels import colourful
+from tests.core.test_occlusion import cloud, ring
 from tests.strategies import ply_of
 
 pytestmark = pytest.mark.slow
@@ -316,3 +317,17 @@ def test_levels_of_a_file_go_by_volumes(splats, views, tmp_path):
         assert (level.means[:, 0] < 1.0).all()
         assert (level.means[:, 0] < -2.0).sum() >= (x < -2.0).sum()
     assert [fact["role"] for fact in told["volumes"]] == ["keep", "protect", "remove"]
+
+
+def test_rows_of_several_lengths_are_those_of_the_splats_that_need_not_go():
+    """The first 100 of 300 take 1,000 bytes each and go; of the others, 10 each, 1,500 hold 150."""
+    splats, forced_out = cloud(300), np.arange(300) < 100
+    row_bytes = np.where(forced_out, 1000, 10)
+
+    result = prune(
+        splats, ring(), Budget(max_mb=0.0015), Settings("closed-form"),
+        removed=forced_out, row_bytes=row_bytes,
+    )  # fmt: skip
+
+    assert np.count_nonzero(result.keep) == 150
+    assert not result.keep[forced_out].any()
