@@ -376,3 +376,12 @@ def test_a_threshold_beyond_the_range_of_scores_removes_all_that_are_finite():
     keep = select(known, Budget(threshold=3.4028235677973366e38))
 
     assert keep.tolist() == [False, True]
+
+
+def test_a_tally_counts_no_protected_splat_and_sorts_what_was_seen():
+    """Of four, .9 are three, but two are free; seen in 0, 60, 1, 50 of 64 views, two miss half."""
+    values = np.arange(1, 5, dtype=np.float32)
+    known = scored(values, [0, 60, 1, 50])
+
+    assert Tally(known, np.arange(4) < 2).removed(Budget(ratio=0.9)) == 2
+    assert Tally(known).removed(Budget(min_seen=50.0)) == 2
