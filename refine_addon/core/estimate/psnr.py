@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..seeing import projection
-from ..seeing.cast import cast
-from ..seeing.ray_sample import colors_from
+from ..seeing.ray_sample import cast_colored
 from ..work import Progress, for_chunks, part, silent
 from .quality import ABSORBED_SHARES, FEWEST, PSNR_CAP, SHARES, Quality, absorbed_from
 
@@ -176,8 +175,7 @@ def psnr_against(
     def cast_again(number: int, rays: Rays) -> tuple[Rays, NDArray[np.float64]]:
         view = sample.views[number][0]
         footprints = projection.project(gaussians, scene, view)
-        other = cast(footprints, rays.columns, rays.rows)
-        return other, colors_from(splats, gaussians.index[other.hit], view)
+        return cast_colored(splats, gaussians, footprints, view, rays.columns, rays.rows)
 
     return mean_psnr(sample, cast_again, part(progress, 0.2, 1.0), threads)
 

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..cleaning.clean import Cleaned
     from ..formats.format import Format
     from ..picture_files import PictureFiles
     from ..selection import Budget
@@ -108,12 +109,7 @@ class PruneRequest(Request["Loaded", "Result"]):
         if self.cleaning is None:
             return self._decide(loaded, runtime.part(0.0, DECIDED))
         forced = loaded.forced
-        cleaned = clean(
-            loaded.splats, self.views, self.cleaning,
-            protected=forced.protected, removed=forced.removed,
-            progress=runtime.part(0.0, CLEANED).progress, threads=runtime.threads,
-        )  # fmt: skip
-        runtime.clock.lap("clean_s")
+        cleaned = _cleaned(loaded, self.views, self.cleaning, runtime.part(0.0, CLEANED))
         # The budget counts what is forced out as removed, so that is not cleaned away.
         left = cleaned.keep if forced.removed is None else cleaned.keep | forced.removed
         result = self._decide(loaded.take(left), runtime.part(CLEANED, DECIDED)).for_all(left)
@@ -176,6 +172,17 @@ class PruneRequest(Request["Loaded", "Result"]):
         return facts
 
 
+def _cleaned(loaded: Loaded, views: ViewSet, cleaning: Cleaning, runtime: Runtime) -> Cleaned:
+    """Clean what was loaded, but for what must stay and what must go."""
+    cleaned = clean(
+        loaded.splats, views, cleaning,
+        protected=loaded.forced.protected, removed=loaded.forced.removed,
+        progress=runtime.progress, threads=runtime.threads,
+    )  # fmt: skip
+    runtime.clock.lap("clean_s")
+    return cleaned
+
+
 @dataclass(frozen=True, eq=False)
 class Kept:
     """Which splats stay, none of which absorbs others.
@@ -221,12 +228,7 @@ class CleanRequest(Request["Loaded", Kept]):
             See `clean`.
         """
         forced = loaded.forced
-        cleaned = clean(
-            loaded.splats, self.views, self.cleaning,
-            protected=forced.protected, removed=forced.removed,
-            progress=runtime.part(0.0, DECIDED).progress, threads=runtime.threads,
-        )  # fmt: skip
-        runtime.clock.lap("clean_s")
+        cleaned = _cleaned(loaded, self.views, self.cleaning, runtime.part(0.0, DECIDED))
         facts: dict[str, Any] = what_was_seen(
             cleaned.seen, cleaned.undrawable, cleaned.views_given, cleaned.views_used
         )

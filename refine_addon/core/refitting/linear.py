@@ -180,19 +180,17 @@ def linear_view(
     left = np.maximum(transmittance - weight, np.float32(LEAST_LEFT))
     kept = np.flatnonzero(weight > _LEAST_WEIGHT)
     owner, ray = rays.owner[kept].astype(np.intp), rays.ray[kept].astype(np.intp)
-    seen = np.empty((3, rays.count))
     by_color, by_alpha = np.empty((2, 3, len(kept)), np.float32)
     for channel, of_splats in enumerate(colors):
         mine = of_splats.astype(np.float32).take(rays.owner)
         light = weight * mine
-        seen[channel] = np.bincount(rays.ray, light, rays.count)
         background = behind(light.astype(np.float64), counts).astype(np.float32) / left
         by_alpha[channel] = (transmittance * (mine - background))[kept]
         unclipped = (of_splats > 0.0) & (of_splats < projection.BRIGHTEST)
         by_color[channel] = weight[kept] * unclipped.take(owner) * np.float32(SH_C0)
     alpha_by = _alpha_by(rays, kept, footprints, shapes, view)
     rows = shapes.gaussians.index[rays.hit]
-    return LinearView(rows, seen.clip(0.0, 1.0), ray, owner, by_color, by_alpha, alpha_by)
+    return LinearView(rows, rays.colors(colors), ray, owner, by_color, by_alpha, alpha_by)
 
 
 def _alpha_by(

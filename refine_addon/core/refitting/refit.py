@@ -24,9 +24,10 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from ..errors import RefineError
+from ..estimate.quality import PSNR_CAP
 from ..seeing import projection
-from ..seeing.cast import cast, depth_complexity, pixels
-from ..seeing.ray_sample import colors_from
+from ..seeing.cast import depth_complexity, pixels
+from ..seeing.ray_sample import MAX_RAYS_OF_VIEW, cast_colored
 from ..splats import rotation_matrices, unit_quaternions
 from ..work import Progress, for_chunks, part, silent
 from .linear import COLOR, COUNT, MEAN, OPACITY, SCALE, TURN, LinearView, Shapes, linear_view
@@ -52,9 +53,6 @@ MAX_HITS = 1 << 25
 """About how many hits the rays of a round may have on the unpruned splats. Survivors have fewer,
 and those that hardly show are left out: some 80 bytes are taken for every third."""
 
-MAX_RAYS_OF_VIEW = 60_000
-"""See `ray_sample.MAX_RAYS_OF_VIEW`."""
-
 STEPS = 4
 """Steps of conjugate gradients in a round."""
 
@@ -68,7 +66,7 @@ MAX_STEP = {"color": 0.5, "opacity": 1.0, "mean": 0.5, "scale": 0.3, "turn": 0.3
 """How far a parameter moves in a round: as `linear` has them, means by the longest scale."""
 
 _OTHER_PIXELS = 2  # numbers of pixels that validation and scoring rays take, see `cast.pixels`
-_CAP = 1e-10  # mean squared error that counts as none: 100 dB
+_LEAST_ERROR = 10.0 ** (-PSNR_CAP / 10.0)
 
 
 @dataclass(frozen=True)
@@ -197,8 +195,12 @@ def refit_rounds(  # noqa: PLR0913 - as `refit`
     for number in range(settings.rounds + 1):
         share = 0.7 / (settings.rounds + 1)
         begin = 0.3 + share * number
-        linear = rays.linear(trial, number, part(progress, begin, begin + share / 2))
-        psnr = rays.psnr([view.colors for view in linear], number)
+        seeing = part(progress, begin, begin + share / 2)
+        last = number == settings.rounds
+        # After the last round nothing is learned, so derivatives are not needed.
+        linear = [] if last else rays.linear(trial, number, seeing)
+        seen = rays.colors(trial, number, seeing) if last else [view.colors for view in linear]
+        psnr = rays.psnr(seen, number)
         if not number:
             best = replace(best, psnr_before=psnr, psnr=psnr)
         else:
@@ -208,7 +210,7 @@ def refit_rounds(  # noqa: PLR0913 - as `refit`
             changed = ~_same(survivors, trial)
             best = Refitted(trial, changed, number, best.psnr_before, best.psnr + gain)
         yield best
-        if number == settings.rounds or (number and gain < LEAST_GAIN):
+        if last or (number and gain < LEAST_GAIN):
             return
         change = rays.solve(
             linear, number, movable, part(progress, begin + share / 2, begin + share)
@@ -279,9 +281,8 @@ class _Rounds:
         view = self._views[number][0]
         place = number + (_OTHER_PIXELS + round_) * len(self._views)
         columns, rows = pixels(view, place, count)
-        rays = cast(footprints, columns, rows)
-        colors = rays.colors(colors_from(original, gaussians.index[rays.hit], view))
-        return _Truth(columns, rows, colors.astype(np.float32))
+        rays, colors = cast_colored(original, gaussians, footprints, view, columns, rows)
+        return _Truth(columns, rows, rays.colors(colors).astype(np.float32))
 
     def linear(self, splats: Splats, round_: int, progress: Progress) -> list[LinearView]:
         """Return how the colours of each view's rays change with survivors as they are now."""
@@ -295,13 +296,16 @@ class _Rounds:
             view, truth = self._views[piece.start][0], self._truths[piece.start][round_]
             with np.errstate(under="ignore"):
                 footprints = projection.project(gaussians, self.scene, view)
-                rays = cast(footprints, truth.columns, truth.rows)
-                colors = colors_from(splats, gaussians.index[rays.hit], view)
+                rays, colors = cast_colored(
+                    splats, gaussians, footprints, view, truth.columns, truth.rows
+                )
                 return linear_view(rays, footprints, colors, shapes, view)
 
         return self._each(linear_of, part(progress, 0.1, 1.0))
 
-    def colors(self, splats: Splats, round_: int) -> list[NDArray[np.float64]]:
+    def colors(
+        self, splats: Splats, round_: int, progress: Progress = silent
+    ) -> list[NDArray[np.float64]]:
         """Return what the rays of each view see of survivors, (3, P)."""
         gaussians, _, _ = projection.prepare(
             splats, self._chosen, self.scene, threads=self._threads
@@ -311,15 +315,17 @@ class _Rounds:
             view, truth = self._views[piece.start][0], self._truths[piece.start][round_]
             with np.errstate(under="ignore"):
                 footprints = projection.project(gaussians, self.scene, view)
-                rays = cast(footprints, truth.columns, truth.rows)
-                return rays.colors(colors_from(splats, gaussians.index[rays.hit], view))
+                rays, colors = cast_colored(
+                    splats, gaussians, footprints, view, truth.columns, truth.rows
+                )
+                return rays.colors(colors)
 
-        return self._each(colors_of, silent)
+        return self._each(colors_of, progress)
 
     def psnr(self, colors: list[NDArray[np.float64]], round_: int) -> float:
         """Return the mean PSNR of what the rays of each view see, weighted as the views are, dB."""
         errors = [
-            max(float(np.mean(np.square(truths[round_].colors - seen))), _CAP)
+            max(float(np.mean(np.square(truths[round_].colors - seen))), _LEAST_ERROR)
             for truths, seen in zip(self._truths, colors, strict=True)
         ]
         weights = [weight for _, weight in self._views]
