@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from ..cameras.sets import CameraChoice
+from ..cameras.sets import CameraChoice, known_turn
+from ..core.estimate.alignment import Alignment
 from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
@@ -16,7 +17,7 @@ from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
 from ..objects import demands, splat_group
 from ..viewport import draw as viewport_draw
-from . import camera_list, plans, preview, price, running, staleness, wrapped
+from . import camera_list, compare, plans, preview, price, running, staleness, wrapped
 from .panel_cache import cached
 from .properties import FLOATERS
 from .view_operators import MODES
@@ -90,12 +91,17 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
         layout.operator("refine.add_ring", icon="OUTLINER_OB_CAMERA")
         layout.prop(settings, "source")
         if settings.source == "COLLECTION":
-            layout.prop(settings, "collection")
+            layout.prop(settings, "collection", text="")  # room for its name
         if settings.source == "FRAMES":
             _draw_frames(layout, settings, context.scene)
         elif settings.source != "ACTIVE":
             count = cached("cameras", context, lambda: len(_cameras(context)))
             layout.label(text=counted(count, "camera"), icon="CAMERA_DATA")
+        obj = context.object
+        if mesh_layout.looks_like_splats(obj) and _record(obj) is None:
+            turn = cached("turn", context, lambda: known_turn(context, obj))
+            if turn:
+                _draw_warning(self.layout, context, plans.turned(Alignment(turn, known=True)))
 
 
 class REFINE_PT_camera_list(_InSidebar, bpy.types.Panel):
@@ -254,6 +260,8 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
             _draw_price(layout, context)
             _draw_plan(layout, context, record)
             layout.operator("refine.compare", icon="IMAGE_DATA")
+            if text := compare.measured(obj, settings):
+                wrapped.label(layout, context, text, icon="CHECKMARK")
             _draw_progress(layout, context, "refine.compare")
         row = layout.row()
         row.enabled = record is not None
@@ -365,8 +373,20 @@ def _draw_plan(
     if remark := plans.remark(plan, record):
         wrapped.label(layout, context, remark, icon="INFO")
     for warning in plans.warnings(plan, record):
-        wrapped.label(layout, context, warning.text, icon="ERROR")
-        if warning.remedy and not _changes(context, obj):  # else these may be put right
-            button = layout.operator(warning.remedy)
-            for name, value in warning.options.items():
-                setattr(button, name, value)
+        remedy = not _changes(context, obj)  # else it may be put right
+        _draw_warning(layout, context, warning, remedy=remedy)
+
+
+def _draw_warning(
+    layout: bpy.types.UILayout,
+    context: bpy.types.Context,
+    warning: plans.Warned,
+    *,
+    remedy: bool = True,
+) -> None:
+    """Draw a warning, with the button that helps."""
+    wrapped.label(layout, context, warning.text, icon="ERROR")
+    if warning.remedy and remedy:
+        button = layout.operator(warning.remedy)
+        for name, value in warning.options.items():
+            setattr(button, name, value)
