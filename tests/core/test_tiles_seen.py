@@ -26,10 +26,10 @@ from refine_addon.core.scoring import closed_form
 from refine_addon.core.seeing import projection
 from refine_addon.core.seeing.ray_sample import validation_rays
 from refine_addon.core.splats import joined
-from refine_addon.core.tiles import absorbing, gaussians, measuring, units
+from refine_addon.core.tiles import absorbing, gaussians, seeing, units
 from refine_addon.core.tiles.folder import Folder
 from refine_addon.core.tiles.gaussians import SceneContext
-from refine_addon.core.tiles.rays import StoredRays
+from refine_addon.core.tiles.seeing import StoredRays
 from refine_addon.core.tiles.workers import InProcess, Runner
 from refine_addon.core.views import ViewSet
 from tests.strategies import plain_header, splat_names
@@ -123,9 +123,9 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(
     Interrupted once, and four times in one job, when a tenth, three tenths, ... are done.
     """
     budget, settings, done = Budget(ratio=0.5), replace(OCCLUSION, views=8), []
-    measure = measuring.measure_footprints
+    measure = seeing.measure_footprints
     monkeypatch.setattr(
-        measuring, "measure_footprints", lambda *some: done.append(some) or measure(*some)
+        seeing, "measure_footprints", lambda *some: done.append(some) or measure(*some)
     )
 
     def measured(folder, *stops):
