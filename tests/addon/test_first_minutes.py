@@ -241,7 +241,7 @@ def test_what_compare_measured_stays_in_the_panel_while_the_plan_is_the_same(
 def test_levels_do_not_stand_on_top_of_each_other(quarter, room_cameras):  # noqa: ARG001
     """They are hidden, in renders too; the original is shown, and stays active."""
     settings = bpy.context.scene.refine
-    settings.levels, settings.nested = "0.5, 0.25", True
+    settings.levels, settings.survivors = "0.5, 0.25", "unchanged"
 
     bpy.ops.refine.levels()
 

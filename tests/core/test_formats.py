@@ -286,7 +286,7 @@ def test_survivors_that_absorbed_are_written_as_they_became(tmp_path, suffix, ca
         prune_file(
             tmp_path / "in.ply",
             tmp_path / name,
-            PruneRequest(cameras, Budget(keep=300), absorb=True),
+            PruneRequest(cameras, Budget(keep=300), survivors="absorb"),
         )
 
     kept = read_splats(tmp_path / f"out{suffix}").splats()

@@ -14,8 +14,7 @@ from ..seeing.scene import Scene, principal_axes
 from ..work import Progress, part
 from .closed_form import by_closed_form
 from .gaussians import SceneContext, SumMoments, store_gaussians
-from .measuring import TileMeasuring
-from .rays import StoredRays
+from .seeing import StoredRays, TileMeasuring
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
