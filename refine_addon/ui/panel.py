@@ -65,17 +65,16 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         objects = splat_group.chosen(context.view_layer, obj)
         count = sum(mesh_layout.splat_count(each.data) for each in objects)
         several = len(objects) > 1
-        name = counted(len(objects), "object") if several else obj.name
-        layout.label(text=name, icon="OUTLINER_OB_POINTCLOUD")
         degree = max(mesh_layout.sh_degree(each.data) for each in objects)
-        layout.label(text=f"{count:,} splats, SH degree {degree}")
+        text = f"{counted(len(objects), 'object') if several else obj.name}: {count:,} splats"
+        size = None
+        if not several:
+            size = cached("bytes", context, lambda: mesh_layout.export_bytes(obj))
+        text += f", SH degree {degree}" + (f", {size_in_words(size)}" if size is not None else "")
+        wrapped.label(layout, context, text, icon="OUTLINER_OB_POINTCLOUD")
         if several:
             wrapped.label(layout, context, "Scored and pruned as one scene", icon="INFO")
             return
-        size = cached("bytes", context, lambda: mesh_layout.export_bytes(obj))
-        if size is not None:
-            layout.label(text=size_in_words(size))
-        layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
         _draw_progress(layout, context, "refine.import_ply")
 
 
@@ -87,8 +86,9 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the choice of cameras."""
         layout, settings = _named_column(self.layout), context.scene.refine
-        layout.operator("refine.import_cameras", icon="IMPORT")
-        layout.operator("refine.add_ring", icon="OUTLINER_OB_CAMERA")
+        row = layout.row(align=True)
+        row.operator("refine.import_cameras", icon="IMPORT")
+        row.operator("refine.add_ring", text="Add a Ring", icon="OUTLINER_OB_CAMERA")
         layout.prop(settings, "source")
         if settings.source == "COLLECTION":
             layout.prop(settings, "collection", text="")  # room for its name
@@ -276,8 +276,10 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the buttons."""
-        layout, settings = self.layout, context.scene.refine
+        layout, settings, obj = self.layout, context.scene.refine, context.object
         layout.operator("refine.export_ply", icon="EXPORT")
+        if mesh_layout.looks_like_splats(obj):
+            layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
         column = _named_column(layout)
         column.prop(settings, "levels")
         column.prop(settings, "level_survivors")

@@ -245,6 +245,7 @@ def _opened(*_: object) -> None:
     wanted = bpy.context.scene.get(SHOWN) if not bpy.app.background else None
     if wanted in MODES:
         show(wanted)
+        _loaded()
 
 
 @persistent
@@ -272,5 +273,7 @@ def _leaving(*_: object) -> None:
 
 @persistent
 def _loaded(*_: object) -> None:
+    for window in bpy.context.window_manager.windows:
+        window.view_layer.update()  # what is not evaluated yet would be drawn as points once
     _hide_points()
     _redraw()
