@@ -56,7 +56,7 @@ def rows():
     return rows
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def views():
     """Give the room's cameras."""
     return read_cameras(ROOM / "cameras.json")
