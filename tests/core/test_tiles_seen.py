@@ -390,4 +390,6 @@ def test_no_box_is_left_out_that_a_splat_reaches_from(seed):
     touching = projection.boxes_touch(np.array(boxes, np.float32), scene, view)
 
     for box, piece in zip(touching, pieces, strict=True):
-        assert box or not len(projection.reaching(gaussians.take(piece), scene, view)[1])
+        assert box or not len(
+            projection.footprints_and_depths(gaussians.take(piece), scene, view)[1]
+        )
