@@ -283,7 +283,7 @@ def absorbed(tmp_path_factory, cameras):
     """Return a folder with the test scene, what is asked of it, and 300 survivors that absorbed."""
     folder, asked = (
         tmp_path_factory.mktemp("a"),
-        PruneRequest(cameras, Budget(keep=300), absorb=True),
+        PruneRequest(cameras, Budget(keep=300), survivors="absorb"),
     )
     (folder / "in.ply").write_bytes(ply_of(scene()))
     prune_file(folder / "in.ply", folder / "out.ply", asked)
