@@ -17,7 +17,17 @@ from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
 from ..objects import demands, splat_group
 from ..viewport import draw as viewport_draw
-from . import camera_list, compare, plans, preview, price, running, staleness, wrapped
+from . import (
+    camera_list,
+    compare,
+    plans,
+    preview,
+    price,
+    running,
+    staleness,
+    transforms,
+    wrapped,
+)
 from .panel_cache import cached
 from .properties import FLOATERS
 from .view_operators import MODES
@@ -72,6 +82,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
             size = cached("bytes", context, lambda: mesh_layout.export_bytes(obj))
         text += f", SH degree {degree}" + (f", {size_in_words(size)}" if size is not None else "")
         wrapped.label(layout, context, text, icon="OUTLINER_OB_POINTCLOUD")
+        transforms.draw(layout, context, objects)
         if several:
             wrapped.label(layout, context, "Scored and pruned as one scene", icon="INFO")
             return
