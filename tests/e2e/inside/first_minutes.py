@@ -46,7 +46,7 @@ def main(
 
     yield from bring_in(show, hand, found, (cloud, cameras))
     yield from prune(show, hand, found)
-    yield from reopen(show, found, blend)
+    show = yield from reopen(show, found, blend)
     show.call(bpy.ops.refine.export_ply, filepath=asset)
     found["exported"] = Path(asset).stat().st_size
     return found
@@ -98,8 +98,8 @@ def prune(show: Show, hand: Hand, found: dict[str, Any]) -> Generator[float, Non
     found["undone"] = scene()
 
 
-def reopen(show: Show, found: dict[str, Any], blend: str) -> Generator[float, None, None]:
-    """Save the scene while a heat map is shown, show nothing, and open it again."""
+def reopen(show: Show, found: dict[str, Any], blend: str) -> Generator[float, None, Show]:
+    """Save the scene while a heat map is shown, show nothing, open it again; return its view."""
     show.call(bpy.ops.refine.view, mode="HEAT")
     yield from show.settle()
     bpy.ops.wm.save_as_mainfile(filepath=blend)
@@ -110,6 +110,7 @@ def reopen(show: Show, found: dict[str, Any], blend: str) -> Generator[float, No
     yield from picture(str(Path(show.pictures).parent), "first-6-reopened", 1.0)
     number = opened.draw.drawn(opened.region)
     found["reopened"] = [opened.draw.mode(), number, shown_as(opened)]
+    return opened
 
 
 def drop(show: Show, path: str) -> None:
