@@ -54,7 +54,7 @@ def score(  # noqa: PLR0913 - as `pipeline.prune`
         Whether the scores get an estimate of the pictures' quality even if that takes longer than
         scoring by the closed form; scores by occlusion always have one.
     settled : int, optional
-        How many splats must be in their final order, those that are `forced_out` left out: scoring by
+        How many splats must be in their final order, those `forced_out` left aside: scoring by
         occlusion takes less time where these are few. By default all.
     progress : callable, optional
         ``progress(fraction, what)``; returning ``False`` cancels.
