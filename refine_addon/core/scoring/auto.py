@@ -109,7 +109,7 @@ def finish(
     else:
         loss, expected = _measure(scoring, tolerance, measuring_progress, threads)
     scores = scoring.rank(part(progress, end, 1.0), settled)
-    facts = {"views": scores.views_used, "loss": loss, "tolerance": tolerance, "judged": expected}
+    facts = {"views": scores.views_used, "loss": loss, "tolerance": tolerance, "expected": expected}
     return replace(scores, facts={**scores.facts, "auto": facts}, method="auto")
 
 
