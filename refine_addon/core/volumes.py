@@ -229,7 +229,10 @@ FREE = Forced()
 
 
 def forced(
-    zones: Sequence[Zone], means: NDArray[Any], protected: NDArray[np.bool_] | None = None
+    zones: Sequence[Zone],
+    means: NDArray[Any],
+    protected: NDArray[np.bool_] | None = None,
+    removed: NDArray[np.bool_] | None = None,
 ) -> Forced:
     """Return what must stay and what must go by volumes.
 
@@ -238,8 +241,8 @@ def forced(
     zones : sequence of Zone
     means : (N, 3) floating
         Centres of the splats, in the frame of the volumes.
-    protected : (N,) bool, optional
-        Splats that stay for another reason.
+    protected, removed : (N,) bool, optional
+        Splats that stay, and that go, for another reason.
 
     Returns
     -------
@@ -260,9 +263,11 @@ def forced(
             raise RefineError(msg)
         facts.append({"role": zone.role, "name": zone.name, "splats": count})
         masks[zone.role] = masks[zone.role] | inside if zone.role in masks else inside
-    removed = masks.get("remove")
     if "keep" in masks:
-        removed = ~masks["keep"] if removed is None else removed | ~masks["keep"]
+        masks["keep"] = ~masks["keep"]
+    for role in ("remove", "keep"):
+        if role in masks:
+            removed = masks[role] if removed is None else removed | masks[role]
     if "protect" in masks:
         protected = masks["protect"] if protected is None else protected | masks["protect"]
     if removed is not None:
