@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ..core.scores import Scores
     from ..core.selection import Budget
     from ..core.splats import Splats
+    from ..core.survivor_choice import SurvivorChoice
     from ..core.task import Result, Settings
     from ..core.views import ViewSet
     from ..mesh.layout import SplatObject
@@ -222,12 +223,13 @@ def stored_task(
     *,
     settings: Settings = DEFAULTS,
     views: ViewSet | None = None,
+    survivors: SurvivorChoice = "unchanged",
 ) -> Task:
     """Return what Apply has to decide of all objects; see `splat_object.stored_task`.
 
     Parameters
     ----------
-    group, budget, settings, views
+    group, budget, settings, views, survivors
         See there.
     forced : sequence of Forced
         What must stay and what must go of each object.
@@ -240,7 +242,9 @@ def stored_task(
     if len(group) > 1:
         _check_scored_together(group)
     tasks = [
-        splat_object.stored_task(member, budget, each, settings=settings, views=views)
+        splat_object.stored_task(
+            member, budget, each, settings=settings, views=views, survivors=survivors
+        )
         for member, each in zip(group, forced, strict=True)
     ]
     if len(tasks) == 1:

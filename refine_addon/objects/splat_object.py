@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from ..core.levels.lod import Level
     from ..core.selection import Budget
     from ..core.splats import Splats
+    from ..core.survivor_choice import SurvivorChoice
     from ..core.views import ViewSet
     from ..mesh.layout import SplatObject
 
@@ -119,6 +120,7 @@ def stored_task(
     *,
     settings: Settings = DEFAULTS,
     views: ViewSet | None = None,
+    survivors: SurvivorChoice = "unchanged",
 ) -> Task:
     """Return what Apply has to decide: by the scores that the object holds, which splats stay.
 
@@ -131,7 +133,9 @@ def stored_task(
     settings : Settings, optional
         For absorbing.
     views : ViewSet, optional
-        With them, survivors absorb what goes.
+        What absorbing and refitting go by.
+    survivors : {"unchanged", "absorb", "refit"}
+        What they may become.
 
     Returns
     -------
@@ -153,7 +157,7 @@ def stored_task(
         scores=stored_scores(checked, forced.removed),
         protected=forced.protected,
         removed=forced.removed,
-        absorb=views is not None,
+        survivors=survivors,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
     )

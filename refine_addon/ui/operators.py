@@ -74,7 +74,8 @@ def apply_task(
         settings.to_budget(),
         forced,
         settings=settings.to_settings(),
-        views=chosen_views(context) if settings.absorb else None,
+        views=chosen_views(context) if settings.survivors != "unchanged" else None,
+        survivors=settings.survivors,
     )
 
 
@@ -213,7 +214,7 @@ def _scored_or_applied(context: bpy.types.Context) -> str:
 
 
 class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
-    """Delete the splats that the budget does not keep; with Absorb, the others make up for them"""
+    """Delete the splats that the budget does not keep; the others make up for them, if they may"""
 
     bl_idname = "refine.apply"
     bl_label = "Apply"
@@ -227,18 +228,18 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         return self.adjusted(context, partial(super().execute, context))
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
-        """Delete at once; absorb on a thread."""
+        """Delete at once; absorb and refit on a thread."""
         start = super().invoke
 
         def call() -> Answer:
             """Go by what the panel says by now."""
-            absorbs = context.scene.refine.absorb
-            return start(context, event) if absorbs else self.execute(context)
+            changing = context.scene.refine.survivors != "unchanged"
+            return start(context, event) if changing else self.execute(context)
 
         return self.adjusted(context, call)
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Applying:
-        """Gather the scores that decide; to absorb, splats and views besides."""
+        """Gather the scores that decide; if survivors change, splats and views besides."""
         group = splat_group.members(context.view_layer, checked)
         for member in group:
             mesh_edit.check_deletable(member.obj)
@@ -251,13 +252,13 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
 
     @staticmethod
     def work(job: _Applying, progress: Progress) -> Result:
-        """Decide which splats stay, and what they absorb."""
+        """Decide which splats stay, and what they become."""
         return pipeline.decide(job.task, progress=progress)
 
     def finish(
         self, context: bpy.types.Context, checked: SplatObject, job: _Applying, result: Result
     ) -> Answer:
-        """Delete what does not stay, and change what absorbed it."""
+        """Delete what does not stay, and change what does."""
         context.view_layer.update()
         group = splat_group.by_uids(job.uids, checked)
         if job.task.absorb:  # on a thread, while volumes can be moved
@@ -321,7 +322,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         settings = context.scene.refine
         levels = settings.to_levels()
         return _MakingLevels(
-            splat_object.gather(checked, whole=True if levels.absorb else None),
+            splat_object.gather(checked, whole=True if levels.survivors != "unchanged" else None),
             chosen_views(context),
             levels,
             settings.to_settings(),

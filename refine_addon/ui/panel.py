@@ -247,7 +247,7 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         column = _named_column(layout)
         column.prop(settings, "budget")
         column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
-        column.prop(settings, "absorb")
+        column.prop(settings, "survivors")
         obj = context.object
         record = _record(obj)
         if record:
@@ -272,7 +272,7 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
         layout.operator("refine.export_ply", icon="EXPORT")
         column = _named_column(layout)
         column.prop(settings, "levels")
-        column.prop(settings, "nested")
+        column.prop(settings, "level_survivors")
         column.operator("refine.levels", icon="MOD_DECIM")
         _draw_progress(layout, context, "refine.export_ply", "refine.levels")
 
@@ -361,7 +361,7 @@ def _draw_plan(
         text = plans.remark(plan, record) if waits else plan["error"]
         wrapped.label(layout, context, text, icon="INFO" if waits else "ERROR")
         return
-    wrapped.label(layout, context, plans.sentence(plan, absorb=settings.absorb))
+    wrapped.label(layout, context, plans.sentence(plan, settings.survivors))
     if remark := plans.remark(plan, record):
         wrapped.label(layout, context, remark, icon="INFO")
     for warning in plans.warnings(plan, record):

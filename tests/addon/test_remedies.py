@@ -76,7 +76,7 @@ def test_absorbing_changes_less(room, room_cameras):  # noqa: ARG001
     settings.method, settings.views, settings.percent = "occlusion", 4, 50.0
     bpy.ops.refine.score()
     deleted = {item.name: item.psnr for item in manager.refine_cameras}
-    settings.absorb = True
+    settings.survivors = "absorb"
     gains = {i.name: i.psnr - deleted[i.name] for i in manager.refine_cameras if i.psnr >= 0.0}
 
     assert len(gains) == 4

@@ -43,7 +43,7 @@ BUDGETS = [
 ]  # fmt: skip
 
 
-WAYS = pytest.mark.parametrize("absorb", [False, True], ids=["delete", "absorb"])
+WAYS = pytest.mark.parametrize("survivors", ["unchanged", "absorb"], ids=["delete", "absorb"])
 
 
 @pytest.fixture(scope="module")
@@ -73,17 +73,17 @@ def rest_budget(budget, gone):
 @WAYS
 @pytest.mark.parametrize("budget", BUDGETS, ids=lambda budget: f"{budget}")
 def test_forcing_out_is_pruning_what_is_left_by_the_rest_of_the_budget(
-    splats, views, removed, budget, absorb
+    splats, views, removed, budget, survivors
 ):
     """The same splats, values and estimate as when they are deleted first, by hand."""
     settings, rest = Settings("occlusion"), ~removed
     size = {"row_bytes": 20.0}
     left = prune(
         splats.take(rest), views, rest_budget(budget, int(removed.sum())), settings,
-        absorb=absorb, **size,
+        survivors=survivors, **size,
     )  # fmt: skip
 
-    found = prune(splats, views, budget, settings, removed=removed, absorb=absorb, **size)
+    found = prune(splats, views, budget, settings, removed=removed, survivors=survivors, **size)
 
     assert not found.keep[removed].any()
     assert np.array_equal(found.keep[rest], left.keep)
@@ -92,7 +92,7 @@ def test_forcing_out_is_pruning_what_is_left_by_the_rest_of_the_budget(
     assert found.report["splats"]["removed"] == COUNT - left.keep.sum()
     assert found.report["splats"]["forced"] == removed.sum()
     assert found.report["budget"] == {budget.kind: getattr(budget, budget.kind)}
-    if absorb:
+    if survivors == "absorb":
         assert np.array_equal(found.absorbed.splats.means, left.absorbed.splats.means)
         assert np.array_equal(found.absorbed.keep, found.keep)
 
@@ -111,7 +111,12 @@ def test_protection_wins_over_force(splats, views):
     rows = np.arange(COUNT)
 
     found = prune(
-        splats, views, Budget(ratio=0.9), protected=rows < 10, removed=rows < 100, absorb=True
+        splats,
+        views,
+        Budget(ratio=0.9),
+        protected=rows < 10,
+        removed=rows < 100,
+        survivors="absorb",
     )
 
     assert found.keep[:10].all()
@@ -214,13 +219,13 @@ def test_all_but_what_is_protected_may_go(splats, views):
 
 
 @WAYS
-def test_levels_hold_nothing_of_it_and_are_those_of_the_rest(splats, views, removed, absorb):
+def test_levels_hold_nothing_of_it_and_are_those_of_the_rest(splats, views, removed, survivors):
     """Half of 576 stays in the first, of the others; as when the others are the scene."""
     rest = ~removed
     shares = (287.5 / rest.sum(), 57.5 / rest.sum())  # rounded up
-    expected = lod(splats.take(rest), views, Levels(shares, absorb=absorb))
+    expected = lod(splats.take(rest), views, Levels(shares, survivors=survivors))
 
-    found = lod(splats, views, Levels((0.5, 0.1), absorb=absorb), removed=removed)
+    found = lod(splats, views, Levels((0.5, 0.1), survivors=survivors), removed=removed)
 
     for one, other in zip(found, expected, strict=True):
         assert np.array_equal(one.keep[rest], other.keep)
@@ -230,11 +235,11 @@ def test_levels_hold_nothing_of_it_and_are_those_of_the_rest(splats, views, remo
     assert [level.keep.sum() for level in found] == [288, 58]
 
 
-@pytest.mark.parametrize("absorb", [False, True])
-def test_levels_where_all_that_had_to_go_is_protected(splats, views, removed, absorb):
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
+def test_levels_where_all_that_had_to_go_is_protected(splats, views, removed, survivors):
     """Nothing is forced out then, and each level is made from the one before."""
     levels = lod(
-        splats, views, Levels((0.5, 0.3), absorb=absorb), protected=removed, removed=removed
+        splats, views, Levels((0.5, 0.3), survivors=survivors), protected=removed, removed=removed
     )
 
     assert len(levels) == 2

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from refine_addon.core import ViewSet
-from refine_addon.core.refitting import linear, refit
+from refine_addon.core import ViewSet, processes
+from refine_addon.core.refitting import linear, refit, round_rays
 from refine_addon.core.rendering import LOW_PASS
 from refine_addon.core.seeing import projection
 from refine_addon.core.seeing.cast import cast
@@ -177,6 +177,25 @@ def test_threads_change_no_bit(threads):
 
     assert found.psnr == expected.psnr
     np.testing.assert_array_equal(found.splats.means, expected.splats.means)
+
+
+@pytest.mark.slow
+def test_processes_change_no_bit(monkeypatch):
+    """Views that are cast elsewhere give what views cast here do, and this process casts none."""
+    splats, here = cloud(300), []
+    expected = refit.refit(splats.take(np.arange(100)), splats, ring(), refit.Refit(rounds=2))
+    for name in ("WORTH", "WORTH_READY"):
+        monkeypatch.setattr(processes, name, 0.0)
+    monkeypatch.setattr(round_rays, "cast", lambda *some: here.append(some))
+
+    found = refit.refit(
+        splats.take(np.arange(100)), splats, ring(), refit.Refit(rounds=2), threads=2
+    )
+
+    assert not here
+    assert found.psnr == expected.psnr
+    for name, values in vars(expected.splats).items():
+        np.testing.assert_array_equal(getattr(found.splats, name), values)
 
 
 @pytest.mark.slow

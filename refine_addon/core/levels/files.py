@@ -235,7 +235,7 @@ class LevelSink:
             "source": {"file": self.source.name, "bytes": loaded.bytes},
             **seen,
             "distances": [short(distance) for distance, _ in first.reach.psnr],
-            "nested": not self.request.levels.absorb,
+            "nested": self.request.levels.survivors == "unchanged",
             "goal_psnr": self.request.goal,
         }
 

@@ -12,6 +12,7 @@ from ..cleaning.clean import Cleaning, clean
 from ..formats.registry import refuse_unknown_size
 from ..pipeline import decide, score
 from ..report import kept_and_removed, scoring_notes, seen_by, what_was_seen
+from ..survivor_choice import refuse_unknown
 from ..task import DEFAULTS, Settings, Task
 from .run import DECIDED, Request
 from .written import written_facts, written_splats
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from ..formats.format import Format
     from ..picture_files import PictureFiles
     from ..selection import Budget
+    from ..survivor_choice import SurvivorChoice
     from ..task import Result
     from ..views import ViewSet
     from ..volumes import Zone
@@ -53,8 +55,8 @@ class PruneRequest(Request["Loaded", "Result"]):
         How to score.
     zones, overwrite, dry_run
         See `Request`.
-    absorb : bool
-        Whether survivors absorb the splats that are removed; see `Task`.
+    survivors : {"unchanged", "absorb", "refit"}
+        What survivors may become; see `Task`.
     cleaning : Cleaning or None
         What to clean away first. The budget then counts what is left.
     pictures : PictureFiles or None
@@ -65,11 +67,26 @@ class PruneRequest(Request["Loaded", "Result"]):
     budget: Budget
     settings: Settings = DEFAULTS
     zones: Sequence[Zone] = ()
-    absorb: bool = False
+    survivors: SurvivorChoice = "unchanged"
     cleaning: Cleaning | None = None
     pictures: PictureFiles | None = None
     overwrite: bool = False
     dry_run: bool = False
+
+    def __post_init__(self) -> None:
+        """Check what survivors may become.
+
+        Raises
+        ------
+        RefineError
+            If there is no such choice.
+        """
+        refuse_unknown(self.survivors)
+
+    @property
+    def absorb(self) -> bool:
+        """Whether survivors absorb the splats that are removed."""
+        return self.survivors != "unchanged"
 
     @property
     def compares_pictures(self) -> bool:
@@ -105,7 +122,7 @@ class PruneRequest(Request["Loaded", "Result"]):
         RefineError, Cancelled
             See `clean` and `pipeline.decide`.
         """
-        loaded = loaded.counted(self.budget, absorb=self.absorb)
+        loaded = loaded.counted(self.budget, changed=self.absorb)
         if self.cleaning is None:
             return self._decide(loaded, runtime.part(0.0, DECIDED))
         forced = loaded.forced
@@ -125,7 +142,7 @@ class PruneRequest(Request["Loaded", "Result"]):
             views=self.views,
             protected=loaded.forced.protected,
             removed=loaded.forced.removed,
-            absorb=self.absorb,
+            survivors=self.survivors,
             row_bytes=loaded.sizes.row,
             fixed_bytes=loaded.sizes.fixed,
             reusable=loaded.reusable,
@@ -185,7 +202,7 @@ def _cleaned(loaded: Loaded, views: ViewSet, cleaning: Cleaning, runtime: Runtim
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """Which splats stay, none of which absorbs others.
+    """Which splats stay, all as they were.
 
     Attributes
     ----------

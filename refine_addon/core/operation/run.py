@@ -48,7 +48,7 @@ class Runtime:
     threads : int or None
     """
 
-    clock: Clock
+    clock: Clock = field(default_factory=Clock)
     progress: Progress = silent
     threads: int | None = None
 
@@ -193,7 +193,7 @@ def run(
         See the steps. Nothing is written then; but where comparing fails or is cancelled, after
         writing, the file that was written stays.
     """
-    runtime = Runtime(Clock(), progress, threads)
+    runtime = Runtime(progress=progress, threads=threads)
     with request.opened(sink.form), sink.opened():
         loaded = source.read(sink.form)
         runtime.clock.lap("read_s")
