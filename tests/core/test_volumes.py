@@ -300,5 +300,5 @@ def test_splats_marked_to_go_go_with_those_of_volumes_but_not_the_protected():
     zone = Zone("remove", "box", Box((3.5, -1, -1), (9, 1, 1)))
     found = forced([zone], means, protected, marked | (np.arange(6) == 1))
 
-    assert np.flatnonzero(found.removed).tolist() == [0, 4]
+    assert np.flatnonzero(found.out).tolist() == [0, 4]
     assert forced([], means, None, marked).counts() == {"protected": 0, "forced": 1}
