@@ -159,7 +159,7 @@ def _measure(
     )
     psnr = {}
     for count, chosen in ((few, FIRST), (more, FIRST + MORE)):
-        values = scoring.once(chosen, part(progress, 0.7, 0.7))
+        values = scoring.in_one_round(chosen, part(progress, 0.7, 0.7))
         told = psnr_by_views(rays, values, RATIOS, validating, threads=threads)
         if told is not None:
             psnr[count] = told
