@@ -8,7 +8,7 @@ from bpy.props import PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
-from .ui import camera_list, demand_changes, panel_cache, plans, price, running
+from .ui import camera_list, demand_changes, panel_cache, plans, price, properties, running
 from .ui.camera_list import REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
 from .ui.export_operators import REFINE_OT_export_ply
@@ -103,6 +103,7 @@ def register() -> None:
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
     camera_list.register()
     panel_cache.register()
+    properties.register()
     demand_changes.register()
     price.register()
     running.register()
@@ -119,6 +120,7 @@ def unregister() -> None:
     plans.unregister()
     price.unregister()
     demand_changes.unregister()
+    properties.unregister()
     panel_cache.unregister()
     camera_list.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)

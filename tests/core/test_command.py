@@ -109,11 +109,12 @@ def test_every_budget_and_setting_keeps_the_rows_that_the_interface_keeps(
         views,
         budget,
         settings,
+        survivors="unchanged",
         row_bytes=file.row_bytes,
         fixed_bytes=file.fixed_bytes,
     ).keep
 
-    assert command.main([*PRUNE, "-o", "out.ply", *options]) == 0
+    assert command.main([*PRUNE, "--survivors", "unchanged", "-o", "out.ply", *options]) == 0
 
     assert 0 < np.count_nonzero(expected) < COUNT
     assert file.rows[expected].tobytes() == read_ply("out.ply").rows.tobytes()
@@ -367,9 +368,12 @@ def test_the_summary_says_how_close_the_pictures_stay(capsys):
     for options, pattern in (
         (
             ["--method", "occlusion"],
-            r"  quality: about \d+ dB in these views; what absorbing reaches is not ",
+            r"  quality: about \d+ dB in these views; what absorbing and refitting reach is not ",
         ),
-        (["--absorb"], r"  quality: about \d+ dB in these views$"),
+        (
+            ["--absorb"],
+            r"  quality: about \d+ dB in these views \(--survivors unchanged about \d+ ",
+        ),
         (["--method", "occlusion", "--ratio", "0"], r"  quality: more than 60 dB in these views$"),
     ):
         assert command.main([*PRUNE, "-o", "out.ply", "--overwrite", *options]) == 0

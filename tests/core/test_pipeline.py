@@ -644,7 +644,7 @@ def test_scoring_for_one_budget_decides_what_scores_for_all_would(scored_for_all
 
     assert whole.scores.settled is None
     np.testing.assert_array_equal(some.keep, whole.keep)
-    for name in ("estimated_psnr", "estimated_psnr_absorbed", "splats", "notes"):
+    for name in ("estimated_psnr", "survivors", "splats", "notes"):
         assert some.report[name] == whole.report[name]
     known = len(some.report["quality"]["shares"])
     for name in ("shares", "psnr", "absorbed"):

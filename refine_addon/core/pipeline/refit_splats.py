@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..estimate.quality import in_words
 from ..refitting.refit import refit
 
 if TYPE_CHECKING:
     from ..absorbing.absorb import Absorbed
     from ..refitting.refit import Refitted
+    from ..survivor_choice import Became
     from ..task import Task
     from ..work import Progress
 
@@ -37,6 +39,17 @@ class Made:
     psnr: float | None = None
     refitted: Refitted | None = None
     seconds: float = 0.0
+
+    @property
+    def became(self) -> Became:
+        """What survivors became."""
+        return "absorb" if self.refitted is None else "refit"
+
+    def measured(self) -> dict[Became, float | None]:
+        """Return the estimates of the PSNR by what survivors became, dB."""
+        if self.refitted is None:
+            return {"absorb": self.psnr}
+        return {"absorb": self.refitted.psnr_before, "refit": self.psnr}
 
     @property
     def survivors(self) -> Absorbed:
@@ -67,6 +80,24 @@ class Made:
             "{psnr:.1f} dB on rays that nothing was fitted to, {seconds:.1f} s".format(**facts)
             for facts in self.facts().values()
         ]
+
+
+def unchanged_note(plain: float | None, tried: Made | None) -> str:
+    """Return why survivors stay unchanged by default, for the user.
+
+    Parameters
+    ----------
+    plain : float or None
+        The estimated PSNR with splats deleted, dB.
+    tried : Made or None
+        What absorbing made; None where it was not tried.
+    """
+    why = "the views see too little to tell what absorbing would gain"
+    if tried is not None and tried.psnr is not None:
+        why = f"absorbing, with {in_words(tried.psnr)}, is not better"
+    elif plain is not None:
+        why = "nobody would see what absorbing gains"
+    return f"survivors stay unchanged: {why}"
 
 
 def refit_absorbed(task: Task, made: Made, progress: Progress, threads: int | None) -> Made:
