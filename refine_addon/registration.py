@@ -8,7 +8,16 @@ from bpy.props import PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
-from .ui import camera_list, demand_changes, panel_cache, plans, price, properties, running
+from .ui import (
+    camera_list,
+    demand_changes,
+    panel_cache,
+    plans,
+    price,
+    properties,
+    running,
+    transforms,
+)
 from .ui.camera_list import REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
 from .ui.export_operators import REFINE_OT_export_ply
@@ -40,6 +49,7 @@ from .ui.remedies import (
     REFINE_OT_leave_out,
     REFINE_OT_turn_cameras,
 )
+from .ui.transforms import REFINE_OT_bake_transform, REFINE_OT_join, REFINE_OT_mend
 from .ui.view_operators import REFINE_OT_preview, REFINE_OT_view
 from .ui.volumes import (
     REFINE_OT_add_volume,
@@ -69,6 +79,9 @@ CLASSES = (
     REFINE_OT_preview,
     REFINE_OT_view,
     REFINE_OT_convert,
+    REFINE_OT_bake_transform,
+    REFINE_OT_join,
+    REFINE_OT_mend,
     REFINE_OT_export_ply,
     REFINE_OT_levels,
     REFINE_OT_turn_cameras,
@@ -107,6 +120,7 @@ def register() -> None:
     demand_changes.register()
     price.register()
     running.register()
+    transforms.register()
     images.use(BlenderImages())
     _commands.append(bpy.utils.register_cli_command("refine", _run_command))
 
@@ -116,6 +130,7 @@ def unregister() -> None:
     draw.stop()
     bpy.utils.unregister_cli_command(_commands.pop())
     images.use(None)
+    transforms.unregister()
     running.unregister()
     plans.unregister()
     price.unregister()

@@ -182,7 +182,8 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         plans.refresh(context)
         self.report({"INFO"}, _scored_in_words(group, scores, job.forced.counts()["forced"]))
         modifiers = [note for each in group for note in splat_object.modifier_notes(each.obj)]
-        for note in (*scoring_notes(scores), *modifiers):
+        drifts = [note for each in group for note in splat_object.drift_notes(each)]
+        for note in (*scoring_notes(scores), *modifiers, *drifts):
             self.report({"WARNING"}, note)
         return {"FINISHED"}
 
@@ -277,6 +278,7 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
             splat_group.check_forced(context.scene, group, job.forced)
         decided = job.task.budget.needs_scores or not result.absorbed  # by the scores
         changed = _changes_since_scoring(context, group, job) if decided else []
+        drifts = [note for each in group for note in splat_object.drift_notes(each)]
         outcome = splat_group.apply(group, result)
         for member in group:
             plans.forget(member.mesh)
@@ -290,6 +292,8 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
             + sizes_in_words(outcome.bytes_before, "->", outcome.bytes_after)
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
+        for note in drifts:
+            self.report({"WARNING"}, note)
         if changed:
             self.report(
                 {"WARNING"},

@@ -49,10 +49,10 @@ def folder(tmp_path, monkeypatch):
         {
             "position": [offset, 0.1 * offset * offset, 0.0],
             "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-            "fx": 450.0,
-            "fy": 450.0,
-            "width": 100,
-            "height": 75,
+            "fx": 180.0,
+            "fy": 180.0,
+            "width": 40,
+            "height": 30,
             "img_name": str(offset),
         }
         for offset in (-0.4, -0.2, 0.0, 0.2, 0.4)

@@ -241,7 +241,7 @@ def in_doubles(splats: Splats, views: ViewSet) -> Scores:
         term = alpha * total * content
         values += share * term / term.mean()
     weighted = (means - middle) / squared[:, None]
-    axes = principal_axes(weighted.T @ (means - middle), weighted.sum(axis=0))
+    axes = principal_axes(np.vstack([weighted.T @ (means - middle), weighted.sum(axis=0)]))
     place = (means - middle) @ axes.T / size
     ball = place / (1 + np.linalg.norm(place, axis=1, keepdims=True))
     _, own = np.unique(np.floor((ball + 1) * 32).astype(int), axis=0, return_inverse=True)

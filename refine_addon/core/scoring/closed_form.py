@@ -217,7 +217,7 @@ def _frame(
         return highest if shift == HIGHEST else radix.added(each("count", prefixes, shift))
 
     size = size_of(radix.median(count, np.dtype(np.float64), good))
-    axes = principal_axes(moments[:3], moments[3]) / size  # (3, 3)
+    axes = principal_axes(moments) / size  # (3, 3)
     eta = ETA_RELATIVE * size * size if settings.eta is None else settings.eta
     return axes, eta, NEAR_RELATIVE * size, size
 

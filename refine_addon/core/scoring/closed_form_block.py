@@ -461,7 +461,7 @@ class RowBlock:
         views: NDArray[np.int64],
     ) -> _Fringe:
         """Return which splats reach into which views from outside, and how far."""
-        limit = reach * self.frustums.steepness[views]  # (c, n)
+        limit = reach * self.frustums.beyond_per_unit[views]  # (c, n)
         outside &= beyond < limit  # (c, n)
         index = np.flatnonzero(outside)  # few pairs: what follows is computed for these alone
         view = index // outside.shape[1]

@@ -54,9 +54,9 @@ class SceneContext:
         with np.errstate(under="ignore"):
             for number in np.flatnonzero(projection.boxes_touch(boxes, self.scene, view)).tolist():
                 chunk = self.chunk(number)
-                reaching, depth = projection.reaching(chunk, self.scene, view)
-                colors.append(chunk.colors[reaching.index])
-                pieces.append((replace(reaching, index=reaching.index + number * CHUNK), depth))
+                found, depth = projection.footprints_and_depths(chunk, self.scene, view)
+                colors.append(chunk.colors[found.index])
+                pieces.append((replace(found, index=found.index + number * CHUNK), depth))
             footprints = projection.front_to_back(pieces)
         # Ascending, since chunks are.
         rows = np.concatenate([np.empty(0, np.int64), *(piece.index for piece, _ in pieces)])

@@ -75,9 +75,9 @@ class _OneView:
     numbers: list[int]
     kinds: list[bool]
 
-    def __call__(self, place: int) -> tuple[ViewMeasurement, float]:
+    def __call__(self, index: int) -> tuple[ViewMeasurement, float]:
         """Return what a view sees, and its weight."""
-        number, context = self.numbers[place], self.context
+        number, context = self.numbers[index], self.context
         view, weight = context.views.by_distance()[number]
         footprints, colors = context.footprints(view)
         for scoring in self.kinds:
