@@ -445,8 +445,8 @@ def test_pictures_show_what_was_and_what_is_written(folder, capsys, options):
     }
     before = read_ply(folder / "in.ply").splats()
     made = folder / options[1] if "-o" in options else None
-    keep = prune(before, read_cameras(folder / "cameras.json"), Budget(ratio=0.5)).keep
-    after = read_splats(made).splats() if made else before.take(keep)
+    decided = prune(before, read_cameras(folder / "cameras.json"), Budget(ratio=0.5))
+    after = read_splats(made).splats() if made else decided.survivors(before)
     found = compare(before, after, chosen(read_cameras(folder / "cameras.json")))
     assert [view["psnr"] for view in drawn["views"]] == [round(one.psnr, 2) for one in found]
     for view, one in zip(drawn["views"], found, strict=True):
