@@ -6,8 +6,6 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ..estimate.quality import in_words
 from ..refitting.refit import refit
 
@@ -61,25 +59,11 @@ class Made:
 
     def facts(self) -> dict[str, Any]:
         """Return what a report says of refitting: nothing where survivors were not refitted."""
-        if self.refitted is None:
-            return {}
-        done = self.refitted
-        facts = {
-            "rounds": done.rounds,
-            "changed": int(np.count_nonzero(done.changed)),
-            "psnr_before": round(done.psnr_before, 2),
-            "psnr": round(done.psnr, 2),
-            "seconds": round(self.seconds, 2),
-        }
-        return {"refitted": facts}
+        return {} if self.refitted is None else {"refitted": self.refitted.facts(self.seconds)}
 
     def notes(self) -> list[str]:
         """Return the same as sentences, for the user."""
-        return [
-            "{changed:,} survivors were refitted in {rounds} rounds: {psnr_before:.1f} -> "
-            "{psnr:.1f} dB on rays that nothing was fitted to, {seconds:.1f} s".format(**facts)
-            for facts in self.facts().values()
-        ]
+        return [] if self.refitted is None else [self.refitted.note(self.seconds)]
 
 
 def unchanged_note(plain: float | None, tried: Made | None) -> str:
@@ -94,7 +78,7 @@ def unchanged_note(plain: float | None, tried: Made | None) -> str:
     """
     why = "the views see too little to tell what absorbing would gain"
     if tried is not None and tried.psnr is not None:
-        why = f"absorbing, with {in_words(tried.psnr)}, is not better"
+        why = f"absorbing reaches {in_words(tried.psnr)}, hardly more"
     elif plain is not None:
         why = "nobody would see what absorbing gains"
     return f"survivors stay unchanged: {why}"
