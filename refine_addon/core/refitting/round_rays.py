@@ -1,5 +1,8 @@
 """The rays of all rounds of refitting: what the unpruned splats look like on them, and survivors.
 
+Each round learns from rays through other pixels. Validation rays, which no round learns from, tell
+what a round has gained.
+
 Views are cast in processes of their own, as they are measured (`processes`).
 """
 
@@ -13,9 +16,9 @@ import numpy as np
 from ..estimate.quality import PSNR_CAP
 from ..processes import for_each
 from ..seeing import projection
-from ..seeing.cast import cast, depth_complexity, pixels
-from ..seeing.ray_sample import MAX_RAYS_OF_VIEW, colors_from
-from ..work import Progress, part, silent
+from ..seeing.cast import cast, pixels
+from ..seeing.ray_sample import MAX_HITS_OF_VIEW, MAX_RAYS_OF_VIEW, colors_from
+from ..work import Progress, part
 from .linear import LinearView, Shapes, linear_view
 
 if TYPE_CHECKING:
@@ -36,15 +39,18 @@ RAYS_OF_SPLAT = 4.0
 MIN_RAYS = 1 << 16
 """Rays of a round where that would be fewer."""
 
+VALIDATION_RAYS = 1 << 15
+"""Rays of all views together that nothing is learned from: they tell what a round gained."""
+
 MAX_HITS = 1 << 25
 """About how many hits the rays of a round may have on the unpruned splats. Survivors have fewer,
-and those that hardly show are left out: some 80 bytes are taken for every third."""
+and those that hardly show are left out: some 50 bytes are taken for at most every second."""
 
 SECONDS, SECONDS_OF_RAY = 2.5e-7, 4e-6
 """About how long one core takes to project a splat into a view, and to cast a ray, to tell what is
 worth a process."""
 
-_OTHER_PIXELS = 2  # numbers of pixels that validation and scoring rays take, see `cast.pixels`
+_OTHER_PIXELS = 2  # numbers of pixels that an estimate and scoring take, see `cast.pixels`
 _LEAST_ERROR = 10.0 ** (-PSNR_CAP / 10.0)
 
 
@@ -112,7 +118,7 @@ class RoundRays:
     count : int
         How many survivors there are.
     rounds : int
-        How many rounds rays are cast for, and once more to measure the last.
+        How many rounds rays are cast for.
     progress : callable
     threads : int, optional
 
@@ -139,18 +145,19 @@ class RoundRays:
         )
         target = InMemory(original, gaussians, self.scene)
         rays = max(RAYS_OF_SPLAT * count, MIN_RAYS)
-        work = _CastTruth(target, self.views, rays, MAX_HITS, rounds + 1)
-        seconds = SECONDS * len(original) * len(self.views) + SECONDS_OF_RAY * rays * (rounds + 1)
-        self._truths = [
-            *for_each(
-                work, len(self.views), seconds,
-                progress=part(progress, 0.2, 1.0), what="casting rays", threads=threads,
-            )
-        ]  # fmt: skip
+        work = _CastTruth(target, self.views, rays, MAX_HITS, rounds)
+        seconds = SECONDS * len(original) * len(self.views) + SECONDS_OF_RAY * (
+            rays * rounds + VALIDATION_RAYS
+        )
+        views_of_rounds = for_each(
+            work, len(self.views), seconds,
+            progress=part(progress, 0.2, 1.0), what="casting rays", threads=threads,
+        )  # fmt: skip
+        self._validation, *self._rounds = map(list, zip(*views_of_rounds, strict=True))
 
     def truths(self, number: int) -> list[Truth]:
         """Return the rays of a round, of each view."""
-        return [of_rounds[number] for of_rounds in self._truths]
+        return self._rounds[number]
 
     def linear(self, splats: Splats, number: int, progress: Progress) -> list[LinearView]:
         """Return how the colours of each view's rays change with survivors as they are now.
@@ -165,23 +172,15 @@ class RoundRays:
         """
         target = self._prepared(splats, part(progress, 0.0, 0.1))
         shapes = Shapes.of(splats, target.gaussians, self.scene)
-        work = _Linearize(target, self.views, self.truths(number), shapes)
-        return self._each(work, len(splats), part(progress, 0.1, 1.0))
+        truths = self.truths(number)
+        work = _Linearize(target, self.views, truths, shapes)
+        return self._each(work, truths, len(splats), part(progress, 0.1, 1.0))
 
-    def colors(
-        self, splats: Splats, number: int, progress: Progress = silent
-    ) -> list[NDArray[np.float64]]:
-        """Return what the rays of each view see of survivors, (3, P); parameters as `linear`."""
+    def psnr(self, splats: Splats, progress: Progress) -> float:
+        """Return the mean PSNR of survivors on validation rays, weighted as the views are, dB."""
         target = self._prepared(splats, part(progress, 0.0, 0.1))
-        work = _CastColors(target, self.views, self.truths(number))
-        return self._each(work, len(splats), part(progress, 0.1, 1.0))
-
-    def psnr(self, colors: Sequence[NDArray[np.float64]], number: int) -> float:
-        """Return the mean PSNR of what the rays of each view see, weighted as the views are, dB."""
-        errors = [
-            max(float(np.mean(np.square(truth.colors - seen))), _LEAST_ERROR)
-            for truth, seen in zip(self.truths(number), colors, strict=True)
-        ]
+        work = _CastErrors(target, self.views, self._validation)
+        errors = self._each(work, self._validation, len(splats), part(progress, 0.1, 1.0))
         weights = [weight for _, weight in self.views]
         return float(np.average(-10.0 * np.log10(errors), weights=weights))
 
@@ -191,9 +190,15 @@ class RoundRays:
         )
         return InMemory(splats, gaussians, self.scene)
 
-    def _each(self, work: Callable[[int], Result], count: int, progress: Progress) -> list[Result]:
-        """Return what is found in each view, of `count` survivors."""
-        rays = sum(truth.colors.shape[1] for truth in self.truths(0))
+    def _each(
+        self,
+        work: Callable[[int], Result],
+        truths: Sequence[Truth],
+        count: int,
+        progress: Progress,
+    ) -> list[Result]:
+        """Return what is found on the rays of each view, of `count` survivors."""
+        rays = sum(truth.colors.shape[1] for truth in truths)
         seconds = SECONDS * count * len(self.views) + SECONDS_OF_RAY * rays
         return [
             *for_each(
@@ -218,43 +223,48 @@ class _CastTruth:
     rounds: int
 
     def __call__(self, number: int) -> list[Truth]:
-        """Return the rays of a view, of each round."""
+        """Return the rays of a view that validate, and those of each round."""
         view, count = self.views[number][0], len(self.views)
+        places = [number + (_OTHER_PIXELS + other) * count for other in range(self.rounds + 1)]
         with np.errstate(under="ignore"):
             footprints = self.target.footprints(view)
-            depth = max(depth_complexity(footprints, view), 1.0)
-            rays = min(self.rays / count, self.hits / count / depth, MAX_RAYS_OF_VIEW)
-            return [
-                self._truth(view, footprints, *pixels(view, number + other * count, rays))
-                for other in range(_OTHER_PIXELS, _OTHER_PIXELS + self.rounds)
-            ]
+            validation, hits = self._cast(
+                view, footprints, pixels(view, places[0], VALIDATION_RAYS / count)
+            )
+            limit = min(self.hits / count, MAX_HITS_OF_VIEW) / max(hits, 1.0)
+            rays = min(self.rays / count, limit, MAX_RAYS_OF_VIEW)
+            of_rounds = (
+                self._cast(view, footprints, pixels(view, place, rays)) for place in places[1:]
+            )
+            return [validation, *(truth for truth, _ in of_rounds)]
 
-    def _truth(
+    def _cast(
         self,
         view: View,
         footprints: Footprints,
-        columns: NDArray[np.int64],
-        rows: NDArray[np.int64],
-    ) -> Truth:
-        rays = cast(footprints, columns, rows)
+        chosen: tuple[NDArray[np.int64], NDArray[np.int64]],
+    ) -> tuple[Truth, float]:
+        """Return the rays through some columns and rows of pixels, and how many hits one has."""
+        rays = cast(footprints, *chosen)
         colors = rays.colors(self.target.colors(rays.hit, view))
-        return Truth(columns, rows, colors.astype(np.float32))
+        return Truth(*chosen, colors.astype(np.float32)), len(rays.ray) / max(rays.count, 1)
 
 
 @dataclass(frozen=True, eq=False)
-class _CastColors:
-    """Casts the rays of a round of a view into survivors; any process can."""
+class _CastErrors:
+    """Casts rays of a view into survivors, and compares colours; any process can."""
 
     target: Target
     views: Sequence[tuple[View, float]]
     truths: Sequence[Truth]
 
-    def __call__(self, number: int) -> NDArray[np.float64]:
-        """Return what the rays of a view see, (3, P)."""
+    def __call__(self, number: int) -> float:
+        """Return the mean squared error of the colours that the rays of a view see."""
         view, truth = self.views[number][0], self.truths[number]
         with np.errstate(under="ignore"):
             rays = cast(self.target.footprints(view), truth.columns, truth.rows)
-            return rays.colors(self.target.colors(rays.hit, view))
+            seen = rays.colors(self.target.colors(rays.hit, view))
+        return float(max(np.mean(np.square(truth.colors - seen)), _LEAST_ERROR))
 
 
 @dataclass(frozen=True, eq=False)
