@@ -24,7 +24,7 @@ alpha and e, a splat the coefficients.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -275,13 +275,15 @@ def linear_view(
     colors : (3, u) float64
         Of the splats that are hit.
     shapes : Shapes
+        Of the first Gaussians; what else is hit does not change.
     view : View
     """
+    movable = int(np.searchsorted(rays.hit, len(shapes.gaussians)))  # of those that are hit
     counts = rays.counts()
     log_front = in_front(rays.log_passed.astype(np.float64), counts)
     transmittance = np.exp(np.where(log_front > LOG_OPAQUE, log_front, -np.inf)).astype(np.float32)
     weight = transmittance * rays.alpha
-    kept = np.flatnonzero(weight > _LEAST_WEIGHT)
+    kept = np.flatnonzero((weight > _LEAST_WEIGHT) & (rays.owner < movable))
     owner, ray = rays.owner[kept].astype(np.intp), rays.ray[kept].astype(np.intp)
     left = np.maximum((transmittance - weight)[kept], np.float32(LEAST_LEFT))
     ends = np.cumsum(counts)
@@ -297,20 +299,24 @@ def linear_view(
     alpha = rays.alpha[kept]
     alpha = np.where(alpha < ALPHA_MAX, alpha, np.float32(0.0))  # clipped: it does not change
     unclipped = (colors > 0.0) & (colors < projection.BRIGHTEST)
+    hit = rays.hit[:movable]
     return LinearView(
-        shapes.gaussians.index[rays.hit], seen.clip(0.0, 1.0), ray, owner, weight[kept], by_alpha,
-        alpha, _steepness(rays, kept, footprints), _slopes(rays, unclipped, shapes, view),
+        shapes.gaussians.index[hit], seen.clip(0.0, 1.0), ray, owner, weight[kept], by_alpha, alpha,
+        _steepness(replace(rays, hit=hit), kept, footprints),
+        _slopes(hit, unclipped[:, :movable], shapes, view),
     )  # fmt: skip
 
 
-def _slopes(rays: Rays, unclipped: NDArray[np.bool_], shapes: Shapes, view: View) -> Slopes:
-    """Return how alpha changes with the parameters of the splats hit; see the top of this file.
+def _slopes(
+    hit: NDArray[np.int64], unclipped: NDArray[np.bool_], shapes: Shapes, view: View
+) -> Slopes:
+    """Return how alpha changes with the parameters of the Gaussians hit; see the top of this file.
 
     `unclipped`, (3, u), is where their colours are not clipped.
     """
-    hit, scales = shapes.gaussians.take(rays.hit), shapes.scales[rays.hit]  # (u, 3)
-    in_image = projection.jacobian(hit, shapes.scene, view)  # rows of J W, (u, 3) each
-    x, y = (np.einsum("ui,uij->ju", each, shapes.axes[rays.hit]) for each in in_image)  # (3, u)
+    gaussians, scales = shapes.gaussians.take(hit), shapes.scales[hit]  # (u, 3)
+    in_image = projection.jacobian(gaussians, shapes.scene, view)  # rows of J W, (u, 3) each
+    x, y = (np.einsum("ui,uij->ju", each, shapes.axes[hit]) for each in in_image)  # (3, u) each
     longest, squared = scales.max(axis=1), np.square(scales).T  # (u,), (3, u)
     after, last = [1, 2, 0], [2, 0, 1]
     turned = squared[after] - squared[last]
@@ -325,7 +331,7 @@ def _slopes(rays: Rays, unclipped: NDArray[np.bool_], shapes: Shapes, view: View
     )
     return Slopes(
         unclipped * np.float32(SH_C0),
-        np.float32(1.0) - hit.alphas,
+        np.float32(1.0) - gaussians.alphas,
         (longest * np.stack([x, y], axis=1)).astype(np.float32),
         np.concatenate([scaled, turns]).astype(np.float32),
     )

@@ -80,8 +80,34 @@ class Refit:
             raise RefineError(msg)
 
 
+class Gains:
+    """What refitting changed and gained; see `Refitted`."""
+
+    changed: NDArray[np.bool_]
+    rounds: int
+    psnr_before: float
+    psnr: float
+
+    def facts(self, seconds: float) -> dict[str, float]:
+        """Return it for a report, with how long it took."""
+        return {
+            "rounds": self.rounds,
+            "changed": int(np.count_nonzero(self.changed)),
+            "psnr_before": round(self.psnr_before, 2),
+            "psnr": round(self.psnr, 2),
+            "seconds": round(seconds, 2),
+        }
+
+    def note(self, seconds: float) -> str:
+        """Return it as a sentence, for the user."""
+        return (
+            "{changed:,} survivors were refitted in {rounds} rounds: {psnr_before:.1f} -> "
+            "{psnr:.1f} dB on rays that nothing was fitted to, {seconds:.1f} s"
+        ).format(**self.facts(seconds))
+
+
 @dataclass(frozen=True, eq=False)
-class Refitted:
+class Refitted(Gains):
     """What some rounds have made of survivors.
 
     Attributes
@@ -166,21 +192,37 @@ def refit_rounds(  # noqa: PLR0913 - as `refit`
 
     Parameters and errors are those of `refit`.
     """
+    rays = RoundRays.of(
+        original, views, len(survivors), settings.rounds, part(progress, 0.0, 0.3), threads
+    )
+    yield from refit_on(
+        rays, survivors, settings,
+        protected=protected, progress=part(progress, 0.3, 1.0), threads=threads,
+    )  # fmt: skip
+
+
+def refit_on(
+    rays: RoundRays,
+    survivors: Splats,
+    settings: Refit,
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Iterator[Refitted]:
+    """Yield what `refit_rounds` does, of rays that have been cast into the unpruned splats."""
     moving = np.zeros(COUNT, np.bool_)
     moving[: COUNT if settings.geometry else MEAN.start] = True
     movable = moving[:, None] & ~(
         np.zeros(len(survivors), np.bool_) if protected is None else protected
     )
-    rays = RoundRays(
-        original, views, len(survivors), settings.rounds, part(progress, 0.0, 0.3), threads
-    )
-    psnr = rays.psnr(survivors, part(progress, 0.3, 0.32))
+    psnr = rays.psnr(survivors, part(progress, 0.0, 0.04))
     best = Refitted(survivors, np.zeros(len(survivors), np.bool_), 0, psnr, psnr)
     yield best
     known, damping = np.zeros((COUNT, len(survivors))), 1.0
-    for number in range(settings.rounds):
+    for number in range(1, settings.rounds + 1):
         begin, middle, near, end = (
-            0.32 + 0.68 * (number + share) / settings.rounds for share in (0.0, 0.4, 0.9, 1.0)
+            0.04 + 0.96 * (number - 1 + share) / settings.rounds for share in (0.0, 0.4, 0.9, 1.0)
         )
         linear = rays.linear(best.splats, number, part(progress, begin, middle))
         solver = _Solver(linear, rays.truths(number), movable, threads)
