@@ -14,8 +14,10 @@ from .ui import (
     panel_cache,
     plans,
     price,
+    properties,
     running,
     select_tools,
+    transforms,
 )
 from .ui.camera_list import REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
@@ -58,6 +60,7 @@ from .ui.select_operators import (
 )
 from .ui.select_panel import REFINE_PT_select
 from .ui.select_tools import REFINE_OT_brush_radius, REFINE_OT_select_stroke
+from .ui.transforms import REFINE_OT_bake_transform, REFINE_OT_join, REFINE_OT_mend
 from .ui.view_operators import REFINE_OT_preview, REFINE_OT_view
 from .ui.volumes import (
     REFINE_OT_add_volume,
@@ -95,6 +98,9 @@ CLASSES = (
     REFINE_OT_preview,
     REFINE_OT_view,
     REFINE_OT_convert,
+    REFINE_OT_bake_transform,
+    REFINE_OT_join,
+    REFINE_OT_mend,
     REFINE_OT_export_ply,
     REFINE_OT_levels,
     REFINE_OT_turn_cameras,
@@ -131,9 +137,11 @@ def register() -> None:
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
     camera_list.register()
     panel_cache.register()
+    properties.register()
     demand_changes.register()
     price.register()
     running.register()
+    transforms.register()
     select_tools.register()
     images.use(BlenderImages())
     _commands.append(bpy.utils.register_cli_command("refine", _run_command))
@@ -144,11 +152,13 @@ def unregister() -> None:
     draw.stop()
     bpy.utils.unregister_cli_command(_commands.pop())
     images.use(None)
+    transforms.unregister()
     select_tools.unregister()
     running.unregister()
     plans.unregister()
     price.unregister()
     demand_changes.unregister()
+    properties.unregister()
     panel_cache.unregister()
     camera_list.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)

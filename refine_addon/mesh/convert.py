@@ -12,7 +12,7 @@ import bpy
 
 from ..core.errors import RefineError
 from . import attributes as mesh_attributes
-from . import heat_map, native
+from . import drift, heat_map, native
 from .edit import check_changeable, group_weights
 from .layout import KINDS, STORAGE, SplatObject, check, rest_count
 from .node_trees import add, chain, new_tree
@@ -159,6 +159,7 @@ def _fill(checked: SplatObject, obj: bpy.types.Object) -> None:
     for material in checked.mesh.materials:
         obj.data.materials.append(material)
     _copy_columns(checked, check(obj))
+    drift.carry(checked.mesh, obj.data)
 
 
 def _copy_attributes(checked: SplatObject, data: bpy.types.ID) -> None:

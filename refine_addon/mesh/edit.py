@@ -78,12 +78,7 @@ def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
     """Undo what a block did to the data of an object if the block fails, however far it came.
 
     A copy of the data stands by, which costs nothing: Blender shares attributes until one is
-    changed. Where it is needed, it takes the place and the name of the data.
-
-    Parameters
-    ----------
-    obj : bpy.types.Object
-        See `check_deletable`: no other object may have its data.
+    changed. Where it is needed, it takes the place and the name of the data, for all its users.
     """
     mesh = obj.data
     before = mesh.copy()
@@ -91,7 +86,7 @@ def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
         yield
     except BaseException:
         name, before.use_fake_user = mesh.name, mesh.use_fake_user
-        obj.data = before
+        mesh.user_remap(before)
         bpy.data.batch_remove([mesh])
         before.name = name
         raise

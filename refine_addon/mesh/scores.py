@@ -72,6 +72,8 @@ class Provenance:
         What the scores are to be refined by, if that is still to come.
     together : Together, optional
         Where other objects were scored with them; the curve is that of all then.
+    seconds : float, optional
+        How long scoring took.
     """
 
     settings: Settings
@@ -80,6 +82,7 @@ class Provenance:
     protected: NDArray[np.bool_] | None = None
     asked: Settings | None = None
     together: Together | None = None
+    seconds: float | None = None
 
 
 def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
@@ -117,6 +120,7 @@ def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
             "cameras": provenance.cameras,
             "protected": digest(provenance.protected),
             "asked": asdict(asked) if asked else None,
+            "seconds": provenance.seconds,
             "together": together and {"id": together.id, "splats": together.splats},
         }
     )
@@ -146,6 +150,17 @@ def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
     except (KeyError, TypeError, ValueError, AttributeError):
         return None
     return recorded if complete else None
+
+
+def move_origin(
+    mesh: bpy.types.Mesh, before: NDArray[np.float64], after: NDArray[np.float64]
+) -> None:
+    """Have scores hold for an object whose matrix, (4, 4), changed while its splats stayed."""
+    recorded = record(mesh) or {}
+    origin = recorded.get("origin")
+    if origin and np.allclose(origin.get("matrix", np.nan), before, rtol=0.0, atol=1e-6):
+        origin = {**origin, "matrix": np.asarray(after).tolist()}
+        mesh[RECORD] = json.dumps({**recorded, "origin": origin})
 
 
 def unrefined(record: dict[str, Any]) -> bool:

@@ -89,12 +89,12 @@ class Demands:
         for name in ("", *self.names):
             mask = mesh_edit.protected_mask(checked.obj, name)
             protected = mask if protected is None or mask is None else protected | mask
-        removed = mesh_edit.marks(checked.obj, mesh_edit.MUST_GO)
-        if not self.zones and removed is None:
+        out = mesh_edit.marks(checked.obj, mesh_edit.MUST_GO)
+        if not self.zones and out is None:
             return Forced(protected)
         means = world_means(checked) if self.zones else np.empty((0, 3))
         try:
-            return core_volumes.forced(self.zones, means, protected, removed)
+            return core_volumes.forced(self.zones, means, protected, out)
         except RefineError as error:
             msg = f"object '{checked.obj.name}': {error}"
             raise RefineError(msg) from error
@@ -189,7 +189,7 @@ def mark(checked: SplatObject, forced: Forced) -> None:
     RefineError
         If the object cannot be written to.
     """
-    mesh, forced_out = checked.mesh, forced.removed
+    mesh, forced_out = checked.mesh, forced.out
     mesh_edit.mark_forced(checked.obj, forced.protected, forced_out)
     scored = mesh_scores.record(mesh) is not None
     if forced_out is not None:

@@ -22,6 +22,7 @@ from ..core.survivors import survivor_columns
 from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.volumes import FREE, Forced
 from ..mesh import attributes as mesh_attributes
+from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
 from ..mesh import layout as mesh_layout
@@ -100,6 +101,20 @@ def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
     return transformed(splats, matrix, rotate_sh=whole)
 
 
+def can_become(group: Sequence[SplatObject], survivors: SurvivorChoice) -> SurvivorChoice:
+    """Return what survivors may become: by default unchanged where the scale of any is uneven.
+
+    Parameters
+    ----------
+    group : sequence of SplatObject
+    survivors : {"auto", "unchanged", "absorb", "refit"}
+        What is asked.
+    """
+    graph = bpy.context.evaluated_depsgraph_get()
+    even = all(is_uniform(world_matrix(member.obj, graph)) for member in group)
+    return survivors if even or survivors != "auto" else "unchanged"
+
+
 def modifier_notes(obj: bpy.types.Object) -> list[str]:
     """Return a sentence if modifiers show the object otherwise than it is scored and exported."""
     drawing = ("REFINE", "KIRI")  # these draw splats and move none
@@ -111,6 +126,15 @@ def modifier_notes(obj: bpy.types.Object) -> list[str]:
         "first if they move splats"
     )
     return [note]
+
+
+def drift_notes(checked: SplatObject) -> list[str]:
+    """Return what others did to an object's splats, in sentences; see `mesh.drift`."""
+    drift = mesh_drift.found(checked.mesh)
+    if drift is None:
+        return []
+    remedy = "; Mend Splats in the panel puts that right" if drift.mendable else ""
+    return [f"object '{checked.obj.name}': {told}{remedy}" for told in drift.sentences()]
 
 
 def stored_task(
@@ -154,9 +178,9 @@ def stored_task(
         settings=settings,
         splats=None if views is None else gather(checked, whole=True),
         views=views,
-        scores=stored_scores(checked, forced.removed),
+        scores=stored_scores(checked, forced.out),
         protected=forced.protected,
-        removed=forced.removed,
+        forced_out=forced.out,
         survivors=survivors,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
@@ -237,6 +261,8 @@ def reduce_object(
     mesh_edit.delete_vertices(checked.obj, ~keep)
     columns = {name: values[keep] for name, values in columns.items()}
     mesh_attributes.write_columns(checked, columns)
+    if columns:
+        mesh_drift.renew(checked.mesh)
     mesh_floaters.forget(checked.mesh)
     if RECORD in checked.mesh:
         del checked.mesh[RECORD]

@@ -6,13 +6,13 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
+from ..estimate.quality import in_words
 from ..refitting.refit import refit
 
 if TYPE_CHECKING:
     from ..absorbing.absorb import Absorbed
     from ..refitting.refit import Refitted
+    from ..survivor_choice import Became
     from ..task import Task
     from ..work import Progress
 
@@ -39,6 +39,17 @@ class Made:
     seconds: float = 0.0
 
     @property
+    def became(self) -> Became:
+        """What survivors became."""
+        return "absorb" if self.refitted is None else "refit"
+
+    def measured(self) -> dict[Became, float | None]:
+        """Return the estimates of the PSNR by what survivors became, dB."""
+        if self.refitted is None:
+            return {"absorb": self.psnr}
+        return {"absorb": self.refitted.psnr_before, "refit": self.psnr}
+
+    @property
     def survivors(self) -> Absorbed:
         """The survivors as they became in the end."""
         if self.refitted is None:
@@ -48,25 +59,29 @@ class Made:
 
     def facts(self) -> dict[str, Any]:
         """Return what a report says of refitting: nothing where survivors were not refitted."""
-        if self.refitted is None:
-            return {}
-        done = self.refitted
-        facts = {
-            "rounds": done.rounds,
-            "changed": int(np.count_nonzero(done.changed)),
-            "psnr_before": round(done.psnr_before, 2),
-            "psnr": round(done.psnr, 2),
-            "seconds": round(self.seconds, 2),
-        }
-        return {"refitted": facts}
+        return {} if self.refitted is None else {"refitted": self.refitted.facts(self.seconds)}
 
     def notes(self) -> list[str]:
         """Return the same as sentences, for the user."""
-        return [
-            "{changed:,} survivors were refitted in {rounds} rounds: {psnr_before:.1f} -> "
-            "{psnr:.1f} dB on rays that nothing was fitted to, {seconds:.1f} s".format(**facts)
-            for facts in self.facts().values()
-        ]
+        return [] if self.refitted is None else [self.refitted.note(self.seconds)]
+
+
+def unchanged_note(plain: float | None, tried: Made | None) -> str:
+    """Return why survivors stay unchanged by default, for the user.
+
+    Parameters
+    ----------
+    plain : float or None
+        The estimated PSNR with splats deleted, dB.
+    tried : Made or None
+        What absorbing made; None where it was not tried.
+    """
+    why = "the views see too little to tell what absorbing would gain"
+    if tried is not None and tried.psnr is not None:
+        why = f"absorbing reaches {in_words(tried.psnr)}, hardly more"
+    elif plain is not None:
+        why = "nobody would see what absorbing gains"
+    return f"survivors stay unchanged: {why}"
 
 
 def refit_absorbed(task: Task, made: Made, progress: Progress, threads: int | None) -> Made:
