@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import bpy
+import mathutils
 from bpy.app.handlers import persistent
 from bpy.props import BoolProperty
 
@@ -120,8 +121,10 @@ def draw(
         wrapped.label(layout, context, sentence, icon="ERROR")
     if any(drift.mendable for drift in drifts):
         layout.operator("refine.mend", icon="MODIFIER")
-    several = len(objects) > 1
-    layout.operator("refine.join" if several else "refine.bake_transform")
+    if len(objects) > 1:
+        layout.operator("refine.join", icon="SELECT_EXTEND")
+    elif objects[0].matrix_basis != mathutils.Matrix():
+        layout.operator("refine.bake_transform", icon="OBJECT_ORIGIN")
 
 
 def _draw_apply(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
