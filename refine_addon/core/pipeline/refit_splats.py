@@ -6,8 +6,6 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from ..refitting.refit import refit
 
 if TYPE_CHECKING:
@@ -48,25 +46,11 @@ class Made:
 
     def facts(self) -> dict[str, Any]:
         """Return what a report says of refitting: nothing where survivors were not refitted."""
-        if self.refitted is None:
-            return {}
-        done = self.refitted
-        facts = {
-            "rounds": done.rounds,
-            "changed": int(np.count_nonzero(done.changed)),
-            "psnr_before": round(done.psnr_before, 2),
-            "psnr": round(done.psnr, 2),
-            "seconds": round(self.seconds, 2),
-        }
-        return {"refitted": facts}
+        return {} if self.refitted is None else {"refitted": self.refitted.facts(self.seconds)}
 
     def notes(self) -> list[str]:
         """Return the same as sentences, for the user."""
-        return [
-            "{changed:,} survivors were refitted in {rounds} rounds: {psnr_before:.1f} -> "
-            "{psnr:.1f} dB on rays that nothing was fitted to, {seconds:.1f} s".format(**facts)
-            for facts in self.facts().values()
-        ]
+        return [] if self.refitted is None else [self.refitted.note(self.seconds)]
 
 
 def refit_absorbed(task: Task, made: Made, progress: Progress, threads: int | None) -> Made:

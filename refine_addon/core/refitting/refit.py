@@ -80,8 +80,34 @@ class Refit:
             raise RefineError(msg)
 
 
+class Gains:
+    """What refitting changed and gained; see `Refitted`."""
+
+    changed: NDArray[np.bool_]
+    rounds: int
+    psnr_before: float
+    psnr: float
+
+    def facts(self, seconds: float) -> dict[str, float]:
+        """Return it for a report, with how long it took."""
+        return {
+            "rounds": self.rounds,
+            "changed": int(np.count_nonzero(self.changed)),
+            "psnr_before": round(self.psnr_before, 2),
+            "psnr": round(self.psnr, 2),
+            "seconds": round(seconds, 2),
+        }
+
+    def note(self, seconds: float) -> str:
+        """Return it as a sentence, for the user."""
+        return (
+            "{changed:,} survivors were refitted in {rounds} rounds: {psnr_before:.1f} -> "
+            "{psnr:.1f} dB on rays that nothing was fitted to, {seconds:.1f} s"
+        ).format(**self.facts(seconds))
+
+
 @dataclass(frozen=True, eq=False)
-class Refitted:
+class Refitted(Gains):
     """What some rounds have made of survivors.
 
     Attributes
@@ -167,20 +193,35 @@ def refit_rounds(  # noqa: PLR0913 - as `refit`
 
     Parameters and errors are those of `refit`.
     """
+    rays = RoundRays.of(
+        original, views, len(survivors), settings.rounds, part(progress, 0.0, 0.3), threads
+    )
+    yield from refit_on(
+        rays, survivors, settings,
+        protected=protected, progress=part(progress, 0.3, 1.0), threads=threads,
+    )  # fmt: skip
+
+
+def refit_on(
+    rays: RoundRays,
+    survivors: Splats,
+    settings: Refit,
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Iterator[Refitted]:
+    """Yield what `refit_rounds` does, of rays that have been cast into the unpruned splats."""
     moving = np.zeros(COUNT, np.bool_)
     moving[: COUNT if settings.geometry else MEAN.start] = True
     movable = moving[:, None] & ~(
         np.zeros(len(survivors), np.bool_) if protected is None else protected
     )
-    rays = RoundRays(
-        original, views, len(survivors), settings.rounds, part(progress, 0.0, 0.3), threads
-    )
     solver = _Solver(rays, len(survivors), threads)
     best = Refitted(survivors, np.zeros(len(survivors), np.bool_), 0, 0.0, 0.0)
-    trial = survivors
+    trial, share = survivors, 1.0 / (settings.rounds + 1)
     for number in range(settings.rounds + 1):
-        share = 0.7 / (settings.rounds + 1)
-        begin = 0.3 + share * number
+        begin = share * number
         seeing = part(progress, begin, begin + share / 2)
         last = number == settings.rounds
         # After the last round nothing is learned, so derivatives are not needed.
@@ -277,7 +318,7 @@ class _Solver:
     def _each(self, work: Callable[[slice], Found], progress: Progress) -> list[Found]:
         return for_chunks(
             work,
-            len(self._rays.views),
+            len(self._rays.windows),
             1,
             progress=progress,
             what="refitting",

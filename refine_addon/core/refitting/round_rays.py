@@ -5,7 +5,8 @@ Views are cast in processes of their own, as they are measured (`processes`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
@@ -15,6 +16,7 @@ from ..processes import for_each
 from ..seeing import projection
 from ..seeing.cast import cast, depth_complexity, pixels
 from ..seeing.ray_sample import MAX_RAYS_OF_VIEW, colors_from
+from ..views import ViewSet
 from ..work import Progress, part, silent
 from .linear import LinearView, Shapes, linear_view
 
@@ -26,7 +28,7 @@ if TYPE_CHECKING:
     from ..seeing.projection import Footprints, Gaussians
     from ..seeing.scene import Scene
     from ..splats import Splats
-    from ..views import View, ViewSet
+    from ..views import View
 
 Result = TypeVar("Result")
 
@@ -44,15 +46,76 @@ SECONDS, SECONDS_OF_RAY = 2.5e-7, 4e-6
 """About how long one core takes to project a splat into a view, and to cast a ray, to tell what is
 worth a process."""
 
-_OTHER_PIXELS = 2  # numbers of pixels that validation and scoring rays take, see `cast.pixels`
 _LEAST_ERROR = 10.0 ** (-PSNR_CAP / 10.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Where rays go through a view, in each round.
+
+    Attributes
+    ----------
+    view : View
+    number : int
+        Of the view, see `cast.pixels`.
+    weight : float
+        How much it counts for the PSNR.
+    rays, hits : float
+        About how many rays there are, and how many hits they may have on the unpruned splats.
+    left, top, width, height : int
+        The part of the image that they go through, pixels; by default all of it.
+    """
+
+    view: View
+    number: int
+    weight: float
+    rays: float
+    hits: float
+    left: int = 0
+    top: int = 0
+    width: int = 0
+    height: int = 0
+
+    @cached_property
+    def part(self) -> View:
+        """The part of the image as a view of its own."""
+        view = self.view
+        if not self.width:
+            return view
+        return replace(
+            view, cx=view.cx - self.left, cy=view.cy - self.top,
+            width=self.width, height=self.height,
+        )  # fmt: skip
+
+    def pixels(
+        self, footprints: Footprints, number: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the columns and rows that the rays of a round go through.
+
+        Rounds follow the validation rays of the view in the R2 sequence (`cast.pixels`), so that
+        the rays of one are not next to those of another.
+
+        Parameters
+        ----------
+        footprints : Footprints
+            Of the unpruned splats.
+        number : int
+            Of the round.
+        """
+        depth = max(depth_complexity(footprints, self.part), 1.0)
+        count = min(self.rays, self.hits / depth, MAX_RAYS_OF_VIEW)
+        columns, rows = pixels(self.part, self.number + 1 + number, count)
+        return columns + self.left, rows + self.top
 
 
 class Target(Protocol):
     """Splats that rays are cast into. It is pickled, so that any process can."""
 
-    def footprints(self, view: View) -> Footprints:
-        """Return the footprints in a view; their index says which of the splats they are."""
+    def footprints(self, window: Window) -> Footprints:
+        """Return the footprints in a view that may reach into a window of it.
+
+        Their index says which of the splats they are.
+        """
         ...
 
     def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float64]:
@@ -76,9 +139,12 @@ class InMemory:
     gaussians: Gaussians
     scene: Scene
 
-    def footprints(self, view: View) -> Footprints:
-        """Return the footprints in a view."""
-        return projection.project(self.gaussians, self.scene, view)
+    def footprints(self, window: Window) -> Footprints:
+        """Return the footprints in a view that may reach into a window of it."""
+        reaching = projection.footprints_and_depths(
+            self.gaussians, self.scene, window.view, window.part
+        )
+        return projection.front_to_back([reaching])
 
     def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float64]:
         """Return the colours in which a view sees some of the Gaussians, (3, u)."""
@@ -106,47 +172,68 @@ class RoundRays:
 
     Parameters
     ----------
-    original : Splats
-        The unpruned splats, in the frame of the views.
-    views : ViewSet
-    count : int
-        How many survivors there are.
-    rounds : int
-        How many rounds rays are cast for, and once more to measure the last.
-    progress : callable
-    threads : int, optional
-
-    Attributes
-    ----------
+    windows : sequence of Window
+        Of the views that rays are cast from; also an attribute.
     scene : Scene
-        Of the unpruned splats.
-    views : list of (View, float)
-        Views and their weights, see `ViewSet.by_distance`.
+        Of the unpruned splats; also an attribute.
+    truths : sequence of sequence of Truth
+        Of each window, the rays of each round; there is one round more than are refitted, to
+        measure the last.
+    threads : int, optional
     """
+
+    around = 0
+    """How many splats there are besides the survivors that are refitted."""
 
     def __init__(
         self,
+        windows: Sequence[Window],
+        scene: Scene,
+        truths: Sequence[Sequence[Truth]],
+        threads: int | None,
+    ) -> None:
+        self.windows, self.scene, self._truths = windows, scene, truths
+        self._threads = threads
+
+    @classmethod
+    def of(
+        cls,
         original: Splats,
         views: ViewSet,
         count: int,
         rounds: int,
         progress: Progress,
         threads: int | None,
-    ) -> None:
-        self.views, self._chosen, self._threads = views.by_distance(), views, threads
-        gaussians, self.scene, _ = projection.prepare(
+    ) -> RoundRays:
+        """Return the rays of all views into splats in memory.
+
+        Parameters
+        ----------
+        original : Splats
+            The unpruned splats, in the frame of the views.
+        views : ViewSet
+        count : int
+            How many survivors there are.
+        rounds : int
+            How many rounds are refitted.
+        progress : callable
+        threads : int, optional
+        """
+        gaussians, scene, _ = projection.prepare(
             original, views, progress=part(progress, 0.0, 0.2), threads=threads
         )
-        target = InMemory(original, gaussians, self.scene)
-        rays = max(RAYS_OF_SPLAT * count, MIN_RAYS)
-        work = _CastTruth(target, self.views, rays, MAX_HITS, rounds + 1)
-        seconds = SECONDS * len(original) * len(self.views) + SECONDS_OF_RAY * rays * (rounds + 1)
-        self._truths = [
-            *for_each(
-                work, len(self.views), seconds,
-                progress=part(progress, 0.2, 1.0), what="casting rays", threads=threads,
-            )
-        ]  # fmt: skip
+        chosen = views.by_distance()
+        rays = max(RAYS_OF_SPLAT * count, MIN_RAYS) / len(chosen)
+        windows = [
+            Window(view, number, weight, rays, MAX_HITS / len(chosen))
+            for number, (view, weight) in enumerate(chosen)
+        ]
+        target = InMemory(original, gaussians, scene)
+        truths = cast_truths(
+            CastTruth(target, windows, range(rounds + 1)), len(original),
+            part(progress, 0.2, 1.0), threads,
+        )  # fmt: skip
+        return cls(windows, scene, truths, threads)
 
     def truths(self, number: int) -> list[Truth]:
         """Return the rays of a round, of each view."""
@@ -163,17 +250,17 @@ class RoundRays:
             Of the round.
         progress : callable
         """
-        target = self._prepared(splats, part(progress, 0.0, 0.1))
-        shapes = Shapes.of(splats, target.gaussians, self.scene)
-        work = _Linearize(target, self.views, self.truths(number), shapes)
+        gaussians = self._gaussians(splats, part(progress, 0.0, 0.1))
+        shapes = Shapes.of(splats, gaussians, self.scene)
+        work = _Linearize(self.target(splats, gaussians), self.windows, self.truths(number), shapes)
         return self._each(work, len(splats), part(progress, 0.1, 1.0))
 
     def colors(
         self, splats: Splats, number: int, progress: Progress = silent
     ) -> list[NDArray[np.float64]]:
         """Return what the rays of each view see of survivors, (3, P); parameters as `linear`."""
-        target = self._prepared(splats, part(progress, 0.0, 0.1))
-        work = _CastColors(target, self.views, self.truths(number))
+        gaussians = self._gaussians(splats, part(progress, 0.0, 0.1))
+        work = _CastColors(self.target(splats, gaussians), self.windows, self.truths(number))
         return self._each(work, len(splats), part(progress, 0.1, 1.0))
 
     def psnr(self, colors: Sequence[NDArray[np.float64]], number: int) -> float:
@@ -182,51 +269,57 @@ class RoundRays:
             max(float(np.mean(np.square(truth.colors - seen))), _LEAST_ERROR)
             for truth, seen in zip(self.truths(number), colors, strict=True)
         ]
-        weights = [weight for _, weight in self.views]
+        weights = [window.weight for window in self.windows]
         return float(np.average(-10.0 * np.log10(errors), weights=weights))
 
-    def _prepared(self, splats: Splats, progress: Progress) -> InMemory:
-        gaussians, _, _ = projection.prepare(
-            splats, self._chosen, self.scene, progress=progress, threads=self._threads
-        )
+    def target(self, splats: Splats, gaussians: Gaussians) -> Target:
+        """Return what rays are cast into: survivors, given also as Gaussians, the first of all."""
         return InMemory(splats, gaussians, self.scene)
+
+    def _gaussians(self, splats: Splats, progress: Progress) -> Gaussians:
+        views = ViewSet(tuple(window.view for window in self.windows))
+        prepared = projection.prepare(
+            splats, views, self.scene, progress=progress, threads=self._threads
+        )
+        return prepared[0]
 
     def _each(self, work: Callable[[int], Result], count: int, progress: Progress) -> list[Result]:
         """Return what is found in each view, of `count` survivors."""
         rays = sum(truth.colors.shape[1] for truth in self.truths(0))
-        seconds = SECONDS * count * len(self.views) + SECONDS_OF_RAY * rays
+        seconds = SECONDS * (count + self.around) * len(self.windows) + SECONDS_OF_RAY * rays
         return [
             *for_each(
-                work, len(self.views), seconds,
+                work, len(self.windows), seconds,
                 progress=progress, what="refitting", threads=self._threads,
             )
         ]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
-class _CastTruth:
-    """Casts the rays of all rounds of a view; any process can.
+class CastTruth:
+    """Casts the rays of all rounds of a view into the unpruned splats; any process can.
 
-    All views together have about `rays` rays in each of so many rounds, and at most about `hits`
-    hits on the unpruned splats.
+    Attributes
+    ----------
+    target : Target
+        The unpruned splats.
+    windows : sequence of Window
+    rounds : sequence of int
+        Their numbers.
     """
 
     target: Target
-    views: Sequence[tuple[View, float]]
-    rays: float
-    hits: float
-    rounds: int
+    windows: Sequence[Window]
+    rounds: Sequence[int]
 
-    def __call__(self, number: int) -> list[Truth]:
+    def __call__(self, place: int) -> list[Truth]:
         """Return the rays of a view, of each round."""
-        view, count = self.views[number][0], len(self.views)
+        window = self.windows[place]
         with np.errstate(under="ignore"):
-            footprints = self.target.footprints(view)
-            depth = max(depth_complexity(footprints, view), 1.0)
-            rays = min(self.rays / count, self.hits / count / depth, MAX_RAYS_OF_VIEW)
+            footprints = self.target.footprints(window)
             return [
-                self._truth(view, footprints, *pixels(view, number + other * count, rays))
-                for other in range(_OTHER_PIXELS, _OTHER_PIXELS + self.rounds)
+                self._truth(window.view, footprints, *window.pixels(footprints, number))
+                for number in self.rounds
             ]
 
     def _truth(
@@ -241,20 +334,34 @@ class _CastTruth:
         return Truth(columns, rows, colors.astype(np.float32))
 
 
+def cast_truths(
+    work: CastTruth, count: int, progress: Progress, threads: int | None
+) -> list[list[Truth]]:
+    """Return the rays of each view and round into `count` unpruned splats."""
+    rays = sum(window.rays for window in work.windows) * len(work.rounds)
+    seconds = SECONDS * count * len(work.windows) + SECONDS_OF_RAY * rays
+    return [
+        *for_each(
+            work, len(work.windows), seconds,
+            progress=progress, what="casting rays", threads=threads,
+        )
+    ]  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class _CastColors:
     """Casts the rays of a round of a view into survivors; any process can."""
 
     target: Target
-    views: Sequence[tuple[View, float]]
+    windows: Sequence[Window]
     truths: Sequence[Truth]
 
     def __call__(self, number: int) -> NDArray[np.float64]:
         """Return what the rays of a view see, (3, P)."""
-        view, truth = self.views[number][0], self.truths[number]
+        window, truth = self.windows[number], self.truths[number]
         with np.errstate(under="ignore"):
-            rays = cast(self.target.footprints(view), truth.columns, truth.rows)
-            return rays.colors(self.target.colors(rays.hit, view))
+            rays = cast(self.target.footprints(window), truth.columns, truth.rows)
+            return rays.colors(self.target.colors(rays.hit, window.view))
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,15 +369,15 @@ class _Linearize:
     """Casts the rays of a round of a view, and finds how their colours change; any process can."""
 
     target: Target
-    views: Sequence[tuple[View, float]]
+    windows: Sequence[Window]
     truths: Sequence[Truth]
     shapes: Shapes
 
     def __call__(self, number: int) -> LinearView:
         """Return how the colours of a view's rays change with the survivors."""
-        view, truth = self.views[number][0], self.truths[number]
+        window, truth = self.windows[number], self.truths[number]
         with np.errstate(under="ignore"):
-            footprints = self.target.footprints(view)
+            footprints = self.target.footprints(window)
             rays = cast(footprints, truth.columns, truth.rows)
-            colors = self.target.colors(rays.hit, view)
-            return linear_view(rays, footprints, colors, self.shapes, view)
+            colors = self.target.colors(rays.hit, window.view)
+            return linear_view(rays, footprints, colors, self.shapes, window.view)

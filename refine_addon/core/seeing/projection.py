@@ -253,11 +253,12 @@ _NOTHING = Footprints(
 
 
 def footprints_and_depths(
-    gaussians: Gaussians, scene: Scene, view: View
+    gaussians: Gaussians, scene: Scene, view: View, window: View | None = None
 ) -> tuple[Footprints, NDArray[np.float32]]:
     """Return the footprints of `project` in the order of the Gaussians, and their depths, (n,).
 
-    Depths are along the view's axis, in scene sizes.
+    Depths are along the view's axis, in scene sizes. If only those are wanted that may reach into a
+    part of the image, `window` is that part as a view of its own.
     """
     if not _computable(scene, view):
         return _joined([])
@@ -268,7 +269,9 @@ def footprints_and_depths(
         checkpoint()
         piece = slice(start, start + _CHUNK)
         local = _local(gaussians.means[:, piece], scene, view)  # (3, chunk)
-        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, planes))
+        touching = np.flatnonzero(
+            _touches(local, gaussians.largest[piece], (view, window or view), planes)
+        )
         if len(touching):
             local = np.take(local, touching, axis=1)  # (3, n), as all that follows
             shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)  # (6, n)
@@ -341,23 +344,27 @@ def _local(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.f
 def _touches(
     local: NDArray[np.float32],
     largest: NDArray[np.float32],
-    view: View,
+    views: tuple[View, View],
     planes: tuple[float, float],
 ) -> NDArray[np.bool_]:
     """Return which footprints may reach into the image, (M,); on the safe side.
 
-    It is `frustum.contains` with the image widened by how far each footprint reaches.
+    It is `frustum.contains` with the image widened by how far each footprint reaches. Of `views`,
+    the first is drawn, and the second is the part of it that counts; see `footprints_and_depths`.
     """
     x, y, z = local
     touching: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
-    for coordinate, side in zip((x, y), frustum.image_sides(view), strict=True):
-        margin = _margin(side) * largest  # (M,), px times depth
+    drawn, sides = map(frustum.image_sides, views)
+    for coordinate, whole, side in zip((x, y), drawn, sides, strict=True):
+        margin = _margin(whole) * largest  # (M,), px times depth
         pixels = side.half + CUT_SIGMAS * LOW_PASS**0.5
         touching &= np.abs(side.focal * coordinate + side.offset * z) <= pixels * z + margin
     return touching
 
 
-def boxes_touch(boxes: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.bool_]:
+def boxes_touch(
+    boxes: NDArray[np.float32], scene: Scene, view: View, window: View | None = None
+) -> NDArray[np.bool_]:
     """Return in which of B boxes a Gaussian may lie that reaches into the image of a view, (B,).
 
     Parameters
@@ -365,8 +372,8 @@ def boxes_touch(boxes: NDArray[np.float32], scene: Scene, view: View) -> NDArray
     boxes : (B, 7) float32
         Least and greatest coordinates of the means, and the longest standard deviation, in the
         scene's frame, in scene sizes.
-    scene, view
-        See `project`.
+    scene, view, window
+        See `footprints_and_depths`.
     """
     if not _computable(scene, view):
         return np.zeros(len(boxes), np.bool_)
@@ -377,8 +384,9 @@ def boxes_touch(boxes: NDArray[np.float32], scene: Scene, view: View) -> NDArray
     x, y, z = local.reshape(3, len(boxes), 8).astype(np.float64)
     slack = _SLACK * (1.0 + np.abs(local).max(axis=0).reshape(len(boxes), 8).max(axis=1))
     touching: NDArray[np.bool_] = (z.max(axis=1) + slack >= near) & (z.min(axis=1) - slack <= far)
-    for coordinate, side in zip((x, y), frustum.image_sides(view), strict=True):
-        margin = _margin(side) * (boxes[:, 6].astype(np.float64) + slack)
+    drawn, sides = map(frustum.image_sides, (view, window or view))
+    for coordinate, whole, side in zip((x, y), drawn, sides, strict=True):
+        margin = _margin(whole) * (boxes[:, 6].astype(np.float64) + slack)
         shown = (side.half + CUT_SIGMAS * LOW_PASS**0.5) * z
         across = side.focal * coordinate + side.offset * z
         for way in (1.0, -1.0):
