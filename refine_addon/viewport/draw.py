@@ -16,7 +16,7 @@ from .content import Content
 from .view import Camera, View
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
 MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
 """What can be drawn: nothing, all as it is, coloured by rank, what Apply leaves, what it takes."""
@@ -26,6 +26,10 @@ _TICK = 0.03
 
 _VIEWS = 16
 """Regions whose pictures are kept on the graphics card."""
+
+
+warned_by: list[Callable[[bpy.types.Context], Sequence[str]]] = []
+"""Who is asked, whenever a view is drawn, for warnings that are written into it."""
 
 
 class _State:
@@ -176,7 +180,8 @@ def _existing() -> set[tuple[int, int]]:
 
 
 def _draw_legend() -> None:
-    legend.draw(bpy.context, _state.mode, _state.content.marks())
+    warnings = [text for tell in warned_by for text in tell(bpy.context)]
+    legend.draw(bpy.context, _state.mode, _state.content.marks(), warnings)
 
 
 def _tick() -> float | None:
