@@ -204,7 +204,7 @@ def test_join_splats_keeps_what_is_seen_of_objects_that_stand_apart(addon, impor
     group = second.vertex_groups.new(name="mine")
     group.add([5, 7], 0.25, "REPLACE")
     mark = np.arange(9939) % 3 == 0
-    addon.mesh.edit.mark_protected(third, mark)
+    addon.mesh.edit.mark_by_hand(third, mark)
     child = bpy.data.objects.new("child", None)
     bpy.context.scene.collection.objects.link(child)
     child.parent = second
