@@ -19,7 +19,7 @@ from .content import Content
 from .view import Camera, View
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -37,6 +37,10 @@ _EDIT_REST = 0.3
 
 _VIEWS = 16
 """Regions whose pictures are kept on the graphics card."""
+
+
+warned_by: list[Callable[[bpy.types.Context], Sequence[str]]] = []
+"""Who is asked, whenever a view is drawn, for warnings that are written into it."""
 
 
 class _State:
@@ -208,7 +212,8 @@ def _draw() -> None:
 
 
 def _draw_legend() -> None:
-    legend.draw(bpy.context, _state.mode, _state.content.marks())
+    warnings = [text for tell in warned_by for text in tell(bpy.context)]
+    legend.draw(bpy.context, _state.mode, _state.content.marks(), warnings)
 
 
 def _tick() -> float | None:
