@@ -22,6 +22,7 @@ from ..core.survivors import survivor_columns
 from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.volumes import FREE, Forced
 from ..mesh import attributes as mesh_attributes
+from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
 from ..mesh import layout as mesh_layout
@@ -113,6 +114,15 @@ def modifier_notes(obj: bpy.types.Object) -> list[str]:
     return [note]
 
 
+def drift_notes(checked: SplatObject) -> list[str]:
+    """Return what others did to an object's splats, in sentences; see `mesh.drift`."""
+    drift = mesh_drift.found(checked.mesh)
+    if drift is None:
+        return []
+    remedy = "; Mend Splats in the panel puts that right" if drift.mendable else ""
+    return [f"object '{checked.obj.name}': {told}{remedy}" for told in drift.sentences()]
+
+
 def stored_task(
     checked: SplatObject,
     budget: Budget,
@@ -154,9 +164,9 @@ def stored_task(
         settings=settings,
         splats=None if views is None else gather(checked, whole=True),
         views=views,
-        scores=stored_scores(checked, forced.removed),
+        scores=stored_scores(checked, forced.out),
         protected=forced.protected,
-        removed=forced.removed,
+        forced_out=forced.out,
         survivors=survivors,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
@@ -237,6 +247,8 @@ def reduce_object(
     mesh_edit.delete_vertices(checked.obj, ~keep)
     columns = {name: values[keep] for name, values in columns.items()}
     mesh_attributes.write_columns(checked, columns)
+    if columns:
+        mesh_drift.renew(checked.mesh)
     mesh_floaters.forget(checked.mesh)
     if RECORD in checked.mesh:
         del checked.mesh[RECORD]

@@ -145,10 +145,10 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
         """Score, and count how many splats lie in each view."""
-        forced_out, means = job.forced.removed, job.splats.means
+        forced_out, means = job.forced.out, job.splats.means
         scores = pipeline.score(
             job.splats, job.views, job.settings,
-            protected=job.forced.protected, removed=forced_out,
+            protected=job.forced.protected, forced_out=forced_out,
             quality=job.quality, progress=part(progress, 0.0, _SCORED),
         )  # fmt: skip
         means = means if forced_out is None else means[~forced_out]
@@ -171,7 +171,8 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         plans.refresh(context)
         self.report({"INFO"}, _scored_in_words(group, scores, job.forced.counts()["forced"]))
         modifiers = [note for each in group for note in splat_object.modifier_notes(each.obj)]
-        for note in (*scoring_notes(scores), *modifiers):
+        drifts = [note for each in group for note in splat_object.drift_notes(each)]
+        for note in (*scoring_notes(scores), *modifiers, *drifts):
             self.report({"WARNING"}, note)
         return {"FINISHED"}
 
@@ -192,7 +193,7 @@ def _by_closed_form(job: _Scoring) -> Settings:
 
 def _sketch(job: _Scoring, progress: Progress) -> Scores:
     return pipeline.score(
-        job.splats, job.views, _by_closed_form(job), removed=job.forced.removed, progress=progress
+        job.splats, job.views, _by_closed_form(job), forced_out=job.forced.out, progress=progress
     )
 
 
@@ -265,6 +266,7 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
             splat_group.check_forced(context.scene, group, job.forced)
         decided = job.task.budget.needs_scores or not result.absorbed  # by the scores
         changed = _changes_since_scoring(context, group, job) if decided else []
+        drifts = [note for each in group for note in splat_object.drift_notes(each)]
         outcome = splat_group.apply(group, result)
         for member in group:
             plans.forget(member.mesh)
@@ -278,6 +280,8 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
             + sizes_in_words(outcome.bytes_before, "->", outcome.bytes_after)
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
+        for note in drifts:
+            self.report({"WARNING"}, note)
         if changed:
             self.report(
                 {"WARNING"},
@@ -334,7 +338,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         """Make the levels."""
         return lod(
             job.splats, job.views, job.levels, job.settings,
-            protected=job.forced.protected, removed=job.forced.removed, progress=progress,
+            protected=job.forced.protected, forced_out=job.forced.out, progress=progress,
         )  # fmt: skip
 
     def finish(

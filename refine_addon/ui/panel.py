@@ -16,7 +16,7 @@ from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
 from ..objects import demands, splat_group
 from ..viewport import draw as viewport_draw
-from . import camera_list, plans, preview, price, running, staleness, wrapped
+from . import camera_list, plans, preview, price, running, staleness, transforms, wrapped
 from .panel_cache import cached
 from .properties import FLOATERS
 from .view_operators import MODES
@@ -68,6 +68,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         layout.label(text=name, icon="OUTLINER_OB_POINTCLOUD")
         degree = max(mesh_layout.sh_degree(each.data) for each in objects)
         layout.label(text=f"{count:,} splats, SH degree {degree}")
+        transforms.draw(layout, context, objects)
         if several:
             wrapped.label(layout, context, "Scored and pruned as one scene", icon="INFO")
             return

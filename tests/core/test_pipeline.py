@@ -241,7 +241,7 @@ def in_doubles(splats: Splats, views: ViewSet) -> Scores:
         term = alpha * total * content
         values += share * term / term.mean()
     weighted = (means - middle) / squared[:, None]
-    axes = principal_axes(weighted.T @ (means - middle), weighted.sum(axis=0))
+    axes = principal_axes(np.vstack([weighted.T @ (means - middle), weighted.sum(axis=0)]))
     place = (means - middle) @ axes.T / size
     ball = place / (1 + np.linalg.norm(place, axis=1, keepdims=True))
     _, own = np.unique(np.floor((ball + 1) * 32).astype(int), axis=0, return_inverse=True)
@@ -628,7 +628,7 @@ def scored_for_all(request, small, views):
     splats = read_ply(small).splats()
     every = np.arange(len(splats))
     held = every % 2 == 0 if zoned.startswith("half") else every % 7 == 0
-    demands = {"protected": held, "removed": every % 11 == 0} if zoned else {}
+    demands = {"protected": held, "forced_out": every % 11 == 0} if zoned else {}
     task = Task(Budget(ratio=0.5), Settings(method, views=12), splats, views, **demands)
     return task, replace(task, scores=decide(replace(task, reusable=True)).scores), zoned
 

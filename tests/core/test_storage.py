@@ -44,7 +44,7 @@ def fsspec():
     memory.pseudo_dirs[:] = [""]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def views():
     """Give the room's cameras."""
     return read_cameras(ROOM / "cameras.json")

@@ -56,7 +56,7 @@ def rows():
     return rows
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def views():
     """Give the room's cameras."""
     return read_cameras(ROOM / "cameras.json")
@@ -402,4 +402,6 @@ def test_no_box_is_left_out_that_a_splat_reaches_from(seed):
     touching = projection.boxes_touch(np.array(boxes, np.float32), scene, view)
 
     for box, piece in zip(touching, pieces, strict=True):
-        assert box or not len(projection.reaching(gaussians.take(piece), scene, view)[1])
+        assert box or not len(
+            projection.footprints_and_depths(gaussians.take(piece), scene, view)[1]
+        )

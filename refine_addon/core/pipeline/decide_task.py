@@ -38,7 +38,7 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
     settings: Settings = DEFAULTS,
     *,
     protected: NDArray[np.bool_] | None = None,
-    removed: NDArray[np.bool_] | None = None,
+    forced_out: NDArray[np.bool_] | None = None,
     survivors: SurvivorChoice = "unchanged",
     row_bytes: RowBytes = 0.0,
     fixed_bytes: int = 0,
@@ -55,7 +55,7 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
         How much to remove.
     protected : (N,) bool, optional
         Splats that are neither removed nor changed.
-    removed : (N,) bool, optional
+    forced_out : (N,) bool, optional
         Splats that go in any case, unless they are protected; see `Task`.
     survivors : {"unchanged", "absorb", "refit"}
         What survivors may become; see `Task`.
@@ -77,7 +77,7 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
         splats=splats,
         views=views,
         protected=protected,
-        removed=removed,
+        forced_out=forced_out,
         survivors=survivors,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,

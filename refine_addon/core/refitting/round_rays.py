@@ -141,8 +141,10 @@ class InMemory:
 
     def footprints(self, window: Window) -> Footprints:
         """Return the footprints in a view that may reach into a window of it."""
-        pieces = [projection.reaching(self.gaussians, self.scene, window.view, window.part)]
-        return projection.front_to_back(pieces)
+        reaching = projection.footprints_and_depths(
+            self.gaussians, self.scene, window.view, window.part
+        )
+        return projection.front_to_back([reaching])
 
     def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float64]:
         """Return the colours in which a view sees some of the Gaussians, (3, u)."""

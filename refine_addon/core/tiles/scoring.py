@@ -161,4 +161,4 @@ def _turned(context: SceneContext, units: Sequence[Unit], runner: Runner) -> Sce
     for pieces in runner.run(context, steps, "reading"):
         for moments in pieces:  # one after the other, as in memory
             total += moments
-    return replace(context.scene, axes=principal_axes(total[:3], total[3]))
+    return replace(context.scene, axes=principal_axes(total))
