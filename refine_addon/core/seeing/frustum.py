@@ -211,11 +211,7 @@ class Frustums:
 
 
 def census(
-    points: NDArray[np.floating[Any]],
-    views: ViewSet,
-    *,
-    progress: Progress = silent,
-    threads: int | None = None,
+    points: NDArray[np.floating[Any]], views: ViewSet, *, progress: Progress = silent
 ) -> NDArray[np.int64]:
     """Return how many of N points lie in each of V views, (V,); those not finite lie in none.
 
@@ -227,7 +223,6 @@ def census(
         A view without a near plane of its own begins at its centre.
     progress : callable, optional
         ``progress(fraction, what)``; returning ``False`` cancels.
-    threads : int, optional
 
     Raises
     ------
@@ -248,9 +243,7 @@ def census(
             inside = between & (beyond <= 0.0)
         counts[piece.start // _POINTS] = np.count_nonzero(inside, axis=1)
 
-    for_chunks(
-        count_in_views, len(points), _POINTS, progress=progress, what="counting", threads=threads
-    )
+    for_chunks(count_in_views, len(points), _POINTS, progress=progress, what="counting")
     return np.asarray(counts.sum(axis=0))
 
 
