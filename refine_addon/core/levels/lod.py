@@ -268,8 +268,9 @@ def each_level(
     ----------
     scene : Task
         Splats, views, settings, what is protected and what goes; its budget does not matter.
-    levels, progress, threads
+    levels, progress
         See `lod`.
+    threads : int, optional
     """
     total, forced = len(scene.scene()[0]), scene.forced()
     scene = replace(scene, forced_out=None) if forced is None else scene.without(forced)
