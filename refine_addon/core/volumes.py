@@ -229,7 +229,10 @@ FREE = Forced()
 
 
 def forced(
-    zones: Sequence[Zone], means: NDArray[Any], protected: NDArray[np.bool_] | None = None
+    zones: Sequence[Zone],
+    means: NDArray[Any],
+    protected: NDArray[np.bool_] | None = None,
+    out: NDArray[np.bool_] | None = None,
 ) -> Forced:
     """Return what must stay and what must go by volumes.
 
@@ -238,8 +241,8 @@ def forced(
     zones : sequence of Zone
     means : (N, 3) floating
         Centres of the splats, in the frame of the volumes.
-    protected : (N,) bool, optional
-        Splats that stay for another reason.
+    protected, out : (N,) bool, optional
+        Splats that stay, and that go, for another reason.
 
     Returns
     -------
@@ -260,9 +263,11 @@ def forced(
             raise RefineError(msg)
         facts.append({"role": zone.role, "name": zone.name, "splats": count})
         masks[zone.role] = masks[zone.role] | inside if zone.role in masks else inside
-    out = masks.get("remove")
     if "keep" in masks:
-        out = ~masks["keep"] if out is None else out | ~masks["keep"]
+        masks["keep"] = ~masks["keep"]
+    for role in ("remove", "keep"):
+        if role in masks:
+            out = masks[role] if out is None else out | masks[role]
     if "protect" in masks:
         protected = masks["protect"] if protected is None else protected | masks["protect"]
     if out is not None:

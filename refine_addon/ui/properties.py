@@ -28,6 +28,7 @@ from ..mesh import floaters
 from ..mesh import layout as mesh_layout
 from ..mesh.edit import MARKING
 from . import plans
+from .select_panel import SelectSettings
 from .volumes import RefineVolume
 
 if TYPE_CHECKING:
@@ -206,7 +207,7 @@ def decimal(value: float) -> float:
     return float(str(np.float32(value)))
 
 
-class RefineSettings(bpy.types.PropertyGroup):
+class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     """Settings of the panel, at ``scene.refine``."""
 
     method: EnumProperty(name="Method", description="How splats are scored", items=METHODS)

@@ -145,7 +145,7 @@ class REFINE_OT_keep_unseen(AtOnce, OnSplats, bpy.types.Operator):
             mesh_edit.check_writable(member.obj)
         for member, unseen in zip(group, masks, strict=True):
             marked = mesh_edit.protected_mask(member.obj, "")
-            mesh_edit.mark_protected(member.obj, unseen if marked is None else unseen | marked)
+            mesh_edit.mark_by_hand(member.obj, unseen if marked is None else unseen | marked)
         plans.refresh(context)
         count = sum(int(np.count_nonzero(unseen)) for unseen in masks)
         self.report({"INFO"}, f"{count:,} splats that lie in no view stay")

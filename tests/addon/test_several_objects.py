@@ -41,9 +41,9 @@ def rows(addon, objects):
 @pytest.mark.parametrize(
     ("method", "survivors"),
     [
-        ("closed-form", False),
-        pytest.param("auto", False, marks=pytest.mark.slow),
-        pytest.param("closed-form", True, marks=pytest.mark.slow),
+        ("closed-form", "unchanged"),
+        pytest.param("auto", "unchanged", marks=pytest.mark.slow),
+        pytest.param("closed-form", "absorb", marks=pytest.mark.slow),
     ],
 )
 def test_both_halves_keep_what_the_whole_room_keeps(addon, halves, room_views, method, survivors):

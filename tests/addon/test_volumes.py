@@ -295,7 +295,7 @@ def test_without_a_selection_nothing_is_marked(addon, room, unchanged):  # noqa:
     """In one sentence, in both modes."""
     select(room, [])
     unchanged.start()
-    with pytest.raises(RuntimeError, match="no splat is selected; select some in edit mode"):
+    with pytest.raises(RuntimeError, match="no splat is selected; select some first"):
         bpy.ops.refine.protect(mode="ADD")
     unchanged()
     bpy.ops.object.mode_set(mode="EDIT")

@@ -291,3 +291,14 @@ def test_volumes_that_leave_nothing_are_refused():
     """An idle keep volume keeps nothing."""
     with pytest.raises(RefineError, match="all 10 splats lie where they must go"):
         forced([zone("keep", 20, 21, idle=True)], LINE)
+
+
+def test_splats_marked_to_go_go_with_those_of_volumes_but_not_the_protected():
+    """Of x = 0..5: 0 is marked, 4 and 5 lie in a box, 5 and 1 are protected: 0 and 4 go."""
+    means = np.stack([np.arange(6.0), np.zeros(6), np.zeros(6)], axis=1)
+    marked, protected = np.arange(6) == 0, np.isin(np.arange(6), [1, 5])
+    zone = Zone("remove", "box", Box((3.5, -1, -1), (9, 1, 1)))
+    found = forced([zone], means, protected, marked | (np.arange(6) == 1))
+
+    assert np.flatnonzero(found.out).tolist() == [0, 4]
+    assert forced([], means, None, marked).counts() == {"protected": 0, "forced": 1}
