@@ -8,13 +8,24 @@ from bpy.props import PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
-from .ui import camera_list, demand_changes, panel_cache, plans, price, running, transforms
+from .ui import (
+    camera_list,
+    demand_changes,
+    panel_cache,
+    plans,
+    price,
+    properties,
+    running,
+    select_tools,
+    transforms,
+)
 from .ui.camera_import import REFINE_FH_cameras, REFINE_OT_import_cameras
 from .ui.camera_list import REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
 from .ui.export_operators import REFINE_OT_export_ply
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_ply
+from .ui.instances import REFINE_OT_make_real, REFINE_PT_instances
 from .ui.operators import (
     REFINE_OT_apply,
     REFINE_OT_convert,
@@ -41,6 +52,15 @@ from .ui.remedies import (
     REFINE_OT_leave_out,
     REFINE_OT_turn_cameras,
 )
+from .ui.select_operators import (
+    REFINE_OT_delete_selected,
+    REFINE_OT_grow_selection,
+    REFINE_OT_select,
+    REFINE_OT_select_by,
+    REFINE_OT_separate_selected,
+)
+from .ui.select_panel import REFINE_PT_select
+from .ui.select_tools import REFINE_OT_brush_radius, REFINE_OT_select_stroke
 from .ui.transforms import REFINE_OT_bake_transform, REFINE_OT_join, REFINE_OT_mend
 from .ui.view_operators import REFINE_OT_preview, REFINE_OT_view
 from .ui.volumes import (
@@ -65,6 +85,14 @@ CLASSES = (
     REFINE_OT_add_volume,
     REFINE_OT_drop_volume,
     REFINE_OT_crop,
+    REFINE_OT_make_real,
+    REFINE_OT_select_stroke,
+    REFINE_OT_brush_radius,
+    REFINE_OT_select,
+    REFINE_OT_select_by,
+    REFINE_OT_grow_selection,
+    REFINE_OT_delete_selected,
+    REFINE_OT_separate_selected,
     REFINE_OT_score,
     REFINE_OT_apply,
     REFINE_OT_compare,
@@ -83,9 +111,11 @@ CLASSES = (
     REFINE_FH_ply,
     REFINE_FH_cameras,
     REFINE_PT_splats,
+    REFINE_PT_instances,
     REFINE_PT_cameras,
     REFINE_UL_cameras,
     REFINE_PT_camera_list,
+    REFINE_PT_select,
     REFINE_PT_floaters,
     REFINE_PT_volumes,
     REFINE_PT_score,
@@ -109,12 +139,14 @@ def register() -> None:
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
     camera_list.register()
     panel_cache.register()
+    properties.register()
     demand_changes.register()
     price.register()
     plans.register()
     draw.register()
     running.register()
     transforms.register()
+    select_tools.register()
     images.use(BlenderImages())
     _commands.append(bpy.utils.register_cli_command("refine", _run_command))
 
@@ -125,10 +157,12 @@ def unregister() -> None:
     bpy.utils.unregister_cli_command(_commands.pop())
     images.use(None)
     transforms.unregister()
+    select_tools.unregister()
     running.unregister()
     plans.unregister()
     price.unregister()
     demand_changes.unregister()
+    properties.unregister()
     panel_cache.unregister()
     camera_list.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)

@@ -89,6 +89,22 @@ class Settings:
 DEFAULTS = Settings()
 
 
+def may_absorb(survivors: SurvivorChoice, settings: Settings, budget: Budget) -> bool:
+    """Return whether survivors may absorb others.
+
+    By default they may not where the method or the budget says how to delete.
+
+    Parameters
+    ----------
+    survivors : {"auto", "unchanged", "absorb", "refit"}
+    settings : Settings
+    budget : Budget
+    """
+    if survivors == "auto":
+        return settings.method == DEFAULTS.method and not budget.needs_scores
+    return survivors != "unchanged"
+
+
 @dataclass(frozen=True, eq=False)
 class Origin:
     """The splats that those of a task became of, by absorbing and refitting.
@@ -126,14 +142,14 @@ class Task:
         Known scores of the splats; None computes them.
     protected : (N,) bool or None
         Splats that are neither removed nor changed.
-    removed : (N,) bool or None
+    forced_out : (N,) bool or None
         Splats that go before all others, whatever they are worth, and count as removed; those that
         are protected stay. The rest is scored without them, and is what the pictures of a PSNR are
         compared with; nothing absorbs them.
-    survivors : {"unchanged", "absorb", "refit"}
-        What survivors may become. If they absorb others, the budget only decides how many survive;
-        which ones, and their new values, come from merging, whatever the method. See
-        `survivor_choice.SURVIVORS`.
+    survivors : {"auto", "unchanged", "absorb", "refit"}
+        What survivors may become, see `survivor_choice`. If they absorb others, the budget only
+        decides how many survive; which ones, and their new values, come from merging, whatever the
+        method. By default they absorb, but stay unchanged where that is as good.
     row_bytes, fixed_bytes : float or (N,) int64, int
         See `Budget.removals`.
     origin : Origin or None
@@ -149,8 +165,8 @@ class Task:
     views: ViewSet | None = None
     scores: Scores | None = None
     protected: NDArray[np.bool_] | None = None
-    removed: NDArray[np.bool_] | None = None
-    survivors: SurvivorChoice = "unchanged"
+    forced_out: NDArray[np.bool_] | None = None
+    survivors: SurvivorChoice = "auto"
     row_bytes: RowBytes = 0.0
     fixed_bytes: int = 0
     origin: Origin | None = None
@@ -168,8 +184,10 @@ class Task:
 
     @property
     def absorb(self) -> bool:
-        """Whether survivors absorb the splats that are removed."""
-        return self.survivors != "unchanged"
+        """Whether survivors may absorb the splats that are removed."""
+        if self.survivors == "auto" and self.splats is None:  # only their scores are known
+            return False
+        return may_absorb(self.survivors, self.settings, self.budget)
 
     def scene(self) -> tuple[Splats, ViewSet]:
         """Return splats and views.
@@ -186,10 +204,10 @@ class Task:
 
     def forced(self) -> NDArray[np.bool_] | None:
         """Return which splats go before all others, (N,); None where there are none."""
-        removed = self.removed
-        if removed is not None and self.protected is not None:
-            removed = removed & ~self.protected
-        return None if removed is None or not removed.any() else removed
+        out = self.forced_out
+        if out is not None and self.protected is not None:
+            out = out & ~self.protected
+        return None if out is None or not out.any() else out
 
     def without(self, forced: NDArray[np.bool_]) -> Task:
         """Return the task for what is left when some splats, (N,), have gone.
@@ -207,7 +225,7 @@ class Task:
             splats=None if self.splats is None else self.splats.take(rest),
             scores=None if self.scores is None else self.scores.of(rest),
             protected=None if self.protected is None else self.protected[rest],
-            removed=None,
+            forced_out=None,
             row_bytes=rows[rest] if isinstance(rows, np.ndarray) else rows,
         )
 

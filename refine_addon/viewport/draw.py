@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import time
 import traceback
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -10,13 +12,16 @@ import bpy
 import numpy as np
 from bpy.app.handlers import persistent
 
+from ..core.errors import RefineError
 from ..mesh.layout import looks_like_splats, splat_count
-from . import background, legend, points, shader
+from . import background, legend, outlines, placing, points, shader, veils
 from .content import Content
 from .view import Camera, View
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
 
 MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
 """What can be drawn: nothing, all as it is, coloured by rank, what Apply leaves, what it takes."""
@@ -27,8 +32,15 @@ SHOWN = "refine_shown"
 _TICK = 0.03
 """Seconds between two looks at whether the thread has sorted more splats."""
 
+_EDIT_REST = 0.3
+"""Seconds without a change in edit mode after which the splats are drawn as they are by then."""
+
 _VIEWS = 16
 """Regions whose pictures are kept on the graphics card."""
+
+
+warned_by: list[Callable[[bpy.types.Context], Sequence[str]]] = []
+"""Who is asked, whenever a view is drawn, for warnings that are written into it."""
 
 
 class _State:
@@ -40,6 +52,9 @@ class _State:
         self.content = Content()
         self.views: dict[int, View] = {}
         self.handles: list[Any] = []
+        self.edited_at = 0.0
+        self.reads = False
+        self.updates = 0
 
 
 _state = _State()
@@ -66,6 +81,13 @@ def drawn(region: bpy.types.Region) -> int:
     return view.count if view else 0
 
 
+def select(mesh: int, chosen: NDArray[np.bool_]) -> None:
+    """Show splats of a mesh, (N,), as selected while a tool selects them; nothing is stored."""
+    if _state.mode != "OFF":
+        _state.content.select(mesh, chosen)
+        _redraw()
+
+
 def show(wanted: str) -> None:
     """Draw splats in all 3D views, or stop it."""
     if wanted == "OFF":
@@ -88,6 +110,7 @@ def stop() -> None:
     background.stop()
     _forget()
     shader.forget()
+    veils.forget()
     points.show()
     _redraw()
 
@@ -139,8 +162,9 @@ def _unhook() -> None:
             listening = getattr(bpy.app.handlers, name)
             if handler in listening:
                 listening.remove(handler)
-    if bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.unregister(_tick)
+    for timer in (_tick, _read_edited):
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)
 
 
 def _guarded(work: Callable[[], None]) -> None:
@@ -159,9 +183,9 @@ def _guarded(work: Callable[[], None]) -> None:
 def _draw() -> None:
     context = bpy.context
     region, region_3d, space = context.region, context.region_data, context.space_data
-    objects = [obj for obj in context.view_layer.objects if _is_drawn(obj, space)]
+    visible = [obj for obj in context.view_layer.objects if obj.visible_get(viewport=space)]
     refused = len(_state.content.refused)
-    placed = _state.content.update(objects, _existing)
+    placed = _state.content.update(placing.placings(visible), placing.every)
     if len(_state.content.refused) > refused:  # Blender shows these as it did before
         bpy.app.timers.register(_hide_points, first_interval=0.0)
     key = region.as_pointer()
@@ -174,25 +198,22 @@ def _draw() -> None:
         np.array(region_3d.window_matrix, np.float64),
         (region.width, region.height),
     )
-    solid = any(obj not in objects for obj in context.visible_objects)
-    view.draw(_state.content, placed, camera, _state.mode, solid=solid)
+    solid = not all(looks_like_splats(obj) for obj in context.visible_objects)
+    meshes = veils.seen_through(context.visible_objects, space.shading)
+    layer = None
+    if meshes:
+        matrices = camera.view, camera.projection
+        work = partial(veils.draw, meshes, context.evaluated_depsgraph_get(), matrices, camera.size)
+        layer = (_state.updates, repr(meshes)), work
+    view.draw(_state.content, placed, camera, _state.mode, solid=solid, veils=layer)
+    outlines.draw(context)
     if view.waits() and not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=_TICK)
 
 
-def _is_drawn(obj: bpy.types.Object, space: bpy.types.SpaceView3D) -> bool:
-    if not looks_like_splats(obj) or points.is_edited(obj) or not splat_count(obj.data):
-        return False
-    return obj.visible_get(viewport=space)
-
-
-def _existing() -> set[tuple[int, int]]:
-    splats = (obj for obj in bpy.data.objects if looks_like_splats(obj))
-    return {(obj.session_uid, obj.data.session_uid) for obj in splats}
-
-
 def _draw_legend() -> None:
-    legend.draw(bpy.context, _state.mode, _state.content.marks())
+    warnings = [text for tell in warned_by for text in tell(bpy.context)]
+    legend.draw(bpy.context, _state.mode, _state.content.marks(), warnings)
 
 
 def _tick() -> float | None:
@@ -205,6 +226,24 @@ def _tick() -> float | None:
         if view is None or ready or view.due():
             region.tag_redraw()
     return None if complete() else _TICK
+
+
+def _read_edited() -> float | None:
+    """Read the objects in edit mode once nothing has changed there for a moment."""
+    waits = _EDIT_REST - (time.monotonic() - _state.edited_at)
+    if waits > 0.0:
+        return waits
+    layers = [window.view_layer for window in bpy.context.window_manager.windows]
+    _state.reads = True  # which counts as a change of its own
+    for obj in {obj for layer in layers for obj in layer.objects}:
+        if points.is_edited(obj) and looks_like_splats(obj) and splat_count(obj.data):
+            with contextlib.suppress(RefineError):
+                _state.content.read_edited(obj)
+    for layer in layers:
+        layer.update()
+    _state.reads = False
+    _redraw()
+    return None
 
 
 def _redraw() -> None:
@@ -252,11 +291,16 @@ def _opened(*_: object) -> None:
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     if depsgraph is None:
         return
+    _state.updates += 1
     for update in depsgraph.updates:
         if update.is_updated_geometry:
             data = getattr(update.id.original, "data", update.id.original)
             if isinstance(data, (bpy.types.Mesh, bpy.types.PointCloud)):
                 _state.content.has_changed(data.session_uid)
+                if getattr(data, "is_editmode", False) and not _state.reads:
+                    _state.edited_at = time.monotonic()
+                    if not bpy.app.timers.is_registered(_read_edited):
+                        bpy.app.timers.register(_read_edited, first_interval=_EDIT_REST)
     points.hide(depsgraph, _state.content.refused)
 
 

@@ -24,13 +24,18 @@ class Layout:
 
     column = row
 
-    def panel(self, _name):
+    def grid_flow(self, **_options):
+        """Return itself."""
+        return self
+
+    def panel(self, _name, **_options):
         """Return itself as the header and the body of a part that is open."""
         return self, self
 
     def operator(self, name, **_options):
         """Note a button, and return something to set its properties on."""
-        assert bpy.ops.refine.__getattr__(name.split(".")[1]).get_rna_type()
+        room, _, operator = name.partition(".")
+        assert getattr(getattr(bpy.ops, room), operator).get_rna_type()
         self.drawn.append(name)
         return SimpleNamespace()
 

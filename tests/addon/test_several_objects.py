@@ -41,9 +41,9 @@ def rows(addon, objects):
 @pytest.mark.parametrize(
     ("method", "survivors"),
     [
-        ("closed-form", False),
-        pytest.param("auto", False, marks=pytest.mark.slow),
-        pytest.param("closed-form", True, marks=pytest.mark.slow),
+        ("closed-form", "unchanged"),
+        pytest.param("auto", "unchanged", marks=pytest.mark.slow),
+        pytest.param("closed-form", "absorb", marks=pytest.mark.slow),
     ],
 )
 def test_both_halves_keep_what_the_whole_room_keeps(addon, halves, room_views, method, survivors):
@@ -108,14 +108,14 @@ def test_marks_and_sentence_are_those_of_the_selection(addon, halves):
         ]
 
     assert sum(marked()) == 19_877
-    assert "of 39,755" in plans.sentence(plans.stored(halves[1], settings), survivors="unchanged")
+    assert "of 39,755" in plans.sentence(plans.stored(halves[1], settings))
 
     halves[0].select_set(False)
     assert plans.stored(halves[1], settings) is None  # of both, not of this one
     plans.refresh(bpy.context)
 
     assert marked()[1] == 9_877
-    assert "of 19,755" in plans.sentence(plans.stored(halves[1], settings), survivors="unchanged")
+    assert "of 19,755" in plans.sentence(plans.stored(halves[1], settings))
 
 
 def test_the_curve_is_that_of_all_and_of_no_part(addon, halves):
