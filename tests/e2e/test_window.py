@@ -111,7 +111,7 @@ def test_apply_is_adjusted_as_the_last_operation(binary: Binary, blend: Path):
         "again": 39_755 - 23_853,
     }
     assert found["less"]["panel"][:2] == ["ratio", 30.0]
-    assert found["absorbed"]["panel"] == ["keep", 30.0, 4000, True]
+    assert found["absorbed"]["panel"] == ["keep", 30.0, 4000, "absorb"]
     assert {told["last"] for told in found.values()} == {"REFINE_OT_apply"}
 
 
