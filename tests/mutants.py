@@ -27,8 +27,8 @@ PROJECT = Path(__file__).resolve().parent.parent
 ROOT_FILES = ("pyproject.toml", "blender_manifest.toml", "Makefile", "README.md", "CONTRIBUTING.md")
 """What tests read in the project's folder; without one of them they would fail by themselves."""
 
-SECONDS = 900
-"""A fault that makes the tests take longer is caught: something hangs."""
+SECONDS, SECONDS_ALONE = 900, 120
+"""A fault that makes a stage, or a single test, take longer is caught: something hangs."""
 
 
 class Fault(NamedTuple):
@@ -135,12 +135,13 @@ def _stages(test: str = "") -> list[list[str]]:
 def _caught(copy: Path, stage: list[str]) -> str:
     """Return the first of some tests that fails in a copy of the project, or ""."""
     tests = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *stage]
+    limit = SECONDS_ALONE if len(stage) == 1 and "::" in stage[0] else SECONDS
     try:
         done = subprocess.run(
-            tests, cwd=copy, capture_output=True, text=True, check=False, timeout=SECONDS
+            tests, cwd=copy, capture_output=True, text=True, check=False, timeout=limit
         )
     except subprocess.TimeoutExpired:
-        return f"more than {SECONDS} s"
+        return f"{stage[0]}: more than {limit} s"
     if done.returncode == 0:
         return ""
     if "error" in done.stdout.splitlines()[-1]:

@@ -142,7 +142,7 @@ class Task:
         Known scores of the splats; None computes them.
     protected : (N,) bool or None
         Splats that are neither removed nor changed.
-    removed : (N,) bool or None
+    forced_out : (N,) bool or None
         Splats that go before all others, whatever they are worth, and count as removed; those that
         are protected stay. The rest is scored without them, and is what the pictures of a PSNR are
         compared with; nothing absorbs them.
@@ -165,7 +165,7 @@ class Task:
     views: ViewSet | None = None
     scores: Scores | None = None
     protected: NDArray[np.bool_] | None = None
-    removed: NDArray[np.bool_] | None = None
+    forced_out: NDArray[np.bool_] | None = None
     survivors: SurvivorChoice = "auto"
     row_bytes: RowBytes = 0.0
     fixed_bytes: int = 0
@@ -204,10 +204,10 @@ class Task:
 
     def forced(self) -> NDArray[np.bool_] | None:
         """Return which splats go before all others, (N,); None where there are none."""
-        removed = self.removed
-        if removed is not None and self.protected is not None:
-            removed = removed & ~self.protected
-        return None if removed is None or not removed.any() else removed
+        out = self.forced_out
+        if out is not None and self.protected is not None:
+            out = out & ~self.protected
+        return None if out is None or not out.any() else out
 
     def without(self, forced: NDArray[np.bool_]) -> Task:
         """Return the task for what is left when some splats, (N,), have gone.
@@ -225,7 +225,7 @@ class Task:
             splats=None if self.splats is None else self.splats.take(rest),
             scores=None if self.scores is None else self.scores.of(rest),
             protected=None if self.protected is None else self.protected[rest],
-            removed=None,
+            forced_out=None,
             row_bytes=rows[rest] if isinstance(rows, np.ndarray) else rows,
         )
 

@@ -72,7 +72,7 @@ def mesh_from_file(source: SplatFile, name: str = "") -> bpy.types.Mesh:
     rows = source.rows
     mesh = bpy.data.meshes.new(name or source.path.stem)
     try:
-        mesh.vertices.add(len(rows))
+        add_vertices(mesh, len(rows))
         columns = add_attributes(mesh, rows.dtype, source.header)
         _fill(mesh, rows, columns)
         mesh.update()
@@ -80,6 +80,12 @@ def mesh_from_file(source: SplatFile, name: str = "") -> bpy.types.Mesh:
         bpy.data.meshes.remove(mesh)
         raise
     return mesh
+
+
+def add_vertices(mesh: bpy.types.Mesh, count: int) -> None:
+    """Add vertices to a mesh that has none, not selected as Blender would have them."""
+    mesh.vertices.add(count)
+    remove_attribute(mesh, ".select_vert")
 
 
 def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:

@@ -133,7 +133,7 @@ def _new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
 def _mesh_of(checked: SplatObject) -> bpy.types.Mesh:
     """Return a new mesh with the attributes of a file of splats, to be filled."""
     mesh = bpy.data.meshes.new(checked.mesh.name)
-    mesh.vertices.add(len(checked))
+    mesh_attributes.add_vertices(mesh, len(checked))
     for column in _moved(checked):
         if column.name not in ("x", "y", "z"):
             mesh.attributes.new(column.name, STORAGE[column.dtype[1:]], "POINT")

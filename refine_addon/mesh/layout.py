@@ -86,7 +86,8 @@ _TAKEN = {
     *("position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"),
     *("refine_score", "refine_rank", "refine_seen", "refine_scored"),
     *("refine_heat", "refine_color", "refine_remove"),
-    *("refine_protect", "refine_force", "refine_floats", "refine_home", "refine_shape"),
+    *("refine_protect", "refine_must_go", "refine_force", "refine_floats"),
+    *("refine_home", "refine_shape"),
 }
 
 

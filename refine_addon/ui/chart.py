@@ -64,6 +64,7 @@ class Look:
         else:
             blue, orange, green, red, grey = 0x005A9C, 0xA85400, 0x00704F, 0xB5300F, 0x6A6A6A
         named = {"unchanged": blue, "absorb": orange, "refit": green, "goes": red, "stays": grey}
+        named["in range"] = blue
         return {name: _rgb(value) for name, value in named.items()}
 
 
@@ -81,12 +82,15 @@ class Histogram:
         Places along the axis, 0 to 1, and what stands there.
     name : str
         What the splats are sorted by.
+    parts : (str, str)
+        What the two parts of each bar are, by their names in `Look.colors`: the lower one first.
     """
 
     bins: NDArray[np.uint8]
     total: NDArray[np.int64]
     ticks: tuple[tuple[float, str], ...]
     name: str
+    parts: tuple[str, str] = ("goes", "stays")
 
     def going(self, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Return how many splats of each bar do not stay, (B,), for `keep`, (N,)."""
@@ -163,7 +167,7 @@ class Chart:
             self._low = max(np.floor(least / _STEP) * _STEP, 0.0)
             self._draw_curves(quality)
         self._draw_axis(histogram.ticks, _BOTTOM)
-        self._legend(("goes", "stays"), self._upper - 13, f"splats by {histogram.name}")
+        self._legend(histogram.parts, self._upper - 13, f"splats by {histogram.name}")
         self._barred = self._still
         self._bytes = self._still.bytes()
 

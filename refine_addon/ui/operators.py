@@ -152,10 +152,10 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> _Scored:
         """Score, and count how many splats lie in each view."""
-        forced_out, means, start = job.forced.removed, job.splats.means, time.perf_counter()
+        forced_out, means, start = job.forced.out, job.splats.means, time.perf_counter()
         scores = pipeline.score(
             job.splats, job.views, job.settings,
-            protected=job.forced.protected, removed=forced_out,
+            protected=job.forced.protected, forced_out=forced_out,
             quality=job.quality, progress=part(progress, 0.0, _SCORED),
         )  # fmt: skip
         seconds = time.perf_counter() - start
@@ -204,7 +204,7 @@ def _by_closed_form(job: _Scoring) -> Settings:
 
 def _sketch(job: _Scoring, progress: Progress) -> Scores:
     return pipeline.score(
-        job.splats, job.views, _by_closed_form(job), removed=job.forced.removed, progress=progress
+        job.splats, job.views, _by_closed_form(job), forced_out=job.forced.out, progress=progress
     )
 
 
@@ -350,7 +350,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         """Make the levels."""
         return lod(
             job.splats, job.views, job.levels, job.settings,
-            protected=job.forced.protected, removed=job.forced.removed, progress=progress,
+            protected=job.forced.protected, forced_out=job.forced.out, progress=progress,
         )  # fmt: skip
 
     def finish(

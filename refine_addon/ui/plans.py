@@ -351,7 +351,7 @@ def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
         plan = _noted(known, settings) | depends
         keep = pipeline.decide(task).keep
         splat_group.mark_removed(group, keep)
-        keep = keep if task.removed is None else keep[~task.removed]
+        keep = keep if task.forced_out is None else keep[~task.forced_out]
         plan["unseen_gone"] = int(np.count_nonzero(~keep & (known.tally.scores.seen == 0)))
         price.show(mesh, known.tally.scores, known.kinds, _place(plan), keep)
         _tell_cameras(known.tally.scores, plan)

@@ -29,6 +29,7 @@ from ..mesh import floaters
 from ..mesh import layout as mesh_layout
 from ..mesh.edit import MARKING
 from . import plans
+from .select_panel import SelectSettings
 from .volumes import RefineVolume
 
 if TYPE_CHECKING:
@@ -243,7 +244,7 @@ def unregister() -> None:
     bpy.app.handlers.load_post.remove(_loaded)
 
 
-class RefineSettings(bpy.types.PropertyGroup):
+class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     """Settings of the panel, at ``scene.refine``."""
 
     method: EnumProperty(name="Method", description="How splats are scored", items=METHODS)

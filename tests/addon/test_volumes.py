@@ -147,7 +147,7 @@ def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp
     by_api = core.prune(
         addon.objects.splat_object.gather(addon.mesh.layout.check(quarter), whole=True), views,
         core.Budget(ratio=0.8), core.Settings("closed-form", 8),
-        protected=protected, removed=removed, survivors=survivors,
+        protected=protected, forced_out=removed, survivors=survivors,
     )  # fmt: skip
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
@@ -295,7 +295,7 @@ def test_without_a_selection_nothing_is_marked(addon, room, unchanged):  # noqa:
     """In one sentence, in both modes."""
     select(room, [])
     unchanged.start()
-    with pytest.raises(RuntimeError, match="no splat is selected; select some in edit mode"):
+    with pytest.raises(RuntimeError, match="no splat is selected; select some first"):
         bpy.ops.refine.protect(mode="ADD")
     unchanged()
     bpy.ops.object.mode_set(mode="EDIT")
@@ -515,7 +515,7 @@ def test_levels_and_floaters_leave_out_what_must_go(addon, core, room, quarter, 
     expected = core.clean(
         addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         addon.ui.operators.chosen_views(bpy.context), core.Cleaning(views=8),
-        protected=protected, removed=removed,
+        protected=protected, forced_out=removed,
     )  # fmt: skip
     bpy.ops.refine.find_floaters()
     found = mask(addon, room, "refine_floats") > 0
@@ -565,8 +565,8 @@ def test_a_volume_that_was_deleted_counts_no_more(addon, room):
         collection.objects.unlink(box)
     after = addon.objects.demands.Demands.of_scene(bpy.context.scene).forced(checked)
 
-    assert before.removed.any()
-    assert after.removed is None
+    assert before.out.any()
+    assert after.out is None
 
 
 def test_selected_objects_become_volumes(addon, room):

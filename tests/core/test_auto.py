@@ -90,8 +90,8 @@ def test_the_report_says_what_was_expected_and_chosen(scene):
     report = prune(*scene, Budget(ratio=0.5), settings, survivors="unchanged").report
 
     facts = json.loads(json.dumps(report, allow_nan=False))["weights"]["auto"]
-    assert set(facts) == {"views", "loss", "tolerance", "judged"}
-    assert list(facts["judged"]) == ["8 views", "10 views"]
+    assert set(facts) == {"views", "loss", "tolerance", "expected"}
+    assert list(facts["expected"]) == ["8 views", "10 views"]
     assert report["views"] == {"given": 16, "used": 10}
     assert 0.0 <= facts["loss"] <= facts["tolerance"] == 30.0
 
@@ -238,6 +238,6 @@ def test_scores_depend_on_no_order_of_views(scene):
 
     here, there = (auto.score(splats, some, 0.5, COARSE) for some in (views, backwards))
 
-    assert here.facts["auto"]["judged"] == there.facts["auto"]["judged"]
+    assert here.facts["auto"]["expected"] == there.facts["auto"]["expected"]
     np.testing.assert_array_equal(here.values, there.values)
     assert isinstance(here, Scores)

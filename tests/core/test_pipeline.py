@@ -627,7 +627,7 @@ def scored_for_all(request, small, views):
     splats = read_ply(small).splats()
     every = np.arange(len(splats))
     held = every % 2 == 0 if zoned.startswith("half") else every % 7 == 0
-    demands = {"protected": held, "removed": every % 11 == 0} if zoned else {}
+    demands = {"protected": held, "forced_out": every % 11 == 0} if zoned else {}
     settings = Settings(method, views=12)
     task = Task(Budget(ratio=0.5), settings, splats, views, survivors="unchanged", **demands)
     return task, replace(task, scores=decide(replace(task, reusable=True)).scores), zoned

@@ -113,8 +113,8 @@ class Quality:
         odds, place = self._odds(), _log_odds(share)
         gain = self.at(share, survivors) - self.at(share)
         return {
-            name: min(float(np.interp(place, odds, _begun(own))) + gain, PSNR_CAP)
-            for name, own in self.views.items()
+            name: min(float(np.interp(place, odds, _with_start(psnr))) + gain, PSNR_CAP)
+            for name, psnr in self.views.items()
         }
 
     def share(self, psnr: float, survivors: Became = "unchanged") -> float:
@@ -135,9 +135,9 @@ class Quality:
     def _curve(self, survivors: Became) -> NDArray[np.float64]:
         """Return the PSNR with its beginning, where nothing is removed."""
         if survivors == "unchanged":
-            return _begun(self.psnr)
+            return _with_start(self.psnr)
         gain = REFITTED if survivors == "refit" else 0.0
-        return _begun(np.minimum(self.absorbed + gain, PSNR_CAP))
+        return _with_start(np.minimum(self.absorbed + gain, PSNR_CAP))
 
     def _odds(self) -> NDArray[np.float64]:
         return np.array([_log_odds(share) for share in (0.0, *self.shares.tolist())])
@@ -154,7 +154,7 @@ class Quality:
             "psnr": self.psnr.tolist(),
             "absorbed": self.absorbed.tolist(),
             "foretold": self.foretold,
-            "views": {name: own.round(2).tolist() for name, own in self.views.items()},
+            "views": {name: psnr.round(2).tolist() for name, psnr in self.views.items()},
         }
 
     @classmethod
@@ -164,7 +164,7 @@ class Quality:
         try:
             shares, psnr, absorbed = (np.array((facts or {})[name], np.float64) for name in names)
             single = dict((facts or {}).get("views") or {})  # files of older versions have none
-            views = {str(name): np.array(own, np.float64) for name, own in single.items()}
+            views = {str(name): np.array(values, np.float64) for name, values in single.items()}
         except (AttributeError, KeyError, TypeError, ValueError):
             return None
         curves: Sequence[NDArray[np.float64]] = (shares, psnr, absorbed, *views.values())
@@ -323,7 +323,7 @@ def in_words(psnr: float) -> str:
     return f"more than {UNSEEN:.0f} dB" if psnr > UNSEEN else f"about {psnr:.0f} dB"
 
 
-def _begun(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _with_start(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a curve with its beginning, where nothing is removed."""
     return np.concatenate([[PSNR_CAP], values])
 

@@ -213,7 +213,7 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     settings: Settings = DEFAULTS,
     *,
     protected: NDArray[np.bool_] | None = None,
-    removed: NDArray[np.bool_] | None = None,
+    forced_out: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> list[Level]:
@@ -230,7 +230,7 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
         occlusion count.
     protected : (N,) bool, optional
         Splats that are in all levels, unchanged.
-    removed : (N,) bool, optional
+    forced_out : (N,) bool, optional
         Splats that are in no level, unless they are protected. They count as removed, and levels
         are compared with the pictures of the others.
     progress : callable, optional
@@ -255,7 +255,9 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
         level = lod(file.splats(), views, Levels((0.5, 0.25)))[1]
         file.write("out.ply", level.keep, columns=survivor_columns(file.rows, level.absorbed))
     """
-    scene = Task(Budget(ratio=0.0), settings, splats, views, protected=protected, removed=removed)
+    scene = Task(
+        Budget(ratio=0.0), settings, splats, views, protected=protected, forced_out=forced_out
+    )
     return list(each_level(scene, levels, progress=progress, threads=threads))
 
 
@@ -272,7 +274,7 @@ def each_level(
         See `lod`.
     """
     total, forced = len(scene.scene()[0]), scene.forced()
-    scene = replace(scene, removed=None) if forced is None else scene.without(forced)
+    scene = replace(scene, forced_out=None) if forced is None else scene.without(forced)
     original = OriginalPictures(
         *scene.scene(), progress=part(progress, 0.0, COMPARING), threads=threads
     )

@@ -111,8 +111,8 @@ class Loaded:
 
         If survivors change, each may become as long as the longest row of text can.
         """
-        removed, sizes = self.forced.removed, self.sizes
-        rest = np.ones(len(self.splats), np.bool_) if removed is None else ~removed
+        out, sizes = self.forced.out, self.sizes
+        rest = np.ones(len(self.splats), np.bool_) if out is None else ~out
         count = int(np.count_nonzero(rest))
         if not changed or budget.removals(count, sizes.take(rest).row, sizes.fixed) == 0:
             return self

@@ -128,7 +128,7 @@ class PruneRequest(Request["Loaded", "Result"]):
         forced = loaded.forced
         cleaned = _cleaned(loaded, self.views, self.cleaning, runtime.part(0.0, CLEANED))
         # The budget counts what is forced out as removed, so that is not cleaned away.
-        left = cleaned.keep if forced.removed is None else cleaned.keep | forced.removed
+        left = cleaned.keep if forced.out is None else cleaned.keep | forced.out
         result = self._decide(loaded.take(left), runtime.part(CLEANED, DECIDED)).for_all(left)
         result.report["cleaned"] = cleaned.facts()
         return result
@@ -141,7 +141,7 @@ class PruneRequest(Request["Loaded", "Result"]):
             splats=loaded.splats,
             views=self.views,
             protected=loaded.forced.protected,
-            removed=loaded.forced.removed,
+            forced_out=loaded.forced.out,
             survivors=self.survivors,
             row_bytes=loaded.sizes.row,
             fixed_bytes=loaded.sizes.fixed,
@@ -193,7 +193,7 @@ def _cleaned(loaded: Loaded, views: ViewSet, cleaning: Cleaning, runtime: Runtim
     """Clean what was loaded, but for what must stay and what must go."""
     cleaned = clean(
         loaded.splats, views, cleaning,
-        protected=loaded.forced.protected, removed=loaded.forced.removed,
+        protected=loaded.forced.protected, forced_out=loaded.forced.out,
         progress=runtime.progress, threads=runtime.threads,
     )  # fmt: skip
     runtime.clock.lap("clean_s")
@@ -290,7 +290,7 @@ class ScoreRequest(Request["Loaded", Kept]):
         forced = loaded.forced
         scores = score(
             loaded.splats, self.views, self.settings,
-            protected=forced.protected, removed=forced.removed,
+            protected=forced.protected, forced_out=forced.out,
             progress=runtime.part(0.0, DECIDED).progress, threads=runtime.threads,
         )  # fmt: skip
         runtime.clock.lap("score_s")

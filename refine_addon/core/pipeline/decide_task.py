@@ -43,7 +43,7 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
     settings: Settings = DEFAULTS,
     *,
     protected: NDArray[np.bool_] | None = None,
-    removed: NDArray[np.bool_] | None = None,
+    forced_out: NDArray[np.bool_] | None = None,
     survivors: SurvivorChoice = "auto",
     row_bytes: RowBytes = 0.0,
     fixed_bytes: int = 0,
@@ -60,7 +60,7 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
         How much to remove.
     protected : (N,) bool, optional
         Splats that are neither removed nor changed.
-    removed : (N,) bool, optional
+    forced_out : (N,) bool, optional
         Splats that go in any case, unless they are protected; see `Task`.
     survivors : {"auto", "unchanged", "absorb", "refit"}
         What survivors may become; see `Task`.
@@ -82,7 +82,7 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
         splats=splats,
         views=views,
         protected=protected,
-        removed=removed,
+        forced_out=forced_out,
         survivors=survivors,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,

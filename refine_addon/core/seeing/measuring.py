@@ -188,7 +188,7 @@ class Measuring:
         return len(self.groups)
 
     def groups_of_part(self, turn: int, parts: int) -> range:
-        """Return the groups of one of `parts` parts, by turns; see `occlusion.measure_part`."""
+        """Return every `parts`-th group, the first at `turn`; see `occlusion.measure_part`."""
         parts = min(parts, self.count)
         return range(turn % parts, self.count, parts)
 

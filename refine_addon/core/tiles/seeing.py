@@ -289,7 +289,7 @@ class StoredRays(RaySample):
         for number in sorted(self.noted):
             name = _rays_name(number, scoring=self.scoring)
             self.rays[number] = Rays(*self._context.folder.noted(name)[1])
-        hit = [self.index[rays.hit] for rays in self.rays if rays is not None]
+        hit = [self.splat_rows[rays.hit] for rays in self.rays if rays is not None]
         rows = np.unique(np.concatenate([np.empty(0, np.int64), *hit]))
         begins = np.cumsum([0, *map(len, self._sources)])
         edges = itertools.pairwise(np.searchsorted(rows, begins).tolist())
@@ -301,7 +301,7 @@ class StoredRays(RaySample):
         if steps:
             self.splats = joined([*self._runner.run(self._context, steps, "reading")])
         # Any number for Gaussians that no ray hits.
-        self.rows = np.searchsorted(rows, self.index)
+        self.stored_rows = np.searchsorted(rows, self.splat_rows)
 
 
 def _sums_name(group: int) -> str:
