@@ -22,7 +22,7 @@ from refine_addon.core import (
     score,
 )
 from refine_addon.core.estimate.quality import AS_GOOD, expected
-from refine_addon.core.pipeline import decide
+from refine_addon.core.pipeline import decide, decide_task
 from refine_addon.core.task import Task
 from tests.strategies import ply_of
 
@@ -69,6 +69,22 @@ def test_it_absorbs_where_that_is_better(splats, views):
     assert told["psnr"]["absorb"] > told["psnr"]["unchanged"] + AS_GOOD
     assert told["psnr"]["refit"] > told["psnr"]["absorb"]
     assert set(told["seconds"]) == {"unchanged", "absorb", "refit"}
+
+
+@pytest.mark.slow
+def test_where_absorbing_gains_hardly_anything_rows_stay(splats, views, monkeypatch):
+    """It was tried, and the report says what it reached; the rows are those of deletion."""
+    monkeypatch.setattr(decide_task, "AS_GOOD", 50.0)
+
+    result = prune(splats, views, HALF, FEW)
+
+    wanted = prune(splats, views, HALF, FEW, survivors="unchanged")
+    told = result.report["survivors"]
+    np.testing.assert_array_equal(result.keep, wanted.keep)
+    assert (result.absorbed, told["became"]) == (None, "unchanged")
+    assert told["psnr"]["absorb"] > told["psnr"]["unchanged"]
+    assert told["psnr"]["unchanged"] == wanted.report["estimated_psnr"]
+    assert any("hardly more" in note for note in result.report["notes"])
 
 
 @pytest.mark.slow
