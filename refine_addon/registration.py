@@ -14,6 +14,7 @@ from .ui import (
     panel_cache,
     plans,
     price,
+    properties,
     running,
     select_tools,
     transforms,
@@ -133,6 +134,7 @@ def register() -> None:
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
     camera_list.register()
     panel_cache.register()
+    properties.register()
     demand_changes.register()
     price.register()
     running.register()
@@ -153,6 +155,7 @@ def unregister() -> None:
     plans.unregister()
     price.unregister()
     demand_changes.unregister()
+    properties.unregister()
     panel_cache.unregister()
     camera_list.unregister()
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)

@@ -72,6 +72,8 @@ class Provenance:
         What the scores are to be refined by, if that is still to come.
     together : Together, optional
         Where other objects were scored with them; the curve is that of all then.
+    seconds : float, optional
+        How long scoring took.
     """
 
     settings: Settings
@@ -80,6 +82,7 @@ class Provenance:
     protected: NDArray[np.bool_] | None = None
     asked: Settings | None = None
     together: Together | None = None
+    seconds: float | None = None
 
 
 def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
@@ -117,6 +120,7 @@ def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
             "cameras": provenance.cameras,
             "protected": digest(provenance.protected),
             "asked": asdict(asked) if asked else None,
+            "seconds": provenance.seconds,
             "together": together and {"id": together.id, "splats": together.splats},
         }
     )

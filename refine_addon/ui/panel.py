@@ -362,7 +362,7 @@ def _draw_plan(
         text = plans.remark(plan, record) if waits else plan["error"]
         wrapped.label(layout, context, text, icon="INFO" if waits else "ERROR")
         return
-    wrapped.label(layout, context, plans.sentence(plan, settings.survivors))
+    wrapped.label(layout, context, plans.sentence(plan))
     if remark := plans.remark(plan, record):
         wrapped.label(layout, context, remark, icon="INFO")
     for warning in plans.warnings(plan, record):
