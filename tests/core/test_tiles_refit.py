@@ -206,7 +206,7 @@ def test_a_window_leaves_out_no_footprint_that_reaches_into_it(seed):
     some, depth = projection.footprints_and_depths(shown, scene, view, window.part)
 
     every = projection.project(shown, scene, view)
-    columns, pixel_rows = window.pixels(every, 3)
+    columns, pixel_rows = window.pixels(1.0, 3)
     assert columns.min() >= left
     assert columns.max() < left + 8
     found, expected = (
