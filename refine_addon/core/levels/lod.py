@@ -18,7 +18,7 @@ from ..estimate.quality import PSNR_CAP
 from ..pipeline import decide, score
 from ..selection import Budget
 from ..splats import among_all
-from ..survivor_choice import refuse_unknown
+from ..survivor_choice import SURVIVORS, refuse_unknown
 from ..task import DEFAULTS, Origin, Task
 from ..work import Progress, part, silent
 from .distance import OriginalPictures
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ..absorbing.absorb import Absorbed
     from ..scores import Scores
     from ..splats import Splats
-    from ..survivor_choice import SurvivorChoice
+    from ..survivor_choice import Became
     from ..task import Result, Settings
     from ..views import ViewSet
     from .distance import Reach
@@ -68,7 +68,7 @@ class Levels:
 
     shares: tuple[float, ...] = ()
     psnr: tuple[float, ...] = ()
-    survivors: SurvivorChoice = "absorb"
+    survivors: Became = "absorb"
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -78,7 +78,7 @@ class Levels:
         RefineError
             With the value and what was expected.
         """
-        refuse_unknown(self.survivors)
+        refuse_unknown(self.survivors, SURVIVORS)
         for name in ("shares", "psnr"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if bool(self.shares) == bool(self.psnr):
@@ -215,7 +215,6 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     protected: NDArray[np.bool_] | None = None,
     forced_out: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> list[Level]:
     """Make levels of detail.
 
@@ -235,7 +234,6 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
         are compared with the pictures of the others.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
-    threads : int, optional
 
     Returns
     -------
@@ -258,7 +256,7 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     scene = Task(
         Budget(ratio=0.0), settings, splats, views, protected=protected, forced_out=forced_out
     )
-    return list(each_level(scene, levels, progress=progress, threads=threads))
+    return list(each_level(scene, levels, progress=progress))
 
 
 def each_level(
@@ -270,8 +268,9 @@ def each_level(
     ----------
     scene : Task
         Splats, views, settings, what is protected and what goes; its budget does not matter.
-    levels, progress, threads
+    levels, progress
         See `lod`.
+    threads : int, optional
     """
     total, forced = len(scene.scene()[0]), scene.forced()
     scene = replace(scene, forced_out=None) if forced is None else scene.without(forced)
