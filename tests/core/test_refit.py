@@ -160,7 +160,8 @@ def test_a_round_that_loses_is_undone_and_the_next_damped_more(monkeypatch):
     assert [(each.rounds, each.psnr) for each in found] == [
         (0, 30.0), (1, 31.0), (2, 32.0), (3, 32.01)
     ]  # fmt: skip
-    assert [damping for damping, _ in damped] == [1.0, 1.0, refit.MORE_DAMPING, refit.MORE_DAMPING]
+    least, more = refit.LEAST_DAMPING, refit.LEAST_DAMPING * refit.MORE_DAMPING
+    assert [damping for damping, _ in damped] == [least, least, more, more]
     known = [told for _, told in damped]
     assert known[0] == 0.0 < known[1] == known[2] < known[3]
 

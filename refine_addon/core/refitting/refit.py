@@ -14,8 +14,10 @@ alone: each has a share in what a parameter becomes. The sum is made small by a 
 conjugate gradients, preconditioned by the diagonal. What these and the damping leave of J'r, half
 of it is added to that of the next round.
 
+k is `DAMPING` over how many rays there are for each survivor: the more rays, the less damping.
+
 Validation rays, which nothing is learned from, compare survivors before and after a round. One that
-loses is undone, and the next is damped more (k, at first 1). Rounds end where little is gained.
+loses is undone, and the next is damped more. Rounds end where little is gained.
 """
 
 from __future__ import annotations
@@ -40,8 +42,12 @@ if TYPE_CHECKING:
     from ..views import ViewSet
     from .round_rays import Truth
 
-STEPS = 4
+STEPS = 8
 """Steps of conjugate gradients in a round."""
+
+DAMPING, LEAST_DAMPING = 4.0, 0.1
+"""Damping counts as so many rays for each survivor: k is this over how many there are, but at least
+so much, as colours change with parameters in straight lines near by alone."""
 
 CARRIED = 0.5
 """How much of what a round leaves of J'r counts in the next one."""
@@ -68,7 +74,7 @@ class Refit:
         Whether means, scales and rotations are refitted too, or colours and opacities alone.
     """
 
-    rounds: int = 6
+    rounds: int = 4
     geometry: bool = True
 
     def __post_init__(self) -> None:
@@ -223,13 +229,14 @@ def refit_on(
     psnr = rays.psnr(survivors, part(progress, 0.0, 0.04))
     best = Refitted(survivors, np.zeros(len(survivors), np.bool_), 0, psnr, psnr)
     yield best
-    before, damping = _Told(*np.zeros((2, COUNT, len(survivors)))), 1.0
+    before, more = _Told(*np.zeros((2, COUNT, len(survivors)))), 1.0
     for number in range(1, settings.rounds + 1):
         begin, middle, near, end = (
             0.04 + 0.96 * (number - 1 + share) / settings.rounds for share in (0.0, 0.4, 0.9, 1.0)
         )
         linear = rays.linear(best.splats, number, part(progress, begin, middle))
         solver = _Solver(linear, rays.truths(number), movable, threads)
+        damping = more * max(DAMPING * len(survivors) / rays.count(number), LEAST_DAMPING)
         change, told = solver.solve(damping, before, part(progress, middle, near))
         del linear, solver  # the hits, before those of the next round
         if not change.any():
@@ -244,10 +251,10 @@ def refit_on(
             yield best
             if gain < LEAST_GAIN:
                 return
-        elif damping > 1.0:
+        elif more > 1.0:
             return
         else:
-            damping *= MORE_DAMPING
+            more *= MORE_DAMPING
 
 
 class _Told(NamedTuple):
