@@ -18,7 +18,7 @@ from ..estimate.quality import PSNR_CAP
 from ..processes import for_each
 from ..seeing import projection
 from ..seeing.cast import cast, depth_complexity, pixels
-from ..seeing.ray_sample import MAX_RAYS_OF_VIEW, colors_from
+from ..seeing.ray_sample import MAX_HITS_OF_VIEW, MAX_RAYS_OF_VIEW, colors_from
 from ..views import ViewSet
 from ..work import Progress, part
 from .linear import LEAST_WEIGHT, LinearView, Shapes, linear_view
@@ -323,15 +323,16 @@ class CastTruth:
         truths = []
         with np.errstate(under="ignore"):
             footprints = self.target.footprints(window)
-            # It counts what is hidden or beyond the image, so the first round says better.
-            hits = depth_complexity(footprints, window.part)
+            # Casting takes memory for all hits, also hidden ones, but for one view at a time.
+            share = window.hits / MAX_HITS_OF_VIEW
+            hits = share * depth_complexity(footprints, window.part)
             for number in self.rounds:
                 columns, rows = window.pixels(hits, number)
                 rays = cast(footprints, columns, rows)
                 colors = rays.colors(self.target.colors(rays.hit, window.view))
                 truths.append(Truth(columns, rows, colors.astype(np.float32)))
                 shown = np.count_nonzero(rays.contributions()[2] > LEAST_WEIGHT)
-                hits = shown / max(rays.count, 1)
+                hits = max(shown, share * len(rays.ray)) / max(rays.count, 1)
         return truths
 
 
