@@ -119,7 +119,7 @@ def _draw_range(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     if not body:
         return
     settings, obj = context.scene.refine, context.object
-    body.prop(settings, "select_by", expand=True)
+    body.row(align=True).prop(settings, "select_by", expand=True)
     shown = cached("histogram", context, lambda: _shown(obj, settings))
     if isinstance(shown, str):
         wrapped.label(body, context, shown, icon="INFO")
@@ -160,7 +160,7 @@ def _histogram(found: Quantity, places: NDArray[np.float64], name: str) -> Histo
     bins = (places * BINS).clip(0, BINS - 1).astype(np.uint8)
     ticks = tuple((place, f"{found.axis.value(place):.2g}") for place in (0.0, 0.5, 1.0))
     total = np.bincount(bins, minlength=BINS)
-    return Histogram(bins, total, ticks, name, ("in range", "stays"))
+    return Histogram(bins, total, ticks, name, ("in range", "others"))
 
 
 def _draw_uses(layout: bpy.types.UILayout) -> None:
