@@ -19,11 +19,13 @@ from .ui import (
     select_tools,
     transforms,
 )
+from .ui.camera_import import REFINE_FH_cameras, REFINE_OT_import_cameras
 from .ui.camera_list import REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
 from .ui.export_operators import REFINE_OT_export_ply
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
-from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
+from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_ply
+from .ui.instances import REFINE_OT_make_real, REFINE_PT_instances
 from .ui.operators import (
     REFINE_OT_apply,
     REFINE_OT_convert,
@@ -83,6 +85,7 @@ CLASSES = (
     REFINE_OT_add_volume,
     REFINE_OT_drop_volume,
     REFINE_OT_crop,
+    REFINE_OT_make_real,
     REFINE_OT_select_stroke,
     REFINE_OT_brush_radius,
     REFINE_OT_select,
@@ -106,7 +109,9 @@ CLASSES = (
     REFINE_OT_leave_out,
     REFINE_OT_keep_unseen,
     REFINE_FH_ply,
+    REFINE_FH_cameras,
     REFINE_PT_splats,
+    REFINE_PT_instances,
     REFINE_PT_cameras,
     REFINE_UL_cameras,
     REFINE_PT_camera_list,
@@ -137,6 +142,8 @@ def register() -> None:
     properties.register()
     demand_changes.register()
     price.register()
+    plans.register()
+    draw.register()
     running.register()
     transforms.register()
     select_tools.register()
@@ -146,7 +153,7 @@ def register() -> None:
 
 def unregister() -> None:
     """Undo `register`, in reverse."""
-    draw.stop()
+    draw.unregister()
     bpy.utils.unregister_cli_command(_commands.pop())
     images.use(None)
     transforms.unregister()

@@ -135,6 +135,24 @@ def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
     mesh_attributes.updated(mesh)
 
 
+def forget(checked: SplatObject) -> None:
+    """Remove the scores of an object, with all that shows them and goes by them.
+
+    Raises
+    ------
+    RefineError
+        If the object cannot be written to.
+    """
+    mesh_edit.check_writable(checked.obj)
+    mesh = checked.mesh
+    for name in (SCORE, RANK, SEEN, SCORED, heat_map.HEAT, mesh_edit.REMOVE):
+        if name in mesh.attributes:
+            mesh.attributes.remove(mesh.attributes[name])
+    if RECORD in mesh:
+        del mesh[RECORD]
+    mesh_attributes.updated(mesh)
+
+
 def digest(mask: NDArray[np.bool_] | None) -> list[int]:
     """Return how many splats a mask, (N,) bool, marks, and a checksum of which; [0, 0] if none."""
     if mask is None or not mask.any():

@@ -366,7 +366,8 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
             f"{len(level.splats):,}" + (f" ({in_words(level.psnr)})" if level.psnr else "")
             for level in levels
         ]
-        self.report({"INFO"}, f"'{collection.name}': {', '.join(counts)} splats")
+        told = f"'{collection.name}', hidden: {', '.join(counts)} splats"
+        self.report({"INFO"}, f"{told}; show one by its eye in the Outliner")
         for note in job.levels.notes({level.asked: level.remark for level in levels}):
             self.report({"WARNING"}, note)
         return {"FINISHED"}

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
+from bpy.app.handlers import persistent
 
 from ..core import pipeline
 from ..core.errors import RefineError
@@ -98,8 +99,16 @@ _tried: list[tuple[Any, ...]] = []
 """For what the panel last asked to have a plan made; one at most. Not each draw asks again."""
 
 
+def register() -> None:
+    """Hear of undo."""
+    for listening in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
+        listening.append(_undone)
+
+
 def unregister() -> None:
     """Forget all, and make no more plans."""
+    for listening in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
+        listening.remove(_undone)
     if bpy.app.timers.is_registered(_rested):
         bpy.app.timers.unregister(_rested)
     for kept in (_known, _waiting, _tried):
@@ -284,11 +293,8 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[Warned]:
     record : dict
         The record of the scoring.
     """
-    warned = []
     alignment = Alignment.from_facts(record.get("alignment"))
-    if alignment.turn:
-        options = {"quarter": str(alignment.turn)}
-        warned.append(Warned(_sentence(alignment.turned()), "refine.turn_cameras", options))
+    warned = [turned(alignment)] if alignment.turn else []
     if record["views_used"] == 1:
         text = "One camera decides: add others if the splats are seen from elsewhere too"
         warned.append(Warned(text, "refine.add_ring"))
@@ -306,6 +312,12 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[Warned]:
     return warned
 
 
+def turned(alignment: Alignment) -> Warned:
+    """Return the warning of cameras that are to be turned."""
+    options = {"quarter": str(alignment.turn)}
+    return Warned(_sentence(alignment.turned()), "refine.turn_cameras", options)
+
+
 def _sentence(note: str) -> str:
     """Return what core says as a sentence of the panel."""
     return note[:1].upper() + note[1:]
@@ -321,6 +333,14 @@ def _is_ours(obj: bpy.types.Object) -> bool:
     if not mesh_layout.looks_like_splats(obj) or obj.mode == "EDIT":
         return False
     return not obj.data.library and not obj.library
+
+
+@persistent
+def _undone(*_: object) -> None:
+    """Draw the chart anew after undo, which brings back the plan but not the picture of it."""
+    obj = getattr(bpy.context, "object", None)
+    if not bpy.app.background and obj is not None and _can_have(obj):
+        wait(bpy.context.scene, [obj], 0.0)
 
 
 def _rested() -> None:

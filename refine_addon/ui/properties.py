@@ -132,7 +132,7 @@ AMOUNTS: dict[str, dict[str, Any]] = {
         "max": 100.0,
     },
     "psnr": {
-        "name": "PSNR",
+        "name": "PSNR (dB)",
         "description": "How close the pictures of the cameras stay to those of all splats, in dB: "
         "40 is hard to tell apart, 30 is visible",
         "default": 40.0,
@@ -250,7 +250,7 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     method: EnumProperty(name="Method", description="How splats are scored", items=METHODS)
     views: IntProperty(**VIEWS)
     tolerance: FloatProperty(
-        name="Tolerance",
+        name="Tolerance (dB)",
         description="By how much the PSNR of the pictures may be lower than by Occlusion, in dB",
         default=Settings.tolerance,
         min=0.0,

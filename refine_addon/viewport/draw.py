@@ -14,7 +14,7 @@ from bpy.app.handlers import persistent
 
 from ..core.errors import RefineError
 from ..mesh.layout import looks_like_splats, splat_count
-from . import background, legend, points, shader
+from . import background, legend, outlines, placing, points, shader, veils
 from .content import Content
 from .view import Camera, View
 
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
 """What can be drawn: nothing, all as it is, coloured by rank, what Apply leaves, what it takes."""
+
+SHOWN = "refine_shown"
+"""Custom property of the scene: which of `MODES` was shown when the file was saved."""
 
 _TICK = 0.03
 """Seconds between two looks at whether the thread has sorted more splats."""
@@ -51,6 +54,7 @@ class _State:
         self.handles: list[Any] = []
         self.edited_at = 0.0
         self.reads = False
+        self.updates = 0
 
 
 _state = _State()
@@ -106,8 +110,22 @@ def stop() -> None:
     background.stop()
     _forget()
     shader.forget()
+    veils.forget()
     points.show()
     _redraw()
+
+
+def register() -> None:
+    """Have files keep what is shown, and show it again."""
+    bpy.app.handlers.save_pre.append(_saving)
+    bpy.app.handlers.load_post.append(_opened)
+
+
+def unregister() -> None:
+    """Draw nothing, and let files be."""
+    stop()
+    bpy.app.handlers.load_post.remove(_opened)
+    bpy.app.handlers.save_pre.remove(_saving)
 
 
 def _forget() -> None:
@@ -165,9 +183,9 @@ def _guarded(work: Callable[[], None]) -> None:
 def _draw() -> None:
     context = bpy.context
     region, region_3d, space = context.region, context.region_data, context.space_data
-    objects = [obj for obj in context.view_layer.objects if _is_drawn(obj, space)]
+    visible = [obj for obj in context.view_layer.objects if obj.visible_get(viewport=space)]
     refused = len(_state.content.refused)
-    placed = _state.content.update(objects, _existing)
+    placed = _state.content.update(placing.placings(visible), placing.every)
     if len(_state.content.refused) > refused:  # Blender shows these as it did before
         bpy.app.timers.register(_hide_points, first_interval=0.0)
     key = region.as_pointer()
@@ -180,21 +198,17 @@ def _draw() -> None:
         np.array(region_3d.window_matrix, np.float64),
         (region.width, region.height),
     )
-    solid = any(obj not in objects for obj in context.visible_objects)
-    view.draw(_state.content, placed, camera, _state.mode, solid=solid)
+    solid = not all(looks_like_splats(obj) for obj in context.visible_objects)
+    meshes = veils.seen_through(context.visible_objects, space.shading)
+    layer = None
+    if meshes:
+        matrices = camera.view, camera.projection
+        work = partial(veils.draw, meshes, context.evaluated_depsgraph_get(), matrices, camera.size)
+        layer = (_state.updates, repr(meshes)), work
+    view.draw(_state.content, placed, camera, _state.mode, solid=solid, veils=layer)
+    outlines.draw(context)
     if view.waits() and not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=_TICK)
-
-
-def _is_drawn(obj: bpy.types.Object, space: bpy.types.SpaceView3D) -> bool:
-    if not looks_like_splats(obj) or not splat_count(obj.data):
-        return False
-    return obj.visible_get(viewport=space)
-
-
-def _existing() -> set[tuple[int, int]]:
-    splats = (obj for obj in bpy.data.objects if looks_like_splats(obj))
-    return {(obj.session_uid, obj.data.session_uid) for obj in splats}
 
 
 def _draw_legend() -> None:
@@ -255,9 +269,29 @@ def _regions() -> list[bpy.types.Region]:
 
 
 @persistent
+def _saving(*_: object) -> None:
+    """Note in the file what is shown, where that says anything of its splats."""
+    if bpy.app.background:
+        return
+    for scene in bpy.data.scenes:
+        if not scene.library and any(looks_like_splats(obj) for obj in scene.objects):
+            scene[SHOWN] = _state.mode
+
+
+@persistent
+def _opened(*_: object) -> None:
+    """Show what was shown when the file was saved."""
+    wanted = bpy.context.scene.get(SHOWN) if not bpy.app.background else None
+    if wanted in MODES:
+        show(wanted)
+        _loaded()
+
+
+@persistent
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     if depsgraph is None:
         return
+    _state.updates += 1
     for update in depsgraph.updates:
         if update.is_updated_geometry:
             data = getattr(update.id.original, "data", update.id.original)
@@ -283,5 +317,7 @@ def _leaving(*_: object) -> None:
 
 @persistent
 def _loaded(*_: object) -> None:
+    for window in bpy.context.window_manager.windows:
+        window.view_layer.update()  # what is not evaluated yet would be drawn as points once
     _hide_points()
     _redraw()

@@ -97,7 +97,7 @@ def test_cameras_are_looked_for_where_the_splats_came_from(addon, tmp_path, came
     shutil.copy(ROOM / "point_cloud.ply", place)
     (tmp_path / cameras).write_text("[]")
     bpy.ops.refine.import_ply(filepath=str(place / "point_cloud.ply"))
-    find = addon.ui.import_operators._capture_folder
+    find = addon.ui.camera_import.capture_folder
 
     assert find(bpy.context.object) == tmp_path / expected
     bpy.context.object["refine_folder"] = str(tmp_path / "gone")
