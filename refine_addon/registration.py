@@ -8,7 +8,16 @@ from bpy.props import PointerProperty
 from . import command
 from .core.formats import images
 from .core.formats.registry import SUFFIXES
-from .ui import camera_list, demand_changes, panel_cache, plans, price, running
+from .ui import (
+    camera_list,
+    demand_changes,
+    panel_cache,
+    plans,
+    price,
+    render_notice,
+    render_operators,
+    running,
+)
 from .ui.camera_list import REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
 from .ui.export_operators import REFINE_OT_export_ply
@@ -40,7 +49,8 @@ from .ui.remedies import (
     REFINE_OT_leave_out,
     REFINE_OT_turn_cameras,
 )
-from .ui.view_operators import REFINE_OT_preview, REFINE_OT_view
+from .ui.render_operators import REFINE_OT_render
+from .ui.view_operators import REFINE_OT_view
 from .ui.volumes import (
     REFINE_OT_add_volume,
     REFINE_OT_crop,
@@ -66,8 +76,8 @@ CLASSES = (
     REFINE_OT_score,
     REFINE_OT_apply,
     REFINE_OT_compare,
-    REFINE_OT_preview,
     REFINE_OT_view,
+    REFINE_OT_render,
     REFINE_OT_convert,
     REFINE_OT_export_ply,
     REFINE_OT_levels,
@@ -101,6 +111,8 @@ def register() -> None:
     bpy.types.Scene.refine = PointerProperty(type=RefineSettings)
     bpy.types.TOPBAR_MT_file_import.append(_draw_import)
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
+    bpy.types.TOPBAR_MT_render.append(render_operators.draw_menu)
+    render_notice.register()
     camera_list.register()
     panel_cache.register()
     demand_changes.register()
@@ -121,6 +133,8 @@ def unregister() -> None:
     demand_changes.unregister()
     panel_cache.unregister()
     camera_list.unregister()
+    render_notice.unregister()
+    bpy.types.TOPBAR_MT_render.remove(render_operators.draw_menu)
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)
     bpy.types.TOPBAR_MT_file_import.remove(_draw_import)
     del bpy.types.Scene.refine

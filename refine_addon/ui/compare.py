@@ -18,13 +18,12 @@ from ..core.pictures import AMPLIFIED, Comparison, compare
 from ..core.views import ViewSet
 from ..core.work import part
 from ..objects import splat_group
+from .images import put
 from .on_thread import OnThread
 from .operator_bases import Answer, OnScored
 from .operators import apply_task
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from ..core.splats import Splats
     from ..core.task import Task
     from ..core.work import Progress
@@ -32,9 +31,6 @@ if TYPE_CHECKING:
 
 NAMES = {kind: f"Compare: {kind}" for kind in KINDS}
 """The pictures as images of the file, made anew by each comparison."""
-
-_OURS = "refine_compare"
-"""Custom property of these images: the name. An image without it is the user's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +84,7 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
     ) -> Answer:
         """Put the pictures into images, show them, and say how close they are."""
         comparison, estimated = result
-        images = [_image(NAMES[kind], getattr(comparison, kind)) for kind in KINDS]
+        images = [put(NAMES[kind], getattr(comparison, kind) / np.float32(255.0)) for kind in KINDS]
         if not bpy.app.background and context.window is not None:
             _show(context, images)
         about = "" if estimated is None else f"; {in_words(estimated)} estimated in all views"
@@ -98,25 +94,6 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
             f"The difference is shown {AMPLIFIED} times as large",
         )
         return {"FINISHED"}
-
-
-def _image(name: str, pixels: NDArray[np.uint8]) -> bpy.types.Image:
-    """Return an image of the file that holds pixels, (H, W, 3), in place of the one before."""
-    height, width = pixels.shape[:2]
-    ours = (each for each in bpy.data.images if not each.library and each.get(_OURS) == name)
-    old = next(ours, None)
-    image = bpy.data.images.new(name, width, height)
-    image[_OURS] = name
-    rgba = np.ones((height, width, 4), np.float32)
-    rgba[..., :3] = pixels[::-1] / np.float32(255.0)  # Blender's first row is the lowest
-    image.pixels.foreach_set(rgba.ravel())
-    image.pack()  # or Blender asks on leaving whether to save it
-    if old is not None:
-        old.user_remap(image)
-        name = old.name
-        bpy.data.images.remove(old)
-        image.name = name
-    return image
 
 
 def _show(context: bpy.types.Context, images: list[bpy.types.Image]) -> None:

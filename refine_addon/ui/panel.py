@@ -16,7 +16,7 @@ from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
 from ..objects import demands, splat_group
 from ..viewport import draw as viewport_draw
-from . import camera_list, plans, preview, price, running, staleness, wrapped
+from . import camera_list, plans, price, render_operators, running, staleness, wrapped
 from .panel_cache import cached
 from .properties import FLOATERS
 from .view_operators import MODES
@@ -230,9 +230,7 @@ class REFINE_PT_preview(_InSidebar, bpy.types.Panel):
         obj = context.object
         splats = mesh_layout.looks_like_splats(obj)
         _draw_modes(layout, obj if splats else None)
-        mode = preview.shown(obj) if splats else ""
-        button = layout.operator("refine.preview", icon="RENDER_STILL", depress=bool(mode))
-        button.mode = "OFF" if mode else "COLOR"
+        render_operators.draw_buttons(layout)
 
 
 class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
