@@ -6,6 +6,9 @@ DEMO := .venv/.demo
 DEV := .venv/.dev
 BENCH := .venv/.bench
 
+# pytest rewrites Hypothesis and all tests in each process, unless it may keep their bytecode.
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test test-core test-numpy test-e2e check build bench bench-trade fuzz mutants clean
 
 demo: $(DEMO)         ## the main job: the committed room, its cameras, half of it pruned, into out/

@@ -17,6 +17,8 @@ from .ui import (
     render_notice,
     render_operators,
     running,
+    select_tools,
+    transforms,
 )
 from .ui.camera_list import REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
@@ -50,6 +52,16 @@ from .ui.remedies import (
     REFINE_OT_turn_cameras,
 )
 from .ui.render_operators import REFINE_OT_render
+from .ui.select_operators import (
+    REFINE_OT_delete_selected,
+    REFINE_OT_grow_selection,
+    REFINE_OT_select,
+    REFINE_OT_select_by,
+    REFINE_OT_separate_selected,
+)
+from .ui.select_panel import REFINE_PT_select
+from .ui.select_tools import REFINE_OT_brush_radius, REFINE_OT_select_stroke
+from .ui.transforms import REFINE_OT_bake_transform, REFINE_OT_join, REFINE_OT_mend
 from .ui.view_operators import REFINE_OT_view
 from .ui.volumes import (
     REFINE_OT_add_volume,
@@ -73,12 +85,22 @@ CLASSES = (
     REFINE_OT_add_volume,
     REFINE_OT_drop_volume,
     REFINE_OT_crop,
+    REFINE_OT_select_stroke,
+    REFINE_OT_brush_radius,
+    REFINE_OT_select,
+    REFINE_OT_select_by,
+    REFINE_OT_grow_selection,
+    REFINE_OT_delete_selected,
+    REFINE_OT_separate_selected,
     REFINE_OT_score,
     REFINE_OT_apply,
     REFINE_OT_compare,
     REFINE_OT_view,
     REFINE_OT_render,
     REFINE_OT_convert,
+    REFINE_OT_bake_transform,
+    REFINE_OT_join,
+    REFINE_OT_mend,
     REFINE_OT_export_ply,
     REFINE_OT_levels,
     REFINE_OT_turn_cameras,
@@ -90,6 +112,7 @@ CLASSES = (
     REFINE_PT_cameras,
     REFINE_UL_cameras,
     REFINE_PT_camera_list,
+    REFINE_PT_select,
     REFINE_PT_floaters,
     REFINE_PT_volumes,
     REFINE_PT_score,
@@ -118,6 +141,8 @@ def register() -> None:
     demand_changes.register()
     price.register()
     running.register()
+    transforms.register()
+    select_tools.register()
     images.use(BlenderImages())
     _commands.append(bpy.utils.register_cli_command("refine", _run_command))
 
@@ -127,6 +152,8 @@ def unregister() -> None:
     draw.stop()
     bpy.utils.unregister_cli_command(_commands.pop())
     images.use(None)
+    transforms.unregister()
+    select_tools.unregister()
     running.unregister()
     plans.unregister()
     price.unregister()

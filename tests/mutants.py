@@ -3,13 +3,15 @@
     python tests/mutants.py [--stale] [test or module ...]
 
 The faults are listed in ``mutants.toml``. Each is put into a copy of the project; prints which test
-catches it. Fails if one survives, or if a text to change is no longer there: that alone is what
+catches it. The test that caught it last is asked first, all others only if it does not any more.
+Fails if a fault survives, or if a text to change or a test is no longer there: that alone is what
 ``--stale`` looks for, at once.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import os
 import re
 import shutil
@@ -25,8 +27,8 @@ PROJECT = Path(__file__).resolve().parent.parent
 ROOT_FILES = ("pyproject.toml", "blender_manifest.toml", "Makefile", "README.md", "CONTRIBUTING.md")
 """What tests read in the project's folder; without one of them they would fail by themselves."""
 
-SECONDS = 900
-"""A fault that makes the tests take longer is caught: something hangs."""
+SECONDS, SECONDS_ALONE = 900, 120
+"""A fault that makes a stage, or a single test, take longer is caught: something hangs."""
 
 
 class Fault(NamedTuple):
@@ -35,17 +37,27 @@ class Fault(NamedTuple):
     Attributes
     ----------
     test : str
-        Its tests run first: ``tests/core/test_TEST.py``.
+        The file whose tests guard it: ``tests/core/test_TEST.py``.
     old, new : str
         The text to change and what it becomes.
     label : str
         What is wrong then.
+    caught : str
+        The test that catches it, as far as known: its name in that file, or
+        ``test_OTHER.py::name``.
     """
 
     test: str
     old: str
     new: str
     label: str
+    caught: str = ""
+
+    @property
+    def first(self) -> str:
+        """The test to ask first, as pytest is told."""
+        file, _, name = self.caught.rpartition("::")
+        return f"tests/core/{file or f'test_{self.test}.py'}{name and f'::{name}'}"
 
 
 def faults() -> list[Fault]:
@@ -66,23 +78,39 @@ def module_of(fault: Fault, texts: dict[str, str]) -> str:
     Raises
     ------
     ValueError
-        If the text does not stand in what ships exactly once, or the fault has no tests.
+        If the text does not stand in what ships exactly once, or there is no such test.
     """
     places = [path for path, text in texts.items() for _ in range(text.count(fault.old))]
     if len(places) != 1:
         msg = f"expected {fault.old!r} in one place, it is in {', '.join(places) or 'none'}"
         raise ValueError(msg)
-    if not (PROJECT / f"tests/core/test_{fault.test}.py").exists():
-        msg = f"there is no tests/core/test_{fault.test}.py"
+    file, _, name = fault.first.partition("::")
+    path = PROJECT / file
+    if not path.exists() or (name and f"def {name}(" not in path.read_text("utf-8")):
+        msg = f"there is no {fault.first}"
         raise ValueError(msg)
     return places[0]
 
 
-def outcome(fault: Fault | None, module: str, text: str) -> str:
-    """Return the first test that fails with a fault in a module, or "" if none does.
+def outcome(fault: Fault, module: str, text: str) -> str:
+    """Return the first test that fails with a fault in a module, or "" if none does."""
+    caught = _outcome([[fault.first]], fault, module, text)
+    if not caught and not unbroken():
+        msg = "not known: other tests fail without any fault"
+        raise ValueError(msg)
+    return caught or _outcome(_stages(fault.test), fault, module, text)
 
-    Without a fault, all tests of core run on what is there.
-    """
+
+@functools.cache
+def unbroken() -> bool:
+    """Return whether all tests of core pass without a fault."""
+    return not _outcome(_stages())
+
+
+def _outcome(
+    stages: list[list[str]], fault: Fault | None = None, module: str = "", text: str = ""
+) -> str:
+    """Return the first test of some stages that fails, or "" if none does."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
         for name in ("refine_addon", "tests", "benchmarks", ".ci", "docs"):
@@ -91,11 +119,10 @@ def outcome(fault: Fault | None, module: str, text: str) -> str:
             shutil.copy(PROJECT / name, copy / name)
         if fault:
             (copy / module).write_text(text.replace(fault.old, fault.new), "utf-8")
-        stages = (_caught(copy, stage) for stage in _stages(fault.test if fault else ""))
-        return next(filter(None, stages), "")
+        return next(filter(None, (_caught(copy, stage) for stage in stages)), "")
 
 
-def _stages(test: str) -> list[list[str]]:
+def _stages(test: str = "") -> list[list[str]]:
     """Return what pytest is to run, stage by stage: one file, all quick tests, all slow ones."""
     # What documents and words name does not depend on any line of core.
     apart = {f"test_{test}.py", "test_documents.py", "test_words.py"}
@@ -108,12 +135,13 @@ def _stages(test: str) -> list[list[str]]:
 def _caught(copy: Path, stage: list[str]) -> str:
     """Return the first of some tests that fails in a copy of the project, or ""."""
     tests = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *stage]
+    limit = SECONDS_ALONE if len(stage) == 1 and "::" in stage[0] else SECONDS
     try:
         done = subprocess.run(
-            tests, cwd=copy, capture_output=True, text=True, check=False, timeout=SECONDS
+            tests, cwd=copy, capture_output=True, text=True, check=False, timeout=limit
         )
     except subprocess.TimeoutExpired:
-        return f"more than {SECONDS} s"
+        return f"{stage[0]}: more than {limit} s"
     if done.returncode == 0:
         return ""
     if "error" in done.stdout.splitlines()[-1]:
@@ -140,8 +168,8 @@ def main() -> int:
             known.append((fault, module))
     if options.stale:
         return 1 if stale else 0
-    if outcome(None, "", ""):
-        print("the tests fail without any fault: mend that first")
+    if failed := _outcome([sorted({fault.first for fault, _ in known})]):
+        print(f"{failed} fails without any fault: mend that first")
         return 1
 
     def tried(place: tuple[Fault, str]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,12 @@ CUTS = (0, 700, 700, 2600, COUNT)
 """Rows at which the room is cut: a short tile, an empty one, and two that span units of 1000."""
 
 
+room = functools.cache(lambda: read_ply(ROOM / "point_cloud.ply"))
+
+
 def room_rows():
     """Return `COUNT` rows of the room; some are equal, some cannot be drawn."""
-    rows = read_ply(ROOM / "point_cloud.ply").rows[::7][:COUNT].copy()
+    rows = room().rows[::7][:COUNT].copy()
     rows[900:1300] = rows[100]
     rows["x"][[5, 2000]] = np.nan
     rows["opacity"][10:400:7] = -np.inf
@@ -27,8 +31,7 @@ def room_rows():
 
 def write(path, rows):
     """Write rows of the room as a file."""
-    header = read_ply(ROOM / "point_cloud.ply").header
-    path.write_bytes(with_count(header, len(rows)) + rows.tobytes())
+    path.write_bytes(with_count(room().header, len(rows)) + rows.tobytes())
 
 
 def cut(folder, rows, cuts=CUTS):

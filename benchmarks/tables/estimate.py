@@ -35,9 +35,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from refine_addon.core.splats import Splats
+    from refine_addon.core.survivor_choice import SurvivorChoice
     from refine_addon.core.views import ViewSet
 
-DELETE, ABSORB = "delete", "absorb"
+DELETE, ABSORB, REFIT = "delete", "absorb", "refit"
+BECOMING: dict[str, SurvivorChoice] = {DELETE: "unchanged", ABSORB: "absorb", REFIT: "refit"}
 HEADING = (
     f"{'scene':12}{'':10}{'budget':>12}{'removed':>9}{'estimate':>10}{'truth':>8}{'off by':>8}"
     f"{'expected':>10}{'seconds':>9}"
@@ -51,7 +53,7 @@ class Estimated:
 
     Attributes
     ----------
-    way : {"delete", "absorb"}
+    way : {"delete", "absorb", "refit"}
     budget : Budget
     removed : float
         Share of the splats.
@@ -101,7 +103,7 @@ def measure(
     for way in ways:
         for budget in budgets:
             start = time.perf_counter()
-            result = prune(splats, views, budget, settings, absorb=way == ABSORB)
+            result = prune(splats, views, budget, settings, survivors=BECOMING[way])
             seconds = time.perf_counter() - start
             left = result.absorbed.splats if result.absorbed else splats.take(result.keep)
             estimate = result.report["estimated_psnr"]
@@ -110,7 +112,7 @@ def measure(
             renders, gone = evaluator.evaluate(left).renders, 1.0 - float(result.keep.mean())
             truth, curve = renders.values["psnr"], with_quality(result.scores).quality
             assert curve is not None  # noqa: S101 - there is an estimate
-            of_views = curve.of_views(gone, absorb=way == ABSORB)
+            of_views = curve.of_views(gone, BECOMING[way])
             # Absorbed results are compared in validation views only.
             told = [place for place, name in enumerate(renders.names) if name in of_views]
             guess = np.array([of_views[renders.names[place]] for place in told])  # (V,)
@@ -170,7 +172,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--ratios", type=float, nargs="*", default=[0.3, 0.5, 0.7, 0.9])
     parser.add_argument("--psnr", type=float, nargs="*", default=[40.0])
     parser.add_argument("--views", type=int, default=64, help="that score, at most")
-    parser.add_argument("--only", choices=[DELETE, ABSORB], help="one of the two ways")
+    parser.add_argument("--only", choices=BECOMING, help="one of the ways")
     return parser.parse_args(arguments)
 
 

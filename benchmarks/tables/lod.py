@@ -42,7 +42,7 @@ def from_one_another(scene: Scene) -> Iterator[tuple[Splats, str]]:
 
 def nested(scene: Scene) -> Iterator[tuple[Splats, str]]:
     """Yield the levels of `lod` by deletion, and the PSNR that it estimates."""
-    for level in lod(scene.splats, scene.train, Levels(SHARES, absorb=False)):
+    for level in lod(scene.splats, scene.train, Levels(SHARES, survivors="unchanged")):
         yield level.splats, f" [{level.psnr:.1f}]"
 
 
@@ -50,7 +50,7 @@ def in_one_go(scene: Scene) -> Iterator[tuple[Splats, str]]:
     """Yield what absorbing makes of the original for each level by itself."""
     for budget in Levels(SHARES).budgets(len(scene.splats)):
         start = time.process_time()
-        made = prune(scene.splats, scene.train, budget, absorb=True).absorbed
+        made = prune(scene.splats, scene.train, budget, survivors="absorb").absorbed
         assert made is not None  # noqa: S101 - it was asked for
         yield made.splats, f" ({time.process_time() - start:.0f} s)"
 

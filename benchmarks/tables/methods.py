@@ -204,7 +204,7 @@ def _absorb(task: Task, keep_count: int, ratio: float) -> Splats:
     del ratio
     budget = Budget(keep=keep_count)
     settings = Settings(views=0, method="occlusion")
-    result = core.prune(task.splats, task.views, budget, settings, absorb=True)
+    result = core.prune(task.splats, task.views, budget, settings, survivors="absorb")
     return task.splats.take(result.keep) if result.absorbed is None else result.absorbed.splats
 
 

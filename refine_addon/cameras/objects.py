@@ -124,7 +124,7 @@ def world_matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> NDArr
     """
     evaluated = obj.evaluated_get(depsgraph)
     if evaluated.is_evaluated:
-        return _snapped(np.array(evaluated.matrix_world, np.float64))
+        return snapped(np.array(evaluated.matrix_world, np.float64))
     moving = obj.animation_data and (obj.animation_data.action or obj.animation_data.drivers)
     if moving or obj.constraints or (obj.parent and obj.parent_type != "OBJECT"):
         msg = (
@@ -136,7 +136,7 @@ def world_matrix(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> NDArr
     if obj.parent:
         inverse = np.array(obj.matrix_parent_inverse, np.float64)
         matrix = world_matrix(obj.parent, depsgraph) @ inverse @ matrix
-    return _snapped(matrix)
+    return snapped(matrix)
 
 
 def camera_from_view(view: View, *, upright: bool = False) -> bpy.types.Object:
@@ -249,8 +249,8 @@ def _weight(obj: bpy.types.Object) -> float:
     return float(weight)
 
 
-def _snapped(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the matrix with its linear part exact if that is but quarter turns and a scale."""
+def snapped(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a (4, 4) matrix with an exact linear part if that is but quarter turns and a scale."""
     linear = matrix[:3, :3]
     scale = np.abs(linear).max()
     signs = np.round(linear / (scale or 1.0))
@@ -284,7 +284,7 @@ def _noted(view: View, obj: bpy.types.Object) -> dict[str, Any]:
         **{name: getattr(view, name) for name in ("fx", "fy", "cx", "cy", "width", "height")},
         "near": view.near,
         "far": view.far if math.isfinite(view.far) else None,
-        "matrix": _snapped(np.array(obj.matrix_basis, np.float64)).tolist(),
+        "matrix": snapped(np.array(obj.matrix_basis, np.float64)).tolist(),
         "lens": _lens(obj.data),
         "clip": [obj.data.clip_start, obj.data.clip_end],
     }

@@ -49,6 +49,7 @@ def main(arguments: Sequence[str], *, scene: bool = False, last: bool = False) -
             listener.wait()
             from .terminal import complain  # noqa: PLC0415 - by now it is there
 
-            complain(f"{reason(stop)}; nothing was left half-written")
+            told = "".join(f" {note};" for note in getattr(stop, "__notes__", ()))
+            complain(f"{reason(stop)};{told} nothing was left half-written")
             return exit_code(stop)
     return code

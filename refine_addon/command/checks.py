@@ -217,8 +217,12 @@ def _check_together(parser: argparse.ArgumentParser, options: argparse.Namespace
         if getattr(options, name, None):
             option = "-o" if name == "output" else f"--{name.replace('_', '-')}"
             parser.error(f"{option} does not go with --together")
-    if options.psnr is not None and (options.absorb or options.method == "closed-form"):
-        parser.error("with --together, --psnr goes with --method auto or occlusion, not --absorb")
+    changes = options.survivors != "unchanged"
+    if options.psnr is not None and (changes or options.method == "closed-form"):
+        parser.error(
+            "with --together, --psnr goes with --method auto or occlusion and unchanged survivors, "
+            "not --absorb"
+        )
     if options.workers is not None and options.scheduler:
         parser.error("expected --workers or --scheduler, and not both")
     if options.workers is not None and options.workers < 1:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from ..core import METHODS, REASONS, Budget, Cleaning, Levels, RefineError, Settings
+from ..core import METHODS, REASONS, SURVIVORS, Budget, Cleaning, Levels, RefineError, Settings
 from ..core.errors import printable
 from ..core.formats.registry import SUFFIXES
 from ..core.levels.files import GOAL
@@ -34,7 +34,7 @@ EXAMPLES = {
     "prune": (
         "refine prune in.ply --cameras cameras.json --ratio 0.7 -o out.ply",
         "refine prune *.ply --cameras cameras.json --psnr 40 --output-dir pruned",
-        "refine prune in.ply --cameras sparse/0 --max-mb 5 --absorb -o out.ply",
+        "refine prune in.ply --cameras sparse/0 --max-mb 5 --survivors refit -o out.ply",
         "refine prune in.ply --cameras sparse/0 --keep-inside box:-2,-2,-1,2,2,3 -o out.ply",
         f"{BLENDER}refine prune --object Splats --protect Statue --remove-inside Sky -o out.ply",
         "refine prune *.ply --together --cameras sparse/0 --ratio 0.6 --output-dir out",
@@ -144,12 +144,22 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "is hard to tell apart, 30 is seen",
     )
     _add_scoring(prune)
-    prune.add_argument(
+    becoming = prune.add_mutually_exclusive_group()
+    becoming.add_argument(
+        "--survivors",
+        choices=SURVIVORS,
+        default=SURVIVORS[0],
+        help="what those that stay may become: unchanged; absorb: they take over what is removed, "
+        "by what the cameras see of it, far better when much is removed, and slower (--method then "
+        "only matters with --threshold and --min-seen); refit: they are then fitted to what the "
+        f"unpruned ones look like, better still, and slower still (default {SURVIVORS[0]})",
+    )
+    becoming.add_argument(
         "--absorb",
-        action="store_true",
-        help="survivors take over what is removed, by what the cameras see of it: far better when "
-        "much is removed, and slower; they change; --method then only matters with --threshold and "
-        "--min-seen",
+        dest="survivors",
+        action="store_const",
+        const="absorb",
+        help="short for --survivors absorb",
     )
     prune.add_argument(
         "--clean",
@@ -246,11 +256,20 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
         metavar="DB,DB,...",
         help="or how close each stays to the original in these views, in dB",
     )
-    making.add_argument(
+    becoming = making.add_mutually_exclusive_group()
+    becoming.add_argument(
+        "--survivors",
+        choices=SURVIVORS,
+        default=Levels.survivors,
+        help="what those that stay may become, see prune (default absorb); --method only matters "
+        "where they stay unchanged",
+    )
+    becoming.add_argument(
         "--nested",
-        action="store_true",
-        help="only delete: each level is some of the splats of the one before, unchanged; by "
-        "default survivors absorb what goes, which is far better, and --method does not matter",
+        dest="survivors",
+        action="store_const",
+        const="unchanged",
+        help="short for --survivors unchanged: each level is some of the splats of the one before",
     )
     making.add_argument(
         "--format",
@@ -481,7 +500,7 @@ def cleaning(options: argparse.Namespace) -> Cleaning:
 def levels(options: argparse.Namespace) -> Levels:
     """Return which levels to make, or raise `RefineError` where a value cannot be."""
     shares = () if options.psnr else options.levels or DEFAULT_LEVELS
-    return Levels(shares, options.psnr, absorb=not options.nested)
+    return Levels(shares, options.psnr, options.survivors)
 
 
 def budget(options: argparse.Namespace) -> Budget:

@@ -45,7 +45,7 @@ def _request(options: argparse.Namespace, views: ViewSet, name: str) -> PruneReq
         budget(options),
         settings(options),
         zones=() if options.object else zones.of_files(options),
-        absorb=options.absorb,
+        survivors=options.survivors,
         cleaning=cleaning(options) if options.clean else None,
         pictures=pictures,
         overwrite=options.overwrite,

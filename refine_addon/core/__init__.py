@@ -24,6 +24,7 @@ from .scoring.occlusion import Occlusion
 from .selection import Budget, rank, select
 from .solid import Solid
 from .splats import Splats
+from .survivor_choice import SURVIVORS
 from .survivors import survivor_columns
 from .task import METHODS, Result, Settings
 from .tiles.prune import prune_tiles
@@ -34,6 +35,7 @@ from .work import Cancelled
 __all__ = [
     "METHODS",
     "REASONS",
+    "SURVIVORS",
     "Box",
     "Budget",
     "Cancelled",

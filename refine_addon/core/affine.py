@@ -108,6 +108,26 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
     )
 
 
+def baked(splats: Splats, matrix: NDArray[Any]) -> Splats:
+    """Return the splats transformed by any affine matrix that can be inverted, harmonics as well.
+
+    As `transformed`, but where the matrix scales directions differently, harmonics become the
+    nearest to what is seen (`spherical_harmonics.stretched`); the rest is exact.
+
+    Raises
+    ------
+    RefineError
+        See `transformed`.
+    """
+    uniform = is_uniform(matrix)
+    result = transformed(splats, matrix, rotate_sh=uniform)
+    if uniform or not splats.sh_degree:
+        return result
+    linear = np.asarray(matrix, np.float64)[:3, :3]
+    sh_dc, sh_rest = spherical_harmonics.stretched(splats.sh_dc, splats.sh_rest, linear)
+    return replace(result, sh_dc=sh_dc, sh_rest=sh_rest)
+
+
 def _check(matrix: NDArray[np.float64], *, with_sh: bool) -> None:
     """Refuse a matrix that splats, or with `with_sh` their harmonics, cannot follow."""
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():

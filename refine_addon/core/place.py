@@ -73,7 +73,11 @@ class Place:
         """Return `value` if it is a list of `count` numbers."""
         if not isinstance(value, list) or len(value) != count:
             self.fail(f"expected a list of {count} numbers, got {described(value)}")
-        return [self.at(f"[{index}]").number(item) for index, item in enumerate(value)]
+        try:
+            return [self.number(item) for item in value]
+        except RefineError:
+            # A place for each number would take longer than the checks of all.
+            return [self.at(f"[{index}]").number(item) for index, item in enumerate(value)]
 
     def whole(self, value: object, least: int = 0, most: int = LARGEST_COUNT) -> int:
         """Return `value` if it is a whole number of `least` to `most`."""

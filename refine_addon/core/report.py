@@ -231,7 +231,7 @@ def _quality_facts(
     """Return what a report says about the quality of the pictures; see `conclude`."""
     curve, other = scores.quality, psnr if absorbed else None
     if curve is not None and curve.foretold and not absorbed:
-        other = curve.at(1.0 - float(np.mean(keep)), absorb=True)
+        other = curve.at(1.0 - float(np.mean(keep)), "absorb")
     why = why_other = None
     if psnr is None:
         why = NOT_ESTIMATED if scores.ray_sample is None else SEES_TOO_LITTLE

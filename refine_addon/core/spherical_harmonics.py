@@ -14,6 +14,9 @@ if TYPE_CHECKING:
 
 _CHUNK = 1 << 16  # splats whose coefficients are widened to float64 at a time
 
+_DIRECTIONS = 4096
+"""Directions over which stretched harmonics are fitted; degree 4 has 25 coefficients."""
+
 
 def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
     """Return the values of all harmonics along directions.
@@ -138,3 +141,37 @@ def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.f
         for rows in chunks(len(rotated), _CHUNK):
             rotated[rows, stored] = np.einsum("ij,njc->nic", matrix, sh_rest[rows, stored])
     return rotated
+
+
+def stretched(
+    sh_dc: NDArray[Any], sh_rest: NDArray[Any], linear: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return coefficients whose colour along ``linear @ d`` is nearly the old colour along d.
+
+    A matrix that scales directions differently bends the sphere of directions, which harmonics of
+    no degree can follow exactly: these are the nearest of the same degree, by least squares over
+    the directions after it. For rotations use `rotate`, which is exact.
+
+    Parameters
+    ----------
+    sh_dc : (N, 3) floating
+    sh_rest : (N, K, 3) floating
+    linear : (3, 3) float64
+        Any that can be inverted.
+
+    Returns
+    -------
+    sh_dc : (N, 3) float64
+    sh_rest : (N, K, 3) float64
+    """
+    degree = math.isqrt(sh_rest.shape[1] + 1) - 1
+    here = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
+    here /= np.linalg.norm(here, axis=1, keepdims=True)
+    before = here @ np.linalg.inv(linear).T
+    before /= np.linalg.norm(before, axis=1, keepdims=True)
+    matrix = np.linalg.lstsq(basis(here, degree), basis(before, degree), rcond=None)[0]
+    result = np.empty((len(sh_rest), sh_rest.shape[1] + 1, 3))
+    for rows in chunks(len(result), _CHUNK):
+        old = np.concatenate([sh_dc[rows, None], sh_rest[rows]], axis=1, dtype=np.float64)
+        result[rows] = np.einsum("ij,njc->nic", matrix, old)
+    return result[:, 0], result[:, 1:]

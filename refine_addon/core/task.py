@@ -12,6 +12,7 @@ from .errors import RefineError
 from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
 from .splats import among_all
+from .survivor_choice import refuse_unknown
 from .volumes import refuse_all
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from .seeing.ray_sample import RaySample
     from .selection import Budget, RowBytes
     from .splats import Splats
+    from .survivor_choice import SurvivorChoice
     from .views import ViewSet
 
 METHODS = ("auto", "occlusion", "closed-form")
@@ -89,19 +91,19 @@ DEFAULTS = Settings()
 
 @dataclass(frozen=True, eq=False)
 class Origin:
-    """The splats that those of a task became of, by absorbing.
+    """The splats that those of a task became of, by absorbing and refitting.
 
     Attributes
     ----------
-    count : int
-        How many there were.
+    splats : Splats
+        As they were.
     ray_sample : RaySample or None
         What the views saw of them: the estimated PSNR is against that.
     psnr : float or None
         The estimated PSNR that is left before the task, dB.
     """
 
-    count: int
+    splats: Splats
     ray_sample: RaySample | None
     psnr: float | None
 
@@ -124,13 +126,14 @@ class Task:
         Known scores of the splats; None computes them.
     protected : (N,) bool or None
         Splats that are neither removed nor changed.
-    removed : (N,) bool or None
+    forced_out : (N,) bool or None
         Splats that go before all others, whatever they are worth, and count as removed; those that
         are protected stay. The rest is scored without them, and is what the pictures of a PSNR are
         compared with; nothing absorbs them.
-    absorb : bool
-        Whether survivors absorb the splats that are removed. Then the budget only decides how many
-        survive; which ones, and their new values, come from merging, whatever the method.
+    survivors : {"unchanged", "absorb", "refit"}
+        What survivors may become. If they absorb others, the budget only decides how many survive;
+        which ones, and their new values, come from merging, whatever the method. See
+        `survivor_choice.SURVIVORS`.
     row_bytes, fixed_bytes : float or (N,) int64, int
         See `Budget.removals`.
     origin : Origin or None
@@ -146,12 +149,27 @@ class Task:
     views: ViewSet | None = None
     scores: Scores | None = None
     protected: NDArray[np.bool_] | None = None
-    removed: NDArray[np.bool_] | None = None
-    absorb: bool = False
+    forced_out: NDArray[np.bool_] | None = None
+    survivors: SurvivorChoice = "unchanged"
     row_bytes: RowBytes = 0.0
     fixed_bytes: int = 0
     origin: Origin | None = None
     reusable: bool = False
+
+    def __post_init__(self) -> None:
+        """Check what survivors may become.
+
+        Raises
+        ------
+        RefineError
+            If there is no such choice.
+        """
+        refuse_unknown(self.survivors)
+
+    @property
+    def absorb(self) -> bool:
+        """Whether survivors absorb the splats that are removed."""
+        return self.survivors != "unchanged"
 
     def scene(self) -> tuple[Splats, ViewSet]:
         """Return splats and views.
@@ -168,10 +186,10 @@ class Task:
 
     def forced(self) -> NDArray[np.bool_] | None:
         """Return which splats go before all others, (N,); None where there are none."""
-        removed = self.removed
-        if removed is not None and self.protected is not None:
-            removed = removed & ~self.protected
-        return None if removed is None or not removed.any() else removed
+        out = self.forced_out
+        if out is not None and self.protected is not None:
+            out = out & ~self.protected
+        return None if out is None or not out.any() else out
 
     def without(self, forced: NDArray[np.bool_]) -> Task:
         """Return the task for what is left when some splats, (N,), have gone.
@@ -189,7 +207,7 @@ class Task:
             splats=None if self.splats is None else self.splats.take(rest),
             scores=None if self.scores is None else self.scores.of(rest),
             protected=None if self.protected is None else self.protected[rest],
-            removed=None,
+            forced_out=None,
             row_bytes=rows[rest] if isinstance(rows, np.ndarray) else rows,
         )
 
@@ -207,7 +225,7 @@ class Result:
         `Scores.settled`. With `absorbed`: the scores that decided how many survive, or else which
         tenth was deleted first.
     absorbed : Absorbed or None
-        The survivors with what they absorbed.
+        The survivors as they became; None if all are what they were.
     report : dict
         Counts, settings, facts about the scores, timings and versions, ready for JSON.
     """

@@ -201,27 +201,27 @@ class Forced:
     ----------
     protected : (N,) bool or None
         Those that stay as they are, for this or another reason.
-    removed : (N,) bool or None
+    out : (N,) bool or None
         Those that go whatever they are worth; none that is protected.
     facts : list of dict
         For the report: ``role``, ``name`` and number of ``splats`` of each volume.
     """
 
     protected: NDArray[np.bool_] | None = None
-    removed: NDArray[np.bool_] | None = None
+    out: NDArray[np.bool_] | None = None
     facts: tuple[dict[str, Any], ...] = ()
 
     def counts(self) -> dict[str, int]:
         """Return how many splats are ``protected`` and how many ``forced`` out."""
-        masks = (("protected", self.protected), ("forced", self.removed))
+        masks = (("protected", self.protected), ("forced", self.out))
         return {n: 0 if mask is None else int(np.count_nonzero(mask)) for n, mask in masks}
 
     def of(self, rows: NDArray[np.bool_]) -> Forced:
         """Return the same for the splats in `rows`, (N,) bool, alone."""
-        protected, removed = (
-            None if mask is None else mask[rows] for mask in (self.protected, self.removed)
+        protected, out = (
+            None if mask is None else mask[rows] for mask in (self.protected, self.out)
         )
-        return replace(self, protected=protected, removed=removed)
+        return replace(self, protected=protected, out=out)
 
 
 FREE = Forced()
@@ -229,7 +229,10 @@ FREE = Forced()
 
 
 def forced(
-    zones: Sequence[Zone], means: NDArray[Any], protected: NDArray[np.bool_] | None = None
+    zones: Sequence[Zone],
+    means: NDArray[Any],
+    protected: NDArray[np.bool_] | None = None,
+    out: NDArray[np.bool_] | None = None,
 ) -> Forced:
     """Return what must stay and what must go by volumes.
 
@@ -238,8 +241,8 @@ def forced(
     zones : sequence of Zone
     means : (N, 3) floating
         Centres of the splats, in the frame of the volumes.
-    protected : (N,) bool, optional
-        Splats that stay for another reason.
+    protected, out : (N,) bool, optional
+        Splats that stay, and that go, for another reason.
 
     Returns
     -------
@@ -260,16 +263,18 @@ def forced(
             raise RefineError(msg)
         facts.append({"role": zone.role, "name": zone.name, "splats": count})
         masks[zone.role] = masks[zone.role] | inside if zone.role in masks else inside
-    removed = masks.get("remove")
     if "keep" in masks:
-        removed = ~masks["keep"] if removed is None else removed | ~masks["keep"]
+        masks["keep"] = ~masks["keep"]
+    for role in ("remove", "keep"):
+        if role in masks:
+            out = masks[role] if out is None else out | masks[role]
     if "protect" in masks:
         protected = masks["protect"] if protected is None else protected | masks["protect"]
-    if removed is not None:
+    if out is not None:
         if protected is not None:
-            removed = removed & ~protected
-        refuse_all(removed)
-    return Forced(protected, removed, tuple(facts))
+            out = out & ~protected
+        refuse_all(out)
+    return Forced(protected, out, tuple(facts))
 
 
 def refuse_all(removed: NDArray[np.bool_]) -> None:

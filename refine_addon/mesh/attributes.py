@@ -17,7 +17,7 @@ import numpy as np
 
 from ..core.formats.ply import REQUIRED, SplatFile
 from ..core.splats import Splats, single_unit_quaternions
-from .layout import KINDS, Column, SplatObject, add_attributes, rest_count, splat_count
+from .layout import KINDS, Column, Layout, SplatObject, add_attributes, rest_count, splat_count
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -72,7 +72,7 @@ def mesh_from_file(source: SplatFile, name: str = "") -> bpy.types.Mesh:
     rows = source.rows
     mesh = bpy.data.meshes.new(name or source.path.stem)
     try:
-        mesh.vertices.add(len(rows))
+        add_vertices(mesh, len(rows))
         columns = add_attributes(mesh, rows.dtype, source.header)
         _fill(mesh, rows, columns)
         mesh.update()
@@ -80,6 +80,12 @@ def mesh_from_file(source: SplatFile, name: str = "") -> bpy.types.Mesh:
         bpy.data.meshes.remove(mesh)
         raise
     return mesh
+
+
+def add_vertices(mesh: bpy.types.Mesh, count: int) -> None:
+    """Add vertices to a mesh that has none, not selected as Blender would have them."""
+    mesh.vertices.add(count)
+    remove_attribute(mesh, ".select_vert")
 
 
 def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
@@ -178,6 +184,42 @@ def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> 
         )
     if columns:
         updated(mesh)
+
+
+def move_columns(checked: SplatObject, layout: Layout) -> None:
+    """Have a mesh hold its columns where another layout has them, and in its types.
+
+    Parameters
+    ----------
+    checked : SplatObject
+        Out of date afterwards.
+    layout : Layout
+        It has all columns of the object, and may have more.
+    """
+    mesh, places = checked.mesh, {column.name: column for column in layout.columns}
+    stored = stored_columns(checked)
+    other = [
+        column
+        for column in checked.layout.columns
+        if (column.attribute, column.dtype.lstrip("<>"))
+        != (places[column.name].attribute, places[column.name].dtype.lstrip("<>"))
+    ]
+    values = {column.name: stored[column.name].copy() for column in other}
+    for name in dict.fromkeys(column.attribute for column in other):
+        remove_attribute(mesh, name)
+    vectors: dict[str, NDArray[np.float32]] = {}
+    for name, numbers in values.items():
+        place, kind = places[name].place, places[name].dtype[1:]
+        if place.kinds == ("FLOAT_VECTOR",):
+            vector = vectors.setdefault(place.attribute, np.zeros((len(numbers), 3), np.float32))
+            vector[:, place.component] = numbers
+            continue
+        coded = numbers.astype(kind)
+        coded = coded.view(np.int32) if kind == "u4" else coded
+        write_attribute(mesh, place.attribute, place.kinds[0], coded)
+    for name, vector in vectors.items():
+        write_attribute(mesh, name, "FLOAT_VECTOR", vector)
+    updated(mesh)
 
 
 def updated(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:

@@ -12,7 +12,7 @@ import bpy
 
 from ..core.errors import RefineError
 from . import attributes as mesh_attributes
-from . import native
+from . import drift, native
 from .edit import check_changeable, group_weights
 from .layout import KINDS, STORAGE, SplatObject, check, rest_count
 from .node_trees import add, chain, new_tree
@@ -133,7 +133,7 @@ def _new_point_cloud(name: str, count: int) -> bpy.types.PointCloud:
 def _mesh_of(checked: SplatObject) -> bpy.types.Mesh:
     """Return a new mesh with the attributes of a file of splats, to be filled."""
     mesh = bpy.data.meshes.new(checked.mesh.name)
-    mesh.vertices.add(len(checked))
+    mesh_attributes.add_vertices(mesh, len(checked))
     for column in _moved(checked):
         if column.name not in ("x", "y", "z"):
             mesh.attributes.new(column.name, STORAGE[column.dtype[1:]], "POINT")
@@ -159,6 +159,7 @@ def _fill(checked: SplatObject, obj: bpy.types.Object) -> None:
     for material in checked.mesh.materials:
         obj.data.materials.append(material)
     _copy_columns(checked, check(obj))
+    drift.carry(checked.mesh, obj.data)
 
 
 def _copy_attributes(checked: SplatObject, data: bpy.types.ID) -> None:

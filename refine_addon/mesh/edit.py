@@ -25,6 +25,9 @@ REMOVE = "refine_remove"
 PROTECT = "refine_protect"
 """Boolean point attribute: splats that stay, whatever else is said; set by hand."""
 
+MUST_GO = "refine_must_go"
+"""Boolean point attribute: splats that go before all others; set by hand."""
+
 FORCE = "refine_force"
 """Integer point attribute, for display: 1 what stays in any case, 2 what goes, 0 the rest."""
 
@@ -75,12 +78,7 @@ def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
     """Undo what a block did to the data of an object if the block fails, however far it came.
 
     A copy of the data stands by, which costs nothing: Blender shares attributes until one is
-    changed. Where it is needed, it takes the place and the name of the data.
-
-    Parameters
-    ----------
-    obj : bpy.types.Object
-        See `check_deletable`: no other object may have its data.
+    changed. Where it is needed, it takes the place and the name of the data, for all its users.
     """
     mesh = obj.data
     before = mesh.copy()
@@ -88,7 +86,7 @@ def all_or_nothing(obj: bpy.types.Object) -> Iterator[None]:
         yield
     except BaseException:
         name, before.use_fake_user = mesh.name, mesh.use_fake_user
-        obj.data = before
+        mesh.user_remap(before)
         bpy.data.batch_remove([mesh])
         before.name = name
         raise
@@ -203,10 +201,7 @@ def protected_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None
     RefineError
         If the object has neither of that name.
     """
-    marked = None
-    attribute = obj.data.attributes.get(PROTECT)
-    if attribute and (attribute.data_type, attribute.domain) == ("BOOLEAN", "POINT"):
-        marked = mesh_attributes.read_attribute(obj.data, PROTECT)
+    marked = marks(obj, PROTECT)
     if not name:
         return marked
     named = _named_mask(obj, name)
@@ -231,8 +226,16 @@ def _named_mask(obj: bpy.types.Object, name: str) -> NDArray[np.bool_]:
     raise RefineError(msg)
 
 
-def mark_protected(obj: bpy.types.Object, marked: NDArray[np.bool_]) -> None:
-    """Mark the splats of `marked`, (N,), with `PROTECT`, and no others.
+def marks(obj: bpy.types.Object, name: str) -> NDArray[np.bool_] | None:
+    """Return which splats are marked by hand with `PROTECT` or `MUST_GO`, (N,); None if none is."""
+    attribute = obj.data.attributes.get(name)
+    if attribute and (attribute.data_type, attribute.domain) == ("BOOLEAN", "POINT"):
+        return mesh_attributes.read_attribute(obj.data, name)
+    return None
+
+
+def mark_by_hand(obj: bpy.types.Object, marked: NDArray[np.bool_], name: str = PROTECT) -> None:
+    """Mark the splats of `marked`, (N,), with `PROTECT` or `MUST_GO`, and no others.
 
     Raises
     ------
@@ -241,9 +244,9 @@ def mark_protected(obj: bpy.types.Object, marked: NDArray[np.bool_]) -> None:
     """
     check_writable(obj)
     mesh = obj.data
-    mesh_attributes.remove_attribute(mesh, PROTECT)  # it may be of another type
+    mesh_attributes.remove_attribute(mesh, name)  # it may be of another type
     if marked.any():
-        mesh_attributes.write_attribute(mesh, PROTECT, "BOOLEAN", marked)
+        mesh_attributes.write_attribute(mesh, name, "BOOLEAN", marked)
     mesh_attributes.updated(mesh)
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED, REST_COUNTS
 from ..core.formats.ply_header import new_header
+from ..core.formats.ply_write import PLY_TYPES
 from . import native
 from .native import Place
 
@@ -85,7 +86,8 @@ _TAKEN = {
     *("position", "normal", "id", "radius", "material_index", "sharp_face", "crease_vert"),
     *("refine_score", "refine_rank", "refine_seen", "refine_scored"),
     *("refine_heat", "refine_color", "refine_remove"),
-    *("refine_protect", "refine_force", "refine_floats"),
+    *("refine_protect", "refine_must_go", "refine_force", "refine_floats"),
+    *("refine_home", "refine_shape"),
 }
 
 
@@ -174,8 +176,13 @@ def looks_like_splats(obj: bpy.types.Object | None) -> bool:
     """Tell whether an object is worth offering to the splat tools; cheap enough for a poll."""
     if obj is None or obj.type not in _TYPES:
         return False
-    attributes = obj.data.attributes
-    return ("opacity" in attributes and "f_dc_0" in attributes) or native.is_native(obj.data)
+    return holds_splats(obj.data)
+
+
+def holds_splats(data: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
+    """Tell the same of an object's data."""
+    attributes = data.attributes
+    return ("opacity" in attributes and "f_dc_0" in attributes) or native.is_native(data)
 
 
 def check(obj: bpy.types.Object) -> SplatObject:
@@ -250,11 +257,117 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
         count = rb"\g<1>%d" % splat_count(mesh)
         header = re.sub(_COUNT, count, noted["header"].encode("latin-1"), count=1)
         layout = Layout(columns, header, native.is_native(mesh))
+        # Join adds harmonics of a higher degree.
+        if rest_count(mesh) > sum(column.name.startswith("f_rest_") for column in columns):
+            layout = _with(
+                layout, splat_count(mesh), _unlisted_harmonics(layout, mesh)
+            )  # of a joined object
         described = layout.row_dtype.itemsize > 0
     except (AttributeError, KeyError, TypeError, ValueError):
         # Another program may have written there: what does not describe a file is no layout.
         return None
     return layout if described else None
+
+
+def unlisted(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[str]:
+    """Return the attributes that the layout which the import noted does not know, by name.
+
+    Harmonics are not among them, which a file always gets.
+    """
+    layout = _remembered(mesh)
+    if layout is None:
+        return []
+    taken = {column.attribute for column in layout.columns} | {c.name for c in layout.columns}
+    taken |= {place.attribute for place in _native_places(mesh).values()}
+    return [column.name for column in _further_columns(mesh, taken)]
+
+
+def list_all(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
+    """Have a file of a mesh hold all attributes that it can, harmonics and what `unlisted` names.
+
+    To be called where splats of several files came together.
+    """
+    layout = _remembered(mesh)
+    if layout is None:
+        return  # all of them are listed
+    names = set(unlisted(mesh))
+    more = [column for column in _further_columns(mesh, set()) if column.name in names]
+    note(mesh, _with(layout, splat_count(mesh), more) if more else layout)
+
+
+def merged(layouts: Sequence[Layout]) -> Layout:
+    """Return the layout of meshes that are joined: all columns of each, those of the first first.
+
+    A column has a type that holds the values of all. How many rows there are stands on the mesh.
+    """
+    first = layouts[0]
+    kinds: dict[str, np.dtype[Any]] = {}
+    for column in (column for layout in layouts for column in layout.columns):
+        own = np.dtype(column.dtype).newbyteorder("<")
+        widest = np.promote_types(kinds.get(column.name, own), own)
+        kinds[column.name] = widest if widest.str[1:] in STORAGE else np.dtype("<f8")
+    columns = {column.name: _retyped(column, kinds[column.name].str) for column in first.columns}
+    taken, more = {column.attribute for column in columns.values()}, []
+    for column in (column for layout in layouts[1:] for column in layout.columns):
+        if column.name in columns:
+            continue
+        attribute = column.attribute
+        if attribute in taken:  # which holds another property in the first
+            attribute = f"ply_{column.name}"[:_LONGEST_NAME]
+        new = Column(column.name, column.dtype, column.place._replace(attribute=attribute))
+        columns[column.name] = new = _retyped(new, kinds[column.name].str)
+        taken.add(attribute)
+        more.append(new)
+    same = tuple(columns[column.name] for column in first.columns)
+    if same == first.columns and not more:
+        return first
+    return _with(Layout(same, first.header), 0, more)
+
+
+def _retyped(column: Column, dtype: str) -> Column:
+    """Return a column of another type; vectors of Blender keep theirs."""
+    if column.place.kinds == ("FLOAT_VECTOR",):
+        return Column(column.name, dtype, column.place)
+    return Column(column.name, dtype, _plain(dtype, column.attribute))
+
+
+def _with(layout: Layout, count: int, more: Sequence[Column]) -> Layout:
+    """Return a layout with further columns: harmonics after the others, all else at the end."""
+    columns = list(layout.columns)
+    for column in more:
+        index = len(columns)
+        if column.name.startswith("f_rest_"):
+            before = [i for i, c in enumerate(columns) if c.name.startswith(("f_rest_", "f_dc_"))]
+            index = before[-1] + 1
+        columns.insert(index, column)
+    # Of one byte order, since the header names but one.
+    plain = [Column(c.name, c.dtype.replace(">", "<"), c.place) for c in columns]
+    header = _new_header(plain, count)
+    comments = re.findall(rb"^(?:comment|obj_info)\b[^\r\n]*", layout.header, re.MULTILINE)
+    first = header.index(b"element")
+    header = header[:first] + b"".join(line + b"\n" for line in comments) + header[first:]
+    return Layout(tuple(plain), header, layout.native)
+
+
+def _unlisted_harmonics(layout: Layout, mesh: bpy.types.Mesh) -> list[Column]:
+    """Return the columns of harmonics for which a mesh has attributes, and a layout no columns."""
+    names, places = {column.name for column in layout.columns}, _native_places(mesh)
+    wanted = (f"f_rest_{index}" for index in range(rest_count(mesh)))
+    return [
+        Column(name, "<f4", places.get(name) or _plain("<f4", name))
+        for name in wanted
+        if name not in names
+    ]
+
+
+def note(mesh: bpy.types.Mesh | bpy.types.PointCloud, layout: Layout) -> None:
+    """Note on a mesh how a file of it is laid out."""
+    mesh[LAYOUT] = json.dumps(
+        {
+            "header": layout.header.decode("latin-1"),
+            "columns": [[c.name, c.dtype, c.attribute, c.place.component] for c in layout.columns],
+        }
+    )
 
 
 def _native_places(mesh: bpy.types.Mesh) -> dict[str, Place]:
@@ -367,12 +480,7 @@ def add_attributes(mesh: bpy.types.Mesh, rows: np.dtype[Any], header: bytes) -> 
         attribute = mesh.attributes.new(place, STORAGE[kind[1:]], "POINT")
         attribute = attribute or mesh.attributes.new(f"ply_{index}", STORAGE[kind[1:]], "POINT")
         columns.append(Column(name, kind, _plain(kind, attribute.name)))
-    mesh[LAYOUT] = json.dumps(
-        {
-            "header": vertex_header(header).decode("latin-1"),
-            "columns": [[c.name, c.dtype, c.attribute, c.place.component] for c in columns],
-        }
-    )
+    note(mesh, Layout(tuple(columns), vertex_header(header)))
     return tuple(columns)
 
 
@@ -393,5 +501,5 @@ def vertex_header(header: bytes) -> bytes:
 
 
 def _new_header(columns: Sequence[Column], count: int) -> bytes:
-    types = {"f4": "float", "i4": "int", "i1": "char"}
-    return new_header(((column.name, types[column.dtype[1:]]) for column in columns), count)
+    kinds = ((column.name, PLY_TYPES[column.dtype[1:]]) for column in columns)
+    return new_header(kinds, count)

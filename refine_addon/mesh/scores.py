@@ -148,6 +148,17 @@ def record(mesh: bpy.types.Mesh) -> dict[str, Any] | None:
     return recorded if complete else None
 
 
+def move_origin(
+    mesh: bpy.types.Mesh, before: NDArray[np.float64], after: NDArray[np.float64]
+) -> None:
+    """Have scores hold for an object whose matrix, (4, 4), changed while its splats stayed."""
+    recorded = record(mesh) or {}
+    origin = recorded.get("origin")
+    if origin and np.allclose(origin.get("matrix", np.nan), before, rtol=0.0, atol=1e-6):
+        origin = {**origin, "matrix": np.asarray(after).tolist()}
+        mesh[RECORD] = json.dumps({**recorded, "origin": origin})
+
+
 def unrefined(record: dict[str, Any]) -> bool:
     """Tell whether a record is of a first version of the scores that were asked for."""
     return bool(record.get("asked"))

@@ -51,7 +51,8 @@ class Demands:
     ----------
     names : tuple of str
         Vertex groups and attributes of the splats that protect, see `mesh.edit.protected_mask`;
-        what is marked by `mesh.edit.PROTECT` is protected without being named.
+        what is marked by `mesh.edit.PROTECT` is protected, and what is marked by
+        `mesh.edit.MUST_GO` must go, without being named.
     zones : tuple of Zone
         Volumes in the world.
     """
@@ -88,10 +89,12 @@ class Demands:
         for name in ("", *self.names):
             mask = mesh_edit.protected_mask(checked.obj, name)
             protected = mask if protected is None or mask is None else protected | mask
-        if not self.zones:
+        out = mesh_edit.marks(checked.obj, mesh_edit.MUST_GO)
+        if not self.zones and out is None:
             return Forced(protected)
+        means = world_means(checked) if self.zones else np.empty((0, 3))
         try:
-            return core_volumes.forced(self.zones, world_means(checked), protected)
+            return core_volumes.forced(self.zones, means, protected, out)
         except RefineError as error:
             msg = f"object '{checked.obj.name}': {error}"
             raise RefineError(msg) from error
@@ -186,7 +189,7 @@ def mark(checked: SplatObject, forced: Forced) -> None:
     RefineError
         If the object cannot be written to.
     """
-    mesh, forced_out = checked.mesh, forced.removed
+    mesh, forced_out = checked.mesh, forced.out
     mesh_edit.mark_forced(checked.obj, forced.protected, forced_out)
     scored = mesh_scores.record(mesh) is not None
     if forced_out is not None:
@@ -194,7 +197,7 @@ def mark(checked: SplatObject, forced: Forced) -> None:
             mesh_edit.mark_removed(checked.obj, forced_out)
     elif not scored and not mesh_floaters.counts(mesh):
         mesh_attributes.remove_attribute(mesh, mesh_edit.REMOVE)
-    if forced.facts or forced.protected is not None:
+    if forced.facts or forced.protected is not None or forced_out is not None:
         volumes = [[fact["name"], fact["splats"]] for fact in forced.facts]
         _record(mesh, {**forced.counts(), "volumes": volumes})
     elif FACTS in mesh:

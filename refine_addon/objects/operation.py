@@ -21,7 +21,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject, check
 from ..mesh.scores import Provenance, store
 from .demands import NONE, Demands
-from .splat_object import find, gather, modifier_notes, reduce_object
+from .splat_object import drift_notes, find, gather, modifier_notes, reduce_object
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -154,7 +154,7 @@ class ObjectSource:
             stored=mesh_attributes.stored_columns(checked),
             file=lambda: mesh_attributes.file_from_object(checked),
             matrix=world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get()),
-            notes=tuple(modifier_notes(checked.obj)),
+            notes=(*modifier_notes(checked.obj), *drift_notes(checked)),
             reusable=self.reusable,
         )
 

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ..core.scores import Scores
     from ..core.selection import Budget
     from ..core.splats import Splats
+    from ..core.survivor_choice import SurvivorChoice
     from ..core.task import Result, Settings
     from ..core.views import ViewSet
     from ..mesh.layout import SplatObject
@@ -128,7 +129,7 @@ def check_forced(scene: bpy.types.Scene, group: Members, before: Sequence[Forced
         If not; also see `forced_of_each`.
     """
     for member, was, now in zip(group, before, forced_of_each(scene, group), strict=True):
-        pairs = ((was.protected, now.protected), (was.removed, now.removed))
+        pairs = ((was.protected, now.protected), (was.out, now.out))
         if any(not _same_mask(*pair) for pair in pairs):
             msg = (
                 f"object '{member.obj.name}': what must stay or go has changed meanwhile; nothing "
@@ -157,11 +158,11 @@ def refresh(scene: bpy.types.Scene, group: Members) -> list[Forced]:
 def joined_forced(each: Sequence[Forced], group: Members) -> Forced:
     """Return which splats of all objects must stay and must go, without facts."""
     counts = [len(member) for member in group]
-    protected, removed = (
+    protected, out = (
         None if all(mask is None for mask in masks) else _joined_masks(masks, counts)
-        for masks in ([one.protected for one in each], [one.removed for one in each])
+        for masks in ([one.protected for one in each], [one.out for one in each])
     )
-    return Forced(protected, removed)
+    return Forced(protected, out)
 
 
 def parts_of(mask: NDArray[np.bool_] | None, group: Members) -> list[NDArray[np.bool_]]:
@@ -222,12 +223,13 @@ def stored_task(
     *,
     settings: Settings = DEFAULTS,
     views: ViewSet | None = None,
+    survivors: SurvivorChoice = "unchanged",
 ) -> Task:
     """Return what Apply has to decide of all objects; see `splat_object.stored_task`.
 
     Parameters
     ----------
-    group, budget, settings, views
+    group, budget, settings, views, survivors
         See there.
     forced : sequence of Forced
         What must stay and what must go of each object.
@@ -240,7 +242,9 @@ def stored_task(
     if len(group) > 1:
         _check_scored_together(group)
     tasks = [
-        splat_object.stored_task(member, budget, each, settings=settings, views=views)
+        splat_object.stored_task(
+            member, budget, each, settings=settings, views=views, survivors=survivors
+        )
         for member, each in zip(group, forced, strict=True)
     ]
     if len(tasks) == 1:
@@ -248,7 +252,7 @@ def stored_task(
     counts = [len(member) for member in group]
     masks: dict[str, Any] = {
         name: _joined_masks([getattr(task, name) for task in tasks], counts)
-        for name in ("protected", "removed")
+        for name in ("protected", "forced_out")
         if any(getattr(task, name) is not None for task in tasks)
     }
     return replace(
@@ -328,13 +332,13 @@ def _check_scored_together(group: Members) -> None:
 
 def _scores(group: Members, parts: list[Scores], masks: dict[str, Any]) -> Scores:
     """Return the scores of all objects as one; their curve, if all that were scored are there."""
-    record, removed = mesh_scores.record(group[0].mesh) or {}, masks.get("removed")
+    record, forced_out = mesh_scores.record(group[0].mesh) or {}, masks.get("forced_out")
     values = np.concatenate([part.values for part in parts])
     scored = ~_joined_masks(
         [None if part.scored is None else ~part.scored for part in parts],
         [len(part.values) for part in parts],
     )
-    forced_out = np.zeros_like(scored) if removed is None else removed
+    forced_out = np.zeros_like(scored) if forced_out is None else forced_out
     whole = record["together"]["splats"] == len(values) and np.array_equal(forced_out, ~scored)
     return replace(
         parts[0],

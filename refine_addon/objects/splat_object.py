@@ -22,6 +22,7 @@ from ..core.survivors import survivor_columns
 from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.volumes import FREE, Forced
 from ..mesh import attributes as mesh_attributes
+from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters as mesh_floaters
 from ..mesh import layout as mesh_layout
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from ..core.levels.lod import Level
     from ..core.selection import Budget
     from ..core.splats import Splats
+    from ..core.survivor_choice import SurvivorChoice
     from ..core.views import ViewSet
     from ..mesh.layout import SplatObject
 
@@ -112,6 +114,15 @@ def modifier_notes(obj: bpy.types.Object) -> list[str]:
     return [note]
 
 
+def drift_notes(checked: SplatObject) -> list[str]:
+    """Return what others did to an object's splats, in sentences; see `mesh.drift`."""
+    drift = mesh_drift.found(checked.mesh)
+    if drift is None:
+        return []
+    remedy = "; Mend Splats in the panel puts that right" if drift.mendable else ""
+    return [f"object '{checked.obj.name}': {told}{remedy}" for told in drift.sentences()]
+
+
 def stored_task(
     checked: SplatObject,
     budget: Budget,
@@ -119,6 +130,7 @@ def stored_task(
     *,
     settings: Settings = DEFAULTS,
     views: ViewSet | None = None,
+    survivors: SurvivorChoice = "unchanged",
 ) -> Task:
     """Return what Apply has to decide: by the scores that the object holds, which splats stay.
 
@@ -131,7 +143,9 @@ def stored_task(
     settings : Settings, optional
         For absorbing.
     views : ViewSet, optional
-        With them, survivors absorb what goes.
+        What absorbing and refitting go by.
+    survivors : {"unchanged", "absorb", "refit"}
+        What they may become.
 
     Returns
     -------
@@ -150,10 +164,10 @@ def stored_task(
         settings=settings,
         splats=None if views is None else gather(checked, whole=True),
         views=views,
-        scores=stored_scores(checked, forced.removed),
+        scores=stored_scores(checked, forced.out),
         protected=forced.protected,
-        removed=forced.removed,
-        absorb=views is not None,
+        forced_out=forced.out,
+        survivors=survivors,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
     )
@@ -233,6 +247,8 @@ def reduce_object(
     mesh_edit.delete_vertices(checked.obj, ~keep)
     columns = {name: values[keep] for name, values in columns.items()}
     mesh_attributes.write_columns(checked, columns)
+    if columns:
+        mesh_drift.renew(checked.mesh)
     mesh_floaters.forget(checked.mesh)
     if RECORD in checked.mesh:
         del checked.mesh[RECORD]

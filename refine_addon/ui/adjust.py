@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
+from bpy.props import EnumProperty, FloatProperty, IntProperty
 
 from .properties import AMOUNTS
 
@@ -30,7 +30,7 @@ class Adjustable:
     threshold: FloatProperty(**AMOUNTS["threshold"], options={"SKIP_SAVE"})
     min_seen: FloatProperty(**AMOUNTS["min_seen"], options={"SKIP_SAVE"})
     psnr: FloatProperty(**AMOUNTS["psnr"], options={"SKIP_SAVE"})
-    absorb: BoolProperty(**AMOUNTS["absorb"], options={"SKIP_SAVE"})
+    survivors: EnumProperty(**AMOUNTS["survivors"], options={"SKIP_SAVE"})
 
     if TYPE_CHECKING:  # of every operator
         properties: Any
@@ -70,4 +70,4 @@ class Adjustable:
         layout.use_property_decorate = False
         layout.prop(self, "budget")
         layout.prop(self, "percent" if self.budget == "ratio" else self.budget)
-        layout.prop(self, "absorb")
+        layout.prop(self, "survivors")

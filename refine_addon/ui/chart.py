@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..core.estimate.quality import UNSEEN
+from ..core.survivor_choice import SURVIVORS
 from . import pixel_font
 
 if TYPE_CHECKING:
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..core.estimate.quality import Quality
+    from ..core.survivor_choice import SurvivorChoice
 
     Color = tuple[float, float, float]
     Box = tuple[float, float, float, float]  # left, top, right, bottom
@@ -58,10 +60,11 @@ class Look:
     def colors(self) -> dict[str, Color]:
         """Colours that the colour-blind tell apart too, by what they stand for, sRGB in 0..1."""
         if self.dark:
-            blue, orange, red, grey = (0x56B4E9, 0xE69F00, 0xE8603C, 0x8C8C8C)
+            blue, orange, green, red, grey = 0x56B4E9, 0xE69F00, 0x2FBF8F, 0xE8603C, 0x8C8C8C
         else:
-            blue, orange, red, grey = (0x005A9C, 0xA85400, 0xB5300F, 0x6A6A6A)
-        named = {"delete": blue, "absorb": orange, "goes": red, "stays": grey}
+            blue, orange, green, red, grey = 0x005A9C, 0xA85400, 0x00704F, 0xB5300F, 0x6A6A6A
+        named = {"unchanged": blue, "absorb": orange, "refit": green, "goes": red, "stays": grey}
+        named["in range"] = blue
         return {name: _rgb(value) for name, value in named.items()}
 
 
@@ -79,12 +82,15 @@ class Histogram:
         Places along the axis, 0 to 1, and what stands there.
     name : str
         What the splats are sorted by.
+    parts : (str, str)
+        What the two parts of each bar are, by their names in `Look.colors`: the lower one first.
     """
 
     bins: NDArray[np.uint8]
     total: NDArray[np.int64]
     ticks: tuple[tuple[float, str], ...]
     name: str
+    parts: tuple[str, str] = ("goes", "stays")
 
     def going(self, keep: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Return how many splats of each bar do not stay, (B,), for `keep`, (N,)."""
@@ -99,12 +105,12 @@ class Place:
     ----------
     share : float
         Of the splats that go, 0 to 1.
-    absorb : bool
-        Whether survivors absorb them.
+    survivors : {"unchanged", "absorb", "refit"}
+        What survivors may become.
     """
 
     share: float
-    absorb: bool = False
+    survivors: SurvivorChoice = "unchanged"
 
 
 def by_score(values: NDArray[np.float32]) -> Histogram:
@@ -135,9 +141,9 @@ def by_views(seen: NDArray[np.int32], views: int) -> Histogram:
     return Histogram(bins, np.bincount(bins, minlength=count + 1), ticks, "views")
 
 
-def _ways(quality: Quality) -> list[tuple[str, bool]]:
-    """Return the curves that are drawn, and whether each is that of absorbing."""
-    return [("delete", False), ("absorb", True)][: 2 if quality.foretold else 1]
+def _ways(quality: Quality) -> tuple[SurvivorChoice, ...]:
+    """Return of what survivors may become curves are drawn."""
+    return SURVIVORS if quality.foretold else SURVIVORS[:1]
 
 
 class Chart:
@@ -161,7 +167,7 @@ class Chart:
             self._low = max(np.floor(least / _STEP) * _STEP, 0.0)
             self._draw_curves(quality)
         self._draw_axis(histogram.ticks, _BOTTOM)
-        self._legend(("goes", "stays"), self._upper - 13, f"splats by {histogram.name}")
+        self._legend(histogram.parts, self._upper - 13, f"splats by {histogram.name}")
         self._barred = self._still
         self._bytes = self._still.bytes()
 
@@ -211,10 +217,10 @@ class Chart:
             columns[shares <= quality.shares[-1]],
             shares[shares <= quality.shares[-1]],
         )
-        for name, absorb in reversed(_ways(quality)):
-            heights = [self.at(share, quality.at(share, absorb=absorb))[1] for share in shares]
+        for name in reversed(_ways(quality)):
+            heights = [self.at(share, quality.at(share, name))[1] for share in shares]
             canvas.curve(columns, np.array(heights), 2.0 * self._scale, colors[name])
-        self._legend((name for name, _ in _ways(quality)), 0, "dB")
+        self._legend(_ways(quality), 0, "dB")
 
     def _draw_axis(self, ticks: Iterable[tuple[float, str]], y: float) -> None:
         self._rule(self._still, _LEFT, y, _RIGHT, 0.5)
@@ -255,9 +261,9 @@ class Chart:
     def _draw_place(self, strip: _Canvas, x: float, quality: Quality, place: Place) -> None:
         half, (top, bottom) = 0.5 * self._scale, (_TOP * self._scale, _MIDDLE * self._scale)
         strip.box((x - half, top, x + half, bottom), self.look.ink, 0.8)
-        for name, absorb in _ways(quality):
-            y = self.at(place.share, quality.at(place.share, absorb=absorb))[1]
-            chosen = absorb == place.absorb
+        for name in _ways(quality):
+            y = self.at(place.share, quality.at(place.share, name))[1]
+            chosen = name == place.survivors
             if chosen:
                 strip.dot(x, y, 5.5 * self._scale, self.look.ink)
             strip.dot(x, y, (4.0 if chosen else 3.0) * self._scale, self.look.colors[name])

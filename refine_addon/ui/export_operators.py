@@ -41,6 +41,7 @@ class _Export:
     file: SplatFile
     target: Path
     overwrite: bool
+    notes: list[str]
 
 
 class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelper):
@@ -100,7 +101,7 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
         target = expanded(bpy.path.abspath(self.filepath))
         refuse_existing(target, overwrite=self.overwrite)
         file = splat_object.exported_file(checked, apply_transform=self.apply_transform)
-        return _Export(file, target, self.overwrite)
+        return _Export(file, target, self.overwrite, splat_object.drift_notes(checked))
 
     @staticmethod
     def work(job: _Export, progress: Progress) -> SplatFile | Packed:
@@ -114,12 +115,14 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
         self,
         _context: bpy.types.Context,
         _checked: SplatObject | None,
-        _job: _Export,
+        job: _Export,
         file: SplatFile | Packed,
     ) -> Answer:
         """Say what was written."""
         if isinstance(file, Packed):
             self.report({"INFO"}, "; ".join(file.notes(np.ones(len(file.file), np.bool_))))
+        for note in job.notes:
+            self.report({"WARNING"}, note)
         self.report({"INFO"}, f"Wrote the splats to {self.filepath}")
         return {"FINISHED"}
 

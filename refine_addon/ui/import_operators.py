@@ -21,6 +21,7 @@ from ..core.errors import RefineError
 from ..core.formats.registry import SUFFIXES, read_splats
 from ..core.work import part, report
 from ..mesh import attributes as mesh_attributes
+from ..mesh import drift as mesh_drift
 from ..mesh import layout as mesh_layout
 from ..viewport import draw
 from . import preferences
@@ -130,6 +131,7 @@ class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper
 
     def _import(self, context: bpy.types.Context, file: SplatFile) -> bpy.types.Object:
         mesh = mesh_attributes.mesh_from_file(file)
+        mesh_drift.stamp(mesh)
         obj = bpy.data.objects.new(mesh.name, mesh)
         obj[FOLDER] = str(Path(file.path).parent.absolute())
         if self.upright:

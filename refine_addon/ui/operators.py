@@ -74,7 +74,8 @@ def apply_task(
         settings.to_budget(),
         forced,
         settings=settings.to_settings(),
-        views=chosen_views(context) if settings.absorb else None,
+        views=chosen_views(context) if settings.survivors != "unchanged" else None,
+        survivors=settings.survivors,
     )
 
 
@@ -144,10 +145,10 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
     @staticmethod
     def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
         """Score, and count how many splats lie in each view."""
-        forced_out, means = job.forced.removed, job.splats.means
+        forced_out, means = job.forced.out, job.splats.means
         scores = pipeline.score(
             job.splats, job.views, job.settings,
-            protected=job.forced.protected, removed=forced_out,
+            protected=job.forced.protected, forced_out=forced_out,
             quality=job.quality, progress=part(progress, 0.0, _SCORED),
         )  # fmt: skip
         means = means if forced_out is None else means[~forced_out]
@@ -170,7 +171,8 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         plans.refresh(context)
         self.report({"INFO"}, _scored_in_words(group, scores, job.forced.counts()["forced"]))
         modifiers = [note for each in group for note in splat_object.modifier_notes(each.obj)]
-        for note in (*scoring_notes(scores), *modifiers):
+        drifts = [note for each in group for note in splat_object.drift_notes(each)]
+        for note in (*scoring_notes(scores), *modifiers, *drifts):
             self.report({"WARNING"}, note)
         return {"FINISHED"}
 
@@ -191,7 +193,7 @@ def _by_closed_form(job: _Scoring) -> Settings:
 
 def _sketch(job: _Scoring, progress: Progress) -> Scores:
     return pipeline.score(
-        job.splats, job.views, _by_closed_form(job), removed=job.forced.removed, progress=progress
+        job.splats, job.views, _by_closed_form(job), forced_out=job.forced.out, progress=progress
     )
 
 
@@ -213,7 +215,7 @@ def _scored_or_applied(context: bpy.types.Context) -> str:
 
 
 class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
-    """Delete the splats that the budget does not keep; with Absorb, the others make up for them"""
+    """Delete the splats that the budget does not keep; the others make up for them, if they may"""
 
     bl_idname = "refine.apply"
     bl_label = "Apply"
@@ -227,18 +229,18 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         return self.adjusted(context, partial(super().execute, context))
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
-        """Delete at once; absorb on a thread."""
+        """Delete at once; absorb and refit on a thread."""
         start = super().invoke
 
         def call() -> Answer:
             """Go by what the panel says by now."""
-            absorbs = context.scene.refine.absorb
-            return start(context, event) if absorbs else self.execute(context)
+            changing = context.scene.refine.survivors != "unchanged"
+            return start(context, event) if changing else self.execute(context)
 
         return self.adjusted(context, call)
 
     def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Applying:
-        """Gather the scores that decide; to absorb, splats and views besides."""
+        """Gather the scores that decide; if survivors change, splats and views besides."""
         group = splat_group.members(context.view_layer, checked)
         for member in group:
             mesh_edit.check_deletable(member.obj)
@@ -251,19 +253,20 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
 
     @staticmethod
     def work(job: _Applying, progress: Progress) -> Result:
-        """Decide which splats stay, and what they absorb."""
+        """Decide which splats stay, and what they become."""
         return pipeline.decide(job.task, progress=progress)
 
     def finish(
         self, context: bpy.types.Context, checked: SplatObject, job: _Applying, result: Result
     ) -> Answer:
-        """Delete what does not stay, and change what absorbed it."""
+        """Delete what does not stay, and change what does."""
         context.view_layer.update()
         group = splat_group.by_uids(job.uids, checked)
         if job.task.absorb:  # on a thread, while volumes can be moved
             splat_group.check_forced(context.scene, group, job.forced)
         decided = job.task.budget.needs_scores or not result.absorbed  # by the scores
         changed = _changes_since_scoring(context, group, job) if decided else []
+        drifts = [note for each in group for note in splat_object.drift_notes(each)]
         outcome = splat_group.apply(group, result)
         for member in group:
             plans.forget(member.mesh)
@@ -277,6 +280,8 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
             + sizes_in_words(outcome.bytes_before, "->", outcome.bytes_after)
             + (f", {in_words(psnr)} in the views that scored" if psnr is not None else ""),
         )
+        for note in drifts:
+            self.report({"WARNING"}, note)
         if changed:
             self.report(
                 {"WARNING"},
@@ -321,7 +326,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         settings = context.scene.refine
         levels = settings.to_levels()
         return _MakingLevels(
-            splat_object.gather(checked, whole=True if levels.absorb else None),
+            splat_object.gather(checked, whole=True if levels.survivors != "unchanged" else None),
             chosen_views(context),
             levels,
             settings.to_settings(),
@@ -333,7 +338,7 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         """Make the levels."""
         return lod(
             job.splats, job.views, job.levels, job.settings,
-            protected=job.forced.protected, removed=job.forced.removed, progress=progress,
+            protected=job.forced.protected, forced_out=job.forced.out, progress=progress,
         )  # fmt: skip
 
     def finish(

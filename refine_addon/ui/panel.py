@@ -16,7 +16,16 @@ from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
 from ..objects import demands, splat_group
 from ..viewport import draw as viewport_draw
-from . import camera_list, plans, price, render_operators, running, staleness, wrapped
+from . import (
+    camera_list,
+    plans,
+    price,
+    render_operators,
+    running,
+    staleness,
+    transforms,
+    wrapped,
+)
 from .panel_cache import cached
 from .properties import FLOATERS
 from .view_operators import MODES
@@ -68,6 +77,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         layout.label(text=name, icon="OUTLINER_OB_POINTCLOUD")
         degree = max(mesh_layout.sh_degree(each.data) for each in objects)
         layout.label(text=f"{count:,} splats, SH degree {degree}")
+        transforms.draw(layout, context, objects)
         if several:
             wrapped.label(layout, context, "Scored and pruned as one scene", icon="INFO")
             return
@@ -245,7 +255,7 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         column = _named_column(layout)
         column.prop(settings, "budget")
         column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
-        column.prop(settings, "absorb")
+        column.prop(settings, "survivors")
         obj = context.object
         record = _record(obj)
         if record:
@@ -270,7 +280,7 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
         layout.operator("refine.export_ply", icon="EXPORT")
         column = _named_column(layout)
         column.prop(settings, "levels")
-        column.prop(settings, "nested")
+        column.prop(settings, "level_survivors")
         column.operator("refine.levels", icon="MOD_DECIM")
         _draw_progress(layout, context, "refine.export_ply", "refine.levels")
 
@@ -359,7 +369,7 @@ def _draw_plan(
         text = plans.remark(plan, record) if waits else plan["error"]
         wrapped.label(layout, context, text, icon="INFO" if waits else "ERROR")
         return
-    wrapped.label(layout, context, plans.sentence(plan, absorb=settings.absorb))
+    wrapped.label(layout, context, plans.sentence(plan, settings.survivors))
     if remark := plans.remark(plan, record):
         wrapped.label(layout, context, remark, icon="INFO")
     for warning in plans.warnings(plan, record):

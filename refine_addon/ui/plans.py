@@ -22,6 +22,7 @@ from ..core.estimate.alignment import Alignment
 from ..core.estimate.quality import in_words, out_of_reach
 from ..core.report import sizes_in_words
 from ..core.selection import Tally, quality_of
+from ..core.survivor_choice import SURVIVORS
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.records import parsed
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
     from ..core.scores import Scores
     from ..core.selection import Budget
+    from ..core.survivor_choice import SurvivorChoice
     from ..core.task import Task
     from .chart import Histogram
 
@@ -101,7 +103,7 @@ def unregister() -> None:
 def key(settings: Any) -> str:  # noqa: ANN401 - RefineSettings, which imports this module
     """Return what a plan depends on; a stored plan of another key is out of date."""
     budget = f"{settings.budget} {getattr(settings, settings.budget)!r} {_demanded(settings)!r}"
-    return f"{budget} absorb" if settings.absorb else budget
+    return f"{budget} {settings.survivors}"
 
 
 def changed(context: bpy.types.Context) -> None:
@@ -199,21 +201,22 @@ def forget(mesh: bpy.types.Mesh) -> None:
         del mesh[PLAN]
 
 
-def sentence(plan: dict[str, Any], *, absorb: bool) -> str:
+def sentence(plan: dict[str, Any], survivors: SurvivorChoice) -> str:
     """Return what a plan without an error comes to, as one sentence.
 
     Parameters
     ----------
     plan : dict
         See `stored`.
-    absorb : bool
-        Whether survivors absorb what goes.
+    survivors : {"unchanged", "absorb", "refit"}
+        What they may become.
 
     Examples
     --------
     >>> plan = {"splats": 100, "kept": 50, "bytes_before": 5e6, "bytes_after": 2.5e6}
-    >>> sentence(plan | {"psnr": 38.2, "psnr_absorbed": 45.9}, absorb=False)
-    'Keeps 50 of 100, 2.5 of 5.0 MB, about 38 dB in these views (Absorb: about 46)'
+    >>> known = {"psnr": 38.2, "psnr_absorbed": 45.9, "psnr_refitted": 48.9}
+    >>> sentence(plan | known, "unchanged")
+    'Keeps 50 of 100, 2.5 of 5.0 MB, about 38 dB in these views (Absorb: about 46, Refit: about 49)'
     """
     text = (
         f"Keeps {'about ' if plan.get('about') else ''}{plan['kept']:,} of {plan['splats']:,}, "
@@ -222,11 +225,15 @@ def sentence(plan: dict[str, Any], *, absorb: bool) -> str:
     if "psnr" not in plan:
         return text
     if "psnr_absorbed" not in plan:  # not foretold
-        return f"{text}, {in_words(plan['psnr'])} in these views{' without Absorb' * absorb}"
-    ways = [in_words(plan[name]) for name in ("psnr", "psnr_absorbed")]
-    here, other = ways[::-1] if absorb else ways
-    named = "without Absorb" if absorb else "Absorb"
-    return f"{text}, {here} in these views ({named}: {other.removesuffix(' dB')})"
+        unless = " if survivors stay unchanged" if survivors != "unchanged" else ""
+        return f"{text}, {in_words(plan['psnr'])} in these views{unless}"
+    ways = dict(zip(SURVIVORS, ("psnr", "psnr_absorbed", "psnr_refitted"), strict=True))
+    here = in_words(plan[ways.pop(survivors)])
+    others = ", ".join(
+        f"{name.capitalize()}: {in_words(plan[told]).removesuffix(' dB')}"
+        for name, told in ways.items()
+    )
+    return f"{text}, {here} in these views ({others})"
 
 
 def remark(plan: dict[str, Any], record: dict[str, Any]) -> str:
@@ -336,7 +343,7 @@ def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
         plan = _noted(known, settings) | depends
         keep = pipeline.decide(task).keep
         splat_group.mark_removed(group, keep)
-        keep = keep if task.removed is None else keep[~task.removed]
+        keep = keep if task.forced_out is None else keep[~task.forced_out]
         plan["unseen_gone"] = int(np.count_nonzero(~keep & (known.tally.scores.seen == 0)))
         price.show(mesh, known.tally.scores, known.kinds, _place(plan, settings), keep)
         _tell_cameras(known.tally.scores, plan, settings)
@@ -403,7 +410,7 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
     plan: dict[str, Any] = {"key": key(settings), "splats": count, "unseen": known.unseen}
     try:
         budget = settings.to_budget()
-        removed, about = _removed(known, budget, absorb=settings.absorb)
+        removed, about = _removed(known, budget, settings.survivors)
     except RefineError as error:
         return plan | {"error": str(error)}
     if about:
@@ -415,20 +422,21 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
         return plan
     plan["psnr"] = curve.at(removed / rest)
     if curve.foretold:
-        plan["psnr_absorbed"] = curve.at(removed / rest, absorb=True)
+        plan["psnr_absorbed"] = curve.at(removed / rest, "absorb")
+        plan["psnr_refitted"] = curve.at(removed / rest, "refit")
     if budget.psnr is not None:
-        psnr = curve.at(removed / rest, absorb=settings.absorb)
+        psnr = curve.at(removed / rest, settings.survivors)
         plan["remark"] = _sentence(out_of_reach(budget.psnr, removed, rest, psnr))
     return plan
 
 
-def _removed(known: _Known, budget: Budget, *, absorb: bool) -> tuple[int, bool]:
+def _removed(known: _Known, budget: Budget, survivors: SurvivorChoice) -> tuple[int, bool]:
     """Return how many splats a budget removes beside those forced out, and whether it is a guess.
 
     Raise `RefineError` if the budget means nothing to the scores.
     """
-    if budget.psnr is not None and absorb:
-        share = quality_of(known.tally.scores).share(budget.psnr, absorb=True)
+    if budget.psnr is not None and survivors != "unchanged":
+        share = quality_of(known.tally.scores).share(budget.psnr, survivors)
         rest = known.count - known.forced
         return min(math.floor(share * rest), known.tally.free), True
     left = budget.after(known.forced, known.count)
@@ -441,12 +449,12 @@ def _tell_cameras(scores: Scores, plan: dict[str, Any], settings: Any) -> None: 
     if curve is None or place is None:
         camera_list.tell({})
         return
-    absorb = settings.absorb and curve.foretold
-    camera_list.tell(curve.of_views(place.share, absorb=absorb))
+    survivors: SurvivorChoice = settings.survivors if curve.foretold else "unchanged"
+    camera_list.tell(curve.of_views(place.share, survivors))
 
 
 def _place(plan: dict[str, Any], settings: Any) -> Place | None:  # noqa: ANN401
     if "error" in plan:
         return None
     forced = plan["forced"]  # the chart is of the others
-    return Place((plan["removed"] - forced) / (plan["splats"] - forced), settings.absorb)
+    return Place((plan["removed"] - forced) / (plan["splats"] - forced), settings.survivors)

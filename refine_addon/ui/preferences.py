@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 PACKAGE = __package__.rpartition(".")[0]
 """The name under which the extension is enabled, such as ``bl_ext.user_default.refine_addon``."""
 
-DEFAULTS = ("method", "views", "budget", "percent", "psnr", "absorb")
+DEFAULTS = ("method", "views", "budget", "percent", "psnr", "survivors")
 """The preferences that are settings of a scene, by the same names."""
 
 
@@ -32,7 +32,7 @@ class RefinePreferences(bpy.types.AddonPreferences):
     budget: EnumProperty(**AMOUNTS["budget"])
     percent: FloatProperty(**AMOUNTS["percent"])
     psnr: FloatProperty(**AMOUNTS["psnr"])
-    absorb: BoolProperty(**AMOUNTS["absorb"])
+    survivors: EnumProperty(**AMOUNTS["survivors"])
     upright: BoolProperty(name="Upright", description=UPRIGHT_TEXT)
 
     def draw(self, _context: bpy.types.Context) -> None:

@@ -83,13 +83,13 @@ def show(
     same = old is not None and (old.look, old.histogram) == (look, kinds)
     chart = old if old is not None and same else Chart(look, scores.quality, kinds)
     _shown[:] = [_Shown(mesh.session_uid, chart)]
-    _upload(chart.picture(place, kinds.going(keep)))
+    upload(chart.picture(place, kinds.going(keep)))
 
 
 def move(mesh: bpy.types.Mesh, place: Place | None) -> None:
     """Move the budget's place on the chart, if it is that of this mesh."""
     if shows(mesh):
-        _upload(_shown[0].chart.picture(place))
+        upload(_shown[0].chart.picture(place))
 
 
 def shows(mesh: bpy.types.Mesh) -> bool:
@@ -102,9 +102,9 @@ def fits(preferences: bpy.types.Preferences) -> bool:
     return bool(_shown) and _shown[0].chart.look == look_of(preferences)
 
 
-def icon() -> int:
-    """Return the number of the icon, for `UILayout.template_icon`."""
-    return _previews[0][_NAME].icon_id if _previews and _NAME in _previews[0] else 0
+def icon(name: str = _NAME) -> int:
+    """Return the number of an icon, for `UILayout.template_icon`."""
+    return _previews[0][name].icon_id if _previews and name in _previews[0] else 0
 
 
 def look_of(preferences: bpy.types.Preferences) -> Look:
@@ -117,8 +117,9 @@ def look_of(preferences: bpy.types.Preferences) -> Look:
     return Look(size, (ink[0], ink[1], ink[2]))
 
 
-def _upload(picture: NDArray[np.uint8]) -> None:
+def upload(picture: NDArray[np.uint8], name: str = _NAME) -> None:
+    """Put a picture, (H, W, 4), lowest row first, into an icon."""
     previews = _previews[0]
-    preview = previews[_NAME] if _NAME in previews else previews.new(_NAME)
+    preview = previews[name] if name in previews else previews.new(name)
     preview.image_size = picture.shape[1], picture.shape[0]
     preview.image_pixels.foreach_set(np.ascontiguousarray(picture).view(np.int32).ravel())

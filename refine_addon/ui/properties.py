@@ -28,6 +28,7 @@ from ..mesh import floaters
 from ..mesh import layout as mesh_layout
 from ..mesh.edit import MARKING
 from . import plans
+from .select_panel import SelectSettings
 from .volumes import RefineVolume
 
 if TYPE_CHECKING:
@@ -53,6 +54,21 @@ BUDGETS = (
     ("psnr", "Quality", "Remove as many splats as leave the pictures this close to the unpruned"),
 )
 """Kinds of budget, by the names that core gives them."""
+
+SURVIVORS = (
+    ("unchanged", "Unchanged", "They stay what they are, to the bit"),
+    (
+        "absorb",
+        "Absorb",
+        "They take over what goes, by what the cameras see of it: far better if much goes; slower",
+    ),
+    (
+        "refit",
+        "Refit",
+        "They absorb, then learn what all splats look like to the cameras: better yet, slower yet",
+    ),
+)
+"""What survivors may become, by the names that core gives it."""
 
 UPRIGHT_TEXT = (
     "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "
@@ -115,10 +131,10 @@ AMOUNTS: dict[str, dict[str, Any]] = {
         "min": 1.0,
         "max": 99.0,
     },
-    "absorb": {
-        "name": "Absorb",
-        "description": "Survivors take over what is removed, by what the cameras see of it: far "
-        "better when much is removed, and slower; the survivors change",
+    "survivors": {
+        "name": "Survivors",
+        "description": "What the splats that stay may become",
+        "items": SURVIVORS,
     },
 }
 """How much is removed, and how: properties of the panel and of *Apply*."""
@@ -191,7 +207,7 @@ def decimal(value: float) -> float:
     return float(str(np.float32(value)))
 
 
-class RefineSettings(bpy.types.PropertyGroup):
+class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     """Settings of the panel, at ``scene.refine``."""
 
     method: EnumProperty(name="Method", description="How splats are scored", items=METHODS)
@@ -237,7 +253,7 @@ class RefineSettings(bpy.types.PropertyGroup):
     threshold: FloatProperty(**AMOUNTS["threshold"], update=_plan_again)
     min_seen: FloatProperty(**AMOUNTS["min_seen"], update=_plan_again)
     psnr: FloatProperty(**AMOUNTS["psnr"], update=_plan_again)
-    absorb: BoolProperty(**AMOUNTS["absorb"], update=_plan_again)
+    survivors: EnumProperty(**AMOUNTS["survivors"], update=_plan_again)
     protect: StringProperty(
         name="Protect",
         description="Vertex group, or boolean or float point attribute: the splats in it stay",
@@ -254,10 +270,11 @@ class RefineSettings(bpy.types.PropertyGroup):
         description="Shares of the splats that stay in the levels of detail, the finest first",
         default="0.5, 0.25, 0.12, 0.06",
     )
-    nested: BoolProperty(
-        name="Nested",
-        description="Only delete: each level is some of the splats of the one before, unchanged. "
-        "Else survivors absorb what goes, which is far better",
+    level_survivors: EnumProperty(
+        name="Survivors",
+        description="What the splats that stay in a level may become",
+        items=SURVIVORS,
+        default=Levels.survivors,
     )
 
     def to_settings(self) -> Settings:
@@ -295,7 +312,7 @@ class RefineSettings(bpy.types.PropertyGroup):
         except ValueError as error:
             msg = f"Levels is {self.levels!r}, expected numbers with commas between them"
             raise RefineError(msg) from error
-        return Levels(shares, absorb=not self.nested)
+        return Levels(shares, survivors=self.level_survivors)
 
     def to_frames(self, scene: bpy.types.Scene) -> range:
         """Return the frames whose views count."""

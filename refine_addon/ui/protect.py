@@ -1,9 +1,7 @@
-"""The operator that marks splats by hand to stay."""
+"""The operator that marks splats by hand: to stay, or to go."""
 
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
@@ -13,18 +11,27 @@ from ..core.errors import RefineError
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
+from ..mesh import selection
 from . import demand_changes
 from .operator_bases import Answer, AtOnce, Needing, idle, on_splats
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+_MARKS = {"STAY": mesh_edit.PROTECT, "GO": mesh_edit.MUST_GO}
+
+_TOOLTIPS = {
+    ("ADD", "STAY"): "Mark the selected splats: they stay, whatever the budget",
+    ("ADD", "GO"): "Mark the selected splats: they go before all others",
+    ("SUBTRACT", "STAY"): "Take the marks off the selected splats",
+    ("SUBTRACT", "GO"): "Take the marks off the selected splats",
+    ("CLEAR", "STAY"): "Take the marks off all splats",
+    ("CLEAR", "GO"): "Take the marks off all splats",
+}
 
 
 class REFINE_OT_protect(AtOnce, Needing, bpy.types.Operator):
-    """Change which splats are marked to stay"""
+    """Change which splats are marked to stay, or to go"""
 
     bl_idname = "refine.protect"
-    bl_label = "Protect Splats"
+    bl_label = "Mark Splats"
     bl_options = {"REGISTER", "UNDO"}
     needs = (idle, on_splats)
 
@@ -32,83 +39,78 @@ class REFINE_OT_protect(AtOnce, Needing, bpy.types.Operator):
         name="Mode",
         description="What is done to the marks",
         items=(
-            ("ADD", "Protect Selected", "Mark the selected splats to stay"),
+            ("ADD", "Mark Selected", "Mark the selected splats"),
             ("SUBTRACT", "Release Selected", "Take the marks off the selected splats"),
             ("CLEAR", "Clear", "Take the marks off all splats"),
+        ),
+    )
+    mark: EnumProperty(
+        name="Mark",
+        description="What is marked",
+        items=(
+            ("STAY", "Stay", "They stay, whatever else is said"),
+            ("GO", "Must Go", "They go before all others"),
         ),
     )
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.AnyType) -> str:
         """Return the tooltip of a button."""
-        return {
-            "ADD": "Mark the splats that are selected in edit mode: they stay, whatever the budget",
-            "SUBTRACT": "Take the marks off the splats that are selected in edit mode",
-            "CLEAR": "Take the marks off all splats",
-        }[properties.mode]
+        return _TOOLTIPS[properties.mode, properties.mark]
 
     def act(self, context: bpy.types.Context) -> Answer:
-        """Write the marks."""
-        obj = context.object
+        """Write the marks; a splat that is marked one way loses its mark of the other."""
+        obj, name = context.object, _MARKS[self.mark]
         mesh_edit.check_writable(obj)
-        if obj.mode == "EDIT" and obj.type == "MESH":
-            _mark_in_edit_mode(obj, self.mode)
-        else:
-            _mark(obj, self.mode)
+        change = _mark_in_edit_mode if obj.mode == "EDIT" and obj.type == "MESH" else _mark
+        change(obj, self.mode, name)
+        for other in set(_MARKS.values()) - {name}:
+            if self.mode == "ADD" and other in obj.data.attributes:
+                change(obj, "SUBTRACT", other)
         if obj.mode == "EDIT":
             demand_changes.mark_after_edit_mode(obj)
         else:
-            marked = mesh_edit.protected_mask(obj, "")
+            marked = mesh_edit.marks(obj, name)
             count = 0 if marked is None else int(np.count_nonzero(marked))
-            self.report({"INFO"}, f"{count:,} splats are marked to stay")
+            self.report({"INFO"}, f"{count:,} splats are marked to {self.mark.lower()}")
         demand_changes.mark_again(context)
         return {"FINISHED"}
 
 
-def _mark(obj: bpy.types.Object, mode: str) -> None:
-    """Change the marks by what is selected."""
-    mesh, marked = obj.data, mesh_edit.protected_mask(obj, "")
+def _mark(obj: bpy.types.Object, mode: str, name: str) -> None:
+    """Change the marks of a name by what is selected."""
+    marked = mesh_edit.marks(obj, name)
     if marked is None:
-        marked = np.zeros(mesh_layout.splat_count(mesh), np.bool_)
+        marked = np.zeros(mesh_layout.splat_count(obj.data), np.bool_)
     if mode == "CLEAR":
         marked[:] = False
     else:
-        marked[_selection(obj)] = mode == "ADD"
-    mesh_edit.mark_protected(obj, marked)
+        chosen = selection.selected(obj)
+        if not chosen.any():
+            msg = f"object '{obj.name}': no splat is selected; select some first"
+            raise RefineError(msg)
+        marked[chosen] = mode == "ADD"
+    mesh_edit.mark_by_hand(obj, marked, name)
 
 
-def _selection(obj: bpy.types.Object) -> NDArray[np.bool_]:
-    """Return which splats are selected, (N,), or raise `RefineError` if none is."""
-    name = ".selection" if obj.type == "POINTCLOUD" else ".select_vert"
-    attribute = obj.data.attributes.get(name)
-    if attribute and attribute.domain == "POINT" and attribute.data_type in {"BOOLEAN", "FLOAT"}:
-        selected = mesh_attributes.read_attribute(obj.data, name) > 0
-        if selected.any():
-            return np.asarray(selected)
-    elif obj.mode == "EDIT":
-        return np.ones(mesh_layout.splat_count(obj.data), np.bool_)  # Blender's way to say all
-    msg = f"object '{obj.name}': no splat is selected; select some in edit mode first"
-    raise RefineError(msg)
-
-
-def _mark_in_edit_mode(obj: bpy.types.Object, mode: str) -> None:
+def _mark_in_edit_mode(obj: bpy.types.Object, mode: str, name: str) -> None:
     """Change the marks of a mesh in edit mode, where Blender itself has to write them.
 
     Raise `RefineError` if no splat is selected, or Blender fails.
     """
     mesh = obj.data
     if mode == "CLEAR":
-        mesh_attributes.remove_attribute(mesh, mesh_edit.PROTECT)
+        mesh_attributes.remove_attribute(mesh, name)
         return
     if not mesh.total_vert_sel:
         msg = f"object '{obj.name}': no splat is selected"
         raise RefineError(msg)
-    marks = mesh.attributes.get(mesh_edit.PROTECT)
+    marks = mesh.attributes.get(name)
     if marks and (marks.data_type, marks.domain) != ("BOOLEAN", "POINT"):
-        mesh_attributes.remove_attribute(mesh, mesh_edit.PROTECT)
+        mesh_attributes.remove_attribute(mesh, name)
         marks = None
     before = mesh.attributes.active.name if mesh.attributes.active else ""
-    mesh.attributes.active = marks or mesh.attributes.new(mesh_edit.PROTECT, "BOOLEAN", "POINT")
+    mesh.attributes.active = marks or mesh.attributes.new(name, "BOOLEAN", "POINT")
     try:
         bpy.ops.mesh.attribute_set(value_bool=mode == "ADD")
     except RuntimeError as error:

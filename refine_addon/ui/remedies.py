@@ -145,7 +145,7 @@ class REFINE_OT_keep_unseen(AtOnce, OnSplats, bpy.types.Operator):
             mesh_edit.check_writable(member.obj)
         for member, unseen in zip(group, masks, strict=True):
             marked = mesh_edit.protected_mask(member.obj, "")
-            mesh_edit.mark_protected(member.obj, unseen if marked is None else unseen | marked)
+            mesh_edit.mark_by_hand(member.obj, unseen if marked is None else unseen | marked)
         plans.refresh(context)
         count = sum(int(np.count_nonzero(unseen)) for unseen in masks)
         self.report({"INFO"}, f"{count:,} splats that lie in no view stay")
@@ -154,8 +154,8 @@ class REFINE_OT_keep_unseen(AtOnce, OnSplats, bpy.types.Operator):
 
 def _unseen(checked: SplatObject, forced: Forced) -> NDArray[np.bool_]:
     """Return which splats lie in no view, (N,), and need not go for another reason."""
-    unseen = mesh_scores.stored_scores(checked, forced.removed).seen == 0
-    return unseen if forced.removed is None else unseen & ~forced.removed
+    unseen = mesh_scores.stored_scores(checked, forced.out).seen == 0
+    return unseen if forced.out is None else unseen & ~forced.out
 
 
 def _deciding(context: bpy.types.Context) -> list[bpy.types.Object]:

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 _NOISE = 1e-6
 """Relative: what another machine or version of Blender may make of the same matrices."""
 
+_NONE = [0, 0]
+"""`mesh_scores.digest` of what marks nothing."""
+
 _FITS = ("AUTO", "HORIZONTAL", "VERTICAL")
 _AXES, _PLACE = [0, 1, 2, 4, 5, 6, 8, 9, 10], [3, 7, 11]  # in the rows of a matrix
 
@@ -37,6 +40,7 @@ def origin(context: bpy.types.Context, obj: bpy.types.Object) -> dict[str, Any]:
         "matrix": np.array(obj.matrix_world).tolist(),
         "frame": context.scene.frame_current,
         "volumes": _volumes(context.scene),
+        "must_go": _must_go(obj),
         **_cameras(context),
     }
 
@@ -64,10 +68,11 @@ def changes(
             "object moved": _moved(then, context.scene, obj),
             "cameras changed": _other_cameras(then, _cameras(context)),
             "volumes changed": _other_volumes(then, context.scene),
+            "what must go changed": then.get("must_go", _NONE) != _must_go(obj),
             "settings changed": _deciding(settings)
             != _deciding(asdict(context.scene.refine.to_settings())),
             "what is protected changed": bool(record.get("quality"))
-            and record.get("protected", [0, 0]) != _protected(obj, protected),
+            and record.get("protected", _NONE) != _protected(obj, protected),
         }
     except (KeyError, TypeError, ValueError):  # whoever wrote there, these are no scores of ours
         return []
@@ -93,6 +98,10 @@ def _protected(obj: bpy.types.Object, mask: NDArray[np.bool_] | None) -> list[in
     if mask is None and mesh_edit.FORCE in obj.data.attributes:
         mask = mesh_attributes.read_attribute(obj.data, mesh_edit.FORCE) == 1
     return mesh_scores.digest(mask)
+
+
+def _must_go(obj: bpy.types.Object) -> list[int]:
+    return mesh_scores.digest(mesh_edit.marks(obj, mesh_edit.MUST_GO))
 
 
 def _volumes(scene: bpy.types.Scene) -> list[Any]:

@@ -164,7 +164,7 @@ class REFINE_OT_crop(AtOnce, OnSplats, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> Answer:
         """Delete it."""
         checked = mesh_layout.check(context.object)
-        forced_out = demands.Demands.of_scene(context.scene).forced(checked).removed
+        forced_out = demands.Demands.of_scene(context.scene).forced(checked).out
         if forced_out is None or not forced_out.any():
             msg = f"object '{checked.obj.name}': no volume says of any splat that it must go"
             raise RefineError(msg)

@@ -30,8 +30,12 @@ MOST = 1 << 24
 STAYS, GOES = 1, 2
 """What stays and what goes in any case, as `mesh.edit.FORCE` has it."""
 
-MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (1.0, 1.0, 1.0)}
-"""Their tints. Neither is a colour of the heat map, nor that of what goes by the budget."""
+MARKS = {STAYS: (0.0, 0.9, 0.8), GOES: (0.45, 0.0, 1.0)}
+"""Their tints, visible on white as on black. Neither is a colour of the heat map, nor that of what
+goes by the budget, nor `SELECTED`."""
+
+SELECTED, SELECTED_SHARE = (1.0, 0.1, 0.75), 0.6
+"""What is selected is shown in this colour, by that share."""
 
 SHARES = {"SCENE": 0.35, "HEAT": 0.55, "STAYS": 0.35, "GOES": 0.75}
 """How much of a colour that tint is, by mode of the view."""

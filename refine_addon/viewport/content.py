@@ -11,8 +11,10 @@ from ..core.errors import RefineError
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
+from ..mesh import selection as mesh_selection
+from ..mesh.edit_mode import readable
 from ..mesh.layout import check, sh_degree
-from . import background, shader
+from . import background, points, shader
 from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack, same
 
 if TYPE_CHECKING:
@@ -52,7 +54,8 @@ class MeshSplats:
         What stays and what goes in any case.
     marks : tuple of int
         Which of `arrays.MARKS` are in `forced`.
-    read_remove, read_ranks, read_force : (N,) or None
+    selected, hidden : (M,) bool or None
+    read_remove, read_ranks, read_force, read_selected, read_hidden : (N,) or None
         Attributes of the mesh as they were last read.
     """
 
@@ -67,6 +70,10 @@ class MeshSplats:
     forced: NDArray[np.int32] | None = None
     marked: int = 0
     marks: tuple[int, ...] = ()
+    selected: NDArray[np.bool_] | None = None
+    hidden: NDArray[np.bool_] | None = None
+    read_selected: NDArray[np.bool_] | None = field(default=None, repr=False)
+    read_hidden: NDArray[np.bool_] | None = field(default=None, repr=False)
     read_remove: NDArray[np.bool_] | None = field(default=None, repr=False)
     read_ranks: NDArray[Any] | None = field(default=None, repr=False)
     read_force: NDArray[np.int32] | None = field(default=None, repr=False)
@@ -115,12 +122,15 @@ class Content:
     refused : set of int
         Identities of meshes that look like splats at first sight alone.
     changes : int
-        Rises where what goes has changed, while the splats are the same.
+        Rises where what goes or is hidden has changed, while the splats are the same.
+    selections : int
+        Rises where what is selected has changed.
     """
 
     def __init__(self) -> None:
         self.atlas: Atlas | None = None
-        self.changes = 0
+        self.changes = self.selections = 0
+        self._selection: tuple[object, gpu.types.GPUTexture] | None = None
         self._held: dict[int, MeshSplats] = {}
         self._stale: set[int] = set()
         self.refused: set[int] = set()
@@ -134,6 +144,26 @@ class Content:
         """Return which of `arrays.MARKS` there are among the splats that are drawn."""
         slots = self.atlas.slots.values() if self.atlas else ()
         return {mark for slot in slots for mark in slot.held.marks}
+
+    def select(self, mesh: int, chosen: NDArray[np.bool_]) -> None:
+        """Show splats of a mesh, (N,), as selected, whatever it says, until it changes."""
+        held = self._held.get(mesh)
+        if held is not None and held.packed is not None and held.signature[0] == len(chosen):
+            held.read_selected = chosen
+            self._mark_selected(held)
+
+    def selection(self) -> gpu.types.GPUTexture:
+        """Return a texel for each row of the atlas: 1 where the splat is selected, else 0."""
+        key = (self.atlas, self.selections)
+        if self._selection is None or self._selection[0] != key:
+            slots = self.atlas.slots.values() if self.atlas else ()
+            flags = np.zeros(sum(slot.count for slot in slots), np.float32)
+            for slot in slots:
+                if slot.held.selected is not None:
+                    rows = slice(slot.start, slot.start + slot.count)
+                    flags[rows] = slot.held.selected[: slot.count]
+            self._selection = key, shader.texture(as_texture(flags), 1, "R8")
+        return self._selection[1]
 
     def pending(self) -> bool:
         """Tell whether splats are being packed."""
@@ -151,7 +181,7 @@ class Content:
         Parameters
         ----------
         objects : list of bpy.types.Object
-            That hold splats, not in edit mode.
+            That hold splats. Of those in edit mode it is drawn what `read_edited` read last.
         existing : callable
             Gives the identities of all objects of the file and their meshes.
 
@@ -165,10 +195,13 @@ class Content:
             mesh = obj.data.session_uid
             if mesh in self.refused:
                 continue
-            if mesh not in self._held or mesh in self._stale:
+            if points.is_edited(obj):
+                if mesh not in self._held:
+                    continue  # `read_edited` is to come
+            elif mesh not in self._held or mesh in self._stale:
                 self._stale.discard(mesh)
                 try:
-                    self._read(check(obj))
+                    self._read(check(obj), mesh)
                 except RefineError:
                     self.refused.add(mesh)
                     continue
@@ -181,14 +214,28 @@ class Content:
         self._place(set(wanted), existing)
         return wanted
 
-    def _read(self, checked: SplatObject) -> None:
-        """Read of a mesh what has changed."""
+    def read_edited(self, obj: bpy.types.Object) -> None:
+        """Read an object in edit mode; not while Blender draws, as its mesh is brought up to date.
+
+        Raises
+        ------
+        RefineError
+            If it holds no splats that can be read.
+        """
+        self._stale.discard(obj.data.session_uid)
+        with readable(obj) as checked:
+            self._read(checked, obj.data.session_uid)
+
+    def _read(self, checked: SplatObject, uid: int) -> None:
+        """Read of a mesh what has changed; `uid` is the identity of the mesh that is drawn."""
         mesh = checked.mesh
-        held = self._held.setdefault(mesh.session_uid, MeshSplats())
+        held = self._held.setdefault(uid, MeshSplats())
         held.degree = sh_degree(mesh)
         held.read_ranks = _attribute(mesh, mesh_scores.RANK, "FLOAT")
         held.read_remove = _attribute(mesh, mesh_edit.REMOVE, "BOOLEAN")
         held.read_force = _attribute(mesh, mesh_edit.FORCE, "INT")
+        held.read_selected = _attribute(mesh, mesh_selection.name_of(mesh), "BOOLEAN")
+        held.read_hidden = _attribute(mesh, mesh_selection.HIDDEN, "BOOLEAN")
         signature = (len(checked), held.degree, mesh_attributes.digest(checked))
         if signature != held.signature:
             held.signature = signature
@@ -202,6 +249,8 @@ class Content:
         if packed is None:
             return
         held.going = None if held.read_remove is None else held.read_remove[packed.vertices]
+        held.hidden = None if held.read_hidden is None else held.read_hidden[packed.vertices]
+        self._mark_selected(held)
         forced = None if held.read_force is None else held.read_force[packed.vertices]
         if not same(held.forced, forced):
             held.forced = forced
@@ -213,6 +262,14 @@ class Content:
         if held.important is None:
             held.important = most_important_first(packed, held.ranks)
         self.changes += 1
+
+    def _mark_selected(self, held: MeshSplats) -> None:
+        """Note which of the splats that are drawn are selected."""
+        read = held.read_selected
+        chosen = None if read is None or not read.any() else read[held.packed.vertices]
+        if not same(held.selected, chosen):
+            held.selected = chosen
+            self.selections += 1
 
     def _place(
         self, wanted: set[tuple[int, int]], existing: Callable[[], set[tuple[int, int]]]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import time
 import traceback
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -10,6 +12,7 @@ import bpy
 import numpy as np
 from bpy.app.handlers import persistent
 
+from ..core.errors import RefineError
 from ..mesh.layout import looks_like_splats, splat_count
 from . import background, legend, points, shader
 from .content import Content
@@ -18,11 +21,16 @@ from .view import Camera, View
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from numpy.typing import NDArray
+
 MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
 """What can be drawn: nothing, all as it is, coloured by rank, what Apply leaves, what it takes."""
 
 _TICK = 0.03
 """Seconds between two looks at whether the thread has sorted more splats."""
+
+_EDIT_REST = 0.3
+"""Seconds without a change in edit mode after which the splats are drawn as they are by then."""
 
 _VIEWS = 16
 """Regions whose pictures are kept on the graphics card."""
@@ -37,6 +45,8 @@ class _State:
         self.content = Content()
         self.views: dict[int, View] = {}
         self.handles: list[Any] = []
+        self.edited_at = 0.0
+        self.reads = False
 
 
 _state = _State()
@@ -61,6 +71,13 @@ def drawn(region: bpy.types.Region) -> int:
     """Return how many splats a region shows."""
     view = _state.views.get(region.as_pointer())
     return view.count if view else 0
+
+
+def select(mesh: int, chosen: NDArray[np.bool_]) -> None:
+    """Show splats of a mesh, (N,), as selected while a tool selects them; nothing is stored."""
+    if _state.mode != "OFF":
+        _state.content.select(mesh, chosen)
+        _redraw()
 
 
 def show(wanted: str) -> None:
@@ -123,8 +140,9 @@ def _unhook() -> None:
             listening = getattr(bpy.app.handlers, name)
             if handler in listening:
                 listening.remove(handler)
-    if bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.unregister(_tick)
+    for timer in (_tick, _read_edited):
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)
 
 
 def _guarded(work: Callable[[], None]) -> None:
@@ -165,7 +183,7 @@ def _draw() -> None:
 
 
 def _is_drawn(obj: bpy.types.Object, space: bpy.types.SpaceView3D) -> bool:
-    if not looks_like_splats(obj) or points.is_edited(obj) or not splat_count(obj.data):
+    if not looks_like_splats(obj) or not splat_count(obj.data):
         return False
     return obj.visible_get(viewport=space)
 
@@ -189,6 +207,24 @@ def _tick() -> float | None:
         if view is None or ready or view.due():
             region.tag_redraw()
     return None if complete() else _TICK
+
+
+def _read_edited() -> float | None:
+    """Read the objects in edit mode once nothing has changed there for a moment."""
+    waits = _EDIT_REST - (time.monotonic() - _state.edited_at)
+    if waits > 0.0:
+        return waits
+    layers = [window.view_layer for window in bpy.context.window_manager.windows]
+    _state.reads = True  # which counts as a change of its own
+    for obj in {obj for layer in layers for obj in layer.objects}:
+        if points.is_edited(obj) and looks_like_splats(obj) and splat_count(obj.data):
+            with contextlib.suppress(RefineError):
+                _state.content.read_edited(obj)
+    for layer in layers:
+        layer.update()
+    _state.reads = False
+    _redraw()
+    return None
 
 
 def _redraw() -> None:
@@ -222,6 +258,10 @@ def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = No
             data = getattr(update.id.original, "data", update.id.original)
             if isinstance(data, (bpy.types.Mesh, bpy.types.PointCloud)):
                 _state.content.has_changed(data.session_uid)
+                if getattr(data, "is_editmode", False) and not _state.reads:
+                    _state.edited_at = time.monotonic()
+                    if not bpy.app.timers.is_registered(_read_edited):
+                        bpy.app.timers.register(_read_edited, first_interval=_EDIT_REST)
     points.hide(depsgraph, _state.content.refused)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from ..core.rendering import ALPHA_CUT, ALPHA_MAX, LOW_PASS
-from .arrays import WIDTH
+from .arrays import SELECTED, SELECTED_SHARE, WIDTH
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -26,6 +26,8 @@ _CONSTANTS = f"""
 #define ALPHA_MAX {ALPHA_MAX}
 #define ALPHA_CUT {ALPHA_CUT}
 #define BEYOND 0.3
+#define SELECTED vec3{SELECTED}
+#define SELECTED_SHARE {SELECTED_SHARE}
 """
 
 _VIEW = """
@@ -62,6 +64,8 @@ void main()
     return;
   }
   paint = value_at(colors, row);
+  float chosen = SELECTED_SHARE * step(0.5, value_at(selection, row).r);
+  paint.rgb = mix(paint.rgb, SELECTED, chosen);
   float reach = 2.0 * log(paint.a / ALPHA_CUT);
   if (!(reach > 0.0)) {
     return;
@@ -159,7 +163,10 @@ def splats() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
     info = gpu.types.GPUShaderCreateInfo()
     info.typedef_source(_CONSTANTS + _VIEW)
     info.uniform_buf(0, "ViewData", "view_data")
-    names = ("order", "means", "covariances", "more_covariances", "colors", "matrices", "depths")
+    names = (
+        *("order", "means", "covariances", "more_covariances", "colors", "selection"),
+        *("matrices", "depths"),
+    )
     for slot, name in enumerate(names):
         info.sampler(slot, "FLOAT_2D", name)
     between = gpu.types.GPUStageInterfaceInfo("refine_splat")

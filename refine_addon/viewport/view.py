@@ -99,6 +99,7 @@ class _Part(NamedTuple):
 
     slot: Slot
     going: NDArray[np.bool_] | None
+    hidden: NDArray[np.bool_] | None
     ranks: NDArray[Any] | None
     forced: NDArray[np.int32] | None
     important: NDArray[np.int32] | None
@@ -204,7 +205,7 @@ class View:
         if self._order is None or self._colors is None:
             return
         self.count = self._order.count
-        self._paint(atlas, shown, camera, 1 if self.complete else least.pixels, solid=solid)
+        self._paint(content, shown, camera, 1 if self.complete else least.pixels, solid=solid)
         _put(self._picture)
 
     def _moves(self, key: bytes) -> bool:
@@ -259,17 +260,18 @@ class View:
             self._order = _Order(shader.texture(as_texture(order), 1, "R32F"), len(order), key)
 
     def _paint(
-        self, atlas: Atlas, shown: list[Shown], camera: Camera, pixels: int, *, solid: bool
+        self, content: Content, shown: list[Shown], camera: Camera, pixels: int, *, solid: bool
     ) -> None:
         """Draw the splats into the picture, unless it shows them already."""
         depths = _depths(camera.size) if solid else None
         size = (max(1, camera.size[0] // pixels), max(1, camera.size[1] // pixels))
-        wanted = (self._order.key, self._colors_key, self._camera_key, size)
+        wanted = (self._order.key, self._colors_key, self._camera_key, size, content.selections)
         if self._picture and wanted == self._drawn and same(depths, self._depths):
             return
         self._drawn, self._depths = wanted, depths
         if not self._picture or (self._picture.width, self._picture.height) != size:
             self._picture = gpu.types.GPUTexture(size, format="RGBA16F")
+        atlas = content.atlas
         occluders = np.ones((1, 1), np.float32) if depths is None else depths
         textures = {
             "order": self._order.texture,
@@ -277,6 +279,7 @@ class View:
             "covariances": atlas.covariances,
             "more_covariances": atlas.more_covariances,
             "colors": self._colors,
+            "selection": content.selection(),
             "matrices": shader.texture(_matrix_rows(shown), 4, "RGBA32F"),
             "depths": shader.texture(occluders, 1, "R32F"),
         }  # held until they are drawn: the shader does not keep what it is given
@@ -322,7 +325,9 @@ def _parts(shown: Iterable[Shown], camera: Camera) -> list[_Part]:
             place = np.linalg.pinv(matrix)[:3, :3] @ (0.0, 0.0, -1.0)
         held = slot.held
         eye = Eye(-matrix[2], place, camera.perspective)
-        parts.append(_Part(slot, held.going, held.ranks, held.forced, held.important, eye))
+        parts.append(
+            _Part(slot, held.going, held.hidden, held.ranks, held.forced, held.important, eye)
+        )
     return parts
 
 
@@ -381,6 +386,9 @@ def _in_view(
         shown = chosen[places].astype(np.int64)
     if mode in {"STAYS", "GOES"}:
         wanted = _wanted(part.going, mode, shown)
+        shown, depths = shown[wanted], depths[wanted]
+    if part.hidden is not None:
+        wanted = ~part.hidden[shown]
         shown, depths = shown[wanted], depths[wanted]
     return shown + slot.start, depths
 

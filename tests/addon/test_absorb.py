@@ -15,7 +15,7 @@ def few(addon, room, room_cameras):  # noqa: ARG001
     remove = np.arange(len(room.data.vertices)) % 10 != 0
     addon.mesh.edit.delete_vertices(room, remove)
     settings = bpy.context.scene.refine
-    settings.absorb, settings.ratio = True, 0.6
+    settings.survivors, settings.ratio = "absorb", 0.6
     return room, core.Budget(ratio=0.6)
 
 
@@ -24,7 +24,7 @@ def absorbed_in_core(addon, obj, views, budget):
         addon.objects.splat_object.gather(addon.mesh.layout.check(obj), whole=True),
         views,
         budget,
-        absorb=True,
+        survivors="absorb",
     )
 
 
@@ -87,7 +87,7 @@ def test_the_command_on_an_object_writes_the_same_survivors(addon, few, room_vie
 
     report = addon.objects.operation.prune_object(
         room.name,
-        addon.core.PruneRequest(room_views, budget, addon.core.Settings(), absorb=True),
+        addon.core.PruneRequest(room_views, budget, addon.core.Settings(), survivors="absorb"),
         output=out,
     )
 
@@ -106,7 +106,7 @@ def test_saving_leaves_in_the_blend_what_apply_leaves(addon, few, room_views, tm
 
     addon.objects.operation.prune_object(
         room.name,
-        addon.core.PruneRequest(room_views, budget, addon.core.Settings(), absorb=True),
+        addon.core.PruneRequest(room_views, budget, addon.core.Settings(), survivors="absorb"),
         save=True,
     )
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))

@@ -158,7 +158,7 @@ def test_an_absorption_is_refused_when_other_splats_must_stay_since(addon, few, 
     """By a mark from a script or a volume that moved: each deletes or keeps what it must not."""
     bpy.ops.refine.score()
     settings = bpy.context.scene.refine
-    settings.absorb, settings.percent = True, 80.0
+    settings.survivors, settings.percent = "absorb", 80.0
     volume = bpy.data.objects.new("volume", None)
     volume.empty_display_type, volume.location = "CUBE", (1000.0, 0.0, 0.0)
     bpy.context.scene.collection.objects.link(volume)
@@ -168,7 +168,7 @@ def test_an_absorption_is_refused_when_other_splats_must_stay_since(addon, few, 
     count = len(few.data.vertices)
     operator, context, said = start(addon.ui.operators.REFINE_OT_apply)
     if change == "marks":
-        addon.mesh.edit.mark_protected(few, np.arange(count) < 200)
+        addon.mesh.edit.mark_by_hand(few, np.arange(count) < 200)
     else:
         volume.location, volume.scale = (0.0, 0.0, 0.0), (100.0, 100.0, 100.0)
 

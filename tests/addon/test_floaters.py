@@ -123,7 +123,7 @@ def test_floaters_that_were_protected_after_the_search_stay(addon, polluted):
     goes = marked(addon, room)
     spared = goes & (np.cumsum(goes) % 2 == 0)
     opacities = addon.mesh.attributes.read_attribute(room.data, "opacity")
-    addon.mesh.edit.mark_protected(room, spared)
+    addon.mesh.edit.mark_by_hand(room, spared)
 
     assert bpy.ops.refine.delete_floaters() == {"FINISHED"}
 
@@ -137,7 +137,7 @@ def test_with_no_floaters_to_delete_scores_and_findings_stay(addon, polluted):
     room, _ = polluted
     bpy.ops.refine.score()
     bpy.ops.refine.find_floaters()
-    addon.mesh.edit.mark_protected(room, marked(addon, room))
+    addon.mesh.edit.mark_by_hand(room, marked(addon, room))
 
     assert bpy.ops.refine.delete_floaters() == {"CANCELLED"}
 

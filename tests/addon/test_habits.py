@@ -24,23 +24,27 @@ def preferred(addon):
 def test_preferences_are_the_defaults_of_what_a_scene_has_not_set(addon, preferred):
     """The scene has chosen its method; share and Absorb it takes over, the rest stays."""
     settings = bpy.context.scene.refine
-    preferred.method, preferred.percent, preferred.absorb = "closed-form", 70.0, True
+    preferred.method, preferred.percent, preferred.survivors = "closed-form", 70.0, "absorb"
     settings.method = "occlusion"
 
     addon.ui.preferences.fill(settings, preferred)
 
-    assert (settings.method, settings.absorb, settings.budget) == ("occlusion", True, "ratio")
+    assert (settings.method, settings.survivors, settings.budget) == (
+        "occlusion",
+        "absorb",
+        "ratio",
+    )
     assert settings.ratio == pytest.approx(0.7)
     assert settings.views == 64
 
 
 def test_scripts_get_what_they_ask_for(preferred):
     """In the background preferences change nothing."""
-    preferred.absorb = preferred.upright = True
+    preferred.survivors, preferred.upright = "absorb", True
 
     bpy.ops.refine.import_ply(filepath=str(ROOM / "point_cloud.ply"))
 
-    assert not bpy.context.scene.refine.absorb
+    assert not bpy.context.scene.refine.is_property_set("survivors")
     assert bpy.context.object.matrix_world.is_identity
 
 

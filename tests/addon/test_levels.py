@@ -16,7 +16,7 @@ def few(addon, room, room_cameras):  # noqa: ARG001
     remove = np.arange(len(room.data.vertices)) % 10 != 0
     addon.mesh.edit.delete_vertices(room, remove)
     settings = bpy.context.scene.refine
-    settings.levels, settings.nested = "0.5, 0.1", True
+    settings.levels, settings.level_survivors = "0.5, 0.1", "unchanged"
     return room
 
 
@@ -31,7 +31,7 @@ def test_levels_are_objects_beside_the_original(addon, few, room_views):
     wanted = core.lod(
         addon.objects.splat_object.gather(addon.mesh.layout.check(few), whole=True),
         room_views,
-        core.Levels((0.5, 0.1), absorb=False),
+        core.Levels((0.5, 0.1), survivors="unchanged"),
         core.Settings("closed-form"),
     )
     before, matrix = splats_of(addon, few), few.matrix_world.copy()
@@ -56,7 +56,7 @@ def test_absorbed_levels_stand_where_the_original_does(addon, few):
     for camera in (obj for obj in bpy.data.objects if obj.type == "CAMERA"):
         camera.matrix_world = Matrix.Translation((1.0, 2.0, 3.0)) @ camera.matrix_world
     settings = bpy.context.scene.refine
-    settings.nested, settings.levels, settings.views = False, "0.3", 8
+    settings.level_survivors, settings.levels, settings.views = "absorb", "0.3", 8
     bpy.context.view_layer.update()
     low, high = (f(splats_of(addon, few).means, axis=0) for f in (np.min, np.max))
 

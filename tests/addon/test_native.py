@@ -222,7 +222,7 @@ def test_absorbing_changes_survivors_alone(addon, cloud, room_cameras):  # noqa:
     """What absorbed nothing is equal to the bit, though logarithms are taken and undone."""
     addon.mesh.edit.delete_vertices(cloud, np.arange(len(cloud.data.points)) % 10 != 0)
     settings = bpy.context.scene.refine
-    settings.absorb, settings.ratio, settings.views = True, 0.6, 4
+    settings.survivors, settings.ratio, settings.views = "absorb", 0.6, 4
     store(cloud, "number", "INT", np.arange(len(cloud.data.points), dtype=np.int32))
     bpy.ops.refine.score()
     read = addon.mesh.attributes.read_attribute
@@ -559,12 +559,12 @@ def test_blenders_own_import_is_what_these_tests_build(addon, core, file, tmp_pa
     assert bpy.context.object.data.type == "GAUSSIAN_SPLAT"
 
 
-@pytest.mark.parametrize("nested", [True, False])
-def test_levels_of_detail_of_native_splats_are_native(addon, cloud, room_cameras, nested):  # noqa: ARG001
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
+def test_levels_of_detail_of_native_splats_are_native(addon, cloud, room_cameras, survivors):  # noqa: ARG001
     """Copies reduced by the same apply: points of .1 and .05 of 9,939, rounded up."""
     addon.mesh.edit.delete_vertices(cloud, np.arange(39755) % 4 != 0)
     settings = bpy.context.scene.refine
-    settings.levels, settings.nested, settings.views = "0.1, 0.05", nested, 6
+    settings.levels, settings.level_survivors, settings.views = "0.1, 0.05", survivors, 6
 
     assert bpy.ops.refine.levels() == {"FINISHED"}
 

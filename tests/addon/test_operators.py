@@ -39,9 +39,11 @@ def test_import_score_apply_export_writes_the_file_that_core_writes(addon, room_
     assert _bytes(tmp_path / "panel.ply") == _bytes(tmp_path / "core.ply")
 
 
-@pytest.mark.parametrize(("method", "absorb"), [("occlusion", False), ("closed-form", True)])
+@pytest.mark.parametrize(
+    ("method", "survivors"), [("occlusion", "unchanged"), ("closed-form", "absorb")]
+)
 def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(
-    addon, quarter_file, method, absorb
+    addon, quarter_file, method, survivors
 ):
     """A quarter turn of splats and cameras: the command without Blender never sees it."""
     bpy.ops.refine.import_ply(filepath=str(quarter_file), upright=True)
@@ -50,7 +52,7 @@ def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(
     obj.data.attributes["row"].data.foreach_set("value", np.arange(9939))
     bpy.ops.refine.import_cameras(filepath=str(ROOM / "cameras.json"), upright=True)
     settings = bpy.context.scene.refine
-    settings.method, settings.absorb, settings.views, settings.ratio = method, absorb, 24, 0.9
+    settings.method, settings.survivors, settings.views, settings.ratio = method, survivors, 24, 0.9
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     core = addon.core
@@ -60,7 +62,7 @@ def test_upright_keeps_the_splats_that_core_keeps_of_the_file_as_it_lies(
         core.read_cameras(ROOM / "cameras.json"),
         core.Budget(ratio=0.9),
         core.Settings(method, views=24),
-        absorb=absorb,
+        survivors=survivors,
     ).keep
 
     found = addon.mesh.attributes.read_attribute(obj.data, "row")
@@ -263,7 +265,7 @@ def test_an_impossible_budget_is_said_in_the_plan_and_refused_by_apply(
     [("auto", "threshold", "a threshold means something else"),
      ("closed-form", "min_seen", "min_seen would remove none")],
 )  # fmt: skip
-@pytest.mark.parametrize("absorb", [False, True])
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
 def test_a_budget_that_means_nothing_to_the_scores_is_refused(  # noqa: PLR0917
     addon,
     room,
@@ -271,7 +273,7 @@ def test_a_budget_that_means_nothing_to_the_scores_is_refused(  # noqa: PLR0917
     room_views,
     unchanged,
     case,
-    absorb,
+    survivors,
 ):
     """As the command refuses it, by what made the scores, not by the panel's method now.
 
@@ -279,7 +281,7 @@ def test_a_budget_that_means_nothing_to_the_scores_is_refused(  # noqa: PLR0917
     """
     method, kind, reason = case
     settings, core = bpy.context.scene.refine, addon.core
-    settings.views, settings.absorb = 4, absorb
+    settings.views, settings.survivors = 4, survivors
     checked = addon.mesh.layout.check(room)
     asked = core.Settings(method, 4, core.ClosedForm(frustum=False))
     scores = core.score(addon.objects.splat_object.gather(checked), room_views, asked)

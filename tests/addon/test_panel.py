@@ -22,7 +22,7 @@ class Layout:
         """Return itself, as a part of the layout."""
         return self
 
-    column = row
+    column = grid_flow = row
 
     def panel(self, _name):
         """Return itself as the header and the body of a part that is open."""

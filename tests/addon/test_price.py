@@ -55,7 +55,7 @@ def test_the_curve_goes_where_the_estimate_is(chart, curve, size):
     look = chart.Look(size, INK)
     made = chart.Chart(look, curve, chart.by_views(np.zeros(4, np.int32), 4))
     picture = made.picture(None)
-    blue = np.array(look.colors["delete"]) * 255.0
+    blue = np.array(look.colors["unchanged"]) * 255.0
 
     for share, psnr in ((0.2, 50.0), (0.5, 40.0), (0.79, 30.3)):
         assert np.abs(pixel(picture, *made.at(share, psnr))[:3] - blue).max() < 8
@@ -65,8 +65,8 @@ def test_the_budget_is_a_dot_on_the_curve_that_holds_and_a_line_through_both(cha
     """A dot 4 pixels wide around the estimate: of deleting, or of absorbing where that is asked."""
     look = chart.Look(212, INK)
     made = chart.Chart(look, curve, chart.by_views(np.zeros(4, np.int32), 4))
-    for absorb, name, psnr in ((False, "delete", 40.0), (True, "absorb", 46.0)):
-        picture = made.picture(chart.Place(0.5, absorb))
+    for survivors, name, psnr in (("unchanged", "unchanged", 40.0), ("absorb", "absorb", 46.0)):
+        picture = made.picture(chart.Place(0.5, survivors))
         x, y = made.at(0.5, psnr)
 
         for aside in (-3, 0, 2):
@@ -85,8 +85,8 @@ def test_moving_the_budget_draws_what_drawing_all_anew_does(chart, curve):
     anew = chart.Chart(chart.Look(300, INK), curve, kinds)
 
     assert np.array_equal(
-        moved.picture(chart.Place(0.7, absorb=True)),
-        anew.picture(chart.Place(0.7, absorb=True), going),
+        moved.picture(chart.Place(0.7, survivors="absorb")),
+        anew.picture(chart.Place(0.7, survivors="absorb"), going),
     )
 
 
@@ -255,20 +255,23 @@ def test_a_share_that_a_script_sets_is_shown_in_per_cent(room, addon, room_camer
     assert addon.ui.plans.stored(room, settings)["removed"] == 3975
 
 
-def test_the_sentence_tells_both_ways(addon):
+def test_the_sentence_tells_all_three_ways(addon):
     """The one that Apply would take first; estimates above 60 dB are all the same."""
     plan = {"splats": 39755, "kept": 19878, "bytes_before": 9.86e6, "bytes_after": 4.93e6}
     sentence = addon.ui.plans.sentence
-    both = plan | {"psnr": 37.8, "psnr_absorbed": 46.4}
+    known = plan | {"psnr": 37.8, "psnr_absorbed": 46.4, "psnr_refitted": 49.2}
+    seen = dict.fromkeys(("psnr", "psnr_absorbed", "psnr_refitted"), 70.0)
     start = "Keeps 19,878 of 39,755, 4.9 of 9.9 MB"
 
-    assert sentence(plan, absorb=True) == start
-    assert sentence(both, absorb=False) == f"{start}, about 38 dB in these views (Absorb: about 46)"
-    assert sentence(both, absorb=True) == (
-        f"{start}, about 46 dB in these views (without Absorb: about 38)"
-    )
-    assert sentence(plan | {"psnr": 70.0, "psnr_absorbed": 80.0}, absorb=False).endswith(
-        "more than 60 dB in these views (Absorb: more than 60)"
+    assert sentence(plan, "absorb") == start
+    for survivors, words in (
+        ("unchanged", "about 38 dB in these views (Absorb: about 46, Refit: about 49)"),
+        ("absorb", "about 46 dB in these views (Unchanged: about 38, Refit: about 49)"),
+        ("refit", "about 49 dB in these views (Unchanged: about 38, Absorb: about 46)"),
+    ):
+        assert sentence(known, survivors) == f"{start}, {words}"
+    assert sentence(plan | seen, "unchanged").endswith(
+        "more than 60 dB in these views (Absorb: more than 60, Refit: more than 60)"
     )
 
 
@@ -277,7 +280,7 @@ def test_what_absorbing_reaches_of_few_splats_is_neither_told_nor_drawn(addon, c
     plan = {"splats": 900, "kept": 450, "bytes_before": 9.86e6, "bytes_after": 4.93e6, "psnr": 37.8}
     start, sentence = "Keeps 450 of 900, 4.9 of 9.9 MB", addon.ui.plans.sentence
     look, few = chart.Look(212, INK), replace(curve, foretold=False)
-    kinds, place = chart.by_views(np.zeros(4, np.int32), 4), chart.Place(0.5, absorb=False)
+    kinds, place = chart.by_views(np.zeros(4, np.int32), 4), chart.Place(0.5, survivors="unchanged")
     orange = np.array(look.colors["absorb"]) * 255.0
 
     drawn = [
@@ -288,8 +291,9 @@ def test_what_absorbing_reaches_of_few_splats_is_neither_told_nor_drawn(addon, c
     ]
 
     assert drawn == [True, False]
-    assert sentence(plan, absorb=False) == f"{start}, about 38 dB in these views"
-    assert sentence(plan, absorb=True) == f"{start}, about 38 dB in these views without Absorb"
+    assert sentence(plan, "unchanged") == f"{start}, about 38 dB in these views"
+    unless = "about 38 dB in these views if survivors stay unchanged"
+    assert sentence(plan, "absorb") == f"{start}, {unless}"
 
 
 def test_a_quality_out_of_reach_is_said(addon, room, room_cameras):  # noqa: ARG001
@@ -317,12 +321,12 @@ def test_a_quality_with_absorb_counts_on_what_absorbing_reaches(addon, room, roo
     settings.budget, settings.psnr, settings.views = "psnr", 35.0, 8
     bpy.ops.refine.score()
     deleted = plans.stored(room, settings)
-    settings.absorb = True
+    settings.survivors = "absorb"
     absorbed = plans.stored(room, settings)
 
     assert absorbed["removed"] > 1.2 * deleted["removed"]
     assert absorbed["psnr_absorbed"] == pytest.approx(35.0, abs=0.01)
-    assert plans.sentence(absorbed, absorb=True).startswith("Keeps about ")
+    assert plans.sentence(absorbed, survivors="absorb").startswith("Keeps about ")
 
 
 def test_scores_without_an_estimate_say_how_to_get_one(addon, room, room_cameras):  # noqa: ARG001
@@ -333,7 +337,7 @@ def test_scores_without_an_estimate_say_how_to_get_one(addon, room, room_cameras
     plan = plans.stored(room, settings)
 
     assert plans.remark(plan, record) == "Score with Auto, or with Quality as the budget, to see dB"
-    assert "dB" not in plans.sentence(plan, absorb=False)
+    assert "dB" not in plans.sentence(plan, survivors="unchanged")
 
 
 def test_what_the_cameras_do_not_know_is_said_beside_apply(addon, room, room_cameras):
@@ -355,17 +359,17 @@ def test_what_the_cameras_do_not_know_is_said_beside_apply(addon, room, room_cam
     ]
 
 
-@pytest.mark.parametrize("absorb", [False, True])
-def test_success_is_no_warning(room, room_cameras, capfd, absorb):  # noqa: ARG001
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
+def test_success_is_no_warning(room, room_cameras, capfd, survivors):  # noqa: ARG001
     """Blender prints what operators report, each with its kind in front."""
     settings = bpy.context.scene.refine
-    settings.views, settings.absorb = 4, absorb
+    settings.views, settings.survivors = 4, survivors
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     said = capfd.readouterr().out
 
     assert "Info: Kept 19,878 splats" in said
-    assert ("survivors absorbed" in said) == absorb
+    assert ("survivors absorbed" in said) == (survivors == "absorb")
     assert "Warning" not in said
 
 

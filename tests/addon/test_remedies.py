@@ -76,7 +76,7 @@ def test_absorbing_changes_less(room, room_cameras):  # noqa: ARG001
     settings.method, settings.views, settings.percent = "occlusion", 4, 50.0
     bpy.ops.refine.score()
     deleted = {item.name: item.psnr for item in manager.refine_cameras}
-    settings.absorb = True
+    settings.survivors = "absorb"
     gains = {i.name: i.psnr - deleted[i.name] for i in manager.refine_cameras if i.psnr >= 0.0}
 
     assert len(gains) == 4
@@ -354,7 +354,7 @@ def test_what_must_go_is_not_kept_and_pictures_are_without_it(addon, room, room_
     bpy.context.view_layer.update()
     bpy.ops.refine.score()
     checked = addon.mesh.layout.check(room)
-    gone = addon.objects.demands.Demands.of_scene(bpy.context.scene).forced(checked).removed
+    gone = addon.objects.demands.Demands.of_scene(bpy.context.scene).forced(checked).out
     curve = addon.mesh.scores.stored_scores(checked, gone).quality
     removed = np.count_nonzero(read(addon, room, "refine_remove"))
     share = (removed - gone.sum()) / (len(gone) - gone.sum())

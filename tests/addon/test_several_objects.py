@@ -39,24 +39,24 @@ def rows(addon, objects):
 
 
 @pytest.mark.parametrize(
-    ("method", "absorb"),
+    ("method", "survivors"),
     [
-        ("closed-form", False),
-        pytest.param("auto", False, marks=pytest.mark.slow),
-        pytest.param("closed-form", True, marks=pytest.mark.slow),
+        ("closed-form", "unchanged"),
+        pytest.param("auto", "unchanged", marks=pytest.mark.slow),
+        pytest.param("closed-form", "absorb", marks=pytest.mark.slow),
     ],
 )
-def test_both_halves_keep_what_the_whole_room_keeps(addon, halves, room_views, method, absorb):
+def test_both_halves_keep_what_the_whole_room_keeps(addon, halves, room_views, method, survivors):
     """70 % of 39,755 are 27,828 by one order of removal; 11,927 stay, unevenly in both objects."""
     settings = bpy.context.scene.refine
-    settings.method, settings.absorb, settings.views, settings.ratio = method, absorb, 16, 0.7
+    settings.method, settings.survivors, settings.views, settings.ratio = method, survivors, 16, 0.7
     core = addon.core
     expected = core.prune(
         core.read_ply(ROOM / "point_cloud.ply").splats(),
         room_views,
         core.Budget(ratio=0.7),
         core.Settings(method, views=16),
-        absorb=absorb,
+        survivors=survivors,
     )
 
     assert bpy.ops.refine.score() == {"FINISHED"}
@@ -108,14 +108,14 @@ def test_marks_and_sentence_are_those_of_the_selection(addon, halves):
         ]
 
     assert sum(marked()) == 19_877
-    assert "of 39,755" in plans.sentence(plans.stored(halves[1], settings), absorb=False)
+    assert "of 39,755" in plans.sentence(plans.stored(halves[1], settings), survivors="unchanged")
 
     halves[0].select_set(False)
     assert plans.stored(halves[1], settings) is None  # of both, not of this one
     plans.refresh(bpy.context)
 
     assert marked()[1] == 9_877
-    assert "of 19,755" in plans.sentence(plans.stored(halves[1], settings), absorb=False)
+    assert "of 19,755" in plans.sentence(plans.stored(halves[1], settings), survivors="unchanged")
 
 
 def test_the_curve_is_that_of_all_and_of_no_part(addon, halves):

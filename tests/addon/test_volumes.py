@@ -135,26 +135,26 @@ def opacities(path, core):
     return core.read_ply(path).splats().opacity_logits
 
 
-@pytest.mark.parametrize("absorb", [False, True], ids=["delete", "absorb"])
-def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp_path, absorb):
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"], ids=["delete", "absorb"])
+def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp_path, survivors):
     """By the saved scene, by options that name its objects, and by masks: the same file."""
     protected, removed = crop
     settings = bpy.context.scene.refine
-    settings.ratio, settings.absorb = 0.8, absorb
+    settings.ratio, settings.survivors = 0.8, survivors
     settings.views = 8
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     views = addon.ui.operators.chosen_views(bpy.context)
     by_api = core.prune(
         addon.objects.splat_object.gather(addon.mesh.layout.check(quarter), whole=True), views,
         core.Budget(ratio=0.8), core.Settings("closed-form", 8),
-        protected=protected, removed=removed, absorb=absorb,
+        protected=protected, forced_out=removed, survivors=survivors,
     )  # fmt: skip
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     bpy.ops.refine.export_ply(filepath=str(tmp_path / "panel.ply"))
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     words = ["prune", "--object", "room", "--ratio", ".8", "--views", "8", *CLOSED]
-    words += ["--absorb"] if absorb else []
+    words += ["--absorb"] if survivors == "absorb" else []
     told = tmp_path / "report.json"
     saved = [*words, "-o", str(tmp_path / "saved.ply"), "--report", str(told)]
     assert command(addon, saved) == 0
@@ -172,7 +172,7 @@ def test_panel_command_and_api_keep_the_same_set(addon, core, quarter, crop, tmp
     ]
     kept = opacities(tmp_path / "saved.ply", core)
     assert len(kept) == by_api.keep.sum() == 9_939 - 7_951  # floor(.8 * 9939)
-    if not absorb:
+    if survivors == "unchanged":
         room = bpy.data.objects["room"]
         assert np.array_equal(kept, mask(addon, room, "opacity")[by_api.keep])
 
@@ -295,7 +295,7 @@ def test_without_a_selection_nothing_is_marked(addon, room, unchanged):  # noqa:
     """In one sentence, in both modes."""
     select(room, [])
     unchanged.start()
-    with pytest.raises(RuntimeError, match="no splat is selected; select some in edit mode"):
+    with pytest.raises(RuntimeError, match="no splat is selected; select some first"):
         bpy.ops.refine.protect(mode="ADD")
     unchanged()
     bpy.ops.object.mode_set(mode="EDIT")
@@ -442,7 +442,7 @@ def test_a_plan_to_absorb_keeps_no_fewer_than_are_protected(addon, room, guarded
     guarded.scale = [2.0 * x for x in guarded.scale]
     settings = bpy.context.scene.refine
     bpy.ops.refine.score()
-    settings.absorb, settings.psnr = True, 1.0
+    settings.survivors, settings.psnr = "absorb", 1.0
     addon.ui.plans.refresh(bpy.context)
     plan = addon.ui.plans.stored(room, settings)
     protected = (mask(addon, room, "refine_force") == 1).sum()
@@ -511,11 +511,11 @@ def test_levels_and_floaters_leave_out_what_must_go(addon, core, room, quarter, 
     """No level has any of it, and it is evidence of nothing."""
     protected, removed = crop
     settings = bpy.context.scene.refine
-    settings.levels, settings.nested, settings.views = "0.2", True, 8
+    settings.levels, settings.level_survivors, settings.views = "0.2", "unchanged", 8
     expected = core.clean(
         addon.objects.splat_object.gather(addon.mesh.layout.check(room)),
         addon.ui.operators.chosen_views(bpy.context), core.Cleaning(views=8),
-        protected=protected, removed=removed,
+        protected=protected, forced_out=removed,
     )  # fmt: skip
     bpy.ops.refine.find_floaters()
     found = mask(addon, room, "refine_floats") > 0
@@ -565,8 +565,8 @@ def test_a_volume_that_was_deleted_counts_no_more(addon, room):
         collection.objects.unlink(box)
     after = addon.objects.demands.Demands.of_scene(bpy.context.scene).forced(checked)
 
-    assert before.removed.any()
-    assert after.removed is None
+    assert before.out.any()
+    assert after.out is None
 
 
 def test_selected_objects_become_volumes(addon, room):

@@ -20,7 +20,7 @@ def few(addon, room, room_cameras):  # noqa: ARG001
     """Every tenth splat of the room, to be absorbed to two fifths by four views."""
     addon.mesh.edit.delete_vertices(room, np.arange(len(room.data.vertices)) % 10 != 0)
     settings = bpy.context.scene.refine
-    settings.absorb, settings.ratio, settings.views = True, 0.6, 4
+    settings.survivors, settings.ratio, settings.views = "absorb", 0.6, 4
     return room
 
 
@@ -94,8 +94,8 @@ def pruned(addon, room_views, tmp_path, **options):
     )
 
 
-@pytest.mark.parametrize("absorb", [False, True])
-def test_a_blend_that_cannot_be_saved_keeps_its_splats(addon, few, room_views, tmp_path, absorb):
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
+def test_a_blend_that_cannot_be_saved_keeps_its_splats(addon, few, room_views, tmp_path, survivors):
     """Its folder is gone: what was exported stays and is named, the object is as it was."""
     (tmp_path / "blend").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "blend" / "scene.blend"))
@@ -105,7 +105,7 @@ def test_a_blend_that_cannot_be_saved_keeps_its_splats(addon, few, room_views, t
     with pytest.raises(
         addon.core.RefineError, match=r"nothing was removed, .*out\.ply was written"
     ):
-        pruned(addon, room_views, tmp_path, absorb=absorb)
+        pruned(addon, room_views, tmp_path, survivors=survivors)
 
     assert bits(few) == before
     assert len(addon.core.read_ply(tmp_path / "out.ply")) == len(few.data.vertices) * 2 // 5 + 1
@@ -152,7 +152,7 @@ def test_each_operation_reads_the_layout_of_its_object_once(
         lambda: addon.ui.plans.refresh(bpy.context),
         lambda: bpy.ops.refine.export_ply(filepath=str(tmp_path / "exported.ply")),
         bpy.ops.refine.apply,
-        lambda: pruned(addon, room_views, tmp_path, absorb=True),
+        lambda: pruned(addon, room_views, tmp_path, survivors="absorb"),
     ):
         counts.append(0)
         operation()

@@ -63,4 +63,4 @@ def test_occlusion_beats_rendering_methods_at_every_ratio(scene, evaluator, meth
 
 def test_absorbing_beats_every_known_tool_at_half(scene, evaluator):
     """The better of two of splat-transform 3.7.0: 30.7 dB; required: 39.5."""
-    assert quality(scene, evaluator, 0.5, Settings(), absorb=True) >= 39.5
+    assert quality(scene, evaluator, 0.5, Settings(), survivors="absorb") >= 39.5

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from refine_addon.core import RefineError, Splats
-from refine_addon.core.affine import quaternion, transformed
-from refine_addon.core.spherical_harmonics import basis, rotate
+from refine_addon.core.affine import baked, quaternion, transformed
+from refine_addon.core.spherical_harmonics import basis, rotate, stretched
 from refine_addon.core.splats import rotation_matrices
 
 RNG = np.random.default_rng(7)
@@ -160,3 +160,35 @@ def test_the_quaternion_of_a_rotation_gives_it_back_even_at_half_a_turn():
     matrices = rotation_matrices(quaternion(np.array(turns)))
 
     np.testing.assert_allclose(matrices, turns, atol=1e-14)
+
+
+@pytest.mark.parametrize("linear", [ROTATION, -0.3 * ROTATION], ids=["turned", "mirrored"])
+def test_a_stretch_that_is_none_rotates_harmonics(linear):
+    """The nearest harmonics are those of `rotate` then, which are exact; the constant stays."""
+    splats = some()
+    sign = np.sign(np.linalg.det(linear @ ROTATION.T))
+
+    sh_dc, sh_rest = stretched(splats.sh_dc, splats.sh_rest, linear)
+
+    np.testing.assert_allclose(sh_dc, splats.sh_dc, atol=1e-12)
+    np.testing.assert_allclose(sh_rest, rotate(splats.sh_rest, sign * ROTATION), atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_no_other_harmonics_are_nearer_to_stretched_colours(degree):
+    """Of least squares over the sphere: what is left is orthogonal to every harmonic."""
+    linear = np.diag([1.0, 1.5, 0.8]) @ ROTATION
+    splats = some(5, (degree + 1) ** 2 - 1)
+    where = directions(50_000)
+    before = where @ np.linalg.inv(linear).T
+    before /= np.linalg.norm(before, axis=1, keepdims=True)
+    old = np.concatenate([splats.sh_dc[:, None], splats.sh_rest], axis=1)
+    expected = np.einsum("dk,nkc->dnc", basis(before, degree), old)
+
+    moved = baked(splats, affine(linear))
+
+    new = np.concatenate([moved.sh_dc[:, None], moved.sh_rest], axis=1)
+    left = np.einsum("dk,nkc->dnc", basis(where, degree), new) - expected
+    inner = np.einsum("dk,dnc->nkc", basis(where, degree), left) / len(where)
+    assert np.abs(inner).max() < 0.02 * np.abs(expected).mean()
+    assert np.abs(left).mean() > 10 * np.abs(inner).max()

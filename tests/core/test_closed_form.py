@@ -150,7 +150,7 @@ def reference(splats: Splats, views: ViewSet, settings: ClosedForm) -> np.ndarra
         return scores
     offset = means - middle
     weighted = offset / np.array(squared)[:, None]
-    axes = principal_axes(weighted.T @ offset, weighted.sum(axis=0))
+    axes = principal_axes(np.vstack([weighted.T @ offset, weighted.sum(axis=0)]))
     return beside_their_neighbours(scores, offset @ axes.T / size)
 
 

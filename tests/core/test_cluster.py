@@ -57,10 +57,12 @@ def tiles(tmp_path, monkeypatch):
     return paths
 
 
-def prune(tiles, folder, settings=CLOSED, *, absorb=False, **options):
+def prune(tiles, folder, settings=CLOSED, *, survivors="unchanged", **options):
     """Prune the tiles into a folder, and return the bytes of the files."""
     views = read_cameras(ROOM / "cameras.json")
-    prune_tiles(tiles, folder, PruneRequest(views, BUDGET, settings, absorb=absorb), **options)
+    prune_tiles(
+        tiles, folder, PruneRequest(views, BUDGET, settings, survivors=survivors), **options
+    )
     return [(folder / path.name).read_bytes() for path in tiles]
 
 
@@ -98,11 +100,11 @@ def test_a_worker_killed_while_absorbing_changes_no_byte(
 
     settings = Settings(method="occlusion", views=8)
     found = prune(
-        tiles, tmp_path / "out", settings, absorb=True, workers=workers, progress=progress
+        tiles, tmp_path / "out", settings, survivors="absorb", workers=workers, progress=progress
     )
 
     assert killed
-    assert found == prune(tiles, tmp_path / "here", settings, absorb=True)
+    assert found == prune(tiles, tmp_path / "here", settings, survivors="absorb")
     assert len(list((tmp_path / "out").iterdir())) == len(tiles)
 
 

@@ -28,7 +28,7 @@ from refine_addon.core import (
     score,
 )
 from refine_addon.core.formats import ply
-from refine_addon.core.picture_files import chosen
+from refine_addon.core.picture_files import PictureFiles, chosen
 from refine_addon.core.pictures import compare
 from refine_addon.core.png import png
 from refine_addon.core.scoring import closed_form
@@ -49,10 +49,10 @@ def folder(tmp_path, monkeypatch):
         {
             "position": [offset, 0.1 * offset * offset, 0.0],
             "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-            "fx": 450.0,
-            "fy": 450.0,
-            "width": 100,
-            "height": 75,
+            "fx": 180.0,
+            "fy": 180.0,
+            "width": 40,
+            "height": 30,
             "img_name": str(offset),
         }
         for offset in (-0.4, -0.2, 0.0, 0.2, 0.4)
@@ -461,6 +461,20 @@ def test_pictures_that_exist_are_left_alone_and_nothing_is_pruned(folder, capsys
     assert not (folder / "out.ply").exists()
     assert command.main([*PRUNE, "-o", "out.ply", "--pictures", "shown", "--overwrite"]) == 0
     assert (folder / "shown/in-0.0-after.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_ctrl_c_while_pictures_are_drawn_says_that_the_file_is_written(folder, monkeypatch, capsys):
+    """The same command would refuse it, so it is named."""
+
+    def stop(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PictureFiles, "write", stop)
+
+    assert command.main([*PRUNE, "-o", "out.ply", "--pictures", "shown"]) == 130
+
+    assert names(folder) == {"out.ply"}
+    assert "out.ply is written, its pictures and report are not;" in capsys.readouterr().err
 
 
 def test_pictures_have_names_that_the_system_takes(folder):

@@ -25,10 +25,10 @@ def folder(tmp_path, monkeypatch):
     camera = {
         "position": [0.0, 0.0, 0.0],
         "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
-        "fx": 1800.0,
-        "fy": 1800.0,
-        "width": 400,
-        "height": 300,
+        "fx": 180.0,
+        "fy": 180.0,
+        "width": 40,
+        "height": 30,
     }
     (tmp_path / "cameras.json").write_text(json.dumps([camera]))
     return tmp_path

@@ -28,7 +28,7 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "b.ply").write_bytes(file.header + rows.tobytes())
     view = {
         "position": [0, 0, 0], "rotation": np.eye(3).tolist(), "img_name": "1",
-        "fx": 500.0, "fy": 500.0, "width": 400, "height": 300,
+        "fx": 50.0, "fy": 50.0, "width": 40, "height": 30,
     }  # fmt: skip
     (tmp_path / "cameras.json").write_text(json.dumps([view]))
     return tmp_path

@@ -43,7 +43,7 @@ BUDGETS = [
 ]  # fmt: skip
 
 
-WAYS = pytest.mark.parametrize("absorb", [False, True], ids=["delete", "absorb"])
+WAYS = pytest.mark.parametrize("survivors", ["unchanged", "absorb"], ids=["delete", "absorb"])
 
 
 @pytest.fixture(scope="module")
@@ -73,17 +73,17 @@ def rest_budget(budget, gone):
 @WAYS
 @pytest.mark.parametrize("budget", BUDGETS, ids=lambda budget: f"{budget}")
 def test_forcing_out_is_pruning_what_is_left_by_the_rest_of_the_budget(
-    splats, views, removed, budget, absorb
+    splats, views, removed, budget, survivors
 ):
     """The same splats, values and estimate as when they are deleted first, by hand."""
     settings, rest = Settings("occlusion"), ~removed
     size = {"row_bytes": 20.0}
     left = prune(
         splats.take(rest), views, rest_budget(budget, int(removed.sum())), settings,
-        absorb=absorb, **size,
+        survivors=survivors, **size,
     )  # fmt: skip
 
-    found = prune(splats, views, budget, settings, removed=removed, absorb=absorb, **size)
+    found = prune(splats, views, budget, settings, forced_out=removed, survivors=survivors, **size)
 
     assert not found.keep[removed].any()
     assert np.array_equal(found.keep[rest], left.keep)
@@ -92,15 +92,15 @@ def test_forcing_out_is_pruning_what_is_left_by_the_rest_of_the_budget(
     assert found.report["splats"]["removed"] == COUNT - left.keep.sum()
     assert found.report["splats"]["forced"] == removed.sum()
     assert found.report["budget"] == {budget.kind: getattr(budget, budget.kind)}
-    if absorb:
+    if survivors == "absorb":
         assert np.array_equal(found.absorbed.splats.means, left.absorbed.splats.means)
         assert np.array_equal(found.absorbed.keep, found.keep)
 
 
 def test_a_share_counts_what_had_to_go(splats, views, removed):
     """Half of 576 is 288, of which what is forced out is a part; a tenth of them is less."""
-    half = prune(splats, views, Budget(ratio=0.5), removed=removed).report["splats"]
-    tenth = prune(splats, views, Budget(ratio=0.1), removed=removed).report["splats"]
+    half = prune(splats, views, Budget(ratio=0.5), forced_out=removed).report["splats"]
+    tenth = prune(splats, views, Budget(ratio=0.1), forced_out=removed).report["splats"]
 
     assert half["removed"] == 288
     assert tenth["removed"] == tenth["forced"] == removed.sum() > 57
@@ -111,7 +111,12 @@ def test_protection_wins_over_force(splats, views):
     rows = np.arange(COUNT)
 
     found = prune(
-        splats, views, Budget(ratio=0.9), protected=rows < 10, removed=rows < 100, absorb=True
+        splats,
+        views,
+        Budget(ratio=0.9),
+        protected=rows < 10,
+        forced_out=rows < 100,
+        survivors="absorb",
     )
 
     assert found.keep[:10].all()
@@ -126,11 +131,11 @@ def test_scores_of_what_is_left_decide_as_well_as_a_pruning_that_scores(
 ):
     """As the panel does it: score without them, store, apply. They score 0 and no other does."""
     settings, budget = Settings(method), Budget(ratio=0.6)
-    scores = score(splats, views, settings, removed=removed)
-    task = Task(budget, settings, scores=scores, removed=removed)
+    scores = score(splats, views, settings, forced_out=removed)
+    task = Task(budget, settings, scores=scores, forced_out=removed)
 
     assert np.array_equal(scores.values == 0.0, removed)
-    expected = prune(splats, views, budget, settings, removed=removed)
+    expected = prune(splats, views, budget, settings, forced_out=removed)
     for given in (scores, replace(scores, ray_sample=None)):
         assert np.array_equal(decide(replace(task, scores=given)).keep, expected.keep)
 
@@ -141,7 +146,7 @@ def test_the_curve_has_protected_splats_last_though_others_must_go(splats, views
     protected = rest & (np.arange(COUNT) % 2 == 0)
 
     found, free = (
-        score(splats, views, settings, removed=removed, protected=stays).quality.psnr
+        score(splats, views, settings, forced_out=removed, protected=stays).quality.psnr
         for stays in (protected, None)
     )
 
@@ -152,9 +157,9 @@ def test_the_curve_has_protected_splats_last_though_others_must_go(splats, views
 
 def test_what_was_forced_out_when_scored_and_is_no_more_has_no_score(splats, views, removed):
     """It might be worth most: nothing tells."""
-    scores = score(splats, views, removed=removed)
+    scores = score(splats, views, forced_out=removed)
     fewer = removed & (np.arange(COUNT) > 100)
-    task = Task(Budget(ratio=0.6), scores=scores, removed=fewer)
+    task = Task(Budget(ratio=0.6), scores=scores, forced_out=fewer)
 
     with pytest.raises(RefineError, match=r"splats had to go when the others were scored"):
         decide(task)
@@ -172,21 +177,21 @@ def test_a_splat_without_a_score_is_known_by_its_row_not_by_their_number(splats,
     settings = Settings("closed-form")
     best = int(np.argmax(score(splats, views, settings).values))
     every = np.arange(COUNT)
-    scores = score(splats, views, settings, removed=every == best)
+    scores = score(splats, views, settings, forced_out=every == best)
     removed = every == 5 if now == "another" else None
 
     with pytest.raises(RefineError, match=r"^1 splats had to go when the others were scored"):
-        decide(Task(Budget(ratio=0.5), scores=scores, removed=removed))
+        decide(Task(Budget(ratio=0.5), scores=scores, forced_out=removed))
 
-    assert not decide(Task(Budget(ratio=0.5), scores=scores, removed=every == best)).keep[best]
+    assert not decide(Task(Budget(ratio=0.5), scores=scores, forced_out=every == best)).keep[best]
 
 
 def test_more_than_was_forced_out_when_scored_goes_by_the_scores_there_are(splats, views, removed):
     """The others are ranked as they were."""
-    scores = score(splats, views, removed=removed)
+    scores = score(splats, views, forced_out=removed)
     more = removed | (np.arange(COUNT) < 50)
 
-    found = decide(Task(Budget(keep=200), scores=scores, removed=more))
+    found = decide(Task(Budget(keep=200), scores=scores, forced_out=more))
 
     assert not found.keep[more].any()
     assert found.keep.sum() == 200
@@ -196,9 +201,9 @@ def test_more_than_was_forced_out_when_scored_goes_by_the_scores_there_are(splat
 def test_nothing_left_is_refused(splats, views):
     """In one sentence, before any work."""
     with pytest.raises(RefineError, match="all 576 splats lie where they must go"):
-        prune(splats, views, Budget(ratio=0.5), removed=np.ones(COUNT, bool))
+        prune(splats, views, Budget(ratio=0.5), forced_out=np.ones(COUNT, bool))
     with pytest.raises(RefineError, match="all 576 splats"):
-        score(splats, views, removed=np.ones(COUNT, bool))
+        score(splats, views, forced_out=np.ones(COUNT, bool))
 
 
 def test_all_but_what_is_protected_may_go(splats, views):
@@ -207,20 +212,20 @@ def test_all_but_what_is_protected_may_go(splats, views):
 
     found = prune(
         splats, views, Budget(ratio=0.0), Settings("closed-form"),
-        protected=mine, removed=np.ones(COUNT, bool),
+        protected=mine, forced_out=np.ones(COUNT, bool),
     )  # fmt: skip
 
     assert np.array_equal(found.keep, mine)
 
 
 @WAYS
-def test_levels_hold_nothing_of_it_and_are_those_of_the_rest(splats, views, removed, absorb):
+def test_levels_hold_nothing_of_it_and_are_those_of_the_rest(splats, views, removed, survivors):
     """Half of 576 stays in the first, of the others; as when the others are the scene."""
     rest = ~removed
     shares = (287.5 / rest.sum(), 57.5 / rest.sum())  # rounded up
-    expected = lod(splats.take(rest), views, Levels(shares, absorb=absorb))
+    expected = lod(splats.take(rest), views, Levels(shares, survivors=survivors))
 
-    found = lod(splats, views, Levels((0.5, 0.1), absorb=absorb), removed=removed)
+    found = lod(splats, views, Levels((0.5, 0.1), survivors=survivors), forced_out=removed)
 
     for one, other in zip(found, expected, strict=True):
         assert np.array_equal(one.keep[rest], other.keep)
@@ -230,11 +235,15 @@ def test_levels_hold_nothing_of_it_and_are_those_of_the_rest(splats, views, remo
     assert [level.keep.sum() for level in found] == [288, 58]
 
 
-@pytest.mark.parametrize("absorb", [False, True])
-def test_levels_where_all_that_had_to_go_is_protected(splats, views, removed, absorb):
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
+def test_levels_where_all_that_had_to_go_is_protected(splats, views, removed, survivors):
     """Nothing is forced out then, and each level is made from the one before."""
     levels = lod(
-        splats, views, Levels((0.5, 0.3), absorb=absorb), protected=removed, removed=removed
+        splats,
+        views,
+        Levels((0.5, 0.3), survivors=survivors),
+        protected=removed,
+        forced_out=removed,
     )
 
     assert len(levels) == 2
@@ -248,9 +257,9 @@ def test_cleaning_takes_what_is_forced_out_as_gone():
     half = walls & (splats.means[:, 0] > 100.0)
     half[:5] = True
 
-    found = clean(splats, cameras(), removed=half)
+    found = clean(splats, cameras(), forced_out=half)
     expected = clean(splats.take(~half), cameras())
-    alone = clean(splats, cameras(), Cleaning(), removed=walls)
+    alone = clean(splats, cameras(), Cleaning(), forced_out=walls)
 
     assert not found.keep[:5].any()
     assert np.array_equal(found.keep[5:], expected.keep)
@@ -291,9 +300,9 @@ def test_a_file_is_pruned_by_volumes_as_by_masks(splats, views, tmp_path, cleani
     x, y = loaded.means[:, 0], loaded.means[:, 1]
     protected, removed = x < -2, ((x >= 1) | (y < -1)) & (x >= -2)
     assert np.array_equal(masks.protected, protected)
-    assert np.array_equal(masks.removed, removed)
+    assert np.array_equal(masks.out, removed)
     if cleaning is None:
-        expected = prune(loaded, views, budget, protected=protected, removed=removed)
+        expected = prune(loaded, views, budget, protected=protected, forced_out=removed)
         assert np.array_equal(found.keep, expected.keep)
     assert found.keep[protected].all()
     assert not found.keep[removed].any()
@@ -326,7 +335,7 @@ def test_rows_of_several_lengths_are_those_of_the_splats_that_need_not_go():
 
     result = prune(
         splats, ring(), Budget(max_mb=0.0015), Settings("closed-form"),
-        removed=forced_out, row_bytes=row_bytes,
+        forced_out=forced_out, row_bytes=row_bytes,
     )  # fmt: skip
 
     assert np.count_nonzero(result.keep) == 150

@@ -278,19 +278,26 @@ def test_a_size_is_refused_where_only_writing_tells_it(tmp_path, suffix, cameras
     assert not (tmp_path / f"out{suffix}").exists()
 
 
-@pytest.mark.parametrize("suffix", SUFFIX)
-def test_survivors_that_absorbed_are_written_as_they_became(tmp_path, suffix, cameras):
-    """The same prune to a PLY and to the format: the same splats within the bounds."""
-    (tmp_path / "in.ply").write_bytes(ply_of(scene()))
-    for name in (f"out{suffix}", "out.ply"):
-        prune_file(
-            tmp_path / "in.ply",
-            tmp_path / name,
-            PruneRequest(cameras, Budget(keep=300), absorb=True),
-        )
+@pytest.fixture(scope="module")
+def absorbed(tmp_path_factory, cameras):
+    """Return a folder with the test scene, what is asked of it, and 300 survivors that absorbed."""
+    folder, asked = (
+        tmp_path_factory.mktemp("a"),
+        PruneRequest(cameras, Budget(keep=300), survivors="absorb"),
+    )
+    (folder / "in.ply").write_bytes(ply_of(scene()))
+    prune_file(folder / "in.ply", folder / "out.ply", asked)
+    return folder, asked
 
-    kept = read_splats(tmp_path / f"out{suffix}").splats()
-    plain = read_splats(tmp_path / "out.ply").splats()
+
+@pytest.mark.parametrize("suffix", SUFFIX)
+def test_survivors_that_absorbed_are_written_as_they_became(absorbed, suffix):
+    """The same prune to a PLY and to the format: the same splats within the bounds."""
+    folder, asked = absorbed
+    prune_file(folder / "in.ply", folder / f"out{suffix}", asked)
+
+    kept = read_splats(folder / f"out{suffix}").splats()
+    plain = read_splats(folder / "out.ply").splats()
     apart = np.linalg.norm(kept.means[:, None] - plain.means, axis=2)
     plain = plain.take(apart.argmin(axis=1))
 
@@ -336,9 +343,9 @@ def cameras(tmp_path_factory):
 
 
 CAMERAS = (
-    '[{"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "fx": 300, "fy": 300, "width": 640, '
-    '"height": 480, "position": [0, 0, -6]}, {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], '
-    '"fx": 300, "fy": 300, "width": 640, "height": 480, "position": [1, 0, -6]}]'
+    '[{"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "fx": 30, "fy": 30, "width": 64, '
+    '"height": 48, "position": [0, 0, -6]}, {"rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], '
+    '"fx": 30, "fy": 30, "width": 64, "height": 48, "position": [1, 0, -6]}]'
 )
 
 

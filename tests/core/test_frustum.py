@@ -51,7 +51,7 @@ def answers(seed: int) -> tuple[np.ndarray, ...]:
     points[:3] = low[..., None] + (high - low)[..., None] * share[:, None]
     _, beyond, between = frustums.project(points.reshape(4, -1), np.arange(60), 60)
     inside = between & (beyond <= 0.0)
-    counted = between & (beyond < REACH * frustums.steepness)
+    counted = between & (beyond < REACH * frustums.beyond_per_unit)
     shape = (60, 200, -1)
     return some, whole, counted.reshape(shape), inside.reshape(shape)
 

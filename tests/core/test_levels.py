@@ -38,7 +38,7 @@ from refine_addon.core.pipeline import absorb_splats
 from .test_cleaning import cameras, wall
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
-DELETED = Levels((0.5, 0.25), absorb=False)
+DELETED = Levels((0.5, 0.25), survivors="unchanged")
 QUICK = Settings("closed-form")
 
 
@@ -76,7 +76,7 @@ def test_deleting_keeps_rows_of_the_level_before_as_they_were():
     """
     splats, views = colourful(), cameras()
 
-    levels = lod(splats, views, Levels((0.5, 0.3, 0.1), absorb=False))
+    levels = lod(splats, views, Levels((0.5, 0.3, 0.1), survivors="unchanged"))
 
     assert [len(level.splats) for level in levels] == [288, 173, 58]
     assert [level.number for level in levels] == [1, 2, 3]
@@ -93,7 +93,7 @@ def test_deleting_keeps_rows_of_the_level_before_as_they_were():
 def test_the_first_level_is_what_prune_absorbs():
     """It is made from the original, as prune's result is: equal to the bit."""
     splats, views = colourful(), cameras()
-    wanted = prune(splats, views, Budget(keep=288), absorb=True)
+    wanted = prune(splats, views, Budget(keep=288), survivors="absorb")
 
     first = lod(splats, views, Levels((0.5, 0.25)))[0]
 
@@ -150,23 +150,25 @@ def test_what_absorbed_before_is_not_thinned_by_a_tenth_again(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("absorb", [True, False])
-def test_protected_splats_are_in_all_levels_unchanged(absorb):
+@pytest.mark.parametrize("survivors", ["absorb", "unchanged"])
+def test_protected_splats_are_in_all_levels_unchanged(survivors):
     """60 of 576 are protected; the last level keeps 115 (115.2 rounds up to 116)."""
     splats, protected = colourful(), np.arange(576) % 10 == 3
 
-    for level in lod(splats, cameras(), Levels((0.5, 0.2), absorb=absorb), protected=protected):
+    for level in lod(
+        splats, cameras(), Levels((0.5, 0.2), survivors=survivors), protected=protected
+    ):
         assert level.keep[protected].all()
         there = protected[level.keep]
         wanted = splats.take(protected)
         found = level.splats.take(there)
-        assert equal(found, joined_in_double(wanted) if absorb else wanted)
+        assert equal(found, joined_in_double(wanted) if survivors == "absorb" else wanted)
     assert len(level.splats) == 116
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("absorb", [True, False])
-def test_levels_by_psnr_lie_near_it(absorb):
+@pytest.mark.parametrize("survivors", ["absorb", "unchanged"])
+def test_levels_by_psnr_lie_near_it(survivors):
     """Deleting keeps at least it by the curve; absorbing comes as near as prune does, .7 dB.
 
     Between the shares of the curve, straight lines are off by some tenths on so small a scene.
@@ -174,7 +176,7 @@ def test_levels_by_psnr_lie_near_it(absorb):
     splats, views = read_ply(ROOM / "point_cloud.ply").splats(), read_cameras(ROOM / "cameras.json")
     splats, views = splats.take(slice(0, None, 8)), views.take(range(0, 72, 6))
 
-    levels = lod(splats, views, Levels(psnr=(34.0, 28.0), absorb=absorb))
+    levels = lod(splats, views, Levels(psnr=(34.0, 28.0), survivors=survivors))
 
     assert levels[0].psnr == pytest.approx(34.0, abs=1.0)
     assert levels[1].psnr == pytest.approx(28.0, abs=1.0)
@@ -218,10 +220,10 @@ def test_one_splat_stays_at_least():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("absorb", [True, False])
-def test_progress_only_rises_and_can_cancel(absorb):
+@pytest.mark.parametrize("survivors", ["absorb", "unchanged"])
+def test_progress_only_rises_and_can_cancel(survivors):
     """From 0 to 1, whatever the level; False ends it."""
-    told, levels = [], Levels((0.5, 0.2), absorb=absorb)
+    told, levels = [], Levels((0.5, 0.2), survivors=survivors)
     lod(colourful(), cameras(), levels, progress=lambda f, _: told.append(f))
 
     assert told == sorted(told)
@@ -325,7 +327,7 @@ def test_files_of_absorbed_levels_hold_the_survivors(tmp_path):
 def test_levels_are_written_in_any_format(tmp_path, suffix):
     """As many splats, in a file that is read by its content, with what the format loses noted."""
     source = file_of(colourful(), tmp_path / "a.ply")
-    levels = Levels((0.5,), absorb=False)
+    levels = Levels((0.5,), survivors="unchanged")
 
     done = lod_file(source, tmp_path, LevelsRequest(cameras(2), levels, QUICK, suffix=suffix))
 

@@ -520,16 +520,24 @@ def test_a_round_orders_what_it_removes_and_the_next_one_the_rest_anew():
 
 @pytest.mark.slow
 def test_a_budget_ends_the_rounds_and_changes_no_place_up_to_it():
-    """Of three rounds two are done for .7 removed, one for half, each with all of its order."""
+    """Of three rounds two are done for .7 removed, one for half, each with all of its order.
+
+    One also for .684, which the first removes to the splat: no round is begun for what stays.
+    """
     splats, views = cloud(), ring()
     whole = np.argsort(occlusion.score(splats, views, Occlusion(rounds=3)).values)
 
-    for settled, same in ((150, 205), (210, 270), (300, 300)):
+    for settled, same, next_round in (
+        (150, 205, 270),
+        (205, 205, 270),
+        (210, 270, 300),
+        (300, 300, 300),
+    ):
         found = occlusion.score(splats, views, Occlusion(rounds=3), settled=settled)
         order = np.argsort(found.values)
         assert found.settled == settled
         np.testing.assert_array_equal(order[:same], whole[:same])
-        assert (order[same:] != whole[same:]).any() == (same < 300)
+        assert (order[same:next_round] != whole[same:next_round]).any() == (same < 300)
 
 
 def test_what_no_renderer_draws_goes_first_the_least_first():
@@ -887,6 +895,20 @@ def test_an_image_of_any_shape_has_few_enough_cells():
 
         assert math.ceil(width / side) * math.ceil(height / side) <= points_module.MAX_CELLS
         assert np.isfinite(occlusion.score(splats, ViewSet((view,)), ONCE).values).all()
+
+
+@pytest.mark.parametrize("size", [(40.0, 1600.0), (39.2, 1599.5)])
+def test_each_cell_of_a_narrow_image_has_a_number_of_its_own(size):
+    """64,000 cells, the last column and row also if they are cut: numbers of 16 bits hold them.
+
+    With one more number a row they would not. The last of them says that a point is outside.
+    """
+    across, down = (place.ravel() for place in np.meshgrid(np.arange(40.0), np.arange(1600.0)))
+
+    numbers = points_module._cell_numbers((across + 0.1, down + 0.1), size)
+
+    assert len(np.unique(numbers)) == 64_000
+    assert numbers.max() < points_module._OUTSIDE
 
 
 def test_views_that_see_nothing_are_an_error():

@@ -265,7 +265,7 @@ def test_what_absorbs_is_drawn_as_it_became():
     """With `absorb` the survivors are other splats than before."""
     splats, views = crowd(), ViewSet((view_of(60, 40),))
 
-    result = prune(splats, views, Budget(ratio=0.6), absorb=True)
+    result = prune(splats, views, Budget(ratio=0.6), survivors="absorb")
 
     assert result.survivors(splats) is result.absorbed.splats
     plain = prune(splats, views, Budget(ratio=0.6))

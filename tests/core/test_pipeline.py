@@ -241,7 +241,7 @@ def in_doubles(splats: Splats, views: ViewSet) -> Scores:
         term = alpha * total * content
         values += share * term / term.mean()
     weighted = (means - middle) / squared[:, None]
-    axes = principal_axes(weighted.T @ (means - middle), weighted.sum(axis=0))
+    axes = principal_axes(np.vstack([weighted.T @ (means - middle), weighted.sum(axis=0)]))
     place = (means - middle) @ axes.T / size
     ball = place / (1 + np.linalg.norm(place, axis=1, keepdims=True))
     _, own = np.unique(np.floor((ball + 1) * 32).astype(int), axis=0, return_inverse=True)
@@ -326,7 +326,7 @@ def test_absorbing_file_to_file_writes_the_changed_survivors_and_the_rest_bit_fo
     """The budget says how many survive; the report and a note say how many of them changed."""
     before = read_ply(small)
     result = prune_file(
-        small, tmp_path / "out.ply", PruneRequest(views, Budget(ratio=0.6), absorb=True)
+        small, tmp_path / "out.ply", PruneRequest(views, Budget(ratio=0.6), survivors="absorb")
     )
 
     after = read_ply(tmp_path / "out.ply")
@@ -360,7 +360,7 @@ def test_survivors_of_doubles_are_doubles(small, views, tmp_path):
     result = prune_file(
         tmp_path / "in.ply",
         tmp_path / "out.ply",
-        PruneRequest(moved, Budget(ratio=0.6), absorb=True),
+        PruneRequest(moved, Budget(ratio=0.6), survivors="absorb"),
     )
 
     written, changed = read_ply(tmp_path / "out.ply").splats(), result.absorbed.changed
@@ -386,7 +386,7 @@ def text(small, tmp_path_factory):
 def test_absorbing_text_changes_the_words_of_what_changed_and_no_other(text, views, tmp_path):
     """A survivor that absorbed nothing is its own line; the others read back as they became."""
     result = prune_file(
-        text, tmp_path / "out.ply", PruneRequest(views, Budget(ratio=0.6), absorb=True)
+        text, tmp_path / "out.ply", PruneRequest(views, Budget(ratio=0.6), survivors="absorb")
     )
 
     before, after = read_ply(text), read_ply(tmp_path / "out.ply")
@@ -402,15 +402,15 @@ def test_absorbing_text_changes_the_words_of_what_changed_and_no_other(text, vie
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("absorb", [False, True])
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
 def test_the_report_says_how_large_a_text_file_is_before_it_is_written(
-    text, views, tmp_path, absorb
+    text, views, tmp_path, survivors
 ):
     """Of a dry run as of what stands on the disk, though changed rows are longer than they were."""
     done, dry = (
-        prune_file(text, output, PruneRequest(views, Budget(ratio=0.6), absorb=absorb)).report[
-            "files"
-        ]
+        prune_file(
+            text, output, PruneRequest(views, Budget(ratio=0.6), survivors=survivors)
+        ).report["files"]
         for output in (tmp_path / "out.ply", None)
     )
 
@@ -420,7 +420,9 @@ def test_the_report_says_how_large_a_text_file_is_before_it_is_written(
 @pytest.mark.slow
 def test_a_size_in_megabytes_holds_for_text_whose_rows_grow(text, views, tmp_path):
     """Numbers of three digits become numbers of nine: the rows are counted as they may become."""
-    prune_file(text, tmp_path / "out.ply", PruneRequest(views, Budget(max_mb=0.3), absorb=True))
+    prune_file(
+        text, tmp_path / "out.ply", PruneRequest(views, Budget(max_mb=0.3), survivors="absorb")
+    )
 
     assert 0.1e6 < (tmp_path / "out.ply").stat().st_size <= 0.3e6
 
@@ -438,13 +440,15 @@ def uneven(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("absorb", [False, True])
-def test_a_text_file_that_fits_loses_nothing(uneven, front, tmp_path, absorb):
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
+def test_a_text_file_that_fits_loses_nothing(uneven, front, tmp_path, survivors):
     """However long its longest row is: its limit is its own size, byte by byte."""
     size = uneven.stat().st_size
 
     prune_file(
-        uneven, tmp_path / "out.ply", PruneRequest(front, Budget(max_mb=size / 1e6), absorb=absorb)
+        uneven,
+        tmp_path / "out.ply",
+        PruneRequest(front, Budget(max_mb=size / 1e6), survivors=survivors),
     )
 
     assert (tmp_path / "out.ply").read_bytes() == uneven.read_bytes()
@@ -473,7 +477,7 @@ def test_a_budget_that_only_scores_can_tell_says_how_many_survivors_absorb(small
     splats = read_ply(small).splats()
     median = float(np.median(prune(splats, views, Budget(ratio=0.0), FAST).scores.values))
 
-    result = prune(splats, views, Budget(threshold=median), FAST, absorb=True)
+    result = prune(splats, views, Budget(threshold=median), FAST, survivors="absorb")
 
     assert np.count_nonzero(result.keep) == pytest.approx(len(splats) / 2, abs=1)
 
@@ -492,24 +496,24 @@ def test_what_autos_scores_cannot_mean_is_refused_before_the_work(small, views):
     def never(_fraction, what):
         raise AssertionError(what)
 
-    for absorb in (False, True):
+    for survivors in ("unchanged", "absorb"):
         with pytest.raises(RefineError, match="a threshold means something else"):
             prune(
                 read_ply(small).splats(), views, Budget(threshold=0.5), Settings("auto"),
-                absorb=absorb, progress=never,
+                survivors=survivors, progress=never,
             )  # fmt: skip
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("absorb", [False, True])
-def test_scores_that_are_there_already_decide_as_new_ones_would(small, views, absorb):
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
+def test_scores_that_are_there_already_decide_as_new_ones_would(small, views, survivors):
     """The panel scores once and applies later: the same splats, and the same report of them."""
     splats, budget = read_ply(small).splats(), Budget(threshold=0.5)
-    at_once = prune(splats, views, budget, FAST, absorb=absorb)
+    at_once = prune(splats, views, budget, FAST, survivors=survivors)
     scores = score(splats, views, FAST)
-    scene = {"splats": splats, "views": views} if absorb else {}
+    scene = {"splats": splats, "views": views} if survivors == "absorb" else {}
 
-    later = decide(Task(budget, FAST, scores=scores, absorb=absorb, **scene))
+    later = decide(Task(budget, FAST, scores=scores, survivors=survivors, **scene))
 
     np.testing.assert_array_equal(at_once.keep, later.keep)
     for report in (at_once.report, later.report):
@@ -530,7 +534,7 @@ def test_a_report_of_absorbing_says_what_decided_and_what_was_asked(small, views
     splats = read_ply(small).splats()
     once = score(splats, views, Settings("occlusion", occlusion=Occlusion(rounds=1)))
 
-    report = prune(splats, views, Budget(ratio=0.5), Settings(method), absorb=True).report
+    report = prune(splats, views, Budget(ratio=0.5), Settings(method), survivors="absorb").report
 
     assert report["settings"]["method"] == method
     assert report["weights"] == once.facts
@@ -545,7 +549,7 @@ def test_protected_splats_stay_as_they_are_while_others_absorb(small, views):
     splats = read_ply(small).splats()
     protected = np.arange(len(splats)) % 3 == 0
 
-    result = prune(splats, views, Budget(ratio=0.6), protected=protected, absorb=True)
+    result = prune(splats, views, Budget(ratio=0.6), protected=protected, survivors="absorb")
 
     assert result.keep[protected].all()
     assert np.count_nonzero(result.keep) == len(splats) - len(splats) * 6 // 10
@@ -555,7 +559,7 @@ def test_protected_splats_stay_as_they_are_while_others_absorb(small, views):
 @pytest.mark.slow
 def test_nothing_to_remove_leaves_absorbing_nothing_to_do(small, views):
     """All stay, none changes."""
-    result = prune(read_ply(small).splats(), views, Budget(ratio=0.0), absorb=True)
+    result = prune(read_ply(small).splats(), views, Budget(ratio=0.0), survivors="absorb")
 
     assert result.keep.all()
     assert not result.absorbed.changed.any()
@@ -568,7 +572,7 @@ def test_the_first_tenth_goes_as_occlusion_says_and_nothing_absorbs_it(ratio):
     room, views = read_ply(ROOM / "point_cloud.ply").splats(), read_cameras(ROOM / "cameras.json")
     splats, budget = room.take(slice(None, None, 16)), Budget(ratio=ratio)
 
-    absorbed = prune(splats, views, budget, Settings(views=8), absorb=True)
+    absorbed = prune(splats, views, budget, Settings(views=8), survivors="absorb")
     deleted = prune(splats, views, budget, Settings("occlusion", views=8))
 
     np.testing.assert_array_equal(absorbed.keep, deleted.keep)
@@ -604,7 +608,7 @@ def test_later_stages_measure_half_of_the_views_and_take_over_the_rest(small, vi
 
     monkeypatch.setattr(absorb_splats.occlusion, "measure_part", quarter)
     monkeypatch.setattr(absorb_splats.absorbing, "absorb", listening)
-    prune(read_ply(small).splats(), views, Budget(ratio=0.7), absorb=True)
+    prune(read_ply(small).splats(), views, Budget(ratio=0.7), survivors="absorb")
 
     assert asked == [(turn, 2) for turn in range(len(asked))]
     assert len(seen) == len(asked) > 0
@@ -624,7 +628,7 @@ def scored_for_all(request, small, views):
     splats = read_ply(small).splats()
     every = np.arange(len(splats))
     held = every % 2 == 0 if zoned.startswith("half") else every % 7 == 0
-    demands = {"protected": held, "removed": every % 11 == 0} if zoned else {}
+    demands = {"protected": held, "forced_out": every % 11 == 0} if zoned else {}
     task = Task(Budget(ratio=0.5), Settings(method, views=12), splats, views, **demands)
     return task, replace(task, scores=decide(replace(task, reusable=True)).scores), zoned
 

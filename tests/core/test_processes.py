@@ -259,8 +259,8 @@ print(len(processes._idle))
     assert said.stdout.startswith(b"0")
 
 
-@pytest.mark.parametrize("absorb", [False, True])
-def test_processes_keep_the_same_splats_as_one_thread(absorb, monkeypatch):
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
+def test_processes_keep_the_same_splats_as_one_thread(survivors, monkeypatch):
     """To the bit, with every view measured in a process however little work it is."""
     monkeypatch.setattr(processes, "WORTH", 0.0)
     monkeypatch.setattr(processes, "WORTH_READY", 0.0)
@@ -268,7 +268,7 @@ def test_processes_keep_the_same_splats_as_one_thread(absorb, monkeypatch):
     views = read_cameras(ROOM / "cameras.json").spread(20)
 
     one, two = (
-        prune(splats, views, Budget(ratio=0.5), Settings(), absorb=absorb, threads=threads)
+        prune(splats, views, Budget(ratio=0.5), Settings(), survivors=survivors, threads=threads)
         for threads in (1, 2)
     )
 

@@ -328,8 +328,8 @@ def test_where_the_curve_is_flat_as_much_goes_as_can():
 
 def test_the_curve_of_absorbing_is_read_in_the_same_way():
     """At the points what was put in."""
-    assert CURVE.at(0.5, absorb=True) == pytest.approx(47.0)
-    assert CURVE.share(38.0, absorb=True) == pytest.approx(0.8)
+    assert CURVE.at(0.5, survivors="absorb") == pytest.approx(47.0)
+    assert CURVE.share(38.0, survivors="absorb") == pytest.approx(0.8)
 
 
 def test_absorbing_is_expected_to_be_better_and_never_worse():
@@ -439,7 +439,7 @@ def test_absorbing_reaches_a_psnr_with_fewer(goal):
     """By its own estimate, to `absorb_splats.CLOSE` or as near as three tries come."""
     splats, views = cloud(1500), ring()
     plain = prune(splats, views, Budget(psnr=goal), Settings("occlusion"))
-    merged = prune(splats, views, Budget(psnr=goal), absorb=True)
+    merged = prune(splats, views, Budget(psnr=goal), survivors="absorb")
 
     assert merged.report["estimated_psnr"] == pytest.approx(goal, abs=1.5)
     assert merged.report["estimated_psnr_absorbed"] == merged.report["estimated_psnr"]
@@ -479,7 +479,7 @@ def test_what_absorbing_would_reach_is_told_of_many_splats_alone():
     splats, views = cloud(), ring()
 
     told = [decide(Task(Budget(ratio=0.5), scores=scores)).report for scores in (few.scores, many)]
-    done = prune(splats, views, Budget(ratio=0.5), Settings("occlusion"), absorb=True).report
+    done = prune(splats, views, Budget(ratio=0.5), Settings("occlusion"), survivors="absorb").report
 
     assert told[0]["estimated_psnr_absorbed"] is None
     assert "fewer than 20,000 splats" in told[0]["estimated_psnr_absorbed_note"]

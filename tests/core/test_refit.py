@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from refine_addon.core import ViewSet
-from refine_addon.core.refitting import linear, refit
+from refine_addon.core import ViewSet, processes
+from refine_addon.core.refitting import linear, refit, round_rays
 from refine_addon.core.rendering import LOW_PASS
 from refine_addon.core.seeing import projection
-from refine_addon.core.seeing.cast import cast
+from refine_addon.core.seeing.cast import cast, pixels
 from refine_addon.core.seeing.ray_sample import colors_from
 from refine_addon.core.splats import SH_C0, rotation_matrices
 from refine_addon.core.work import Cancelled
@@ -67,13 +67,16 @@ def drawn(splats, view, fixed):
     return image
 
 
-def linear_of(splats, view):
-    """Return what `linear` says of a view."""
+def linear_of(splats, view, count=12):
+    """Return what `linear` says of a view, of which the first splats are refitted."""
     gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)))
     footprints = projection.project(gaussians, scene, view)
+    order = np.argsort(gaussians.index)  # as rows
+    gaussians, rank = gaussians.take(order), np.argsort(order)
+    footprints = replace(footprints, index=rank[footprints.index])
     rays = cast(footprints, COLUMNS, ROWS)
     colors = colors_from(splats, gaussians.index[rays.hit], view)
-    shapes = linear.Shapes.of(splats, gaussians, scene)
+    shapes = linear.Shapes.of(splats, gaussians.take(slice(count)), scene)
     return linear.linear_view(rays, footprints, colors, shapes, view)
 
 
@@ -177,6 +180,58 @@ def test_threads_change_no_bit(threads):
 
     assert found.psnr == expected.psnr
     np.testing.assert_array_equal(found.splats.means, expected.splats.means)
+
+
+def test_rays_of_one_round_are_not_next_to_those_of_another():
+    """Of 10 x 10 rays a round, 100 px apart, all rounds and validation are 25 px apart at least.
+
+    Else what is learned from one round would be measured by the next one as if it held everywhere.
+    Rounds of the same view are as far apart as seven points of the R2 sequence, whatever its
+    number.
+    """
+    view = replace(ring()[0], width=1000, height=1000)
+    none = projection.front_to_back([])
+    for number in range(0, 200, 7):
+        window = round_rays.Window(view, number, 1.0, 100.0, 1e9)
+        places = [pixels(view, number, 100.0)] + [window.pixels(none, k) for k in range(7)]
+        first = np.array([(columns[0], rows[0]) for columns, rows in places])
+
+        apart = np.abs((first[:, None] - first + 50) % 100 - 50)  # around the edge of a cell
+        distance = np.hypot(*np.moveaxis(apart, 2, 0)) + 1e3 * np.eye(8)
+        assert distance.min() > 25
+
+
+def test_what_is_around_a_region_is_drawn_and_does_not_change():
+    """Of the last six splats of 12, colours and derivatives of the first six are the same."""
+    splats, view = few(), ring()[0]
+    every = linear_of(splats, view)
+
+    found = linear_of(splats, view, 6)
+
+    np.testing.assert_array_equal(found.colors, every.colors)
+    assert found.rows.max() < 6
+    change = np.random.default_rng(2).normal(size=(linear.COUNT, 12)).astype(np.float32)
+    change[:, 6:] = 0.0
+    np.testing.assert_allclose(found.forward(change[:, :6]), every.forward(change), atol=1e-5)
+
+
+@pytest.mark.slow
+def test_processes_change_no_bit(monkeypatch):
+    """Views that are cast elsewhere give what views cast here do, and this process casts none."""
+    splats, here = cloud(300), []
+    expected = refit.refit(splats.take(np.arange(100)), splats, ring(), refit.Refit(rounds=2))
+    for name in ("WORTH", "WORTH_READY"):
+        monkeypatch.setattr(processes, name, 0.0)
+    monkeypatch.setattr(round_rays, "cast", lambda *some: here.append(some))
+
+    found = refit.refit(
+        splats.take(np.arange(100)), splats, ring(), refit.Refit(rounds=2), threads=2
+    )
+
+    assert not here
+    assert found.psnr == expected.psnr
+    for name, values in vars(expected.splats).items():
+        np.testing.assert_array_equal(getattr(found.splats, name), values)
 
 
 @pytest.mark.slow

@@ -16,10 +16,10 @@ pytestmark = pytest.mark.slow
 
 SECTIONS = (Path(__file__).parents[2] / "docs/report.md").read_text("utf-8").split("\n## ")
 CAMERAS = ["--cameras", "."]
-ABSORBING = ["--absorb", "--clean", "--ratio", ".3"]
+CHANGING = ["--survivors", "refit", "--clean", "--ratio", ".3"]
 RUNS = {
     "prune": [
-        ["-o", "a.splat", *ABSORBING, *CAMERAS],
+        ["-o", "a.splat", *CHANGING, *CAMERAS],
         ["--dry-run", "--max-mb", "9", "--pictures", "shots", *CAMERAS],
         ["--together", "--dry-run", "--method", "closed-form", *CAMERAS],
     ],

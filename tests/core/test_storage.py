@@ -44,7 +44,7 @@ def fsspec():
     memory.pseudo_dirs[:] = [""]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def views():
     """Give the room's cameras."""
     return read_cameras(ROOM / "cameras.json")
@@ -84,18 +84,18 @@ def here(folder, views, settings=CLOSED, **options):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("absorb", [False, True])
-def test_behind_urls_the_same_bytes_are_written(folder, memory, views, absorb):
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
+def test_behind_urls_the_same_bytes_are_written(folder, memory, views, survivors):
     """Tiles and folder are in memory; nothing else is left there, nor here."""
-    settings = Settings(method="occlusion", views=4) if absorb else CLOSED
+    settings = Settings(method="occlusion", views=4) if survivors == "absorb" else CLOSED
     report = prune_tiles(
-        URLS, "memory://out/deep", PruneRequest(views, HALF, settings, absorb=absorb)
+        URLS, "memory://out/deep", PruneRequest(views, HALF, settings, survivors=survivors)
     )
 
     assert not list(folder.glob(".refine*"))
     assert sorted(memory.find("/out")) == [f"/out/deep/{name}" for name in NAMES]
     found = [memory.cat_file(f"/out/deep/{name}") for name in NAMES]
-    assert found == here(folder, views, settings, absorb=absorb)
+    assert found == here(folder, views, settings, survivors=survivors)
     assert [tile["input"] for tile in report["tiles"]] == URLS
     assert [tile["output"] for tile in report["tiles"]] == [
         f"memory://out/deep/{name}" for name in NAMES

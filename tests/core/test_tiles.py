@@ -48,7 +48,7 @@ def rows(monkeypatch):
     return room_rows()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def views():
     """Give the room's cameras."""
     return read_cameras(ROOM / "cameras.json")

@@ -26,10 +26,10 @@ from refine_addon.core.scoring import closed_form
 from refine_addon.core.seeing import projection
 from refine_addon.core.seeing.ray_sample import validation_rays
 from refine_addon.core.splats import joined
-from refine_addon.core.tiles import absorbing, gaussians, measuring, units
+from refine_addon.core.tiles import absorbing, gaussians, seeing, units
 from refine_addon.core.tiles.folder import Folder
 from refine_addon.core.tiles.gaussians import SceneContext
-from refine_addon.core.tiles.rays import StoredRays
+from refine_addon.core.tiles.seeing import StoredRays
 from refine_addon.core.tiles.workers import InProcess, Runner
 from refine_addon.core.views import ViewSet
 from tests.strategies import plain_header, splat_names
@@ -56,7 +56,7 @@ def rows():
     return rows
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def views():
     """Give the room's cameras."""
     return read_cameras(ROOM / "cameras.json")
@@ -114,18 +114,18 @@ def test_views_of_nothing_are_refused_as_of_one_file(tmp_path, tiles, views):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("absorb", [False, True], ids=["deleted", "absorbed"])
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"], ids=["deleted", "absorbed"])
 def test_a_job_that_was_interrupted_goes_on_where_it_was(
-    tmp_path, tiles, views, monkeypatch, absorb
+    tmp_path, tiles, views, monkeypatch, survivors
 ):
     """What a block of views has measured is not measured again, and the bytes are the same.
 
     Interrupted once, and four times in one job, when a tenth, three tenths, ... are done.
     """
     budget, settings, done = Budget(ratio=0.5), replace(OCCLUSION, views=8), []
-    measure = measuring.measure_footprints
+    measure = seeing.measure_footprints
     monkeypatch.setattr(
-        measuring, "measure_footprints", lambda *some: done.append(some) or measure(*some)
+        seeing, "measure_footprints", lambda *some: done.append(some) or measure(*some)
     )
 
     def measured(folder, *stops):
@@ -140,7 +140,7 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(
             prune_tiles(
                 tiles,
                 tmp_path / folder,
-                PruneRequest(views, budget, settings, absorb=absorb),
+                PruneRequest(views, budget, settings, survivors=survivors),
                 progress=interrupt,
             )
 
@@ -174,10 +174,12 @@ def test_absorbing_tiles_is_as_good_as_absorbing_one_file(tmp_path, views, monke
     tiles = cut(tmp_path, file.rows, np.linspace(0, len(file), 9).astype(int).tolist())
     settings = Settings(method="occlusion")
     told = prune_tiles(
-        tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=ratio), settings, absorb=True)
+        tiles,
+        tmp_path / "out",
+        PruneRequest(views, Budget(ratio=ratio), settings, survivors="absorb"),
     )
     splats = file.splats()
-    whole = prune(splats, views, Budget(ratio=ratio), settings, absorb=True)
+    whole = prune(splats, views, Budget(ratio=ratio), settings, survivors="absorb")
 
     rays = validation_rays(splats, views.spread(64))
     made = joined([read_ply(tmp_path / "out" / path.name).splats() for path in tiles])
@@ -198,12 +200,12 @@ def test_what_three_views_do_not_show_is_as_good_from_elsewhere(tmp_path, views,
     few, others = ViewSet(views.views[:3]), ViewSet(views.views[10::4])
     splats = read_ply(ROOM / "point_cloud.ply").splats()
     rays = validation_rays(splats, others)
-    whole = prune(splats, few, Budget(ratio=0.5), OCCLUSION, absorb=True)
+    whole = prune(splats, few, Budget(ratio=0.5), OCCLUSION, survivors="absorb")
 
     prune_tiles(
         [ROOM / "point_cloud.ply"],
         tmp_path,
-        PruneRequest(few, Budget(ratio=0.5), OCCLUSION, absorb=True),
+        PruneRequest(few, Budget(ratio=0.5), OCCLUSION, survivors="absorb"),
     )
 
     made = read_ply(tmp_path / "point_cloud.ply").splats()
@@ -219,7 +221,9 @@ def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, rows, views)
     Stages divide along other planes, so regions of a stage are not those of the one before.
     """
     told = prune_tiles(
-        tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=0.8), OCCLUSION, absorb=True)
+        tiles,
+        tmp_path / "out",
+        PruneRequest(views, Budget(ratio=0.8), OCCLUSION, survivors="absorb"),
     )
 
     made, counts = read(tmp_path / "out", tiles), told["absorbed"]
@@ -242,8 +246,10 @@ def test_absorbing_a_single_region_is_absorbing_one_file(
     """
     monkeypatch.setattr(absorbing, "REGION", COUNT)
     budget = Budget(ratio=ratio)
-    told = prune_tiles(tiles, tmp_path / "out", PruneRequest(views, budget, OCCLUSION, absorb=True))
-    request = PruneRequest(views, budget, OCCLUSION, absorb=True)
+    told = prune_tiles(
+        tiles, tmp_path / "out", PruneRequest(views, budget, OCCLUSION, survivors="absorb")
+    )
+    request = PruneRequest(views, budget, OCCLUSION, survivors="absorb")
     whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", request)
 
     assert told["absorbed"] == whole.report["absorbed"]
@@ -274,12 +280,14 @@ def test_stored_rays_know_which_are_wanted(tmp_path, views):
 def test_what_is_deleted_alone_needs_no_merging(tmp_path, tiles, views):
     """Up to a tenth is deleted as in memory: the same rows, and nothing changes."""
     told = prune_tiles(
-        tiles, tmp_path / "out", PruneRequest(views, Budget(ratio=0.1), OCCLUSION, absorb=True)
+        tiles,
+        tmp_path / "out",
+        PruneRequest(views, Budget(ratio=0.1), OCCLUSION, survivors="absorb"),
     )
     whole = prune_file(
         tmp_path / "whole.ply",
         tmp_path / "pruned.ply",
-        PruneRequest(views, Budget(ratio=0.1), OCCLUSION, absorb=True),
+        PruneRequest(views, Budget(ratio=0.1), OCCLUSION, survivors="absorb"),
     )
 
     assert told["absorbed"] == whole.report["absorbed"]
@@ -301,7 +309,9 @@ def test_tiles_of_other_degrees_absorb_one_another(tmp_path, rows, views):
     paths = [tmp_path / "a.ply", tmp_path / "b.ply"]
 
     told = prune_tiles(
-        paths, tmp_path / "out", PruneRequest(views, Budget(ratio=0.6), OCCLUSION, absorb=True)
+        paths,
+        tmp_path / "out",
+        PruneRequest(views, Budget(ratio=0.6), OCCLUSION, survivors="absorb"),
     )
 
     made = [read_ply(tmp_path / "out" / path.name).splats() for path in paths]
@@ -320,7 +330,9 @@ def test_budgets_that_absorbing_tiles_cannot_meet_are_refused(
 ):
     """Before anything is read."""
     with pytest.raises(RefineError, match=words):
-        prune_tiles(tiles, tmp_path / "out", PruneRequest(views, budget, OCCLUSION, absorb=True))
+        prune_tiles(
+            tiles, tmp_path / "out", PruneRequest(views, budget, OCCLUSION, survivors="absorb")
+        )
     assert not (tmp_path / "out").exists()
 
 
@@ -390,4 +402,6 @@ def test_no_box_is_left_out_that_a_splat_reaches_from(seed):
     touching = projection.boxes_touch(np.array(boxes, np.float32), scene, view)
 
     for box, piece in zip(touching, pieces, strict=True):
-        assert box or not len(projection.reaching(gaussians.take(piece), scene, view)[1])
+        assert box or not len(
+            projection.footprints_and_depths(gaussians.take(piece), scene, view)[1]
+        )

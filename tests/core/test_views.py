@@ -171,6 +171,16 @@ def test_the_middle_of_views_ignores_a_stray_one(away):
     assert stray[1] < 16.0
 
 
+def test_views_count_for_the_middle_and_its_variance_by_their_weight():
+    """Three fifths of the weight stand in one place: the middle is there, and so is the median."""
+    places = ([1, 2, 3], 3.0), ([11, 2, 3], 1.0), ([21, 2, 3], 1.0)
+
+    middle, variance = ViewSet(tuple(view(at, weight=weight) for at, weight in places)).middle()
+
+    np.testing.assert_allclose(middle, [1, 2, 3], atol=1e-6)
+    assert variance < 1e-12
+
+
 def test_the_middle_of_one_view_is_its_place():
     """Without any distance."""
     middle, spread = ViewSet((view([1, 2, 3]),)).middle()

@@ -217,3 +217,41 @@ def _psnr(seen: dict, picture: Path, cloud: Path) -> float:
     with Image.open(picture) as screen:
         shown = np.asarray(screen.convert("RGB"))[top : top + height, left : left + width] / 255.0
     return float(-10.0 * np.log10(np.mean((shown - expected) ** 2)))
+
+
+def test_splats_are_selected_as_they_are_seen(binary: Binary, cloud: Path, cameras: Path):
+    """Tools take what is visible, and all if told so; Shift adds, Ctrl subtracts, both intersect.
+
+    A lasso along the edges of the box takes what the box takes, but for a pixel at its edges. The
+    selection is undone, and it is in the file.
+    """
+    try:
+        found = binary.window_step(
+            "selecting",
+            size=(800, 500),
+            cloud=cloud,
+            cameras=cameras,
+            blend=binary.work / "saved.blend",
+            pictures=binary.work,
+        )
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+
+    assert found["imported"] == found["undone"] == found["none"] == 0
+    assert 0 < found["box"] < found["through"]
+    assert found["box is part"]
+    assert found["lasso is box"] < 0.05 * found["box"]
+    assert all(
+        found[f"{what} is {how}"]
+        for what, how in (("added", "both"), ("subtracted", "rest"), ("intersected", "both"))
+    )
+    assert 0 < found["brush"] < found["box"]
+    assert found["sphere"] > 0
+    assert found["color"] > 0
+    assert found["all"] == 39_755
+    assert found["inverted"] == 39_755 - found["box"]
+    assert found["isolated"] == found["box"] < found["drawn"]
+    assert found["edit box"] == found["after edit"] == found["box"] == found["reopened"]
+    assert found["failure"] == ""

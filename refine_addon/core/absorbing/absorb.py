@@ -287,7 +287,7 @@ def mergeable(splats: Splats, scene: Scene, protected: NDArray[np.bool_]) -> Ind
     So ties do not depend on the order of the file.
     """
     rows = np.flatnonzero(drawable(splats) & ~protected)
-    place = scene.place(splats.means[rows])
+    place = scene.positions(splats.means[rows])
     return rows[spatial_order(place, lambda tied: splat_fingerprint(splats, rows[tied]))]
 
 

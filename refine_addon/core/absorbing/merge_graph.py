@@ -121,7 +121,7 @@ class MergeGraph:
     def connect(self, progress: Progress = silent) -> None:
         """Find the pairs of neighbouring splats, and price them."""
         rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))  # (R,)
-        place = self.scene.place(self.field.means[rows])  # (R, 3)
+        place = self.scene.positions(self.field.means[rows])  # (R, 3)
         near = nearest(
             place, NEIGHBOURS, progress=part(progress, 0.0, 0.4), threads=self.threads
         )  # (R, k)

@@ -167,17 +167,11 @@ def _price(ends: _Ends, tilt: float) -> Pairs:
     signals i, j and m of the equations. All arrays are (M,).
     """
     plane, color, rest = _in_plane(ends, tilt), ends.color, ends.rest
-    one, two, merged, x, y = plane[:5]
+    one, two, merged = plane[:3]
     ii, jj, mm = one.squared(), two.squared(), merged.squared()
-    # The merged centre lies between the two, away from each by the other's share of the step.
-    im = one.times(merged, plane.other * x, plane.other * y)
-    jm = two.times(merged, plane.position * x, plane.position * y)
-    pp = ii - 2.0 * color * im + color * color * mm
-    qq = jj - 2.0 * rest * jm + rest * rest * mm
-    pq = plane.overlap - rest * im - color * jm
-    pq += color * rest * mm
     s_i, s_j, both = _contrasts(ends, ends.one.contribution / one.mass * ii,
                                 ends.two.contribution / two.mass * jj)  # fmt: skip
+    pp, qq, pq = _products(plane, color, rest, (ii, jj, mm))
     cost = s_i * pp + 2.0 * both * pq + s_j * qq
     # The contrast of the merged splat is l_i s_i + l_j s_j.
     mixed = color * color * s_i + 2.0 * color * rest * both + rest * rest * s_j
@@ -186,6 +180,22 @@ def _price(ends: _Ends, tilt: float) -> Pairs:
         tau * np.maximum(cost, 0.0), plane.position, color, merged.mass / merged.area, plane.growth,
         tau * np.maximum(mixed, 0.0) * mm,
     )  # fmt: skip
+
+
+def _products(
+    plane: _Plane, color: Array, rest: Array, squares: tuple[Array, Array, Array]
+) -> tuple[Array, Array, Array]:
+    """Return ``<p, p>``, ``<q, q>`` and ``<p, q>``, (M,) each.
+
+    `color` and `rest` are l_i and l_j, `squares` the inner products of i, j and m with themselves.
+    """
+    (ii, jj, mm), x, y = squares, plane.x, plane.y
+    # The merged centre lies between the two, away from each by the other's share of the step.
+    im = plane.one.times(plane.merged, plane.other * x, plane.other * y)
+    jm = plane.two.times(plane.merged, plane.position * x, plane.position * y)
+    pq = plane.overlap - rest * im - color * jm
+    pq += color * rest * mm
+    return ii - 2.0 * color * im + color * color * mm, jj - 2.0 * rest * jm + rest * rest * mm, pq
 
 
 class _Signal(NamedTuple):

@@ -54,7 +54,7 @@ def nearest(
     Parameters
     ----------
     points : (N, 3) float64
-        In scene sizes (`Scene.place`).
+        In scene sizes (`Scene.positions`).
     count : int
         How many neighbours, up to 16; fewer where there are not as many other points.
     progress : callable, optional

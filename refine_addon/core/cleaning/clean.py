@@ -205,7 +205,7 @@ def clean(  # noqa: PLR0913 - as `pipeline.prune`
     settings: Cleaning = Cleaning(),
     *,
     protected: NDArray[np.bool_] | None = None,
-    removed: NDArray[np.bool_] | None = None,
+    forced_out: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Cleaned:
@@ -219,7 +219,7 @@ def clean(  # noqa: PLR0913 - as `pipeline.prune`
     settings : Cleaning
     protected : (N,) bool, optional
         Splats that stay, whatever they are. They are evidence all the same.
-    removed : (N,) bool, optional
+    forced_out : (N,) bool, optional
         Splats that go, unless they are protected, and are no evidence: as if they had gone before.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
@@ -233,8 +233,8 @@ def clean(  # noqa: PLR0913 - as `pipeline.prune`
     Cancelled
         If `progress` answers ``False``.
     """
-    if removed is not None and removed.any():
-        rest = ~removed if protected is None else ~removed | protected
+    if forced_out is not None and forced_out.any():
+        rest = ~forced_out if protected is None else ~forced_out | protected
         refuse_all(~rest)
         cleaned = clean(
             splats.take(rest), views, settings,

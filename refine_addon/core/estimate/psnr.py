@@ -45,7 +45,7 @@ def psnr_kept(
     keep : (N,) bool
     threads : int, optional
     """
-    place, views = keep[sample.index].astype(np.int64), sample.seeing()
+    place, views = keep[sample.splat_rows].astype(np.int64), sample.seeing()
     psnr = _of_each_view(sample, _removing(sample, place, [1]), views, silent, threads)
     return None if psnr is None else float(_mean(sample, psnr, views)[0])
 
@@ -89,7 +89,7 @@ def quality_curve(
     )
     if not removed:
         return None
-    place, views = _places(values, protected)[sample.index], sample.seeing()
+    place, views = _places(values, protected)[sample.splat_rows], sample.seeing()
     of_views = _of_each_view(
         sample, _removing(sample, place, removed), views, part(progress, 0.0, 0.5), threads
     )
@@ -137,7 +137,7 @@ def psnr_by_views(
         return None
     seeing = sorted(set(numbers) & set(sample.seeing()))
     counts = [math.floor(share * len(values)) for share in shares]
-    compare = _removing(sample, _places(values)[sample.index], counts)
+    compare = _removing(sample, _places(values)[sample.splat_rows], counts)
     psnr = _of_each_view(sample, compare, seeing, silent, threads)
     return None if psnr is None else _mean(sample, psnr, seeing)
 

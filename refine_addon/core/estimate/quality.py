@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..survivor_choice import SurvivorChoice
+
 PSNR_CAP = 100.0
 """PSNR of equal pictures, dB, and the highest that an estimate may be."""
 
@@ -42,6 +44,9 @@ FEWEST = 20_000
 
 PLAIN = 0.1
 """Share removed up to which absorbing is plain deletion."""
+
+REFITTED = 3.0
+"""About what refitting gains over absorbing, dB; less where little is removed, see `Quality.at`."""
 
 UNSEEN = 60.0
 """PSNR in dB above which pictures are the same to the eye: rounding to 8 bits alone makes 59."""
@@ -79,39 +84,39 @@ class Quality:
     foretold: bool = True
     views: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
-    def at(self, share: float, *, absorb: bool = False) -> float:
-        """Return the PSNR with a share of the splats removed, dB; with `absorb`, about.
+    def at(self, share: float, survivors: SurvivorChoice = "unchanged") -> float:
+        """Return the PSNR with a share of the splats removed, dB; if survivors may change, about.
 
         Between the shares of the curve the PSNR is taken as linear in the logarithm of the odds
         ``share / (1 - share)``, which it nearly is; beyond the last it stays.
         """
-        return float(np.interp(_log_odds(share), *self._points(absorb=absorb)))
+        return float(np.interp(_log_odds(share), self._odds(), self._curve(survivors)))
 
-    def of_views(self, share: float, *, absorb: bool = False) -> dict[str, float]:
+    def of_views(self, share: float, survivors: SurvivorChoice = "unchanged") -> dict[str, float]:
         """Return the PSNR of single views with a share of the splats removed, dB.
 
-        Absorbing is taken to gain as much in each view as it gains in all together.
+        Absorbing and refitting are taken to gain as much in each view as in all together.
 
         Examples
         --------
         >>> curve = Quality(np.array([0.2, 0.5]), *np.array([[50.0, 40.0], [53.0, 46.0]]))
         >>> curve.views["a"] = np.array([48.0, 36.0])
-        >>> curve.of_views(0.5), curve.of_views(0.5, absorb=True)
+        >>> curve.of_views(0.5), curve.of_views(0.5, "absorb")
         ({'a': 36.0}, {'a': 42.0})
         """
         odds, place = self._odds(), _log_odds(share)
-        gain = self.at(share, absorb=True) - self.at(share) if absorb else 0.0
+        gain = self.at(share, survivors) - self.at(share)
         return {
-            name: min(float(np.interp(place, odds, _begun(own))) + gain, PSNR_CAP)
-            for name, own in self.views.items()
+            name: min(float(np.interp(place, odds, _with_start(psnr))) + gain, PSNR_CAP)
+            for name, psnr in self.views.items()
         }
 
-    def share(self, psnr: float, *, absorb: bool = False) -> float:
+    def share(self, psnr: float, survivors: SurvivorChoice = "unchanged") -> float:
         """Return the largest share that can go while the PSNR is at least `psnr`, dB; or 0.
 
         It is at most the last share of the curve.
         """
-        odds, values = self._points(absorb=absorb)
+        odds, values = self._odds(), self._curve(survivors)
         if psnr > PSNR_CAP:
             return 0.0
         if psnr <= values[-1]:
@@ -121,9 +126,12 @@ class Quality:
         place = odds[right] + step * (odds[right + 1] - odds[right])
         return float(1.0 / (1.0 + np.exp(-place)))
 
-    def _points(self, *, absorb: bool) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the curve with its beginning, where nothing is removed: odds and PSNR."""
-        return self._odds(), _begun(self.absorbed if absorb else self.psnr)
+    def _curve(self, survivors: SurvivorChoice) -> NDArray[np.float64]:
+        """Return the PSNR with its beginning, where nothing is removed."""
+        if survivors == "unchanged":
+            return _with_start(self.psnr)
+        gain = REFITTED if survivors == "refit" else 0.0
+        return _with_start(np.minimum(self.absorbed + gain, PSNR_CAP))
 
     def _odds(self) -> NDArray[np.float64]:
         return np.array([_log_odds(share) for share in (0.0, *self.shares.tolist())])
@@ -135,7 +143,7 @@ class Quality:
             "psnr": self.psnr.tolist(),
             "absorbed": self.absorbed.tolist(),
             "foretold": self.foretold,
-            "views": {name: own.round(2).tolist() for name, own in self.views.items()},
+            "views": {name: psnr.round(2).tolist() for name, psnr in self.views.items()},
         }
 
     @classmethod
@@ -145,7 +153,7 @@ class Quality:
         try:
             shares, psnr, absorbed = (np.array((facts or {})[name], np.float64) for name in names)
             single = dict((facts or {}).get("views") or {})  # files of older versions have none
-            views = {str(name): np.array(own, np.float64) for name, own in single.items()}
+            views = {str(name): np.array(values, np.float64) for name, values in single.items()}
         except (AttributeError, KeyError, TypeError, ValueError):
             return None
         curves: Sequence[NDArray[np.float64]] = (shares, psnr, absorbed, *views.values())
@@ -263,7 +271,7 @@ def in_words(psnr: float) -> str:
     return f"more than {UNSEEN:.0f} dB" if psnr > UNSEEN else f"about {psnr:.0f} dB"
 
 
-def _begun(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _with_start(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return a curve with its beginning, where nothing is removed."""
     return np.concatenate([[PSNR_CAP], values])
 

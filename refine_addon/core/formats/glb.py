@@ -63,6 +63,10 @@ _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Between the frame of captures and that of glTF, either way."""
 
 
+_MOVES = frozenset(("matrix", "translation", "rotation", "scale"))
+"""Members of a node that move what it shows."""
+
+
 def matches(_path: Path, head: bytes) -> bool:
     """Return whether a file is one."""
     return head.startswith(MAGIC)
@@ -127,8 +131,10 @@ def _nodes(document: Document) -> Iterator[tuple[int, Place, NDArray[np.float64]
         if index in visited:
             place.fail("belongs to two nodes, expected a tree")
         visited.add(index)
-        with np.errstate(over="ignore", invalid="ignore", under="ignore"):
-            matrix = frame @ _matrix(node, place)
+        matrix = frame
+        if not _MOVES.isdisjoint(node):
+            with np.errstate(over="ignore", invalid="ignore", under="ignore"):
+                matrix = frame @ _matrix(node, place)
         left += [(child, place, matrix) for child in _listed(node, "children", place)[::-1]]
         if "mesh" in node:
             document.item("meshes", node["mesh"], place)

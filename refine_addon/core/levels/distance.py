@@ -17,8 +17,7 @@ import numpy as np
 from ..estimate.psnr import MIN_RAYS_WITH_HITS
 from ..estimate.quality import PSNR_CAP
 from ..seeing import projection
-from ..seeing.cast import cast
-from ..seeing.ray_sample import colors_from
+from ..seeing.ray_sample import cast_colored
 from ..work import Progress, for_chunks, part, silent
 
 if TYPE_CHECKING:
@@ -142,15 +141,15 @@ class OriginalPictures:
             view = self._views[piece.start][0]
             columns, rows = _patches(view.width), _patches(view.height)
             with np.errstate(under="ignore"):
-                rays = cast(projection.project(gaussians, scene, view), columns, rows)
-                index = gaussians.index[rays.hit]
-                colors = rays.colors(colors_from(splats, index, view))
+                footprints = projection.project(gaussians, scene, view)
+                rays, colors = cast_colored(splats, gaussians, footprints, view, columns, rows)
             _, owner, weight = rays.contributions()
+            means = splats.means[gaussians.index[rays.hit]].astype(np.float64)
             return _Picture(
-                colors.reshape(3, len(rows), len(columns)),
+                rays.colors(colors).reshape(3, len(rows), len(columns)),
                 rays.hitting,
-                np.linalg.norm(splats.means[index].astype(np.float64) - view.center, axis=1),
-                np.bincount(owner, weight, len(index)).astype(np.float64),
+                np.linalg.norm(means - view.center, axis=1),
+                np.bincount(owner, weight, len(means)).astype(np.float64),
             )
 
         return for_chunks(

@@ -115,7 +115,7 @@ class LevelsRequest(Request["Loaded", "LevelSeries"]):
         """Return the levels, each of which is made when it is asked for."""
         scene = Task(
             Budget(ratio=0.0), self.settings, loaded.splats, self.views,
-            protected=loaded.forced.protected, removed=loaded.forced.removed,
+            protected=loaded.forced.protected, forced_out=loaded.forced.out,
         )  # fmt: skip
         levels = each_level(scene, self.levels, progress=runtime.progress, threads=runtime.threads)
         facts = {"settings": asdict(self.settings), "volumes": loaded.volumes, "notes": []}
@@ -235,7 +235,7 @@ class LevelSink:
             "source": {"file": self.source.name, "bytes": loaded.bytes},
             **seen,
             "distances": [short(distance) for distance, _ in first.reach.psnr],
-            "nested": not self.request.levels.absorb,
+            "nested": self.request.levels.survivors == "unchanged",
             "goal_psnr": self.request.goal,
         }
 

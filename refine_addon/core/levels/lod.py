@@ -18,6 +18,7 @@ from ..estimate.quality import PSNR_CAP
 from ..pipeline import decide, score
 from ..selection import Budget
 from ..splats import among_all
+from ..survivor_choice import refuse_unknown
 from ..task import DEFAULTS, Origin, Task
 from ..work import Progress, part, silent
 from .distance import OriginalPictures
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from ..absorbing.absorb import Absorbed
     from ..scores import Scores
     from ..splats import Splats
+    from ..survivor_choice import SurvivorChoice
     from ..task import Result, Settings
     from ..views import ViewSet
     from .distance import Reach
@@ -54,9 +56,9 @@ class Levels:
     psnr : tuple of float
         Instead, how close the pictures of the views stay to those of all splats, dB, each less than
         the one before; see `Budget`.
-    absorb : bool
-        Whether survivors absorb what goes. Else splats are deleted, and the rows of each level stay
-        what they were, to the bit.
+    survivors : {"unchanged", "absorb", "refit"}
+        What survivors may become, see `survivor_choice.SURVIVORS`. If they stay unchanged, the rows
+        of each level are what they were, to the bit.
 
     Examples
     --------
@@ -66,7 +68,7 @@ class Levels:
 
     shares: tuple[float, ...] = ()
     psnr: tuple[float, ...] = ()
-    absorb: bool = True
+    survivors: SurvivorChoice = "absorb"
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -76,6 +78,7 @@ class Levels:
         RefineError
             With the value and what was expected.
         """
+        refuse_unknown(self.survivors)
         for name in ("shares", "psnr"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if bool(self.shares) == bool(self.psnr):
@@ -158,7 +161,7 @@ class Level:
     scores : Scores
         What the views saw of all splats, the same for all levels.
     absorbed : Absorbed or None
-        What absorbing made of all splats.
+        What all splats became by absorbing and refitting.
     remark : str
         Why the PSNR that was asked for is out of reach; "" if it is not.
     """
@@ -210,7 +213,7 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     settings: Settings = DEFAULTS,
     *,
     protected: NDArray[np.bool_] | None = None,
-    removed: NDArray[np.bool_] | None = None,
+    forced_out: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> list[Level]:
@@ -223,10 +226,11 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     views : ViewSet
     levels : Levels
     settings : Settings
-        How to score; with `Levels.absorb` only its number of views and settings of occlusion count.
+        How to score; if survivors absorb, only its number of views and settings of
+        occlusion count.
     protected : (N,) bool, optional
         Splats that are in all levels, unchanged.
-    removed : (N,) bool, optional
+    forced_out : (N,) bool, optional
         Splats that are in no level, unless they are protected. They count as removed, and levels
         are compared with the pictures of the others.
     progress : callable, optional
@@ -251,7 +255,9 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
         level = lod(file.splats(), views, Levels((0.5, 0.25)))[1]
         file.write("out.ply", level.keep, columns=survivor_columns(file.rows, level.absorbed))
     """
-    scene = Task(Budget(ratio=0.0), settings, splats, views, protected=protected, removed=removed)
+    scene = Task(
+        Budget(ratio=0.0), settings, splats, views, protected=protected, forced_out=forced_out
+    )
     return list(each_level(scene, levels, progress=progress, threads=threads))
 
 
@@ -268,20 +274,20 @@ def each_level(
         See `lod`.
     """
     total, forced = len(scene.scene()[0]), scene.forced()
-    scene = replace(scene, removed=None) if forced is None else scene.without(forced)
+    scene = replace(scene, forced_out=None) if forced is None else scene.without(forced)
     original = OriginalPictures(
         *scene.scene(), progress=part(progress, 0.0, COMPARING), threads=threads
     )
     after = part(progress, COMPARING, 1.0)
-    decided = (_absorbing if levels.absorb else _deleting)(
-        scene, levels.budgets(total), after, threads
-    )
+    scene = replace(scene, survivors=levels.survivors)
+    decide_levels = _absorbing if scene.absorb else _deleting
+    decided = decide_levels(scene, levels.budgets(total), after, threads)
     left_before, number = total, 0
     for place, (keep, splats, result, absorbed) in enumerate(decided):
         if len(splats) == left_before:
             continue
         number, left_before = number + 1, len(splats)
-        end = (place + 1) / len(levels) if levels.absorb else 1.0
+        end = (place + 1) / len(levels) if scene.absorb else 1.0
         if number == 1:
             scores = result.scores
         level = Level(
@@ -319,8 +325,8 @@ def _absorbing(
     scene: Task, budgets: Sequence[Budget], progress: Progress, threads: int | None
 ) -> Iterator[_Made]:
     """Make levels each from the one before."""
-    count, ray_sample, whole = len(scene.scene()[0]), None, None
-    task = replace(scene, absorb=True)
+    original, ray_sample, whole = scene.scene()[0], None, None
+    task = scene
     for number, budget in enumerate(budgets):
         of_level = part(progress, number / len(budgets), (number + 1) / len(budgets))
         result = decide(replace(task, budget=budget), progress=of_level, threads=threads)
@@ -333,12 +339,12 @@ def _absorbing(
             task,
             splats=whole.splats,
             protected=None if scene.protected is None else scene.protected[whole.keep],
-            origin=Origin(count, ray_sample, result.report["estimated_psnr"]),
+            origin=Origin(original, ray_sample, result.report["estimated_psnr"]),
         )
 
 
 def _both(first: Absorbed, second: Absorbed) -> Absorbed:
-    """Return what two absorbings make of the splats of the first, one after the other."""
+    """Return what two steps make of the splats of the first, one after the other."""
     keep = first.keep.copy()
     keep[first.keep] = second.keep
     return replace(

@@ -45,7 +45,7 @@ def prune_file(
     --------
     To leave half of the splats, with what they absorbed::
 
-        prune_file("in.ply", "out.ply", PruneRequest(views, Budget(ratio=0.5), absorb=True))
+        prune_file("in.ply", "out.ply", PruneRequest(views, Budget(ratio=0.5), survivors="absorb"))
     """
     return file_to_file(source, output, request, progress=progress, threads=threads)
 

@@ -33,7 +33,7 @@ class RowSizes:
     row : float or (N,) int64
         Of one splat, or of each of them where rows are text.
     changed : float
-        Most bytes of one splat whose numbers absorbing may have changed.
+        Most bytes of one splat whose numbers may have changed.
     fixed : int
         Of everything else in the file.
     """
@@ -106,20 +106,20 @@ class Loaded:
             sizes=self.sizes.take(rows),
         )
 
-    def counted(self, budget: Budget, *, absorb: bool) -> Loaded:
+    def counted(self, budget: Budget, *, changed: bool) -> Loaded:
         """Return this with the bytes of each splat as they count for a budget.
 
-        If survivors absorb others, each may become as long as the longest row of text can.
+        If survivors change, each may become as long as the longest row of text can.
         """
-        removed, sizes = self.forced.removed, self.sizes
-        rest = np.ones(len(self.splats), np.bool_) if removed is None else ~removed
+        out, sizes = self.forced.out, self.sizes
+        rest = np.ones(len(self.splats), np.bool_) if out is None else ~out
         count = int(np.count_nonzero(rest))
-        if not absorb or budget.removals(count, sizes.take(rest).row, sizes.fixed) == 0:
+        if not changed or budget.removals(count, sizes.take(rest).row, sizes.fixed) == 0:
             return self
         return replace(self, sizes=replace(sizes, row=sizes.changed))
 
     def columns(self, absorbed: Absorbed | None) -> dict[str, NDArray[Any]]:
-        """Return the stored properties with what survivors became; none if nothing was absorbed."""
+        """Return the stored properties with what survivors became; none if they did not change."""
         if absorbed is None:
             return {}
         return survivor_columns(self.stored, absorbed, np.linalg.inv(self.matrix))

@@ -12,6 +12,7 @@ from ..cleaning.clean import Cleaning, clean
 from ..formats.registry import refuse_unknown_size
 from ..pipeline import decide, score
 from ..report import kept_and_removed, scoring_notes, seen_by, what_was_seen
+from ..survivor_choice import refuse_unknown
 from ..task import DEFAULTS, Settings, Task
 from .run import DECIDED, Request
 from .written import written_facts, written_splats
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from ..formats.format import Format
     from ..picture_files import PictureFiles
     from ..selection import Budget
+    from ..survivor_choice import SurvivorChoice
     from ..task import Result
     from ..views import ViewSet
     from ..volumes import Zone
@@ -53,8 +55,8 @@ class PruneRequest(Request["Loaded", "Result"]):
         How to score.
     zones, overwrite, dry_run
         See `Request`.
-    absorb : bool
-        Whether survivors absorb the splats that are removed; see `Task`.
+    survivors : {"unchanged", "absorb", "refit"}
+        What survivors may become; see `Task`.
     cleaning : Cleaning or None
         What to clean away first. The budget then counts what is left.
     pictures : PictureFiles or None
@@ -65,11 +67,26 @@ class PruneRequest(Request["Loaded", "Result"]):
     budget: Budget
     settings: Settings = DEFAULTS
     zones: Sequence[Zone] = ()
-    absorb: bool = False
+    survivors: SurvivorChoice = "unchanged"
     cleaning: Cleaning | None = None
     pictures: PictureFiles | None = None
     overwrite: bool = False
     dry_run: bool = False
+
+    def __post_init__(self) -> None:
+        """Check what survivors may become.
+
+        Raises
+        ------
+        RefineError
+            If there is no such choice.
+        """
+        refuse_unknown(self.survivors)
+
+    @property
+    def absorb(self) -> bool:
+        """Whether survivors absorb the splats that are removed."""
+        return self.survivors != "unchanged"
 
     @property
     def compares_pictures(self) -> bool:
@@ -105,13 +122,13 @@ class PruneRequest(Request["Loaded", "Result"]):
         RefineError, Cancelled
             See `clean` and `pipeline.decide`.
         """
-        loaded = loaded.counted(self.budget, absorb=self.absorb)
+        loaded = loaded.counted(self.budget, changed=self.absorb)
         if self.cleaning is None:
             return self._decide(loaded, runtime.part(0.0, DECIDED))
         forced = loaded.forced
         cleaned = _cleaned(loaded, self.views, self.cleaning, runtime.part(0.0, CLEANED))
         # The budget counts what is forced out as removed, so that is not cleaned away.
-        left = cleaned.keep if forced.removed is None else cleaned.keep | forced.removed
+        left = cleaned.keep if forced.out is None else cleaned.keep | forced.out
         result = self._decide(loaded.take(left), runtime.part(CLEANED, DECIDED)).for_all(left)
         result.report["cleaned"] = cleaned.facts()
         return result
@@ -124,8 +141,8 @@ class PruneRequest(Request["Loaded", "Result"]):
             splats=loaded.splats,
             views=self.views,
             protected=loaded.forced.protected,
-            removed=loaded.forced.removed,
-            absorb=self.absorb,
+            forced_out=loaded.forced.out,
+            survivors=self.survivors,
             row_bytes=loaded.sizes.row,
             fixed_bytes=loaded.sizes.fixed,
             reusable=loaded.reusable,
@@ -176,7 +193,7 @@ def _cleaned(loaded: Loaded, views: ViewSet, cleaning: Cleaning, runtime: Runtim
     """Clean what was loaded, but for what must stay and what must go."""
     cleaned = clean(
         loaded.splats, views, cleaning,
-        protected=loaded.forced.protected, removed=loaded.forced.removed,
+        protected=loaded.forced.protected, forced_out=loaded.forced.out,
         progress=runtime.progress, threads=runtime.threads,
     )  # fmt: skip
     runtime.clock.lap("clean_s")
@@ -185,7 +202,7 @@ def _cleaned(loaded: Loaded, views: ViewSet, cleaning: Cleaning, runtime: Runtim
 
 @dataclass(frozen=True, eq=False)
 class Kept:
-    """Which splats stay, none of which absorbs others.
+    """Which splats stay, all as they were.
 
     Attributes
     ----------
@@ -273,7 +290,7 @@ class ScoreRequest(Request["Loaded", Kept]):
         forced = loaded.forced
         scores = score(
             loaded.splats, self.views, self.settings,
-            protected=forced.protected, removed=forced.removed,
+            protected=forced.protected, forced_out=forced.out,
             progress=runtime.part(0.0, DECIDED).progress, threads=runtime.threads,
         )  # fmt: skip
         runtime.clock.lap("score_s")

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from ..report import Clock
-from ..work import Progress, part, silent
+from ..work import Cancelled, Progress, part, silent
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -48,7 +48,7 @@ class Runtime:
     threads : int or None
     """
 
-    clock: Clock
+    clock: Clock = field(default_factory=Clock)
     progress: Progress = silent
     threads: int | None = None
 
@@ -193,14 +193,19 @@ def run(
         See the steps. Nothing is written then; but where comparing fails or is cancelled, after
         writing, the file that was written stays.
     """
-    runtime = Runtime(Clock(), progress, threads)
+    runtime = Runtime(progress=progress, threads=threads)
     with request.opened(sink.form), sink.opened():
         loaded = source.read(sink.form)
         runtime.clock.lap("read_s")
         decision = request.decide(loaded, runtime)
         written = sink.write(loaded, decision, runtime)
         runtime.clock.lap(sink.timing)
-        compared = request.compare(loaded, decision, written.path, runtime)
+        try:
+            compared = request.compare(loaded, decision, written.path, runtime)
+        except (Cancelled, KeyboardInterrupt) as stop:
+            if written.path is not None:
+                stop.add_note(f"{written.path} is written, its pictures and report are not")
+            raise
     runtime.clock.stop()
     report = decision.report
     report |= written.facts | compared

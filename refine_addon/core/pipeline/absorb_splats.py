@@ -17,6 +17,7 @@ from ..scoring import occlusion
 from ..selection import Budget, quality_of, select
 from ..task import DEFAULTS, Settings
 from ..work import Progress, part, silent
+from .refit_splats import Made, refit_absorbed
 from .score_splats import score_once, with_quality
 
 if TYPE_CHECKING:
@@ -43,6 +44,9 @@ PARTS = 2
 """While splats are merged, they are measured again in one of so many parts of the views, which take
 turns; what the other views see is carried over."""
 
+ABSORBED = 0.3
+"""Share of the work that absorbing is where refitting follows, for a progress bar."""
+
 
 def absorb_task(
     task: Task,
@@ -50,8 +54,8 @@ def absorb_task(
     known: tuple[Scores, Measured] | None,
     progress: Progress,
     threads: int | None,
-) -> tuple[Absorbed, float | None]:
-    """Return what absorbing makes of a task, and the estimated PSNR of it, dB.
+) -> Made:
+    """Return what absorbing, and refitting if asked, makes of a task.
 
     Parameters
     ----------
@@ -65,9 +69,7 @@ def absorb_task(
 
     Returns
     -------
-    absorbed : Absorbed
-    psnr : float or None
-        None if too little is seen.
+    Made
     """
     goal, start = task.budget.psnr, 0.0 if known else 0.2
     if known is None:
@@ -88,21 +90,26 @@ def _absorb_to_count(
     known: tuple[Scores, Measured],
     progress: Progress,
     threads: int | None,
-) -> tuple[Absorbed, float | None]:
+) -> Made:
     """Return what so many survivors become, and the estimated PSNR of it, dB."""
     splats, views = task.scene()
-    origin = task.origin
+    origin, refits = task.origin, task.survivors == "refit"
     absorbed = absorb_removed(
         splats, views, count, task.settings, known=known, protected=task.protected,
-        began=None if origin is None else origin.count,
-        progress=part(progress, 0.0, 0.95), threads=threads,
+        began=None if origin is None else len(origin.splats),
+        progress=part(progress, 0.0, ABSORBED if refits else 0.95), threads=threads,
     )  # fmt: skip
+    made = Made(absorbed)
+    if refits:
+        made = refit_absorbed(task, made, part(progress, ABSORBED, 0.95), threads)
     truth = known[0].ray_sample if origin is None else origin.ray_sample
     if truth is None:
-        return absorbed, None
+        return made
     used = views.spread(task.settings.views)
     progress = part(progress, 0.95, 1.0)
-    return absorbed, psnr_against(truth, absorbed.splats, used, progress=progress, threads=threads)
+    survivors = made.survivors.splats
+    psnr = psnr_against(truth, survivors, used, progress=progress, threads=threads)
+    return replace(made, psnr=psnr)
 
 
 def _absorb_to_psnr(
@@ -111,7 +118,7 @@ def _absorb_to_psnr(
     known: tuple[Scores, Measured],
     progress: Progress,
     threads: int | None,
-) -> tuple[Absorbed, float | None]:
+) -> Made:
     """Return the result with as few survivors as keep a PSNR, dB.
 
     What a number of survivors reaches is read from the curve of the scores, and put right by what
@@ -123,18 +130,20 @@ def _absorb_to_psnr(
     curve = quality_of(scores)
     # By how much results are closer than the curve expects, dB.
     offset = 0.0 if task.origin is None else goal - left_to_lose(goal, task.origin.psnr)
-    best: tuple[Absorbed, float] | None = None
+    best: Made | None = None
+    missed = math.inf
     for number in range(TRIES):
-        count = total - math.floor(curve.share(goal - offset, absorb=True) * total)
+        count = total - math.floor(curve.share(goal - offset, task.survivors) * total)
         try_progress = part(progress, number / TRIES, (number + 1) / TRIES)
-        absorbed, psnr = _absorb_to_count(task, count, known, try_progress, threads)
-        if psnr is None:
-            return absorbed, None
-        if best is None or abs(psnr - goal) < abs(best[1] - goal):
-            best = absorbed, psnr
-        if abs(psnr - goal) <= CLOSE:
+        made = _absorb_to_count(task, count, known, try_progress, threads)
+        if made.psnr is None:
+            return made
+        if best is None or abs(made.psnr - goal) < missed:
+            best, missed = made, abs(made.psnr - goal)
+        if missed <= CLOSE:
             break
-        offset = psnr - curve.at(1.0 - len(absorbed.splats) / total, absorb=True)
+        gone = 1.0 - len(made.absorbed.splats) / total
+        offset = made.psnr - curve.at(gone, task.survivors)
     assert best is not None  # noqa: S101 - every try gives one
     return best
 

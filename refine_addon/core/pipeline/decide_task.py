@@ -1,8 +1,8 @@
 """The way from splats, views and a budget to the splats that stay.
 
 The panel, the command and Python code all call `decide`, so all of them keep the same splats. It
-has two steps: splats are scored, and the budget selects by score; then, to absorb, splats are
-merged until as many are left as were selected.
+has two steps: splats are scored, and the budget selects by score; then, if survivors may change,
+splats are merged until as many are left as were selected, and those are refitted, if asked.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ..seeing.measuring import Measured
     from ..selection import Budget, RowBytes
     from ..splats import Splats
+    from ..survivor_choice import SurvivorChoice
     from ..views import ViewSet
 
 
@@ -37,14 +38,14 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
     settings: Settings = DEFAULTS,
     *,
     protected: NDArray[np.bool_] | None = None,
-    removed: NDArray[np.bool_] | None = None,
-    absorb: bool = False,
+    forced_out: NDArray[np.bool_] | None = None,
+    survivors: SurvivorChoice = "unchanged",
     row_bytes: RowBytes = 0.0,
     fixed_bytes: int = 0,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Result:
-    """Score splats and decide which of them stay; with `absorb`, also merge the others into them.
+    """Score splats and decide which of them stay, and what those become.
 
     Parameters
     ----------
@@ -54,10 +55,10 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
         How much to remove.
     protected : (N,) bool, optional
         Splats that are neither removed nor changed.
-    removed : (N,) bool, optional
+    forced_out : (N,) bool, optional
         Splats that go in any case, unless they are protected; see `Task`.
-    absorb : bool
-        See `Task`.
+    survivors : {"unchanged", "absorb", "refit"}
+        What survivors may become; see `Task`.
     row_bytes, fixed_bytes
         See `Budget.removals`.
 
@@ -76,8 +77,8 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
         splats=splats,
         views=views,
         protected=protected,
-        removed=removed,
-        absorb=absorb,
+        forced_out=forced_out,
+        survivors=survivors,
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
     )
@@ -91,10 +92,11 @@ def decide(
     progress: Progress = silent,
     threads: int | None = None,
 ) -> Result:
-    """Decide which splats stay and, to absorb, what they become. Nothing is changed or written.
+    """Decide which splats stay and what they become. Nothing is changed or written.
 
-    Step 1 selects by scores, which are computed unless the task has them. Step 2, only to absorb,
-    keeps the number of survivors, but finds them and their new values by merging.
+    Step 1 selects by scores, which are computed unless the task has them. Step 2, only if survivors
+    may change, keeps the number of survivors, but finds them and their new values by merging, and
+    refits them, if asked.
 
     Parameters
     ----------
@@ -146,11 +148,11 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
             fixed_bytes=task.fixed_bytes,
         )
     clock.lap("select_s")
-    absorbed = None
+    made = None
     if task.absorb:
         count = int(np.count_nonzero(keep))
-        absorbed, psnr = absorb_task(task, count, known, part(progress, 0.2, 1.0), threads)
-        keep = absorbed.keep
+        made = absorb_task(task, count, known, part(progress, 0.2, 1.0), threads)
+        keep, psnr = made.absorbed.keep, made.psnr
         clock.lap("absorb_s")
     else:
         psnr = _estimated(scores, keep, threads)
@@ -158,10 +160,14 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     size = int(np.broadcast_to(task.row_bytes, len(keep)).sum() + task.fixed_bytes)
     gone = len(keep) - int(np.count_nonzero(keep))
     why = remark(task.budget, gone, len(keep), psnr, size)
-    conclude(facts, scores, keep, psnr, absorbed, why)
-    if absorbed and known and task.settings.method == "closed-form":
+    conclude(facts, scores, keep, psnr, None if made is None else made.absorbed, why)
+    if made is None:
+        return Result(keep, scores, facts)
+    facts |= made.facts()
+    facts["notes"] += made.notes()
+    if known and task.settings.method == "closed-form":
         facts["notes"].append(MEASURES)
-    return Result(keep, scores, facts, absorbed)
+    return Result(keep, scores, facts, made.survivors)
 
 
 def _estimated(scores: Scores, keep: NDArray[np.bool_], threads: int | None) -> float | None:

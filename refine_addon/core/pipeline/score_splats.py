@@ -30,7 +30,7 @@ def score(  # noqa: PLR0913 - as `pipeline.prune`
     settings: Settings = DEFAULTS,
     *,
     protected: NDArray[np.bool_] | None = None,
-    removed: NDArray[np.bool_] | None = None,
+    forced_out: NDArray[np.bool_] | None = None,
     quality: bool = False,
     settled: int | None = None,
     progress: Progress = silent,
@@ -47,14 +47,14 @@ def score(  # noqa: PLR0913 - as `pipeline.prune`
     protected : (N,) bool, optional
         Splats that are not removed: no score depends on them, the estimate of the pictures' quality
         does.
-    removed : (N,) bool, optional
+    forced_out : (N,) bool, optional
         Splats that are to go in any case: the others are scored as if they had gone, and they
         score 0; see `Task`.
     quality : bool
         Whether the scores get an estimate of the pictures' quality even if that takes longer than
         scoring by the closed form; scores by occlusion always have one.
     settled : int, optional
-        How many splats must be in their final order, those that are `removed` left out: scoring by
+        How many splats must be in their final order, those `forced_out` left aside: scoring by
         occlusion takes less time where these are few. By default all.
     progress : callable, optional
         ``progress(fraction, what)``; returning ``False`` cancels.
@@ -71,9 +71,9 @@ def score(  # noqa: PLR0913 - as `pipeline.prune`
     Cancelled
         If `progress` answers ``False``.
     """
-    if removed is not None and removed.any():
-        refuse_all(removed)
-        rest = ~removed
+    if forced_out is not None and forced_out.any():
+        refuse_all(forced_out)
+        rest = ~forced_out
         scores = score(
             splats.take(rest), views, settings,
             protected=None if protected is None else protected[rest],

@@ -20,7 +20,7 @@ those of the splat's own axes, so results turn and grow with the scene.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -171,14 +171,16 @@ def linear_view(
     colors : (3, u) float64
         Of the splats that are hit.
     shapes : Shapes
+        Of the first Gaussians; what else is hit does not change.
     view : View
     """
+    movable = int(np.searchsorted(rays.hit, len(shapes.gaussians)))  # of those that are hit
     counts = rays.counts()
     log_front = in_front(rays.log_passed.astype(np.float64), counts)
     transmittance = np.exp(np.where(log_front > LOG_OPAQUE, log_front, -np.inf)).astype(np.float32)
     weight = transmittance * rays.alpha
     left = np.maximum(transmittance - weight, np.float32(LEAST_LEFT))
-    kept = np.flatnonzero(weight > _LEAST_WEIGHT)
+    kept = np.flatnonzero((weight > _LEAST_WEIGHT) & (rays.owner < movable))
     owner, ray = rays.owner[kept].astype(np.intp), rays.ray[kept].astype(np.intp)
     by_color, by_alpha = np.empty((2, 3, len(kept)), np.float32)
     for channel, of_splats in enumerate(colors):
@@ -188,8 +190,8 @@ def linear_view(
         by_alpha[channel] = (transmittance * (mine - background))[kept]
         unclipped = (of_splats > 0.0) & (of_splats < projection.BRIGHTEST)
         by_color[channel] = weight[kept] * unclipped.take(owner) * np.float32(SH_C0)
-    alpha_by = _alpha_by(rays, kept, footprints, shapes, view)
-    rows = shapes.gaussians.index[rays.hit]
+    rows = shapes.gaussians.index[rays.hit[:movable]]
+    alpha_by = _alpha_by(replace(rays, hit=rays.hit[:movable]), kept, footprints, shapes, view)
     return LinearView(rows, rays.colors(colors), ray, owner, by_color, by_alpha, alpha_by)
 
 

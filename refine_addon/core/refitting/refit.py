@@ -24,34 +24,20 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from ..errors import RefineError
-from ..estimate.quality import PSNR_CAP
-from ..seeing import projection
-from ..seeing.cast import depth_complexity, pixels
-from ..seeing.ray_sample import MAX_RAYS_OF_VIEW, cast_colored
 from ..splats import rotation_matrices, unit_quaternions
 from ..work import Progress, for_chunks, part, silent
-from .linear import COLOR, COUNT, MEAN, OPACITY, SCALE, TURN, LinearView, Shapes, linear_view
+from .linear import COLOR, COUNT, MEAN, OPACITY, SCALE, TURN, LinearView
+from .round_rays import RoundRays
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
 
-    from ..seeing.projection import Gaussians
     from ..splats import Splats
     from ..views import ViewSet
 
 Found = TypeVar("Found")
-
-RAYS_OF_SPLAT = 4.0
-"""Rays of a round for each survivor: with fewer, survivors learn them by heart."""
-
-MIN_RAYS = 1 << 16
-"""Rays of a round where that would be fewer."""
-
-MAX_HITS = 1 << 25
-"""About how many hits the rays of a round may have on the unpruned splats. Survivors have fewer,
-and those that hardly show are left out: some 80 bytes are taken for every third."""
 
 STEPS = 4
 """Steps of conjugate gradients in a round."""
@@ -64,9 +50,6 @@ LEAST_GAIN = 0.05
 
 MAX_STEP = {"color": 0.5, "opacity": 1.0, "mean": 0.5, "scale": 0.3, "turn": 0.3}
 """How far a parameter moves in a round: as `linear` has them, means by the longest scale."""
-
-_OTHER_PIXELS = 2  # numbers of pixels that validation and scoring rays take, see `cast.pixels`
-_LEAST_ERROR = 10.0 ** (-PSNR_CAP / 10.0)
 
 
 @dataclass(frozen=True)
@@ -97,8 +80,34 @@ class Refit:
             raise RefineError(msg)
 
 
+class Gains:
+    """What refitting changed and gained; see `Refitted`."""
+
+    changed: NDArray[np.bool_]
+    rounds: int
+    psnr_before: float
+    psnr: float
+
+    def facts(self, seconds: float) -> dict[str, float]:
+        """Return it for a report, with how long it took."""
+        return {
+            "rounds": self.rounds,
+            "changed": int(np.count_nonzero(self.changed)),
+            "psnr_before": round(self.psnr_before, 2),
+            "psnr": round(self.psnr, 2),
+            "seconds": round(seconds, 2),
+        }
+
+    def note(self, seconds: float) -> str:
+        """Return it as a sentence, for the user."""
+        return (
+            "{changed:,} survivors were refitted in {rounds} rounds: {psnr_before:.1f} -> "
+            "{psnr:.1f} dB on rays that nothing was fitted to, {seconds:.1f} s"
+        ).format(**self.facts(seconds))
+
+
 @dataclass(frozen=True, eq=False)
-class Refitted:
+class Refitted(Gains):
     """What some rounds have made of survivors.
 
     Attributes
@@ -161,7 +170,7 @@ def refit(  # noqa: PLR0913 - all but three are optional
     Notes
     -----
     Memory: about 200 bytes a survivor, 12 bytes for each ray of all rounds, and 80 bytes for each
-    hit of a round, see `MAX_HITS`.
+    hit of a round, see `round_rays.MAX_HITS`.
     """
     *_, last = refit_rounds(
         survivors, original, views, settings,
@@ -184,17 +193,35 @@ def refit_rounds(  # noqa: PLR0913 - as `refit`
 
     Parameters and errors are those of `refit`.
     """
+    rays = RoundRays.of(
+        original, views, len(survivors), settings.rounds, part(progress, 0.0, 0.3), threads
+    )
+    yield from refit_on(
+        rays, survivors, settings,
+        protected=protected, progress=part(progress, 0.3, 1.0), threads=threads,
+    )  # fmt: skip
+
+
+def refit_on(
+    rays: RoundRays,
+    survivors: Splats,
+    settings: Refit,
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> Iterator[Refitted]:
+    """Yield what `refit_rounds` does, of rays that have been cast into the unpruned splats."""
     moving = np.zeros(COUNT, np.bool_)
     moving[: COUNT if settings.geometry else MEAN.start] = True
     movable = moving[:, None] & ~(
         np.zeros(len(survivors), np.bool_) if protected is None else protected
     )
-    rays = _Rounds(survivors, original, views, settings.rounds, part(progress, 0.0, 0.3), threads)
+    solver = _Solver(rays, len(survivors), threads)
     best = Refitted(survivors, np.zeros(len(survivors), np.bool_), 0, 0.0, 0.0)
-    trial = survivors
+    trial, share = survivors, 1.0 / (settings.rounds + 1)
     for number in range(settings.rounds + 1):
-        share = 0.7 / (settings.rounds + 1)
-        begin = 0.3 + share * number
+        begin = share * number
         seeing = part(progress, begin, begin + share / 2)
         last = number == settings.rounds
         # After the last round nothing is learned, so derivatives are not needed.
@@ -212,124 +239,25 @@ def refit_rounds(  # noqa: PLR0913 - as `refit`
         yield best
         if last or (number and gain < LEAST_GAIN):
             return
-        change = rays.solve(
+        change = solver.solve(
             linear, number, movable, part(progress, begin + share / 2, begin + share)
         )
         trial = _moved(trial, change)
 
 
-class _Rounds:
-    """The rays of all rounds, with the colours that the unpruned splats have on them.
+class _Solver:
+    """Solves the least squares of a round.
 
     Parameters
     ----------
-    survivors, original, views
-        See `refit`.
-    rounds : int
-    progress : callable
+    rays : RoundRays
+    count : int
+        How many survivors there are.
     threads : int, optional
-
-    Attributes
-    ----------
-    scene : Scene
-        Of the unpruned splats.
     """
 
-    def __init__(
-        self,
-        survivors: Splats,
-        original: Splats,
-        views: ViewSet,
-        rounds: int,
-        progress: Progress,
-        threads: int | None,
-    ) -> None:
-        self._chosen, self._threads, self._count = views, threads, len(survivors)
-        self._views = views.by_distance()
-        gaussians, self.scene, _ = projection.prepare(
-            original, views, progress=part(progress, 0.0, 0.2), threads=threads
-        )
-        rays = max(RAYS_OF_SPLAT * len(survivors), MIN_RAYS) / len(self._views)
-        hits = MAX_HITS / len(self._views)
-
-        def truth(piece: slice) -> list[_Truth]:
-            number = piece.start
-            view = self._views[number][0]
-            with np.errstate(under="ignore"):
-                footprints = projection.project(gaussians, self.scene, view)
-                depth = max(depth_complexity(footprints, view), 1.0)
-                count = min(rays, hits / depth, MAX_RAYS_OF_VIEW)
-                return [
-                    self._truth(gaussians, original, number, footprints, count, k)
-                    for k in range(rounds + 1)
-                ]
-
-        self._truths: list[list[_Truth]] = for_chunks(
-            truth, len(self._views), 1,
-            progress=part(progress, 0.2, 1.0), what="casting rays", threads=threads,
-        )  # fmt: skip
-
-    def _truth(
-        self,
-        gaussians: Gaussians,
-        original: Splats,
-        number: int,
-        footprints: projection.Footprints,
-        count: float,
-        round_: int,
-    ) -> _Truth:
-        view = self._views[number][0]
-        place = number + (_OTHER_PIXELS + round_) * len(self._views)
-        columns, rows = pixels(view, place, count)
-        rays, colors = cast_colored(original, gaussians, footprints, view, columns, rows)
-        return _Truth(columns, rows, rays.colors(colors).astype(np.float32))
-
-    def linear(self, splats: Splats, round_: int, progress: Progress) -> list[LinearView]:
-        """Return how the colours of each view's rays change with survivors as they are now."""
-        gaussians, _, _ = projection.prepare(
-            splats, self._chosen, self.scene,
-            progress=part(progress, 0.0, 0.1), threads=self._threads,
-        )  # fmt: skip
-        shapes = Shapes.of(splats, gaussians, self.scene)
-
-        def linear_of(piece: slice) -> LinearView:
-            view, truth = self._views[piece.start][0], self._truths[piece.start][round_]
-            with np.errstate(under="ignore"):
-                footprints = projection.project(gaussians, self.scene, view)
-                rays, colors = cast_colored(
-                    splats, gaussians, footprints, view, truth.columns, truth.rows
-                )
-                return linear_view(rays, footprints, colors, shapes, view)
-
-        return self._each(linear_of, part(progress, 0.1, 1.0))
-
-    def colors(
-        self, splats: Splats, round_: int, progress: Progress = silent
-    ) -> list[NDArray[np.float64]]:
-        """Return what the rays of each view see of survivors, (3, P)."""
-        gaussians, _, _ = projection.prepare(
-            splats, self._chosen, self.scene, threads=self._threads
-        )
-
-        def colors_of(piece: slice) -> NDArray[np.float64]:
-            view, truth = self._views[piece.start][0], self._truths[piece.start][round_]
-            with np.errstate(under="ignore"):
-                footprints = projection.project(gaussians, self.scene, view)
-                rays, colors = cast_colored(
-                    splats, gaussians, footprints, view, truth.columns, truth.rows
-                )
-                return rays.colors(colors)
-
-        return self._each(colors_of, progress)
-
-    def psnr(self, colors: list[NDArray[np.float64]], round_: int) -> float:
-        """Return the mean PSNR of what the rays of each view see, weighted as the views are, dB."""
-        errors = [
-            max(float(np.mean(np.square(truths[round_].colors - seen))), _LEAST_ERROR)
-            for truths, seen in zip(self._truths, colors, strict=True)
-        ]
-        weights = [weight for _, weight in self._views]
-        return float(np.average(-10.0 * np.log10(errors), weights=weights))
+    def __init__(self, rays: RoundRays, count: int, threads: int | None) -> None:
+        self._rays, self._count, self._threads = rays, count, threads
 
     def solve(
         self,
@@ -350,11 +278,11 @@ class _Rounds:
         """
         steps = [part(progress, k / (STEPS + 2), (k + 1) / (STEPS + 2)) for k in range(STEPS + 2)]
 
+        truths = self._rays.truths(round_)
+
         def errors(number: int) -> NDArray[np.float64]:
             view = linear[number]
-            return view.backward(
-                self._truths[number][round_].colors - view.colors.astype(np.float32)
-            )
+            return view.backward(truths[number].colors - view.colors.astype(np.float32))
 
         residual = self._sum(linear, errors, steps[0]) * movable
         diagonal = self._sum(linear, lambda number: linear[number].diagonal(), steps[1]) * movable
@@ -389,17 +317,13 @@ class _Rounds:
 
     def _each(self, work: Callable[[slice], Found], progress: Progress) -> list[Found]:
         return for_chunks(
-            work, len(self._views), 1, progress=progress, what="refitting", threads=self._threads
+            work,
+            len(self._rays.windows),
+            1,
+            progress=progress,
+            what="refitting",
+            threads=self._threads,
         )
-
-
-@dataclass(frozen=True, eq=False)
-class _Truth:
-    """Rays of one view and round: their columns and rows of pixels, and their colours, (3, P)."""
-
-    columns: NDArray[np.int64]
-    rows: NDArray[np.int64]
-    colors: NDArray[np.float32]
 
 
 def _medians(diagonal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -109,7 +109,7 @@ def finish(
     else:
         loss, expected = _measure(scoring, tolerance, measuring_progress, threads)
     scores = scoring.rank(part(progress, end, 1.0), settled)
-    facts = {"views": scores.views_used, "loss": loss, "tolerance": tolerance, "judged": expected}
+    facts = {"views": scores.views_used, "loss": loss, "tolerance": tolerance, "expected": expected}
     return replace(scores, facts={**scores.facts, "auto": facts}, method="auto")
 
 
@@ -159,7 +159,7 @@ def _measure(
     )
     psnr = {}
     for count, chosen in ((few, FIRST), (more, FIRST + MORE)):
-        values = scoring.once(chosen, part(progress, 0.7, 0.7))
+        values = scoring.in_one_round(chosen, part(progress, 0.7, 0.7))
         told = psnr_by_views(rays, values, RATIOS, validating, threads=threads)
         if told is not None:
             psnr[count] = told

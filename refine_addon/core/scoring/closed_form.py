@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     Each = Callable[..., Iterable[Any]]
 
 SHARES = {"read": 0.2, "count": 0.0, "sum_views": 0.75, "add": 0.0, "compare": 0.0}
-"""How much of the time each step takes, for progress; the rest is not worth a report."""
+"""How much of the time each step takes, for progress; the other steps are too short to tell."""
 
 
 def score(
@@ -151,8 +151,8 @@ def steps(
     views, settings
         See `score`.
     remember : callable, optional
-        ``remember(name, make)`` returns what `make` returns, or returned when it was asked before:
-        blocks forget what the frame is made of.
+        ``remember(name, make)`` returns what `make` returns, or returned in an earlier run: blocks
+        drop the arrays that the frame is computed from.
 
     Raises
     ------
@@ -162,16 +162,13 @@ def steps(
     if not total:
         msg = "there are no splats to score"
         raise RefineError(msg)
-    read = zip(*each("read"), strict=True)
-    tallies, moments = (np.concatenate(next(read)) for _ in range(2))
-    highest = radix.added(map(radix.Sparse, *read))
+    tallies, moments, highest = _joined(each("read"))
     good = int(tallies[:, 0].sum())
     refuse_undrawable(good, total)
     axes, eta, near, size = remember(
-        "frame", lambda: _frame(each, good, np.sum(moments, axis=0), highest, settings)
+        "frame", lambda: _frame(each, good, moments, highest, settings)
     )
-    frame = Frame(axes, float(eta), float(near))
-    sums = np.concatenate([*each("sum_views", frame)])
+    sums = np.concatenate([*each("sum_views", Frame(axes, float(eta), float(near)))])
     if settings.frustum and not sums[:, 3].any():
         msg = (
             f"no camera sees the splats: none of {total} lies in the frustum of any of "
@@ -182,14 +179,27 @@ def steps(
     lambdas = _lambdas(statistics, settings)
     means = np.sum(sums[:, :3], axis=0) / total  # of H G, for each of the three G
     factors = np.divide(lambdas, means, out=np.zeros(3), where=means > 0.0)
-    powers, overall = _powers(each("add", factors), local=settings.local)
-    for _ in each("compare", powers, overall):
+    of_neighbourhoods = _powers(each("add", factors), local=settings.local)
+    for _ in each("compare", *of_neighbourhoods):
         pass
     facts = {
         "lambda": dict(zip(adaptive.TERMS, lambdas, strict=True)),
         "statistics": vars(statistics).copy(),
     }
     return SceneFacts(total - good, float(size), facts)
+
+
+def _joined(
+    read: Iterable[tuple[Any, ...]],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Return what `RowBlock.read` tells of all blocks together.
+
+    The tallies of all chunks, (chunks, 5), the sum of their moments, (4, 3), and how often each
+    value of the highest digit occurs, (1, 65536).
+    """
+    tallies, moments, *highest = zip(*read, strict=True)
+    digits = radix.added(map(radix.Sparse, *highest))
+    return np.concatenate(tallies), np.sum(np.concatenate(moments), axis=0), digits
 
 
 def _lambdas(statistics: adaptive.Statistics, settings: ClosedForm) -> tuple[float, float, float]:
@@ -209,15 +219,14 @@ def _frame(
     """Return what `Frame` takes, and the scene's size, of which eta and near plane are multiples.
 
     The size is a median over splats, so a few far splats hardly change it. Of the splats `good` can
-    be drawn, `moments` is what `RowBlock.read` returns of all, (4, 3), and `highest` what the step
-    "count" would return of the highest digit, (1, 65536).
+    be drawn; for `moments`, (4, 3), and `highest` see `_joined`.
     """
 
     def count(prefixes: list[int], shift: int) -> NDArray[np.int64]:
         return highest if shift == HIGHEST else radix.added(each("count", prefixes, shift))
 
     size = size_of(radix.median(count, np.dtype(np.float64), good))
-    axes = principal_axes(moments[:3], moments[3]) / size  # (3, 3)
+    axes = principal_axes(moments) / size  # (3, 3)
     eta = ETA_RELATIVE * size * size if settings.eta is None else settings.eta
     return axes, eta, NEAR_RELATIVE * size, size
 
@@ -232,13 +241,12 @@ def _powers(
         return None, 0.0
     powers, count, end = np.zeros(CELLS**3), np.zeros(CELLS**3, np.int64), 0
     for of_block in neighbourhoods:
-        assert of_block is not None  # noqa: S101 - as blocks are told
+        assert of_block is not None  # noqa: S101 - `local` is in the blocks' settings
         cells, sums, counts = of_block
         powers[cells] += sums
         count[cells] += counts
         end = max(end, int(cells[-1]) + 1)
-    # Up to the last that occurs, be it of splats that cannot be drawn: zeros behind it would change
-    # how NumPy pairs what it sums.
+    # Cut behind the last occupied cell: more zeros would change the pairs of NumPy's pairwise sum.
     powers, count = powers[:end], count[:end]
     overall = float(powers.sum() / count.sum())
     # Sums, means and logarithms in turn, in place.

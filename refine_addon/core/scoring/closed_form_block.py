@@ -1,8 +1,8 @@
 """A run of consecutive splats, and what the closed form computes of it step by step.
 
-Between the steps stand sums, counts and medians over all splats, which `closed_form.steps` puts
-together from those of the blocks. A block needs no other block, so blocks may be computed one after
-the other, with their numbers on disk in between, or on several machines.
+Between two steps `closed_form.steps` puts together the sums, counts and medians of all blocks. A
+block needs no other block, so blocks may be computed one after the other, with their numbers on
+disk in between, or on several machines.
 """
 
 from __future__ import annotations
@@ -340,7 +340,7 @@ class RowBlock:
         )
 
     def _sum_visibility(self, order: NDArray[np.int64], piece: slice) -> None:
-        """Set H before alpha, and in how many views each splat lies, of a slice of an order.
+        """Set H without its factor alpha, and the number of views, for a slice of `order`.
 
         Splats of a run lie near each other, so most views see none of them, and many see all.
         """
@@ -375,12 +375,12 @@ class RowBlock:
         views: NDArray[np.int64],
         partly: int,
     ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-        """Return H before alpha of n splats, and in how many views each lies, (n,) each.
+        """Return H without its factor alpha, and the number of views, of n splats, (n,) each.
 
         `points` is (4, n), `reach` (n,). Only `views`, (v,), see some of them; of these, the first
         `partly` may not see all.
         """
-        total = np.zeros(points.shape[1])  # (n,), H before alpha
+        total = np.zeros(points.shape[1])  # (n,), H without its factor alpha
         seen = np.full(points.shape[1], len(views) - partly, np.int32)
         for start in range(0, len(views), _VIEW_BLOCK):
             some_views = views[start : start + _VIEW_BLOCK]
@@ -397,7 +397,7 @@ class RowBlock:
         return total, seen
 
     def _sum(self, piece: slice) -> list[float]:
-        """Make H of what `_sum_visibility` left, and return its sums; see `sum_views`."""
+        """Complete H: alpha, and splats that no view sees. Return its sums, see `sum_views`."""
         points = np.empty((3, piece.stop - piece.start))
         np.subtract(self.means[piece].T, self.origin[:, None], out=points)
         visibility, good = self.visibility[piece], self.good[piece]
@@ -408,7 +408,7 @@ class RowBlock:
             if self.settings.visibility:
                 visibility *= self.alpha[piece]
             visibility *= good
-            sums = [float(np.sum(visibility * content)) for content in self._contents(piece)]
+            sums = [float(np.sum(visibility * g)) for g in self._three_g(piece)]
             if self.settings.local:
                 self.cells[piece] = self._cells(points)
         self.seen[piece] *= good
@@ -430,7 +430,7 @@ class RowBlock:
         fringe: _Fringe | None,
         views: NDArray[np.int64],
     ) -> NDArray[np.float64]:
-        """Return H before alpha of n splats from a block of views, (n,); `depth` is overwritten."""
+        """Return H, without alpha, of n splats by some views, (n,); `depth` is overwritten."""
         weights = self.weights[views]
         share = fringe.share if fringe else None
         if self.settings.projection:
@@ -461,7 +461,7 @@ class RowBlock:
         views: NDArray[np.int64],
     ) -> _Fringe:
         """Return which splats reach into which views from outside, and how far."""
-        limit = reach * self.frustums.steepness[views]  # (c, n)
+        limit = reach * self.frustums.beyond_per_unit[views]  # (c, n)
         outside &= beyond < limit  # (c, n)
         index = np.flatnonzero(outside)  # few pairs: what follows is computed for these alone
         view = index // outside.shape[1]
@@ -470,7 +470,7 @@ class RowBlock:
         share = 1.0 - away / limit.ravel()[index]
         return _Fringe(view, splat, share, depth.ravel()[index] + away)
 
-    def _contents(self, piece: slice) -> tuple[NDArray[np.float64], ...]:
+    def _three_g(self, piece: slice) -> tuple[NDArray[np.float64], ...]:
         """Return the three G of n splats, (n,) each."""
         luma, alpha = self.luma[piece].astype(np.float64), self.alpha[piece]
         return self.area[piece], luma * luma, alpha * alpha
@@ -509,8 +509,8 @@ class RowBlock:
     def _add(self, factors: NDArray[np.float64], piece: slice) -> None:
         visibility = self.visibility[piece]
         with np.errstate(under="ignore"):
-            terms = zip(factors, self._contents(piece), strict=True)
-            total = sum(factor * (visibility * content) for factor, content in terms)
+            terms = zip(factors, self._three_g(piece), strict=True)
+            total = sum(factor * (visibility * g) for factor, g in terms)
             self._store(self.plain, np.asarray(total), piece)
 
     def compare(self, powers: NDArray[np.float64] | None, overall: float) -> None:

@@ -11,12 +11,14 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _BITS = 5
-"""Of a cell's number along each axis: three of them fit into 16 bits, which sort by counting."""
+"""Bits of a cell's number along each axis: those of three axes fit into 16, which NumPy sorts by
+radix."""
 
-_SAMPLE = 4096  # splats that tell where most of them lie
+_SAMPLE = 4096  # splats that say where the grid lies
 
-_MOST = (0.02, 0.98)
-"""Those of the sample between these shares along each axis lie in the grid, others at its faces."""
+_ENDS = (0.02, 0.98)
+"""The grid lies between these quantiles of the sample along each axis; splats beyond them count to
+its outermost cells."""
 
 _LEAST_SPAN = 1e-200
 
@@ -35,16 +37,16 @@ def near_order(means: NDArray[np.floating[Any]]) -> NDArray[np.int64]:
         Those of a cell, and those beyond the same face of the grid, keep their order.
     """
     sample = means[:: max(len(means) // _SAMPLE, 1)].astype(np.float64)
-    low, high = np.quantile(sample, _MOST, axis=0)  # (3,) each
+    low, high = np.quantile(sample, _ENDS, axis=0)  # (3,) each
     # Cubes: a run is about as wide as high, however flat the scene.
     scale = (1 << _BITS) / max(float(np.max(high - low)), _LEAST_SPAN)
     cell = np.zeros(len(means), np.uint16)
     with np.errstate(under="ignore"):
         for values, least in zip(means.T, low, strict=True):
-            place = np.subtract(values, least, dtype=np.float64)  # (N,)
-            place *= scale
+            number = np.subtract(values, least, dtype=np.float64)  # (N,)
+            number *= scale
             cell <<= _BITS
-            cell |= np.clip(place, 0, (1 << _BITS) - 1, out=place).astype(np.uint16)
+            cell |= np.clip(number, 0, (1 << _BITS) - 1, out=number).astype(np.uint16)
     return np.argsort(_places()[cell], kind="stable")
 
 

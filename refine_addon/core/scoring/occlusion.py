@@ -289,7 +289,9 @@ class OcclusionScoring:
         chosen = sorted(self._sums if groups is None else groups)
         return Measured.sum(self._sums[k][k] for k in chosen)
 
-    def once(self, groups: Sequence[int], progress: Progress = silent) -> NDArray[np.float32]:
+    def in_one_round(
+        self, groups: Sequence[int], progress: Progress = silent
+    ) -> NDArray[np.float32]:
         """Return the values of all N splats, in one round, by some of the groups measured.
 
         Raises

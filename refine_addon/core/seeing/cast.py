@@ -66,7 +66,7 @@ def spread(size: int, count: int, start: float) -> NDArray[np.int64]:
 def depth_complexity(footprints: Footprints, view: View) -> float:
     """Return about how many footprints a ray of a view hits on average, at most all of them."""
     size = float(view.width * view.height)
-    area = _squared_reach(footprints.alphas)  # (n,), px^2
+    area = _squared_radius(footprints.alphas)  # (n,), px^2
     area *= np.float32(math.pi) * footprints.sigmas[0] * footprints.sigmas[1]
     return float(np.minimum(area, np.float32(size)).sum(dtype=np.float64)) / size
 
@@ -124,10 +124,11 @@ def hits(
     alpha : (h,) float32
         Of the footprint there, at most `ALPHA_MAX`.
     """
-    reach = _squared_reach(footprints.alphas)  # (n,)
+    squared_radius = _squared_radius(footprints.alphas)  # (n,)
     # Of each footprint: the first column and row in its bounding box, and how many lie in it.
     across, down = (
-        boxes(footprints, reach, axis, places) for axis, places in enumerate((columns, rows))
+        _bounding_boxes(footprints, squared_radius, axis, places)
+        for axis, places in enumerate((columns, rows))
     )
     boxed = np.flatnonzero(across[1] * down[1] > 0)  # (r,)
     for start, end in _slices((across[1] * down[1])[boxed], limit):
@@ -139,7 +140,7 @@ def hits(
             owner, pixel = owner[left], pixel[left]
             column, row = column[left], row[left]
         squared = _mahalanobis(footprints, owner, columns.take(column), rows.take(row))
-        inside = np.flatnonzero(squared < reach.take(owner))
+        inside = np.flatnonzero(squared < squared_radius.take(owner))
         owner = owner[inside]
         alpha = footprints.alphas.take(owner) * np.exp(squared[inside] / np.float32(-2.0))
         yield owner, pixel[inside], np.minimum(alpha, np.float32(ALPHA_MAX))
@@ -171,18 +172,18 @@ def _boxed_pixels(
 ) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.int32]]:
     """Return all p pairs of some of n footprints, (b,), and the pixels in their bounding boxes.
 
-    For the boxes of all n see `boxes`. Of each pair these are the footprint, and the places of the
-    pixel among the columns and rows, (p,) each.
+    For the boxes of all n see `_bounding_boxes`. Of each pair these are the footprint, and which of
+    the columns and rows the pixel lies in, (p,) each.
     """
-    (left, wide), (top, tall) = ([each[chosen] for each in box] for box in (across, down))
+    (left, wide), (top, tall) = ([each[chosen] for each in axis] for axis in (across, down))
     count = wide * tall
-    place = np.repeat(np.arange(len(chosen)), count)
-    number = np.arange(len(place), dtype=np.int32)
+    box = np.repeat(np.arange(len(chosen)), count)  # (p,), as all that follows
+    number = np.arange(len(box), dtype=np.int32)  # of the pixel in its box, row by row
     number -= np.repeat((np.cumsum(count) - count).astype(np.int32), count)
-    row, column = np.divmod(number, wide.astype(np.int32).take(place))
-    column += left.astype(np.int32).take(place)
-    row += top.astype(np.int32).take(place)
-    return chosen.take(place), column, row
+    row, column = np.divmod(number, wide.astype(np.int32).take(box))
+    column += left.astype(np.int32).take(box)
+    row += top.astype(np.int32).take(box)
+    return chosen.take(box), column, row
 
 
 def _members(
@@ -202,15 +203,18 @@ def _members(
     return index[members], place.take(footprint)
 
 
-def boxes(
-    footprints: Footprints, reach: NDArray[np.float32], axis: int, places: NDArray[np.int64]
+def _bounding_boxes(
+    footprints: Footprints,
+    squared_radius: NDArray[np.float32],
+    axis: int,
+    places: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first of some columns or rows in each footprint's bounding box, and how many.
 
     Parameters
     ----------
     footprints : Footprints
-    reach : (n,) float32
+    squared_radius : (n,) float32
         Squared Mahalanobis distance to which a footprint is followed.
     axis : int
         0 for columns, 1 for rows.
@@ -218,7 +222,7 @@ def boxes(
         Numbers of the columns or rows, ascending; their centres are at + 0.5.
     """
     center = footprints.centers[axis] - np.float32(0.5)
-    half = np.sqrt(reach * (footprints.major[axis] ** 2 + footprints.minor[axis] ** 2))
+    half = np.sqrt(squared_radius * (footprints.major[axis] ** 2 + footprints.minor[axis] ** 2))
     first, end = (_before(places, np.ceil(edge)) for edge in (center - half, center + half))
     return first, end - first
 
@@ -252,7 +256,7 @@ def _mahalanobis(
     return squared
 
 
-def _squared_reach(alphas: NDArray[np.float32]) -> NDArray[np.float32]:
+def _squared_radius(alphas: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the squared Mahalanobis distance at which alpha falls to `ALPHA_CUT`, (n,)."""
     ratio = alphas * np.float32(1.0 / ALPHA_CUT)
     return np.asarray(np.float32(2.0) * np.log(np.maximum(ratio, np.float32(1.0))))

@@ -103,7 +103,7 @@ class Frustums:
     ----------
     centers : (V, 3) float64
         Of the views, relative to the origin.
-    steepness : (V, 1) float64
+    beyond_per_unit : (V, 1) float64
         Growth of `beyond` (see `project`) for each world unit that a point moves straight away from
         a side of the frustum; as if the image were square, of the same area.
     """
@@ -113,7 +113,7 @@ class Frustums:
         self._rows = _rows(views, self.centers)
         slopes = [[side.focal / side.half for side in image_sides(view)] for view in views]
         slope = np.minimum(np.prod(np.sqrt(slopes), axis=1, keepdims=True), _STEEPEST)
-        self.steepness = np.hypot(1.0, slope)
+        self.beyond_per_unit = np.hypot(1.0, slope)
         planes = np.array([clip_planes(view, near) for view in views])
         self._near, self._far = planes[:, :1], planes[:, 1:]
         self._ends = bool(np.isfinite(self._far).any())
@@ -136,7 +136,7 @@ class Frustums:
         -------
         touching : (V, k) bool
             Where it is False, each point of the box lies beyond a plane, or ``beyond`` of `project`
-            is at least `reach` times `steepness`.
+            is at least `reach` times `beyond_per_unit`.
         whole : (V, k) bool
             Where it is True, each point lies in the view.
         """
@@ -154,7 +154,7 @@ class Frustums:
             most.append(at + around)
         near, far = self._near, self._far
         outside = np.maximum.reduce(least[:4])
-        touching = (outside < reach * self.steepness) & (most[4] >= near) & (least[4] <= far)
+        touching = (outside < reach * self.beyond_per_unit) & (most[4] >= near) & (least[4] <= far)
         whole = (np.maximum.reduce(most[:4]) <= 0.0) & (least[4] >= near) & (most[4] <= far)
         return touching, whole
 

@@ -29,7 +29,7 @@ Axis = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
 
 _EXTENT = 2.4  # standard deviations, of lattices of fewer than `_WIDE` points along an axis
 _WIDE = 8
-_CORNER = 0.1  # points farther beyond the extent, in standard deviations, are left out: corners
+_CORNER = 0.1  # standard deviations; points farther than that beyond the extent are left out
 _PATCH = 6  # points along a side of a patch, at most
 
 

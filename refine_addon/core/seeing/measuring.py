@@ -188,7 +188,7 @@ class Measuring:
         return len(self.groups)
 
     def groups_of_part(self, turn: int, parts: int) -> range:
-        """Return the groups of one of `parts` parts, by turns; see `occlusion.measure_part`."""
+        """Return every `parts`-th group, the first at `turn`; see `occlusion.measure_part`."""
         parts = min(parts, self.count)
         return range(turn % parts, self.count, parts)
 
@@ -282,9 +282,9 @@ class _MeasureAndCast:
     numbers: list[int]  # of the views to measure
     wanted: list[WantedRays]
 
-    def __call__(self, place: int) -> tuple[ViewMeasurement, list[Rays | None]]:
+    def __call__(self, index: int) -> tuple[ViewMeasurement, list[Rays | None]]:
         """Return what a view sees of the splats, and its rays."""
-        number = self.numbers[place]
+        number = self.numbers[index]
         footprints, measurement = measure_view(
             self.gaussians, self.scene, self.views[number][0], self.sampling
         )
@@ -331,12 +331,13 @@ def measure_footprints(
         mass, mass_squared = froxels.masses(footprints)  # (n,) each
         traits = froxels.traits(footprints, mass, colors, points.area)  # (n, 6)
         visible, errors = np.empty((2, len(points.owners)))  # (m,) each
-        for cells, place in points.pieces():
-            shares, of_points = points.shares[place], traits.take(points.owners[place], axis=0)
+        for cells, members in points.pieces():
+            shares = points.shares[members]
+            of_points = traits.take(points.owners[members], axis=0)
             weight, squared_contrast = froxels.composite(shares, of_points, points.counts[cells])
             weight *= shares
-            visible[place] = weight
+            visible[members] = weight
             weight *= weight
-            errors[place] = weight * squared_contrast
+            errors[members] = weight * squared_contrast
         visible, errors = froxels.means_over_footprints(points, visible, errors)
         return ViewMeasurement(rows, inside, mass * visible, mass_squared * errors)

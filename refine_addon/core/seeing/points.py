@@ -84,9 +84,9 @@ class Points:
 
     def pieces(self) -> Iterator[tuple[slice, slice]]:
         """Yield about `_BLOCK` points at a time, in whole cells: slices of the cells and points."""
-        for cells, place in _runs(self.counts):
+        for cells, members in _runs(self.counts):
             checkpoint()
-            yield cells, place
+            yield cells, members
 
 
 def _runs(sizes: NDArray[np.int64]) -> Iterator[tuple[slice, slice]]:
@@ -203,9 +203,9 @@ def _patches(
     for axis, size in enumerate(frame.size):
         checkpoint()
         major, minor = frame.axes[axis].take(rows), frame.axes[2 + axis].take(rows)  # (q,) each
-        where = major * middle[0] + minor * middle[1] + frame.axes[4 + axis].take(rows)
-        reach = np.abs(major) * half[0] + np.abs(minor) * half[1] + np.float32(_MARGIN)
-        low, high = where - reach, where + reach
+        center = major * middle[0] + minor * middle[1] + frame.axes[4 + axis].take(rows)
+        extent = np.abs(major) * half[0] + np.abs(minor) * half[1] + np.float32(_MARGIN)
+        low, high = center - extent, center + extent
         touching &= (high >= 0.0) & (low < size)
         whole &= (low >= 0.0) & (high < size)
     kept = np.flatnonzero(touching)
@@ -231,20 +231,19 @@ def _lay_out(
     shares, sums = np.empty(len(cells), np.float32), table.sums.take(patches, axis=1)
     # Equal patches are laid out together: they have the same points, so none needs an index.
     inner = np.flatnonzero(whole)
-    inner = inner.take(np.argsort(patches.take(inner).astype(np.uint16), kind="stable"))  # (s,)
-    axes, begin = frame.axes.take(rows.take(inner), axis=1), first.take(inner)
-    for patch, piece in _equal_runs(patches.take(inner)):
-        members = slice(int(table.start[patch]), int(table.start[patch] + table.sizes[patch]))
-        at = begin[piece] + np.arange(members.stop - members.start)[:, None]  # (points, patches)
-        place = _positions(axes[:, piece], table.points[:, members, None])
-        cells[at] = _cell_numbers(place, frame.size)
-        shares[at] = table.shares[members, None]
+    inner = inner.take(np.argsort(patches.take(inner).astype(np.uint16), kind="stable"))
+    for patch, run in _equal_runs(patches.take(inner)):
+        equal = inner[run]
+        numbers, cell, share = _lay_out_inside(frame, rows[equal], patch, first[equal])
+        cells[numbers], shares[numbers] = cell, share
     edge = np.flatnonzero(~whole)
-    for piece, _ in _runs(sizes.take(edge)):
+    for run, _ in _runs(sizes.take(edge)):
         checkpoint()
-        cut = edge[piece]
-        at, cell, share, sums[:, cut] = _lay_out_at_edge(frame, rows[cut], patches[cut], first[cut])
-        cells[at], shares[at] = cell, share
+        cut = edge[run]
+        numbers, cell, share, sums[:, cut] = _lay_out_at_edge(
+            frame, rows[cut], patches[cut], first[cut]
+        )
+        cells[numbers], shares[numbers] = cell, share
     return cells, shares, sums
 
 
@@ -257,6 +256,22 @@ def _equal_runs(patches: NDArray[np.int64]) -> Iterator[tuple[int, slice]]:
         for begin in range(start, stop, step):
             checkpoint()
             yield patch, slice(begin, min(begin + step, stop))
+
+
+def _lay_out_inside(
+    frame: _CellFrame, rows: NDArray[np.int64], patch: int, first: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.uint16], NDArray[np.float32]]:
+    """Return the k points of each of b equal patches that lie in the image.
+
+    `rows`, (b,), are those of their footprints, `patch` is the row of the table, and `first`, (b,),
+    the number of each one's first point. Return the numbers and cells of the points, (k, b), and
+    their shares, (k, 1).
+    """
+    table = lattice_table()
+    members = slice(int(table.start[patch]), int(table.start[patch] + table.sizes[patch]))
+    numbers = first + np.arange(members.stop - members.start)[:, None]
+    positions = _positions(frame.axes.take(rows, axis=1), table.points[:, members, None])
+    return numbers, _cell_numbers(positions, frame.size), table.shares[members, None]
 
 
 def _lay_out_at_edge(
@@ -277,12 +292,12 @@ def _lay_out_at_edge(
     step = np.arange(int(sizes.sum())) - np.repeat(begin, sizes)  # (p,), as all that follows
     which = step + np.repeat(table.start.take(patches), sizes)
     axes = np.repeat(frame.axes.take(rows, axis=1), sizes, axis=1)
-    place = _positions(axes, table.points.take(which, axis=1))
-    there = np.ones(len(which), np.bool_)
-    for where, size in zip(place, frame.size, strict=True):
-        there &= (where >= 0.0) & (where < np.float32(size))
-    cells = np.where(there, _cell_numbers(place, frame.size), np.uint16(_OUTSIDE))
-    shares = np.where(there, table.shares.take(which), np.float32(0.0))
+    positions = _positions(axes, table.points.take(which, axis=1))
+    inside = np.ones(len(which), np.bool_)
+    for coordinate, size in zip(positions, frame.size, strict=True):
+        inside &= (coordinate >= 0.0) & (coordinate < np.float32(size))
+    cells = np.where(inside, _cell_numbers(positions, frame.size), np.uint16(_OUTSIDE))
+    shares = np.where(inside, table.shares.take(which), np.float32(0.0))
     sums = np.add.reduceat([shares, shares * shares], begin, axis=1)
     return step + np.repeat(first, sizes), cells, shares, sums
 
@@ -305,15 +320,15 @@ def _positions(
 
 
 def _cell_numbers(
-    place: tuple[NDArray[np.float32], NDArray[np.float32]], size: tuple[float, float]
+    positions: tuple[NDArray[np.float32], NDArray[np.float32]], size: tuple[float, float]
 ) -> NDArray[np.uint16]:
     """Return the number of each point's cell; meaningless for points outside the image.
 
-    The place of each point and the size of the image are across and down, in cells.
+    The position of each point and the size of the image are across and down, in cells.
     """
-    number = place[1].astype(np.int32)
+    number = positions[1].astype(np.int32)
     number *= math.ceil(size[0])
-    number += place[0].astype(np.int32)
+    number += positions[0].astype(np.int32)
     return number.astype(np.uint16)
 
 
@@ -361,17 +376,30 @@ def _sort_into_cells(
     checkpoint()
     owners, shares = owners.take(order), shares.take(order)
     if len(order):
-        new = np.empty(len(owners), np.bool_)  # whether a point is the first of its splat there
-        np.not_equal(owners[1:], owners[:-1], out=new[1:])
-        new[np.cumsum(counts) - counts] = True  # the first point of each cell
-        again = np.flatnonzero(~new)  # (a,)
-        starts = np.flatnonzero(new.take(again - 1))  # where another splat's points begin
-        if len(starts):
-            first = again.take(starts) - 1
-            more, own = shares.take(again), shares.take(first)
-            total = own + np.add.reduceat(more, starts)
-            apart = own * own + np.add.reduceat(more * more, starts)
-            squares += np.bincount(owners.take(first), total * total - apart, len(squares))
-            shares[again] = 0.0
-            shares[first] = total
+        first = np.empty(len(owners), np.bool_)  # whether a point is the first of its splat there
+        np.not_equal(owners[1:], owners[:-1], out=first[1:])
+        first[np.cumsum(counts) - counts] = True  # the first point of each cell
+        _merge(owners, shares, squares, first)
     return Points(owners, shares, counts, inside, squares, area)
+
+
+def _merge(
+    owners: NDArray[np.int32],
+    shares: NDArray[np.float32],
+    squares: NDArray[np.float64],
+    first: NDArray[np.bool_],
+) -> None:
+    """Give the shares of all points of a splat in a cell to the first of them, `first`, (m,).
+
+    For the others, which come right behind it, see `_sort_into_cells`.
+    """
+    more = np.flatnonzero(~first)  # points that are not the first
+    starts = np.flatnonzero(first.take(more - 1))  # where those of another splat or cell begin
+    if len(starts):
+        firsts = more.take(starts) - 1
+        merged, own = shares.take(more), shares.take(firsts)
+        total = own + np.add.reduceat(merged, starts)
+        apart = own * own + np.add.reduceat(merged * merged, starts)
+        squares += np.bincount(owners.take(firsts), total * total - apart, len(squares))
+        shares[more] = 0.0
+        shares[firsts] = total

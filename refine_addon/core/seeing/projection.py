@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from ..splats import Splats
     from ..views import View, ViewSet
 
-REACH = 3.3
-"""Standard deviations to which a footprint is followed; alpha = 1 falls to `ALPHA_CUT` at 3.33."""
+CUT_SIGMAS = 3.3
+"""Standard deviations to which a footprint counts as reaching: alpha = 1 falls to `ALPHA_CUT` at
+3.33."""
 
 BRIGHTEST = 16.0
 """Colours are clipped to this, white being 1; keeps sums finite."""
@@ -148,11 +149,11 @@ def prepare(
     good, opaque = classify(splats, progress=part(progress, 0.0, 0.4), threads=threads)
     scene = scene or scene_of(splats.means, good, views)
     report(progress, 0.4, "reading")
-    index, place = near_scene(splats, opaque, scene)
+    index, positions = near_scene(splats, opaque, scene)
     report(progress, 0.4, "reading")
-    order = spatial_order(place, lambda rows: splat_fingerprint(splats, index[rows]))
+    order = spatial_order(positions, lambda rows: splat_fingerprint(splats, index[rows]))
     gaussians = activate(
-        splats, index[order], place[order], scene, part(progress, 0.4, 1.0), threads
+        splats, index[order], positions[order], scene, part(progress, 0.4, 1.0), threads
     )
     return gaussians, scene, good
 
@@ -178,20 +179,20 @@ def classify(
 def near_scene(
     splats: Splats, opaque: NDArray[np.bool_], scene: Scene
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the rows of opaque splats that are not too far away, (M,), and their places, (M, 3).
+    """Return the rows of opaque splats that are not too far away, (M,).
 
-    Places are those that `Scene.place` returns.
+    Also return their positions in the scene's frame, (M, 3) float64.
     """
     index = np.flatnonzero(opaque)
-    place = scene.place(splats.means[index])
-    close = np.max(np.abs(place), axis=1, initial=0.0) <= _FARTHEST
-    return index[close], place[close]
+    positions = scene.positions(splats.means[index])
+    close = np.max(np.abs(positions), axis=1, initial=0.0) <= _FARTHEST
+    return index[close], positions[close]
 
 
 def activate(
     splats: Splats,
     index: NDArray[np.int64],
-    place: NDArray[np.float64],
+    positions: NDArray[np.float64],
     scene: Scene,
     progress: Progress,
     threads: int | None,
@@ -203,8 +204,8 @@ def activate(
     splats : Splats
     index : (M,) int64
         Which of them.
-    place : (M, 3) float64
-        Their positions in the scene's frame, see `Scene.place`.
+    positions : (M, 3) float64
+        In the scene's frame, see `Scene.positions`.
     scene : Scene
     progress : callable
     threads : int, optional
@@ -212,7 +213,7 @@ def activate(
     count = len(index)
     result = Gaussians(
         index,
-        np.ascontiguousarray(place.T, np.float32),
+        np.ascontiguousarray(positions.T, np.float32),
         np.empty((6, count), np.float32),
         np.empty(count, np.float32),
         np.empty(count, np.float32),
@@ -242,7 +243,7 @@ def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
     The footprint is the Gaussian of covariance ``J W S W' J' + 0.3 I`` (Zwicker et al., "EWA
     splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean.
     """
-    return front_to_back([reaching(gaussians, scene, view)])
+    return front_to_back([footprints_and_depths(gaussians, scene, view)])
 
 
 _NONE = np.empty((2, 0), np.float32)
@@ -251,12 +252,13 @@ _NOTHING = Footprints(
 )
 
 
-def reaching(
-    gaussians: Gaussians, scene: Scene, view: View
+def footprints_and_depths(
+    gaussians: Gaussians, scene: Scene, view: View, window: View | None = None
 ) -> tuple[Footprints, NDArray[np.float32]]:
     """Return the footprints of `project` in the order of the Gaussians, and their depths, (n,).
 
-    Depths are along the view's axis, in scene sizes.
+    Depths are along the view's axis, in scene sizes. If only those are wanted that may reach into a
+    part of the image, `window` is that part as a view of its own.
     """
     if not _computable(scene, view):
         return _joined([])
@@ -267,7 +269,9 @@ def reaching(
         checkpoint()
         piece = slice(start, start + _CHUNK)
         local = _local(gaussians.means[:, piece], scene, view)  # (3, chunk)
-        touching = np.flatnonzero(_touches(local, gaussians.largest[piece], view, planes))
+        touching = np.flatnonzero(
+            _touches(local, gaussians.largest[piece], (view, window or view), planes)
+        )
         if len(touching):
             local = np.take(local, touching, axis=1)  # (3, n), as all that follows
             shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)  # (6, n)
@@ -286,7 +290,7 @@ def front_to_back(pieces: Sequence[tuple[Footprints, NDArray[np.float32]]]) -> F
     Parameters
     ----------
     pieces : sequence of Footprints, (n,) float32
-        As `reaching` returns them.
+        As `footprints_and_depths` returns them.
     """
     footprints, depth = _joined(pieces)
     checkpoint()
@@ -345,23 +349,27 @@ def _local(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.f
 def _touches(
     local: NDArray[np.float32],
     largest: NDArray[np.float32],
-    view: View,
+    views: tuple[View, View],
     planes: tuple[float, float],
 ) -> NDArray[np.bool_]:
     """Return which footprints may reach into the image, (M,); on the safe side.
 
-    It is `frustum.contains` with the image widened by the reach of each footprint.
+    It is `frustum.contains` with the image widened by how far each footprint reaches. Of `views`,
+    the first is drawn, and the second is the part of it that counts; see `footprints_and_depths`.
     """
     x, y, z = local
     touching: NDArray[np.bool_] = (z >= planes[0]) & (z <= planes[1])
-    for coordinate, side in zip((x, y), frustum.image_sides(view), strict=True):
-        reach = _reach(side) * largest  # (M,), px times depth
-        pixels = side.half + REACH * LOW_PASS**0.5
-        touching &= np.abs(side.focal * coordinate + side.offset * z) <= pixels * z + reach
+    drawn, sides = map(frustum.image_sides, views)
+    for coordinate, whole, side in zip((x, y), drawn, sides, strict=True):
+        margin = _margin(whole) * largest  # (M,), px times depth
+        pixels = side.half + CUT_SIGMAS * LOW_PASS**0.5
+        touching &= np.abs(side.focal * coordinate + side.offset * z) <= pixels * z + margin
     return touching
 
 
-def boxes_touch(boxes: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.bool_]:
+def boxes_touch(
+    boxes: NDArray[np.float32], scene: Scene, view: View, window: View | None = None
+) -> NDArray[np.bool_]:
     """Return in which of B boxes a Gaussian may lie that reaches into the image of a view, (B,).
 
     Parameters
@@ -369,33 +377,34 @@ def boxes_touch(boxes: NDArray[np.float32], scene: Scene, view: View) -> NDArray
     boxes : (B, 7) float32
         Least and greatest coordinates of the means, and the longest standard deviation, in the
         scene's frame, in scene sizes.
-    scene, view
-        See `project`.
+    scene, view, window
+        See `footprints_and_depths`.
     """
     if not _computable(scene, view):
         return np.zeros(len(boxes), np.bool_)
     near, far = clip_planes(scene, view)
-    places = itertools.product((0, 3), (1, 4), (2, 5))
-    corners = np.stack([boxes[:, place] for place in places], axis=-1)  # (B, 3, 8)
+    columns = itertools.product((0, 3), (1, 4), (2, 5))
+    corners = np.stack([boxes[:, corner] for corner in columns], axis=-1)  # (B, 3, 8)
     local = _local(np.moveaxis(corners, 1, 0).reshape(3, -1), scene, view)
     x, y, z = local.reshape(3, len(boxes), 8).astype(np.float64)
     slack = _SLACK * (1.0 + np.abs(local).max(axis=0).reshape(len(boxes), 8).max(axis=1))
     touching: NDArray[np.bool_] = (z.max(axis=1) + slack >= near) & (z.min(axis=1) - slack <= far)
-    for coordinate, side in zip((x, y), frustum.image_sides(view), strict=True):
-        reach = _reach(side) * (boxes[:, 6].astype(np.float64) + slack)
-        shown = (side.half + REACH * LOW_PASS**0.5) * z
+    drawn, sides = map(frustum.image_sides, (view, window or view))
+    for coordinate, whole, side in zip((x, y), drawn, sides, strict=True):
+        margin = _margin(whole) * (boxes[:, 6].astype(np.float64) + slack)
+        shown = (side.half + CUT_SIGMAS * LOW_PASS**0.5) * z
         across = side.focal * coordinate + side.offset * z
         for way in (1.0, -1.0):
-            # It is linear in the place, so it is least in a corner.
-            touching &= (way * across - shown).min(axis=1) <= reach
+            # It is linear in the position, so it is least in a corner.
+            touching &= (way * across - shown).min(axis=1) <= margin
     return touching
 
 
-def _reach(side: frustum.Side) -> float:
+def _margin(side: frustum.Side) -> float:
     """Return how far a footprint reaches, px times depth, for a longest standard deviation of 1."""
     # A footprint is longest where its ray is most oblique; beyond `_BEYOND` it grows no further.
     slope = (abs(side.offset) + (1.0 + 2.0 * _BEYOND) * side.half) / side.focal
-    return REACH * side.focal * float(np.hypot(1.0, slope))
+    return CUT_SIGMAS * side.focal * float(np.hypot(1.0, slope))
 
 
 def _rotation6(rotation: NDArray[np.float64]) -> NDArray[np.float32]:

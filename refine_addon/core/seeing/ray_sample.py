@@ -72,10 +72,10 @@ class RaySample:
 
     Attributes
     ----------
-    index : (M,) int64
-        Rows of the splats that the Gaussians are, among all.
-    rows : (M,) int64
-        The same among `splats`, which need only hold those that are hit.
+    splat_rows : (M,) int64
+        Which of all splats each Gaussian is.
+    stored_rows : (M,) int64
+        Which of `splats` it is: they need only hold those that are hit.
     rays : list of Rays or None
         Of each view; None where they have not been cast.
     """
@@ -91,12 +91,12 @@ class RaySample:
     ) -> None:
         self.views, self.splats, self.scoring = views, splats, scoring
         self._step = max(math.ceil(len(views) / VALIDATION_VIEWS), 1) if few_views else 1
-        self.index = self.rows = gaussians.index
+        self.splat_rows = self.stored_rows = gaussians.index
         self.rays: list[Rays | None] = [None] * len(views)
 
     def colors(self, number: int, rays: Rays) -> NDArray[np.float64]:
         """Return the colours in which view `number` sees what its rays hit, (3, u)."""
-        return colors_from(self.splats, self.rows[rays.hit], self.views[number][0])
+        return colors_from(self.splats, self.stored_rows[rays.hit], self.views[number][0])
 
     def load(self) -> None:
         """Load the hits, in a subclass that keeps them on disk."""
@@ -190,12 +190,12 @@ def cast_view(
         Whether these are scoring rays, which go through other pixels than the validation rays.
     """
     view = views[number][0]
-    rays, hits = SCORING_RAYS, MAX_SCORING_HITS
-    if not scoring:
-        rays, hits = VALIDATION_RAYS, MAX_VALIDATION_HITS
-    hits_of_view = min(hits / len(views), MAX_HITS_OF_VIEW)
-    count = min(rays / len(views), MAX_RAYS_OF_VIEW)
-    count = min(count, hits_of_view / max(depth_complexity(footprints, view), 1.0))
+    rays_of_all, hits_of_all = VALIDATION_RAYS, MAX_VALIDATION_HITS
+    if scoring:
+        rays_of_all, hits_of_all = SCORING_RAYS, MAX_SCORING_HITS
+    most_rays = min(rays_of_all / len(views), MAX_RAYS_OF_VIEW)
+    most_hits = min(hits_of_all / len(views), MAX_HITS_OF_VIEW)
+    count = min(most_rays, most_hits / max(depth_complexity(footprints, view), 1.0))
     return cast(footprints, *pixels(view, number + len(views) * scoring, count))
 
 

@@ -56,7 +56,7 @@ class Scene:
     size: float
     axes: NDArray[np.float64]
 
-    def place(self, means: NDArray[Any]) -> NDArray[np.float64]:
+    def positions(self, means: NDArray[Any]) -> NDArray[np.float64]:
         """Return positions in the frame, in scene sizes.
 
         Parameters
@@ -71,19 +71,14 @@ class Scene:
         return np.asarray((means - self.origin) @ (self.axes.T / self.size))
 
 
-def _median_size(squared: NDArray[np.float64], drawable: NDArray[np.bool_]) -> float:
-    """Return the size of a scene of drawable splats, or 1 if the whole scene is one point.
-
-    `squared`, (N,), is the squared distance of each splat to the scene's origin, plus the median
-    over views of theirs.
-    """
-    if not drawable.any():
-        return 1.0
-    return size_of(float(np.median(squared if drawable.all() else squared[drawable])))
-
-
 def size_of(median: float) -> float:
-    """Return the size of a scene from the median that `_median_size` takes."""
+    """Return the size of a scene, or 1 if the whole scene is one point.
+
+    Parameters
+    ----------
+    median : float
+        S + V of `Scene.size`.
+    """
     return float(np.sqrt(median)) or 1.0
 
 
@@ -109,57 +104,46 @@ def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -
             # Undrawable splats may hold any number, such as infinity.
             offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
             squared[piece] = np.einsum("ij,ij->i", offset, offset) + views_squared
-        unturned = Scene(origin, _median_size(squared, drawable), np.eye(3))
-        return replace(unturned, axes=_principal_axes(means, drawable, unturned))
-
-
-def _principal_axes(
-    means: NDArray[Any], drawable: NDArray[np.bool_], scene: Scene
-) -> NDArray[np.float64]:
-    """Return the principal axes of positions as the rows of a rotation, the least variance first.
-
-    A position at distance r has the weight 1 / (1 + r^2)^2, so that a few far ones hardly matter.
-    Axes point to where more of the splats lie. If two variances are equal, two axes are arbitrary.
-    Of `scene` the origin and the size are used; for the others see `scene_of`.
-    """
-    total = np.zeros((4, 3))
-    for sums in moments(means, drawable, scene):
-        total += sums
-    return principal_axes(total[:3], total[3])
+        median = float(np.median(squared[drawable])) if drawable.any() else 0.0
+        unturned = Scene(origin, size_of(median), np.eye(3))
+        total = sum(moments(means, drawable, unturned), np.zeros((4, 3)))
+        return replace(unturned, axes=principal_axes(total))
 
 
 def moments(
     means: NDArray[Any], drawable: NDArray[np.bool_], scene: Scene
 ) -> Iterator[NDArray[np.float64]]:
-    """Yield what `principal_axes` takes, (4, 3) float64, for one chunk of positions at a time.
+    """Yield what `principal_axes` takes of splats, for one chunk at a time: (4, 3) float64 each.
 
-    The first three rows are the weighted sums of the products of coordinates, the last those of the
-    coordinates.
+    A position at distance r has the weight 1 / (1 + r^2)^2, so that a few far ones hardly matter.
 
     Parameters
     ----------
-    means, drawable, scene
-        See `_principal_axes`.
+    means, drawable
+        See `scene_of`.
+    scene : Scene
+        Unturned, that is with the axes of the world.
     """
     for piece in chunks(len(means), _CHUNK):
-        place = scene.place(means[piece][drawable[piece]])  # (n, 3)
-        nearness = (1.0 + np.einsum("ij,ij->i", place, place)) ** -2.0  # (n,)
-        weighted = place * nearness[:, None]
-        yield np.vstack([weighted.T @ place, weighted.sum(axis=0)])
+        positions = scene.positions(means[piece][drawable[piece]])  # (n, 3)
+        nearness = (1.0 + np.einsum("ij,ij->i", positions, positions)) ** -2.0  # (n,)
+        weighted = positions * nearness[:, None]
+        yield np.vstack([weighted.T @ positions, weighted.sum(axis=0)])
 
 
-def principal_axes(second: NDArray[np.float64], first: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the axes of a cloud as the rows of a rotation, the least variance first.
+def principal_axes(total: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the principal axes of splats as the rows of a rotation, the least variance first.
+
+    Axes point to where more of the splats lie. If two variances are equal, two axes are arbitrary.
 
     Parameters
     ----------
-    second : (3, 3) float64
-        Weighted sum over the cloud of the products of coordinates.
-    first : (3,) float64
-        Weighted sum of the coordinates: axes point to where there are more.
+    total : (4, 3) float64
+        Weighted sums over the splats: of the products of coordinates, and in the last row of the
+        coordinates; see `moments`.
     """
-    _, vectors = np.linalg.eigh(second)  # in columns
-    axes = (vectors * np.where(first @ vectors < 0.0, -1.0, 1.0)).T
+    _, vectors = np.linalg.eigh(total[:3])  # in columns
+    axes = (vectors * np.where(total[3] @ vectors < 0.0, -1.0, 1.0)).T
     if np.linalg.det(axes) < 0.0:
         axes[2] = -axes[2]
     return np.ascontiguousarray(axes)
@@ -189,15 +173,15 @@ def splat_fingerprint(splats: Splats, rows: NDArray[np.int64]) -> NDArray[np.uin
 
 
 def spatial_order(
-    place: NDArray[np.float64],
+    positions: NDArray[np.float64],
     ties: Callable[[NDArray[np.int64]], NDArray[np.uint64]] | None = None,
 ) -> NDArray[np.int64]:
     """Return the order of positions along a Z-shaped curve: neighbours follow (Morton, 1966).
 
     Parameters
     ----------
-    place : (N, 3) float64
-        As `Scene.place` returns them.
+    positions : (N, 3) float64
+        As `Scene.positions` returns them.
     ties : callable, optional
         ``ties(rows)`` returns numbers that order rows at the same place.
 
@@ -207,18 +191,18 @@ def spatial_order(
         Positions that agree in 21 bits of each coordinate are at the same place; without `ties`
         they keep their order.
     """
-    return code_order(spatial_code(place), ties)
+    return code_order(spatial_code(positions), ties)
 
 
-def spatial_code(place: NDArray[np.float64]) -> NDArray[np.int64]:
+def spatial_code(positions: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return where positions lie along the curve of `spatial_order`, (N,)."""
     cells = float(1 << _BITS)
-    code = np.zeros(len(place), np.int64)  # (N,), bits of the three coordinates interleaved
+    code = np.zeros(len(positions), np.int64)  # (N,), bits of the three coordinates interleaved
     # All of space is mapped into a ball, so the resolution falls with the distance.
     with np.errstate(under="ignore"):
-        scale = cells / 2.0 / (1.0 + np.sqrt(np.einsum("ij,ij->i", place, place)))  # (N,)
+        scale = cells / 2.0 / (1.0 + np.sqrt(np.einsum("ij,ij->i", positions, positions)))  # (N,)
     for axis in range(3):
-        bits = (place[:, axis] * scale + cells / 2.0).clip(0.0, cells - 1.0).astype(np.int64)
+        bits = (positions[:, axis] * scale + cells / 2.0).clip(0.0, cells - 1.0).astype(np.int64)
         for shift, mask in _SPREAD_BITS:
             bits = (bits | bits << shift) & mask
         code |= bits << axis

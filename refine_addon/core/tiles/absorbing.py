@@ -20,8 +20,6 @@ from ..pipeline.absorb_splats import FIRST, PARTS
 from ..seeing.measuring import Measured
 from ..selection import Budget, select
 from .gaussians import store_gaussians
-from .measuring import TileMeasuring
-from .rays import StoredRays
 from .regions import (
     SURVIVORS,
     AbsorbAtOnce,
@@ -33,6 +31,7 @@ from .regions import (
     SettleUnit,
     StageContext,
 )
+from .seeing import StoredRays, TileMeasuring
 from .workers import Runner
 
 if TYPE_CHECKING:

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..operation.run import Runtime
     from ..scoring.closed_form_settings import ClosedForm
     from ..views import ViewSet
-    from ..work import Progress
     from .folder import Folder
     from .units import Unit
     from .workers import Runner
@@ -64,27 +64,27 @@ class ComputeRows:
     step: str
     arguments: tuple[Any, ...]
 
-    def run(self, context: ClosedFormContext, progress: Progress, threads: int | None) -> Any:  # noqa: ANN401 - of each step its own
+    def run(self, context: ClosedFormContext, runtime: Runtime) -> Any:  # noqa: ANN401 - of each step its own
         """Do the step, unless it is done; return what came of it."""
         folder, index = context.folder, self.unit.index
         if self.step in _REPEATED:
-            return self._computed(context, progress, threads)
+            return self._computed(context, runtime)
         name = f"{index:06d}.{self.step}"
-        result = folder.once(name, lambda: self._computed(context, progress, threads))
+        result = folder.once(name, lambda: self._computed(context, runtime))
         folder.drop(index, STEPS[self.step][2])
         return result
 
-    def _computed(self, context: ClosedFormContext, progress: Progress, threads: int | None) -> Any:  # noqa: ANN401 - of each step its own
+    def _computed(self, context: ClosedFormContext, runtime: Runtime) -> Any:  # noqa: ANN401 - of each step its own
         folder, unit = context.folder, self.unit
         needed, made, _ = STEPS[self.step]
         # From a disk a unit is read chunk by chunk; behind a URL each chunk would be a request.
         splats = unit.splats() if self.step == "read" and unit.remote else unit
         block = RowBlock(
             splats, context.views, context.settings, context.middle,
-            threads=threads, arrays=folder.load(unit.index, needed),
+            threads=runtime.threads, arrays=folder.load(unit.index, needed),
         )  # fmt: skip
         del splats
-        block.progress = progress
+        block.progress = runtime.progress
         arguments = [
             folder.noted(each.name)[1] if isinstance(each, _Stored) else each
             for each in self.arguments

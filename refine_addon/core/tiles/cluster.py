@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Any
 
 from ...version import VERSION
 from ..errors import RefineError
-from ..work import report, silent
+from ..operation.run import Runtime
+from ..work import report
 from .folder import Interrupted
 from .units import header_of
 
@@ -234,7 +235,7 @@ class Cluster:
 def _run(packed: bytes, group: Sequence[Any]) -> list[Any]:
     """Do steps one after the other, in a worker."""
     context = _unpacked(packed)
-    return [step.run(context, silent, 1) for step in group]
+    return [step.run(context, Runtime(threads=1)) for step in group]
 
 
 @functools.lru_cache(maxsize=2)

@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..operation.run import Runtime
     from ..seeing.measuring import Sampling
     from ..seeing.scene import Scene
     from ..views import View, ViewSet
-    from ..work import Progress
     from .folder import Folder
     from .units import Source
     from .workers import Runner
@@ -54,9 +54,9 @@ class SceneContext:
         with np.errstate(under="ignore"):
             for number in np.flatnonzero(projection.boxes_touch(boxes, self.scene, view)).tolist():
                 chunk = self.chunk(number)
-                reaching, depth = projection.reaching(chunk, self.scene, view)
-                colors.append(chunk.colors[reaching.index])
-                pieces.append((replace(reaching, index=reaching.index + number * CHUNK), depth))
+                found, depth = projection.footprints_and_depths(chunk, self.scene, view)
+                colors.append(chunk.colors[found.index])
+                pieces.append((replace(found, index=found.index + number * CHUNK), depth))
             footprints = projection.front_to_back(pieces)
         # Ascending, since chunks are.
         rows = np.concatenate([np.empty(0, np.int64), *(piece.index for piece, _ in pieces)])
@@ -77,9 +77,7 @@ class SumMoments:
 
     source: Source
 
-    def run(
-        self, context: SceneContext, _progress: Progress, _threads: int | None
-    ) -> NDArray[np.float64]:
+    def run(self, context: SceneContext, _runtime: Runtime) -> NDArray[np.float64]:
         """Return `scene.moments` of the source, (pieces, 4, 3)."""
         splats = self.source.splats()
         with np.errstate(under="ignore"):
@@ -93,19 +91,19 @@ class ActivateSplats:
 
     source: Source
 
-    def run(self, context: SceneContext, progress: Progress, threads: int | None) -> int:
+    def run(self, context: SceneContext, runtime: Runtime) -> int:
         """Save the Gaussians, unless that is done; return how many there are."""
         name = f"{self.source.index:06d}.activated"
-        return int(context.folder.once(name, lambda: self._activate(context, progress, threads)))
+        return int(context.folder.once(name, lambda: self._activate(context, runtime)))
 
-    def _activate(
-        self, context: SceneContext, progress: Progress, threads: int | None
-    ) -> NDArray[np.int64]:
+    def _activate(self, context: SceneContext, runtime: Runtime) -> NDArray[np.int64]:
         splats, scene = self.source.splats(), context.scene
-        good, opaque = projection.classify(splats, threads=threads)
+        good, opaque = projection.classify(splats, threads=runtime.threads)
         with np.errstate(under="ignore"):
             rows, place = projection.near_scene(splats, opaque, scene)
-            activated = projection.activate(splats, rows, place, scene, progress, threads)
+            activated = projection.activate(
+                splats, rows, place, scene, runtime.progress, runtime.threads
+            )
             code = spatial_code(place)
         table = np.empty((len(rows), 14), np.float32)
         table[:, _MEANS], table[:, _COVARIANCES] = activated.means.T, activated.covariances.T
@@ -124,9 +122,7 @@ class GatherChunk:
     number: int
     starts: NDArray[np.int64]  # (sources + 1,): Gaussians of the sources before each, and of all
 
-    def run(
-        self, context: SceneContext, _progress: Progress, _threads: int | None
-    ) -> NDArray[np.float32]:
+    def run(self, context: SceneContext, _runtime: Runtime) -> NDArray[np.float32]:
         """Save the chunk, unless that is done; return its box, (7,): `projection.boxes_touch`."""
         name = f"{self.number:06d}.gathered"
         box = context.folder.once(name, lambda: self._gathered(context.folder))

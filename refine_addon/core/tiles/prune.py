@@ -200,6 +200,9 @@ class TilesRequest(Request[TileScene, TileDecision]):
         if budget.psnr is not None and not settings.estimates:
             msg = f"over tiles {settings.method} estimates no PSNR: choose auto or occlusion"
             raise RefineError(msg)
+        if self.prune.survivors == "refit":
+            msg = "over tiles survivors are not refitted yet: choose absorb or unchanged"
+            raise RefineError(msg)
         budget.refuse_meaningless(settings.method, frustum=settings.frustum)
 
     def decide(self, scene: TileScene, runtime: Runtime) -> TileDecision:
@@ -416,7 +419,7 @@ def _facts(
 def _digest(tiles: Sequence[Tile], request: TilesRequest) -> str:
     """Return a name for a job: that of the same job again, and of no other."""
     digest, asked = hashlib.blake2b(digest_size=8), request.prune
-    for fact in (VERSION, ROWS, [*tiles], asked.budget, asked.settings, asked.absorb):
+    for fact in (VERSION, ROWS, [*tiles], asked.budget, asked.settings, asked.survivors):
         digest.update(repr(fact).encode("utf-8", "surrogateescape"))
     for view in asked.views.spread(asked.settings.views):
         for field in fields(view):

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..operation.run import Runtime
     from ..seeing.scene import Scene
     from ..splats import Splats
     from ..task import Settings
     from ..views import ViewSet
-    from ..work import Progress
     from .folder import Folder
     from .units import Source, Unit
 
@@ -108,7 +108,7 @@ class SaveMeans:
 
     source: Source
 
-    def run(self, context: StageContext, _progress: Progress, _threads: int | None) -> None:
+    def run(self, context: StageContext, _runtime: Runtime) -> None:
         """Save the means, in float32."""
         means = np.asarray(self.source.splats().means, np.float32)
         context.folder.save(self.source.index, {"means": means})
@@ -120,24 +120,20 @@ class GatherRegion:
 
     index: int
 
-    def run(
-        self, context: StageContext, progress: Progress, threads: int | None
-    ) -> NDArray[np.float64]:
+    def run(self, context: StageContext, runtime: Runtime) -> NDArray[np.float64]:
         """Save the region; return `merge_field.MeasuredField.seen_and_whole`, (2, 2)."""
         name = f"{self.index:06d}.gathered"
-        sums = context.folder.once(name, lambda: self._gathered(context, progress, threads))
+        sums = context.folder.once(name, lambda: self._gathered(context, runtime))
         return np.asarray(sums)
 
-    def _gathered(
-        self, context: StageContext, progress: Progress, threads: int | None
-    ) -> NDArray[np.float64]:
+    def _gathered(self, context: StageContext, runtime: Runtime) -> NDArray[np.float64]:
         rows, sums = context.folder.load(self.index, ("rows", "sums")).values()
         table, origin, members = context.gathered(rows)
         splats = unpacked(table)
         places = mergeable(splats, context.scene, np.zeros(len(rows), np.bool_))
         measured = merge_field.measured_field(
             splats, places, context.views, context.scene, ViewSums(*sums),
-            progress=progress, threads=threads,
+            progress=runtime.progress, threads=runtime.threads,
         )  # fmt: skip
         arrays = dict(zip(_GATHERED, (table, origin, members, places), strict=True))
         arrays |= {"mass": measured.mass, "seen_by": measured.seen}
@@ -152,20 +148,21 @@ class PriceRegion:
     index: int
     whole: NDArray[np.float64]  # what `GatherRegion` returns, of all regions together
 
-    def run(self, context: StageContext, progress: Progress, threads: int | None) -> None:
+    def run(self, context: StageContext, runtime: Runtime) -> None:
         """Save the graph, and of each splat the cost of its cheapest operation and its weight."""
         name = f"{self.index:06d}.priced"
-        context.folder.once(name, lambda: self._price(context, progress, threads))
+        context.folder.once(name, lambda: self._price(context, runtime))
 
-    def _price(self, context: StageContext, progress: Progress, threads: int | None) -> None:
+    def _price(self, context: StageContext, runtime: Runtime) -> None:
         folder = context.folder
         arrays = folder.load(self.index, (*_FIELD, "mass", "seen_by", "rows", "mergeable"))
         field = Field(*(arrays[name] for name in _FIELD))
         measured = merge_field.MeasuredField(field, arrays["mass"], arrays["seen_by"])
         graph = MergeGraph(
-            measured.with_allowance(self.whole), context.scene, context.factor, threads=threads
-        )
-        graph.connect(progress)
+            measured.with_allowance(self.whole), context.scene, context.factor,
+            threads=runtime.threads,
+        )  # fmt: skip
+        graph.connect(runtime.progress)
         best, merges = graph.best()
         costs = np.full(len(arrays["rows"]), -1.0)  # what cannot be drawn goes first
         weights = np.ones(len(costs), np.float32)
@@ -186,24 +183,22 @@ class AbsorbRegion:
     index: int
     count: int
 
-    def run(self, context: StageContext, progress: Progress, threads: int | None) -> int:
+    def run(self, context: StageContext, runtime: Runtime) -> int:
         """Save the survivors, unless that is done; return how many there are."""
         name = f"{self.index:06d}.absorbed"
-        left = context.folder.once(name, lambda: self._absorbed(context, progress, threads))
+        left = context.folder.once(name, lambda: self._absorbed(context, runtime))
         context.folder.drop(self.index, _NEEDED_NO_MORE)
         return int(left)
 
-    def _absorbed(
-        self, context: StageContext, progress: Progress, threads: int | None
-    ) -> NDArray[np.int64]:
+    def _absorbed(self, context: StageContext, runtime: Runtime) -> NDArray[np.int64]:
         folder = context.folder
         arrays = folder.load(self.index, (*_GATHERED, "sums"))
-        graph = partial(self._graph, context, threads)
+        graph = partial(self._graph, context, runtime.threads)
         protected = np.zeros(len(arrays["gathered"]), np.bool_)
         with np.errstate(under="ignore"):
             left, keep, taken, expected = reduced(
                 unpacked(arrays["gathered"]), ViewSums(*arrays["sums"]), arrays["mergeable"], graph,
-                self.count, protected=protected, progress=progress,
+                self.count, protected=protected, progress=runtime.progress,
             )  # fmt: skip
         # A survivor now also stands for all that the splats it absorbed stood for.
         stays = taken >= 0
@@ -232,17 +227,13 @@ class AbsorbAtOnce:
     total: int  # before some of them were deleted
     settings: Settings
 
-    def run(
-        self, context: StageContext, progress: Progress, threads: int | None
-    ) -> tuple[int, int]:
+    def run(self, context: StageContext, runtime: Runtime) -> tuple[int, int]:
         """Save the survivors, unless that is done; return how many there are, and were merged."""
         once = context.folder.once
-        left, merged = once("000000.absorbed", lambda: self._absorbed(context, progress, threads))
+        left, merged = once("000000.absorbed", lambda: self._absorbed(context, runtime))
         return int(left), int(merged)
 
-    def _absorbed(
-        self, context: StageContext, progress: Progress, threads: int | None
-    ) -> NDArray[np.int64]:
+    def _absorbed(self, context: StageContext, runtime: Runtime) -> NDArray[np.int64]:
         rows, sums = context.folder.load(0, ("rows", "sums")).values()
         splats = unpacked(context.gathered(rows)[0])
         none = np.zeros(len(rows), np.int32)
@@ -252,7 +243,7 @@ class AbsorbAtOnce:
         absorbed = absorb_removed(
             splats, views, self.goal, self.settings,
             known=(scores, Measured(sums[0], sums[1], none)), began=self.total,
-            progress=progress, threads=threads,
+            progress=runtime.progress, threads=runtime.threads,
         )  # fmt: skip
         arrays = {"splats": packed(absorbed.splats), "origin": rows[absorbed.keep]}
         context.folder.save(0, arrays | {"changed": absorbed.changed})
@@ -267,7 +258,7 @@ class SettleUnit:
     begin: int  # how many splats lie before it
     regions: Sequence[Region]  # where the survivors are
 
-    def run(self, folder: Folder, _progress: Progress, _threads: int | None) -> NDArray[np.int64]:
+    def run(self, folder: Folder, _runtime: Runtime) -> NDArray[np.int64]:
         """Note them; return what `save_kept` returns."""
         origin, place, changed = (folder.mapped(name) for name in SURVIVORS)
         end = self.begin + len(self.unit)

@@ -14,8 +14,7 @@ from ..seeing.scene import Scene, principal_axes
 from ..work import Progress, part
 from .closed_form import by_closed_form
 from .gaussians import SceneContext, SumMoments, store_gaussians
-from .measuring import TileMeasuring
-from .rays import StoredRays
+from .seeing import StoredRays, TileMeasuring
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -162,4 +161,4 @@ def _turned(context: SceneContext, units: Sequence[Unit], runner: Runner) -> Sce
     for pieces in runner.run(context, steps, "reading"):
         for moments in pieces:  # one after the other, as in memory
             total += moments
-    return replace(context.scene, axes=principal_axes(total[:3], total[3]))
+    return replace(context.scene, axes=principal_axes(total))

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..operation.run import Runtime
     from ..scores import Scores
     from ..selection import Budget
-    from ..work import Progress
     from .folder import Folder
     from .units import Tile, Unit
     from .workers import Runner
@@ -66,7 +66,7 @@ class CountScores:
     shift: int
     by_bytes: bool
 
-    def run(self, folder: Folder, _progress: Progress, _threads: int | None) -> radix.Sparse:
+    def run(self, folder: Folder, _runtime: Runtime) -> radix.Sparse:
         """Return the counts."""
         weights = self.unit.row_bytes() if self.by_bytes else None
         keys = _keys(self.unit, folder)
@@ -84,7 +84,7 @@ class CountTied:
     edge: int
     by_bytes: bool
 
-    def run(self, folder: Folder, _progress: Progress, _threads: int | None) -> int:
+    def run(self, folder: Folder, _runtime: Runtime) -> int:
         """Return the count."""
         ties = _keys(self.unit, folder) == self.edge
         return int(self.unit.row_bytes()[ties].sum() if self.by_bytes else np.count_nonzero(ties))
@@ -97,7 +97,7 @@ class ChooseByScore:
     unit: Unit
     rule: Rule
 
-    def run(self, folder: Folder, _progress: Progress, _threads: int | None) -> NDArray[np.int64]:
+    def run(self, folder: Folder, _runtime: Runtime) -> NDArray[np.int64]:
         """Note which stay; return what `save_kept` returns."""
         index, rule = self.unit.index, self.rule
         if rule.least_seen is not None:

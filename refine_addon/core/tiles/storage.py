@@ -40,8 +40,7 @@ def located(path: Path | str) -> Path | Url:
 def identity(path: Path | Url) -> str:
     """Return a name of a file that is the same however the file is named."""
     if isinstance(path, Url):
-        with _explained(path, "cannot be looked for"):
-            system, inner = _opened(path)
+        with _opened(path, "cannot be looked for") as (system, inner):
             name: str = system.unstrip_protocol(inner)
         if not name.startswith(_LOCAL):
             return name
@@ -61,12 +60,11 @@ def file_key(path: Path | Url) -> Hashable:
 
 def state(path: Path | Url) -> tuple[int, int | str]:
     """Return the bytes of a file and what changes with its content: a time in ns, or facts."""
-    with _explained(path, "cannot be read"):
-        if not isinstance(path, Url):
+    if not isinstance(path, Url):
+        with _explained(path, "cannot be read"):
             status = path.stat()
             return status.st_size, status.st_mtime_ns
-        system, inner = _opened(path)
-        system.invalidate_cache()
+    with _opened(path, "cannot be read") as (system, inner):
         facts = system.info(inner)
         if facts.get("type") == "directory":
             msg = f"{path}: is a folder, expected a PLY file"
@@ -87,13 +85,14 @@ def beginning(url: Url, size: int, whole: int) -> bytes:
 
     A file that can only be read from its beginning is refused: `array` would be sent all of it.
     """
-    with _explained(url, "cannot be read"):
-        system, inner = _opened(url)
-        with system.open(inner, "rb", cache_type="none") as stream:
-            start: bytes = stream.read(size)
-            stream.seek(max(whole - 1, 0))
-            stream.read(1)
-            return start
+    with (
+        _opened(url, "cannot be read") as (system, inner),
+        system.open(inner, "rb", cache_type="none") as stream,
+    ):
+        start: bytes = stream.read(size)
+        stream.seek(max(whole - 1, 0))
+        stream.read(1)
+        return start
 
 
 def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDArray[Any]:
@@ -108,12 +107,12 @@ def array(path: Path | Url, dtype: np.dtype[Any], count: int, begin: int) -> NDA
     begin : int
         Bytes before the first.
     """
-    with _explained(path, "cannot be read"):
-        if not isinstance(path, Url):
+    if not isinstance(path, Url):
+        with _explained(path, "cannot be read"):
             return np.fromfile(path, dtype, count, offset=begin)
-        if not count:
-            return np.empty(0, dtype)
-        system, inner = _opened(path)
+    if not count:
+        return np.empty(0, dtype)
+    with _opened(path, "cannot be read") as (system, inner):
         # By name: storages have other arguments between these.
         sent = system.cat_file(inner, start=begin, end=begin + count * dtype.itemsize)
         return np.frombuffer(sent, dtype, len(sent) // dtype.itemsize)
@@ -130,11 +129,10 @@ def new_folder(folder: Path | Url) -> Iterator[None]:
         with whole_file.new_folder(folder):
             yield
         return
-    with _explained(folder, "cannot be written to"):
-        system, inner = _opened(folder)
+    with _opened(folder, "cannot be written to") as (system, inner):
         system.makedirs(inner, exist_ok=True)
         name = f".refine-{secrets.token_hex(8)}"
-        here, there = (_opened(folder / f"{name}-{end}")[1] for end in "ab")
+        here, there = (_split(folder / f"{name}-{end}")[1] for end in "ab")
         system.pipe_file(here, b"")
         system.mv(here, there)
         system.rm_file(there)
@@ -146,9 +144,7 @@ def refuse_existing(path: Path | Url, *, overwrite: bool) -> None:
     if not isinstance(path, Url):
         whole_file.refuse_existing(path, overwrite=overwrite)
         return
-    with _explained(path, "cannot be written"):
-        system, inner = _opened(path)
-        system.invalidate_cache()
+    with _opened(path, "cannot be written") as (system, inner):
         if system.isdir(inner):
             msg = f"{path}: is a folder, expected a file name to write to"
             raise RefineError(msg)
@@ -159,9 +155,7 @@ def refuse_existing(path: Path | Url, *, overwrite: bool) -> None:
 
 def upload(made: Path, url: Url) -> None:
     """Copy a file to a URL, unless one of that size is there."""
-    with _explained(url, "cannot be written"):
-        system, inner = _opened(url)
-        system.invalidate_cache()
+    with _opened(url, "cannot be written") as (system, inner):
         if not system.exists(inner) or system.size(inner) != made.stat().st_size:
             system.put_file(str(made), inner)
 
@@ -176,30 +170,35 @@ def publish(made: Path | Url, path: Path | Url, *, overwrite: bool) -> None:
         return
     assert isinstance(path, Url)  # noqa: S101 - both are
     refuse_existing(path, overwrite=overwrite)
-    with _explained(path, "cannot be written"):
-        system, inner = _opened(path)
-        system.mv(_opened(Url(made))[1], inner)
+    with _opened(path, "cannot be written") as (system, inner):
+        system.mv(_split(Url(made))[1], inner)
 
 
 def size_of(path: Path | Url) -> int | None:
     """Return the bytes of a file; None if there is none."""
     if not isinstance(path, Url):
         return path.stat().st_size if path.is_file() else None
-    with _explained(path, "cannot be looked for"):
-        system, inner = _opened(path)
-        system.invalidate_cache()
+    with _opened(path, "cannot be looked for") as (system, inner):
         return int(system.size(inner)) if system.isfile(inner) else None
 
 
 def discard(url: Url) -> None:
     """Remove a file if it is there."""
-    with contextlib.suppress(RefineError), _explained(url, ""):
-        system, inner = _opened(url)
+    with contextlib.suppress(RefineError), _opened(url, "") as (system, inner):
         system.rm_file(inner)
 
 
-def _opened(url: Url) -> tuple[Any, str]:
-    """Return the file system of a URL, and its path there."""
+@contextlib.contextmanager
+def _opened(url: Url, problem: str) -> Iterator[tuple[Any, str]]:
+    """Yield the file system of a URL, as it is now, and the path there; see `_explained`."""
+    with _explained(url, problem):
+        system, inner = _split(url)
+        system.invalidate_cache()
+        yield system, inner
+
+
+def _split(url: Url) -> tuple[Any, str]:
+    """Return the file system of a URL, and the path there."""
     try:
         from fsspec.core import url_to_fs  # noqa: PLC0415 - an optional extra
     except ImportError as error:

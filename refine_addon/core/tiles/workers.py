@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
+from ..operation.run import Runtime
 from ..work import Progress, part, report, silent
 
 if TYPE_CHECKING:
@@ -26,18 +27,15 @@ class Step(Protocol[_Context_contra, _Result_co]):
     small. It can be done again: where its result was noted, that is returned.
     """
 
-    def run(
-        self, context: _Context_contra, progress: Progress, threads: int | None, /
-    ) -> _Result_co:
+    def run(self, context: _Context_contra, runtime: Runtime, /) -> _Result_co:
         """Do it.
 
         Parameters
         ----------
         context : object
             What all steps that are done together need.
-        progress : callable
-        threads : int or None
-            See `refine_addon.core.work.for_chunks`.
+        runtime : Runtime
+            Its clock does not matter.
         """
 
 
@@ -89,8 +87,8 @@ class InProcess:
         done = 0.0
         for step, share in zip(batch.steps, batch.shares(), strict=True):
             report(batch.progress, done, batch.what)
-            ahead = part(batch.progress, done, done + share)
-            yield step.run(batch.context, ahead, self._threads)
+            progress = part(batch.progress, done, done + share)
+            yield step.run(batch.context, Runtime(progress=progress, threads=self._threads))
             done += share
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..work import Progress
+    from ..operation.run import Runtime
     from .folder import Folder
     from .units import Piece, Tile
 
@@ -44,7 +44,7 @@ class WriteTile:
     changed: bool  # whether some of them absorbed others
     url: Url | None  # where to copy the file
 
-    def run(self, folder: Folder, _progress: Progress, _threads: int | None) -> int:
+    def run(self, folder: Folder, _runtime: Runtime) -> int:
         """Write the file, unless it is there; return its bytes."""
         waiting_file, name = folder.tiles / self.tile.name, f"{self.number:06d}.written"
         done, size = folder.noted(name)

@@ -44,14 +44,14 @@ def main(name: str, pictures: str) -> Generator[float, None, dict[str, Any]]:
     for label, values in (
         ("less", {"percent": 30.0}),
         ("count", {"budget": "keep", "keep": 4000}),
-        ("absorbed", {"absorb": True}),
+        ("absorbed", {"survivors": "absorb"}),
     ):
         yield from adjust(hand, values)
         found[label] = state(name)
     yield from hand.undo()
     yield from until(lambda: count(name) == 39_755, "they are back")
     scene = bpy.context.scene
-    scene.refine.absorb, scene.refine.budget, scene.refine.percent = False, "ratio", 60.0
+    scene.refine.survivors, scene.refine.budget, scene.refine.percent = "unchanged", "ratio", 60.0
     yield from hand.scroll(down=True)
     yield from hand.click("refine.apply(")
     yield from until(lambda: count(name) < 39_755, "splats are removed")
@@ -80,6 +80,6 @@ def state(name: str) -> dict[str, Any]:
     settings = bpy.context.scene.refine
     return {
         "vertices": count(name),
-        "panel": [settings.budget, round(settings.percent, 3), settings.keep, settings.absorb],
+        "panel": [settings.budget, round(settings.percent, 3), settings.keep, settings.survivors],
         "last": bpy.context.window_manager.operators[-1].bl_idname,
     }

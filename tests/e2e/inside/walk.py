@@ -70,7 +70,7 @@ def main(
     yield from hand.scroll(down=True)
     yield from show.picture("4-price")
 
-    settings.absorb = True
+    settings.survivors = "absorb"
     show.call(bpy.ops.refine.apply)
     show.call(bpy.ops.refine.view, mode="SCENE")
     yield from show.picture("5-applied")

@@ -1,15 +1,21 @@
-"""Rays into splats that no memory holds at once: `seeing.ray_sample`, with the hits on a disk."""
+"""What views see of splats that no memory holds at once: `core.seeing`, with its sums on a disk.
+
+The sums of groups of views and the hits of rays lie in the folder of the job.
+"""
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..estimate.psnr import mean_psnr
+from ..processes import for_each
 from ..seeing.cast import cast
+from ..seeing.measuring import SECONDS, Measured, Measuring, measure_footprints
 from ..seeing.ray_sample import RaySample, cast_view
 from ..seeing.rays import Rays
 from ..splats import joined
@@ -17,18 +23,66 @@ from .units import unpacked
 from .workers import Runner
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
+    from ..operation.run import Runtime
+    from ..seeing.measuring import ViewMeasurement
     from ..seeing.projection import Footprints, Gaussians
     from ..seeing.scene import Scene
     from ..splats import Splats
     from ..work import Progress
+    from .folder import Folder
     from .gaussians import SceneContext, StoredGaussians
     from .units import Source
 
     Pixels = tuple[NDArray[np.int64], NDArray[np.int64]]
+
+
+@dataclass(frozen=True)
+class MeasureViews:
+    """Measures what a group of views sees of all splats, and casts rays of these views."""
+
+    group: int
+    numbers: list[int]  # of its views, in the order of `ViewSet.by_distance`
+    kinds: list[bool]  # of the rays to cast: whether they are scoring rays, see `RaySample`
+
+    def run(self, context: SceneContext, runtime: Runtime) -> None:
+        """Note the sums and the rays, unless that is done."""
+        folder, name = context.folder, _sums_name(self.group)
+        if folder.noted(name)[0]:
+            return
+        sample, count = folder.noted("sample")[1], int(folder.noted("count")[1])
+        total, errors = Measured.zero(count), []
+        measurements = for_each(
+            _OneView(context, self.numbers, self.kinds), len(self.numbers),
+            SECONDS * count * len(self.numbers),
+            progress=runtime.progress, what="scoring", threads=runtime.threads,
+        )  # fmt: skip
+        for measurement, weight in measurements:
+            before = total.error[sample]
+            total.add_view(measurement, weight)
+            errors.append(total.error[sample] - before)
+        folder.note(name, (total.contribution, total.error, total.seen, np.array(errors)))
+
+
+@dataclass(frozen=True)
+class _OneView:
+    """Measures one of some views and notes its rays; any process can. See `MeasureViews`."""
+
+    context: SceneContext
+    numbers: list[int]
+    kinds: list[bool]
+
+    def __call__(self, index: int) -> tuple[ViewMeasurement, float]:
+        """Return what a view sees, and its weight."""
+        number, context = self.numbers[index], self.context
+        view, weight = context.views.by_distance()[number]
+        footprints, colors = context.footprints(view)
+        for scoring in self.kinds:
+            note_rays(context, number, footprints, scoring=scoring)
+        return measure_footprints(footprints, colors, view, context.sampling), weight
 
 
 @dataclass(frozen=True)
@@ -38,7 +92,7 @@ class CastRays:
     number: int
     pixels: Pixels | None = None
 
-    def run(self, context: SceneContext, _progress: Progress, _threads: int | None) -> None:
+    def run(self, context: SceneContext, _runtime: Runtime) -> None:
         """Note the rays, unless that is done."""
         view, _ = context.views.by_distance()[self.number]
         note_rays(context, self.number, context.footprints(view)[0], self.pixels)
@@ -51,7 +105,7 @@ class TakeSplats:
     source: Source
     rows: NDArray[np.int64]
 
-    def run(self, _context: SceneContext, _progress: Progress, _threads: int | None) -> Splats:
+    def run(self, _context: SceneContext, _runtime: Runtime) -> Splats:
         """Return the splats."""
         return self.source.splats().take(self.rows)
 
@@ -77,7 +131,7 @@ def note_rays(
     scoring : bool
         Whether these are scoring rays, see `RaySample`.
     """
-    name = _name(number, scoring=scoring)
+    name = _rays_name(number, scoring=scoring)
     if context.folder.noted(name)[0]:
         return
     with np.errstate(under="ignore"):
@@ -86,6 +140,71 @@ def note_rays(
         else:
             rays = cast(footprints, *pixels)
     context.folder.note(name, tuple(vars(rays).values()))
+
+
+class StoredSums(Mapping[int, Measured]):
+    """Sums of groups of views, in a folder.
+
+    Parameters
+    ----------
+    folder : Folder
+    groups : iterable of int
+        The numbers of those that lie there.
+    """
+
+    def __init__(self, folder: Folder, groups: Iterable[int]) -> None:
+        self._folder, self._groups = folder, [*groups]
+
+    def __getitem__(self, group: int) -> Measured:
+        """Return the sums of a group."""
+        return Measured(*self._folder.noted(_sums_name(group))[1][:3])
+
+    def __iter__(self) -> Iterator[int]:
+        """Return the numbers of the groups."""
+        return iter(self._groups)
+
+    def __len__(self) -> int:
+        """Return how many groups there are."""
+        return len(self._groups)
+
+
+class TileMeasuring(Measuring):
+    """The views of one scoring, which measure the splats that a folder holds.
+
+    Parameters
+    ----------
+    context : SceneContext
+    runner : Runner
+        Only its workers count.
+    groups : list of list of int, optional
+        See `Measuring`.
+    """
+
+    def __init__(
+        self, context: SceneContext, runner: Runner, groups: list[list[int]] | None = None
+    ) -> None:
+        super().__init__(context.scene, context.views, context.sampling, None, groups)
+        self._context, self._runner = context, runner
+
+    def measure_groups(  # type: ignore[override]
+        self,
+        gaussians: StoredGaussians,  # noqa: ARG002 - the folder holds them
+        groups: Sequence[int],
+        sample: NDArray[np.int64],
+        progress: Progress,
+        ray_samples: Sequence[RaySample] = (),
+    ) -> tuple[StoredSums, dict[int, NDArray[np.float64]]]:
+        """Return the sums over each group of views, and the errors of a sample in each view."""
+        folder = self._context.folder
+        folder.note("sample", sample)
+        kinds = [rays.scoring for rays in ray_samples]
+        steps = [MeasureViews(group, self.groups[group], kinds) for group in groups]
+        replace(self._runner, progress=progress).run_all(self._context, steps, "scoring")
+        for rays in ray_samples:
+            assert isinstance(rays, StoredRays)  # noqa: S101 - as those of `_TileScoring` are
+            rays.noted.update(itertools.chain(*(self.groups[group] for group in groups)))
+        errors = {group: folder.noted(_sums_name(group))[1][3] for group in groups}
+        return StoredSums(folder, groups), errors
 
 
 class StoredRays(RaySample):
@@ -168,9 +287,9 @@ class StoredRays(RaySample):
     def load(self) -> None:
         """Load the rays that were noted, and the splats that they hit."""
         for number in sorted(self.noted):
-            name = _name(number, scoring=self.scoring)
+            name = _rays_name(number, scoring=self.scoring)
             self.rays[number] = Rays(*self._context.folder.noted(name)[1])
-        hit = [self.index[rays.hit] for rays in self.rays if rays is not None]
+        hit = [self.splat_rows[rays.hit] for rays in self.rays if rays is not None]
         rows = np.unique(np.concatenate([np.empty(0, np.int64), *hit]))
         begins = np.cumsum([0, *map(len, self._sources)])
         edges = itertools.pairwise(np.searchsorted(rows, begins).tolist())
@@ -182,9 +301,14 @@ class StoredRays(RaySample):
         if steps:
             self.splats = joined([*self._runner.run(self._context, steps, "reading")])
         # Any number for Gaussians that no ray hits.
-        self.rows = np.searchsorted(rows, self.index)
+        self.stored_rows = np.searchsorted(rows, self.splat_rows)
 
 
-def _name(number: int, *, scoring: bool) -> str:
+def _sums_name(group: int) -> str:
+    """Return under which name the sums of a group of views are noted."""
+    return f"{group}.measured"
+
+
+def _rays_name(number: int, *, scoring: bool) -> str:
     """Return under which name the rays of a view are noted."""
     return f"{'scoring' if scoring else 'validation'}-rays-{number:06d}"

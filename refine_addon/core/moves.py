@@ -1,0 +1,194 @@
+"""Which affine maps took points from where they were to where they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .affine import moved
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+LEAST = 6
+"""Points that a map is found of at least: any four have one in common."""
+
+_MOST = 32
+"""Maps that are looked for."""
+
+_NOISE = 4e-6
+"""Rounding of float32, relative to the terms that make a coordinate: 32 times its precision."""
+
+_FLAT = 1e-5
+"""Thickness over extent of points that count as lying in a plane."""
+
+_SAMPLE, _FITTED = 2048, 16384
+"""Points by which candidates are compared, and to which a map is fitted at last; evenly spread."""
+
+_TRIES, _DRAWN = 120, 6
+"""Candidates for each map, and points that each is fitted to."""
+
+_BLOCKS = (1.0, 0.1, 0.01)
+"""Shares of the points, in a row, from which a candidate draws: what was joined or copied lies
+together, what was selected by hand does not."""
+
+
+@dataclass(frozen=True, eq=False)
+class Move:
+    """Points that one affine map moved.
+
+    Attributes
+    ----------
+    rows : (M,) int64
+    matrix : (4, 4) float64
+        From where they were. Its linear part is exactly the identity where they were not moved, or
+        moved alike.
+    """
+
+    rows: NDArray[np.int64]
+    matrix: NDArray[np.float64]
+
+    @property
+    def shifts(self) -> bool:
+        """Whether the points at most changed their place, as by a translation."""
+        return np.array_equal(self.matrix[:3, :3], np.eye(3))
+
+    @property
+    def mirrors(self) -> bool:
+        """Whether left became right."""
+        return bool(np.linalg.det(self.matrix[:3, :3]) < 0.0)
+
+
+def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
+    """Return the maps that explain how points moved, those that did not move first.
+
+    A map is fitted to all points, and where it does not fit, to a few that are drawn at random, of
+    which the map is taken that most points agree with (RANSAC, Fischler and Bolles 1981); then the
+    rest is looked at. The draws are the same at each call.
+
+    Parameters
+    ----------
+    before, after : (N, 3) floating
+        Rounded to float32 once or a few times.
+
+    Returns
+    -------
+    list of Move
+        Each point is in one of them at most: none explains those that were moved one by one, and
+        those that are not finite.
+    """
+    before, after = np.asarray(before, np.float64), np.asarray(after, np.float64)
+    finite = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
+    same = finite & (before == after).all(axis=1)
+    moves = [Move(np.flatnonzero(same), np.eye(4))] if same.any() else []
+    left = np.flatnonzero(finite & ~same)
+    random = np.random.default_rng(0)
+    while len(left) >= LEAST and len(moves) <= _MOST:
+        matrix = _best(before[left], after[left], random)
+        if matrix is None:
+            break
+        fits = _fits(matrix, before[left], after[left])
+        moves.append(Move(left[fits], matrix))
+        left = left[~fits]
+    return moves
+
+
+def _best(
+    before: NDArray[np.float64], after: NDArray[np.float64], random: np.random.Generator
+) -> NDArray[np.float64] | None:
+    """Return the map that most points agree with, (4, 4); None where hardly any agree."""
+    whole = _refined(before, after, np.arange(len(before)))
+    if whole is not None and _fits(whole, before, after).all():
+        return whole
+    some = _spread(np.arange(len(before)), _SAMPLE)
+    best, most = None, LEAST - 1
+    for drawn in _draws(len(before), random):
+        matrix = _fitted(before[drawn], after[drawn])
+        if matrix is None or not _fits(matrix, before[drawn], after[drawn]).all():
+            continue
+        # Few points tell a map less exactly than all that agree with it.
+        agree = _fits(matrix, before[some], after[some], slack=100.0)
+        if np.count_nonzero(agree) >= LEAST:
+            better = _fitted(before[some][agree], after[some][agree])
+            matrix = matrix if better is None else better
+        agreeing = int(np.count_nonzero(_fits(matrix, before[some], after[some])))
+        if agreeing > most:
+            best, most = matrix, agreeing
+        if most > len(some) // 2:
+            break
+    if best is None:
+        return None
+    return _refined(before, after, np.flatnonzero(_fits(best, before, after)))
+
+
+def _draws(count: int, random: np.random.Generator) -> Iterator[NDArray[np.int64]]:
+    """Yield a few points at a time, from smaller and smaller runs of all."""
+    for number in range(_TRIES):
+        size = max(min(count, 2 * _DRAWN), int(count * _BLOCKS[number % len(_BLOCKS)]))
+        start = random.integers(0, count - size + 1)
+        yield start + random.choice(size, min(size, _DRAWN), replace=False)
+
+
+def _spread(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
+    """Return at most so many of some rows, evenly spread."""
+    return rows[np.unique(np.linspace(0, len(rows) - 1, most).astype(np.int64))]
+
+
+def _refined(
+    before: NDArray[np.float64], after: NDArray[np.float64], agree: NDArray[np.int64]
+) -> NDArray[np.float64] | None:
+    """Return the map of points that agree, (4, 4); a translation where that explains them."""
+    if len(agree) < LEAST:
+        return None
+    rows = _spread(agree, _FITTED)
+    before, after = before[rows], after[rows]
+    shift = np.eye(4)
+    shift[:3, 3] = (after - before).mean(axis=0)
+    if _fits(shift, before, after).all():
+        return shift
+    return _fitted(before, after)
+
+
+def _fits(
+    matrix: NDArray[np.float64],
+    before: NDArray[np.float64],
+    after: NDArray[np.float64],
+    *,
+    slack: float = 1.0,
+) -> NDArray[np.bool_]:
+    """Return which points a map takes to where they are but for rounding, (N,)."""
+    terms = np.abs(before) @ np.abs(matrix[:3, :3]).T + np.abs(matrix[:3, 3]) + np.abs(after)
+    allowed = slack * _NOISE * terms.max(axis=1)
+    off = np.abs(moved(before, matrix) - after).max(axis=1)
+    return np.asarray(off <= allowed)
+
+
+def _fitted(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the affine map of least squares between points, (4, 4).
+
+    Points in a plane say nothing of the direction across it. It is mapped across the plane that
+    they lie in now, by the mean scale within it, and not mirrored. None for points on a line.
+    """
+    # Relative to their size: far points are rounded more coarsely.
+    extents = np.abs(before).max(axis=1) + np.abs(after).max(axis=1)
+    weights = 1.0 / (extents + (np.median(extents) or 1.0))
+    middle, target = (np.average(points, axis=0, weights=weights) for points in (before, after))
+    source = (before - middle) * weights[:, None]
+    left, spread, axes = np.linalg.svd(source, full_matrices=False)
+    if len(spread) < 3 or not spread[1] > _FLAT * spread[0]:  # noqa: PLR2004 - of space
+        return None
+    flat = not spread[2] > _FLAT * spread[0]
+    inverse = np.array([1.0 / spread[0], 1.0 / spread[1], 0.0 if flat else 1.0 / spread[2]])
+    images = (inverse[:, None] * left.T) @ ((after - target) * weights[:, None])  # (3 axes, 3)
+    if flat:
+        images[2] = np.cross(images[0], images[1]) * np.linalg.det(axes)
+        length = np.linalg.norm(images[2])
+        images[2] /= np.sqrt(length) or 1.0
+    matrix = np.eye(4)
+    matrix[:3, :3] = (axes.T @ images).T
+    matrix[:3, 3] = target - matrix[:3, :3] @ middle
+    return matrix

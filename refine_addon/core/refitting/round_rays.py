@@ -1,0 +1,383 @@
+"""The rays of all rounds of refitting: what the unpruned splats look like on them, and survivors.
+
+Views are cast in processes of their own, as they are measured (`processes`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+import numpy as np
+
+from ..estimate.quality import PSNR_CAP
+from ..processes import for_each
+from ..seeing import projection
+from ..seeing.cast import cast, depth_complexity, pixels
+from ..seeing.ray_sample import MAX_RAYS_OF_VIEW, colors_from
+from ..views import ViewSet
+from ..work import Progress, part, silent
+from .linear import LinearView, Shapes, linear_view
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from ..seeing.projection import Footprints, Gaussians
+    from ..seeing.scene import Scene
+    from ..splats import Splats
+    from ..views import View
+
+Result = TypeVar("Result")
+
+RAYS_OF_SPLAT = 4.0
+"""Rays of a round for each survivor: with fewer, survivors learn them by heart."""
+
+MIN_RAYS = 1 << 16
+"""Rays of a round where that would be fewer."""
+
+MAX_HITS = 1 << 25
+"""About how many hits the rays of a round may have on the unpruned splats. Survivors have fewer,
+and those that hardly show are left out: some 80 bytes are taken for every third."""
+
+SECONDS, SECONDS_OF_RAY = 2.5e-7, 4e-6
+"""About how long one core takes to project a splat into a view, and to cast a ray, to tell what is
+worth a process."""
+
+_LEAST_ERROR = 10.0 ** (-PSNR_CAP / 10.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Where rays go through a view, in each round.
+
+    Attributes
+    ----------
+    view : View
+    number : int
+        Of the view, see `cast.pixels`.
+    weight : float
+        How much it counts for the PSNR.
+    rays, hits : float
+        About how many rays there are, and how many hits they may have on the unpruned splats.
+    left, top, width, height : int
+        The part of the image that they go through, pixels; by default all of it.
+    """
+
+    view: View
+    number: int
+    weight: float
+    rays: float
+    hits: float
+    left: int = 0
+    top: int = 0
+    width: int = 0
+    height: int = 0
+
+    @cached_property
+    def part(self) -> View:
+        """The part of the image as a view of its own."""
+        view = self.view
+        if not self.width:
+            return view
+        return replace(
+            view, cx=view.cx - self.left, cy=view.cy - self.top,
+            width=self.width, height=self.height,
+        )  # fmt: skip
+
+    def pixels(
+        self, footprints: Footprints, number: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the columns and rows that the rays of a round go through.
+
+        Rounds follow the validation rays of the view in the R2 sequence (`cast.pixels`), so that
+        the rays of one are not next to those of another.
+
+        Parameters
+        ----------
+        footprints : Footprints
+            Of the unpruned splats.
+        number : int
+            Of the round.
+        """
+        depth = max(depth_complexity(footprints, self.part), 1.0)
+        count = min(self.rays, self.hits / depth, MAX_RAYS_OF_VIEW)
+        columns, rows = pixels(self.part, self.number + 1 + number, count)
+        return columns + self.left, rows + self.top
+
+
+class Target(Protocol):
+    """Splats that rays are cast into. It is pickled, so that any process can."""
+
+    def footprints(self, window: Window) -> Footprints:
+        """Return the footprints in a view that may reach into a window of it.
+
+        Their index says which of the splats they are.
+        """
+        ...
+
+    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float64]:
+        """Return the colours in which a view sees some of the splats, (3, u)."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class InMemory:
+    """Splats in memory as a `Target`.
+
+    Attributes
+    ----------
+    splats : Splats
+    gaussians : Gaussians
+        Made of these.
+    scene : Scene
+    """
+
+    splats: Splats
+    gaussians: Gaussians
+    scene: Scene
+
+    def footprints(self, window: Window) -> Footprints:
+        """Return the footprints in a view that may reach into a window of it."""
+        reaching = projection.footprints_and_depths(
+            self.gaussians, self.scene, window.view, window.part
+        )
+        return projection.front_to_back([reaching])
+
+    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float64]:
+        """Return the colours in which a view sees some of the Gaussians, (3, u)."""
+        return colors_from(self.splats, self.gaussians.index[hit], view)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Rays of one view and round, and the colours that the unpruned splats have on them.
+
+    Attributes
+    ----------
+    columns, rows : (C,), (R,) int64
+        See `Rays`.
+    colors : (3, P) float32
+    """
+
+    columns: NDArray[np.int64]
+    rows: NDArray[np.int64]
+    colors: NDArray[np.float32]
+
+
+class RoundRays:
+    """The rays of all rounds, with the colours that the unpruned splats have on them.
+
+    Parameters
+    ----------
+    windows : sequence of Window
+        Of the views that rays are cast from; also an attribute.
+    scene : Scene
+        Of the unpruned splats; also an attribute.
+    truths : sequence of sequence of Truth
+        Of each window, the rays of each round; there is one round more than are refitted, to
+        measure the last.
+    threads : int, optional
+    """
+
+    around = 0
+    """How many splats there are besides the survivors that are refitted."""
+
+    def __init__(
+        self,
+        windows: Sequence[Window],
+        scene: Scene,
+        truths: Sequence[Sequence[Truth]],
+        threads: int | None,
+    ) -> None:
+        self.windows, self.scene, self._truths = windows, scene, truths
+        self._threads = threads
+
+    @classmethod
+    def of(
+        cls,
+        original: Splats,
+        views: ViewSet,
+        count: int,
+        rounds: int,
+        progress: Progress,
+        threads: int | None,
+    ) -> RoundRays:
+        """Return the rays of all views into splats in memory.
+
+        Parameters
+        ----------
+        original : Splats
+            The unpruned splats, in the frame of the views.
+        views : ViewSet
+        count : int
+            How many survivors there are.
+        rounds : int
+            How many rounds are refitted.
+        progress : callable
+        threads : int, optional
+        """
+        gaussians, scene, _ = projection.prepare(
+            original, views, progress=part(progress, 0.0, 0.2), threads=threads
+        )
+        chosen = views.by_distance()
+        rays = max(RAYS_OF_SPLAT * count, MIN_RAYS) / len(chosen)
+        windows = [
+            Window(view, number, weight, rays, MAX_HITS / len(chosen))
+            for number, (view, weight) in enumerate(chosen)
+        ]
+        target = InMemory(original, gaussians, scene)
+        truths = cast_truths(
+            CastTruth(target, windows, range(rounds + 1)), len(original),
+            part(progress, 0.2, 1.0), threads,
+        )  # fmt: skip
+        return cls(windows, scene, truths, threads)
+
+    def truths(self, number: int) -> list[Truth]:
+        """Return the rays of a round, of each view."""
+        return [of_rounds[number] for of_rounds in self._truths]
+
+    def linear(self, splats: Splats, number: int, progress: Progress) -> list[LinearView]:
+        """Return how the colours of each view's rays change with survivors as they are now.
+
+        Parameters
+        ----------
+        splats : Splats
+            The survivors.
+        number : int
+            Of the round.
+        progress : callable
+        """
+        gaussians = self._gaussians(splats, part(progress, 0.0, 0.1))
+        shapes = Shapes.of(splats, gaussians, self.scene)
+        work = _Linearize(self.target(splats, gaussians), self.windows, self.truths(number), shapes)
+        return self._each(work, len(splats), part(progress, 0.1, 1.0))
+
+    def colors(
+        self, splats: Splats, number: int, progress: Progress = silent
+    ) -> list[NDArray[np.float64]]:
+        """Return what the rays of each view see of survivors, (3, P); parameters as `linear`."""
+        gaussians = self._gaussians(splats, part(progress, 0.0, 0.1))
+        work = _CastColors(self.target(splats, gaussians), self.windows, self.truths(number))
+        return self._each(work, len(splats), part(progress, 0.1, 1.0))
+
+    def psnr(self, colors: Sequence[NDArray[np.float64]], number: int) -> float:
+        """Return the mean PSNR of what the rays of each view see, weighted as the views are, dB."""
+        errors = [
+            max(float(np.mean(np.square(truth.colors - seen))), _LEAST_ERROR)
+            for truth, seen in zip(self.truths(number), colors, strict=True)
+        ]
+        weights = [window.weight for window in self.windows]
+        return float(np.average(-10.0 * np.log10(errors), weights=weights))
+
+    def target(self, splats: Splats, gaussians: Gaussians) -> Target:
+        """Return what rays are cast into: survivors, given also as Gaussians, the first of all."""
+        return InMemory(splats, gaussians, self.scene)
+
+    def _gaussians(self, splats: Splats, progress: Progress) -> Gaussians:
+        views = ViewSet(tuple(window.view for window in self.windows))
+        prepared = projection.prepare(
+            splats, views, self.scene, progress=progress, threads=self._threads
+        )
+        return prepared[0]
+
+    def _each(self, work: Callable[[int], Result], count: int, progress: Progress) -> list[Result]:
+        """Return what is found in each view, of `count` survivors."""
+        rays = sum(truth.colors.shape[1] for truth in self.truths(0))
+        seconds = SECONDS * (count + self.around) * len(self.windows) + SECONDS_OF_RAY * rays
+        return [
+            *for_each(
+                work, len(self.windows), seconds,
+                progress=progress, what="refitting", threads=self._threads,
+            )
+        ]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class CastTruth:
+    """Casts the rays of all rounds of a view into the unpruned splats; any process can.
+
+    Attributes
+    ----------
+    target : Target
+        The unpruned splats.
+    windows : sequence of Window
+    rounds : sequence of int
+        Their numbers.
+    """
+
+    target: Target
+    windows: Sequence[Window]
+    rounds: Sequence[int]
+
+    def __call__(self, place: int) -> list[Truth]:
+        """Return the rays of a view, of each round."""
+        window = self.windows[place]
+        with np.errstate(under="ignore"):
+            footprints = self.target.footprints(window)
+            return [
+                self._truth(window.view, footprints, *window.pixels(footprints, number))
+                for number in self.rounds
+            ]
+
+    def _truth(
+        self,
+        view: View,
+        footprints: Footprints,
+        columns: NDArray[np.int64],
+        rows: NDArray[np.int64],
+    ) -> Truth:
+        rays = cast(footprints, columns, rows)
+        colors = rays.colors(self.target.colors(rays.hit, view))
+        return Truth(columns, rows, colors.astype(np.float32))
+
+
+def cast_truths(
+    work: CastTruth, count: int, progress: Progress, threads: int | None
+) -> list[list[Truth]]:
+    """Return the rays of each view and round into `count` unpruned splats."""
+    rays = sum(window.rays for window in work.windows) * len(work.rounds)
+    seconds = SECONDS * count * len(work.windows) + SECONDS_OF_RAY * rays
+    return [
+        *for_each(
+            work, len(work.windows), seconds,
+            progress=progress, what="casting rays", threads=threads,
+        )
+    ]  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _CastColors:
+    """Casts the rays of a round of a view into survivors; any process can."""
+
+    target: Target
+    windows: Sequence[Window]
+    truths: Sequence[Truth]
+
+    def __call__(self, number: int) -> NDArray[np.float64]:
+        """Return what the rays of a view see, (3, P)."""
+        window, truth = self.windows[number], self.truths[number]
+        with np.errstate(under="ignore"):
+            rays = cast(self.target.footprints(window), truth.columns, truth.rows)
+            return rays.colors(self.target.colors(rays.hit, window.view))
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearize:
+    """Casts the rays of a round of a view, and finds how their colours change; any process can."""
+
+    target: Target
+    windows: Sequence[Window]
+    truths: Sequence[Truth]
+    shapes: Shapes
+
+    def __call__(self, number: int) -> LinearView:
+        """Return how the colours of a view's rays change with the survivors."""
+        window, truth = self.windows[number], self.truths[number]
+        with np.errstate(under="ignore"):
+            footprints = self.target.footprints(window)
+            rays = cast(footprints, truth.columns, truth.rows)
+            colors = self.target.colors(rays.hit, window.view)
+            return linear_view(rays, footprints, colors, self.shapes, window.view)

@@ -1,0 +1,251 @@
+"""What others did to splats: Blender moves vertices, and knows nothing of what else makes a splat.
+
+*Apply*, *Join*, a mirror modifier and transforms in edit mode change positions, and leave scales,
+rotations and harmonics as they were. So each splat notes where it was when these were written; the
+note goes with its vertex wherever Blender takes it, and into the file.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..core.moves import Move, affine_moves
+from . import attributes as mesh_attributes
+from . import native
+from .layout import sh_degree, splat_count, unlisted
+
+if TYPE_CHECKING:
+    import bpy
+    from numpy.typing import NDArray
+
+HOME = "refine_home"
+"""Vector on points: where the splat was when its scales, rotation and harmonics were written."""
+
+SHAPE = "refine_shape"
+"""Integer on points, by its bits from the lowest: 3, the degree of the object's harmonics then; 13,
+a number for the object (a checksum of its positions); 16, a checksum of the splat's scales and
+rotation, by which it is seen that somebody changed these too. 0 where nothing was noted."""
+
+_DEGREE, _OBJECT, _ORIGIN, _CHECKSUM = 0x7, 0xFFF8, 0xFFFF, 16
+"""Bits of `SHAPE`: degree, object, both, and by how many the checksum is shifted."""
+
+_MIX = np.uint32(0x9E3779B1)
+"""An odd number near 2^32 over the golden ratio, as multiplicative hashing takes it."""
+
+_SHOWN = 1 << 15
+"""Splats that are looked at, evenly spread, for what the panel says."""
+
+
+@dataclass(frozen=True)
+class Drift:
+    """What was found that others did to splats.
+
+    Attributes
+    ----------
+    turned : int
+        Splats that were turned, scaled or mirrored without their scales, rotations and harmonics.
+    mirrored : bool
+        Whether some of them were mirrored.
+    sources : int
+        Objects that the splats came from; more than one after *Join*.
+    regrouped : int
+        Splats whose harmonics stand under the names of another degree.
+    unlisted : tuple of str
+        Properties of joined splats that an export would leave out.
+    strangers : int
+        Vertices of which nothing was noted, among others of which it was.
+    """
+
+    turned: int
+    mirrored: bool
+    sources: int
+    regrouped: int
+    unlisted: tuple[str, ...]
+    strangers: int
+
+    @property
+    def mendable(self) -> bool:
+        """Whether anything can be put right."""
+        return bool(self.turned or self.regrouped or self.unlisted)
+
+    def sentences(self) -> list[str]:
+        """Return what was done, each in a sentence."""
+        told = []
+        if self.turned:
+            how = "joined" if self.sources > 1 else "mirrored" if self.mirrored else "transformed"
+            told.append(
+                f"{self.turned:,} splats were {how} without their sizes, rotations and colours, "
+                "as Blender's own tools do"
+            )
+        if self.regrouped:
+            told.append(
+                f"{self.regrouped:,} splats were joined with others of another SH degree: their "
+                "colours are mixed up"
+            )
+        if self.unlisted:
+            names = ", ".join(self.unlisted)
+            told.append(f"Joined splats have properties that an export leaves out: {names}")
+        if self.strangers:
+            told.append(
+                f"{self.strangers:,} vertices that are no splats, or of an object never seen here, "
+                "were joined: undo that"
+            )
+        return told
+
+
+def stamp(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
+    """Note of all splats of a mesh that they are as they should be."""
+    position = mesh_attributes.read_attribute(mesh, "position")
+    mesh_attributes.write_attribute(mesh, HOME, "FLOAT_VECTOR", position)
+    number = (zlib.crc32(position.data) << 3 & _OBJECT) or 1 << 3
+    codes = _checksums(mesh) << _CHECKSUM | np.uint32(number | sh_degree(mesh))
+    mesh_attributes.write_attribute(mesh, SHAPE, "INT", codes.view(np.int32))
+
+
+def is_stamped(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> bool:
+    """Tell whether it was noted of a mesh where its splats were."""
+    kinds = {HOME: "FLOAT_VECTOR", SHAPE: "INT"}
+    attributes = ((mesh.attributes.get(name), kind) for name, kind in kinds.items())
+    return all(a and (a.data_type, a.domain) == (kind, "POINT") for a, kind in attributes)
+
+
+def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
+    """Return what others did to the splats of a mesh, None if nothing, or nothing was noted.
+
+    Quick where nothing was done: 10 ms at a million splats. Else counts are estimated by some.
+    """
+    if not is_stamped(mesh):
+        return None
+    notes = _Notes(mesh)
+    if notes.undisturbed():
+        return None
+    step = max(1, len(notes.codes) // _SHOWN)
+    moves = notes.moves(step)
+    drift = Drift(
+        turned=min(step * sum(len(move.rows) for move in moves), len(notes.codes)),
+        mirrored=any(move.mirrors for move in moves),
+        sources=len(notes.objects()),
+        regrouped=len(notes.regrouped()),
+        unlisted=tuple(unlisted(mesh)) if len(notes.objects()) > 1 else (),
+        strangers=int(np.count_nonzero(notes.codes == 0)),
+    )
+    return drift if drift.mendable or drift.strangers else None
+
+
+def turned(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[Move]:
+    """Return by what maps which splats were moved that did not follow, but in their positions."""
+    return _Notes(mesh).moves() if is_stamped(mesh) else []
+
+
+def regrouped(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[tuple[int, NDArray[np.int64]]]:
+    """Return which splats have their harmonics under the names of which other degree."""
+    if not is_stamped(mesh):
+        return []
+    notes = _Notes(mesh)
+    rows = notes.regrouped()
+    degrees = notes.codes[rows] & _DEGREE
+    return [(int(degree), rows[degrees == degree]) for degree in np.unique(degrees)]
+
+
+def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
+    """Note anew the splats whose scales and rotations were just written, as by absorbing."""
+    if not is_stamped(mesh):
+        return
+    notes = _Notes(mesh)
+    checksums = _checksums(mesh)
+    rows = notes.codes >> _CHECKSUM != checksums
+    notes.home[rows] = notes.position[rows]
+    codes = np.where(rows, checksums << _CHECKSUM | notes.codes & _ORIGIN, notes.codes)
+    mesh_attributes.write_attribute(mesh, HOME, "FLOAT_VECTOR", notes.home)
+    mesh_attributes.write_attribute(mesh, SHAPE, "INT", codes.view(np.int32))
+
+
+def carry(
+    source: bpy.types.Mesh | bpy.types.PointCloud, target: bpy.types.Mesh | bpy.types.PointCloud
+) -> None:
+    """Give a mesh that holds the same splats in another form the notes of the first."""
+    if is_stamped(source):
+        codes = mesh_attributes.read_attribute(source, SHAPE).view(np.uint32)
+        # A checksum that was right is right again, and one that was not is not.
+        changed = (_checksums(source) ^ _checksums(target)) << np.uint32(_CHECKSUM)
+        mesh_attributes.write_attribute(target, SHAPE, "INT", (codes ^ changed).view(np.int32))
+
+
+class _Notes:
+    """What was noted of a mesh, beside what is."""
+
+    def __init__(self, mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
+        self.mesh = mesh
+        self.home: NDArray[np.float32] = mesh_attributes.read_attribute(mesh, HOME)
+        self.position: NDArray[np.float32] = mesh_attributes.read_attribute(mesh, "position")
+        self.codes = mesh_attributes.read_attribute(mesh, SHAPE).view(np.uint32)
+
+    def undisturbed(self) -> bool:
+        """Tell whether all splats are where they were, of one object of that degree."""
+        origins = self.codes & _ORIGIN
+        return bool(
+            np.array_equal(self.home.view(np.uint32), self.position.view(np.uint32))
+            and (origins == origins[0]).all()
+            and (native.is_native(self.mesh) or origins[0] & _DEGREE == sh_degree(self.mesh))
+        )
+
+    def objects(self) -> list[int]:
+        """Return the numbers of the objects that the splats came from."""
+        return [int(number) for number in np.unique(self.codes & _OBJECT) if number]
+
+    def moves(self, step: int = 1) -> list[Move]:
+        """Return the maps that splats did not follow; one splat of `step` is looked at."""
+        rows = np.arange(0, len(self.codes), step)
+        codes = self.codes[rows]
+        rows = rows[(codes >> _CHECKSUM == _checksums(self.mesh, step)) & (codes != 0)]
+        moves = []
+        for number in self.objects():
+            own = rows[self.codes[rows] & _OBJECT == number]
+            moves += _followed(own, affine_moves(self.home[own], self.position[own]))
+        return [move for move in moves if not move.shifts]
+
+    def regrouped(self) -> NDArray[np.int64]:
+        """Return the splats whose harmonics stand under the names of another degree."""
+        if native.is_native(self.mesh):  # names of harmonics do not depend on the degree
+            return np.empty(0, np.int64)
+        degrees = self.codes & _DEGREE
+        other = (self.codes != 0) & (degrees != sh_degree(self.mesh)) & (degrees != 0)
+        return np.flatnonzero(other)
+
+
+def _followed(rows: NDArray[np.int64], moves: list[Move]) -> list[Move]:
+    """Return maps of some rows as maps of the mesh's rows.
+
+    What was moved by itself besides went with most others.
+    """
+    if not moves:
+        return []
+    loose = np.ones(len(rows), np.bool_)
+    for move in moves:
+        loose[move.rows] = False
+    most = max(moves, key=lambda move: len(move.rows))
+    return [
+        Move(rows[np.concatenate([move.rows, np.flatnonzero(loose)])], move.matrix)
+        if move is most
+        else Move(rows[move.rows], move.matrix)
+        for move in moves
+    ]
+
+
+def _checksums(mesh: bpy.types.Mesh | bpy.types.PointCloud, step: int = 1) -> NDArray[np.uint32]:
+    """Return a checksum of 16 bits of the scales and the rotation of one splat of `step`."""
+    names = [*(f"scale_{axis}" for axis in range(3)), *(f"rot_{index}" for index in range(4))]
+    if native.is_native(mesh):
+        names = [native.SCALE, native.ROTATION]
+    total = np.zeros(len(range(0, splat_count(mesh), step)), np.uint32)
+    for name in names:
+        values: NDArray[Any] = mesh_attributes.read_attribute(mesh, name)
+        for plane in values[::step].reshape(len(total), -1).T:
+            total ^= np.ascontiguousarray(plane).view(np.uint32)
+            total *= _MIX
+            total ^= total >> np.uint32(15)
+    return total >> np.uint32(_CHECKSUM)

@@ -1,0 +1,37 @@
+"""Splats of a mesh in edit mode, where Blender lets nobody read attributes."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import bpy
+
+from .layout import SplatObject, check
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+
+@contextmanager
+def readable(obj: bpy.types.Object) -> Iterator[SplatObject]:
+    """Give an object whose splats can be read: in edit mode a copy as it is by now.
+
+    The copy stands in no scene, and not where the object does.
+
+    Raises
+    ------
+    RefineError
+        See `check`.
+    """
+    if obj.mode != "EDIT" or obj.type != "MESH":
+        yield check(obj)
+        return
+    obj.update_from_editmode()
+    mesh = obj.data.copy()
+    copy = bpy.data.objects.new(obj.name, mesh)
+    try:
+        yield check(copy)
+    finally:
+        bpy.data.objects.remove(copy)
+        bpy.data.meshes.remove(mesh)

@@ -1,0 +1,116 @@
+"""Which splats are selected and hidden: Blender's own vertex selection, kept by undo and files.
+
+A mesh has the attributes of edit mode, ``.select_vert`` and ``.hide_vert``; while it is in that
+mode, its vertices there have both. A point cloud has ``.selection``, and the same for what is
+hidden, of which Blender itself knows nothing.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import bmesh
+import numpy as np
+
+from . import attributes as mesh_attributes
+from .edit import check_writable
+from .layout import splat_count
+
+if TYPE_CHECKING:
+    import bpy
+    from numpy.typing import NDArray
+
+HIDDEN = ".hide_vert"
+
+
+def name_of(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> str:
+    """Return the attribute that holds what is selected."""
+    return ".selection" if hasattr(mesh, "points") else ".select_vert"
+
+
+def selected(obj: bpy.types.Object) -> NDArray[np.bool_]:
+    """Return which splats of an object are selected, (N,)."""
+    if _in_edit_mode(obj):
+        vertices = bmesh.from_edit_mesh(obj.data).verts
+        return np.fromiter((v.select for v in vertices), np.bool_, len(vertices))
+    return _chosen(obj)
+
+
+def hidden(obj: bpy.types.Object) -> NDArray[np.bool_]:
+    """Return which splats of an object are hidden, (N,)."""
+    if _in_edit_mode(obj):
+        vertices = bmesh.from_edit_mesh(obj.data).verts
+        return np.fromiter((v.hide for v in vertices), np.bool_, len(vertices))
+    return _flags(obj.data, HIDDEN)
+
+
+def select(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
+    """Select splats, (N,) bool, and no others; hidden ones stay unselected.
+
+    Raises
+    ------
+    RefineError
+        If the object belongs to a library.
+    """
+    _store(obj, wanted & ~hidden(obj), hidden(obj))
+
+
+def hide(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
+    """Hide splats, (N,) bool, and no others; what is hidden is selected no more.
+
+    Raises
+    ------
+    RefineError
+        If the object belongs to a library.
+    """
+    _store(obj, selected(obj) & ~wanted, wanted)
+
+
+def count(obj: bpy.types.Object) -> int:
+    """Return how many splats are selected; quick enough to draw."""
+    if _in_edit_mode(obj):
+        return int(obj.data.total_vert_sel)
+    return int(np.count_nonzero(_chosen(obj)))
+
+
+def _store(
+    obj: bpy.types.Object, wanted: NDArray[np.bool_], out_of_sight: NDArray[np.bool_]
+) -> None:
+    check_writable(obj)
+    mesh = obj.data
+    if _in_edit_mode(obj):
+        vertices = bmesh.from_edit_mesh(mesh).verts
+        pairs = zip(wanted.tolist(), out_of_sight.tolist(), strict=True)
+        for vertex, (chosen, away) in zip(vertices, pairs, strict=True):
+            if vertex.hide != away:
+                vertex.hide_set(away)
+            if vertex.select != chosen:
+                vertex.select = chosen
+        bmesh.update_edit_mesh(mesh, loop_triangles=False, destructive=False)
+        return
+    for name, flags in ((name_of(mesh), wanted), (HIDDEN, out_of_sight)):
+        if flags.any():
+            mesh_attributes.write_attribute(mesh, name, "BOOLEAN", flags)
+        else:
+            mesh_attributes.remove_attribute(mesh, name)
+    mesh_attributes.updated(mesh)
+
+
+def _in_edit_mode(obj: bpy.types.Object) -> bool:
+    return obj.type == "MESH" and obj.mode == "EDIT"
+
+
+def _chosen(obj: bpy.types.Object) -> NDArray[np.bool_]:
+    name = name_of(obj.data)
+    if obj.mode == "EDIT" and name not in obj.data.attributes:
+        return np.ones(splat_count(obj.data), np.bool_)  # Blender's way to say all
+    return _flags(obj.data, name)
+
+
+def _flags(mesh: bpy.types.Mesh | bpy.types.PointCloud, name: str) -> NDArray[np.bool_]:
+    attribute = mesh.attributes.get(name)
+    if not attribute or attribute.domain != "POINT" or len(attribute.data) != splat_count(mesh):
+        return np.zeros(splat_count(mesh), np.bool_)
+    if attribute.data_type not in {"BOOLEAN", "FLOAT"}:
+        return np.zeros(splat_count(mesh), np.bool_)
+    return np.asarray(mesh_attributes.read_attribute(mesh, name) > 0)

@@ -1,0 +1,273 @@
+"""Operators on the selection of splats: what changes it at once, and what is done with it."""
+
+# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, EnumProperty, FloatProperty
+
+from ..core import picking
+from ..core.errors import RefineError
+from ..core.picking import Axis
+from ..core.splats import opacity
+from ..mesh import attributes as mesh_attributes
+from ..mesh import edit as mesh_edit
+from ..mesh import floaters, selection
+from ..mesh import layout as mesh_layout
+from ..mesh import scores as mesh_scores
+from ..objects import splat_object
+from ..objects.demands import Demands
+from . import plans
+from .on_thread import OnThread
+from .operator_bases import Answer, AtOnce, OnSplats
+from .select_tools import MODES
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..core.work import Progress
+    from ..mesh.layout import SplatObject
+
+ACTIONS = (
+    ("ALL", "All", "Select all splats that are not hidden"),
+    ("NONE", "None", "Select no splat"),
+    ("INVERT", "Invert", "Select what is not selected"),
+    ("HIDE", "Hide", "Hide the selected splats in the 3D views"),
+    ("ISOLATE", "Isolate", "Hide the splats that are not selected"),
+    ("REVEAL", "Reveal", "Show the hidden splats again, selected"),
+)
+
+SETS = (
+    ("FLOATERS", "Floaters", "Those that Find Floaters found, for the reasons that are on"),
+    ("OUTSIDE", "Must Go", "Those that must go: outside or inside of volumes, or marked"),
+    ("STAYING", "Must Stay", "Those that must stay: inside of volumes, or marked"),
+    ("GOING", "What Goes", "Those that Apply would remove"),
+    ("RANGE", "Range", "Those in the range of the histogram"),
+)
+
+QUANTITIES = (
+    ("SCORE", "Score", "What the cameras would miss of it"),
+    ("OPACITY", "Opacity", "From 0 to 1"),
+    ("SIZE", "Size", "Its longest standard deviation, in units of the object"),
+)
+
+
+class Quantity(NamedTuple):
+    """What a histogram shows: a value of each splat, (N,), and the axis."""
+
+    values: NDArray[Any]
+    axis: Axis
+
+
+class REFINE_OT_select(AtOnce, OnSplats, bpy.types.Operator):
+    """Select or hide splats"""
+
+    bl_idname = "refine.select"
+    bl_label = "Select"
+    bl_options = {"REGISTER", "UNDO"}
+
+    action: EnumProperty(name="Action", description="What is done", items=ACTIONS)
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.AnyType) -> str:
+        """Return the tooltip of a button."""
+        return next(text for name, _, text in ACTIONS if name == properties.action)
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Do it."""
+        obj = context.object
+        mesh_edit.check_writable(obj)
+        chosen, hidden = selection.selected(obj), selection.hidden(obj)
+        if self.action == "HIDE":
+            selection.hide(obj, hidden | _some(obj, chosen))
+        elif self.action == "ISOLATE":
+            selection.hide(obj, ~_some(obj, chosen))
+        elif self.action == "REVEAL":
+            selection.hide(obj, np.zeros_like(hidden))
+            selection.select(obj, chosen | hidden)
+        else:
+            wanted = {"ALL": ~hidden, "NONE": np.zeros_like(chosen), "INVERT": ~chosen}
+            selection.select(obj, wanted[self.action])
+        return {"FINISHED"}
+
+
+class REFINE_OT_select_by(AtOnce, OnSplats, bpy.types.Operator):
+    """Select splats by what is known of them"""
+
+    bl_idname = "refine.select_by"
+    bl_label = "Select By"
+    bl_options = {"REGISTER", "UNDO"}
+
+    what: EnumProperty(name="What", description="Which splats are taken", items=SETS)
+    mode: EnumProperty(name="Mode", description="What becomes of those taken", items=MODES)
+    quantity: EnumProperty(name="By", description="What the range is of", items=QUANTITIES)
+    low: FloatProperty(name="From", description="Place on the axis", min=0.0, max=1.0)
+    high: FloatProperty(name="To", description="Place on the axis", min=0.0, max=1.0, default=1.0)
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.AnyType) -> str:
+        """Return the tooltip of a button."""
+        return next(text for name, _, text in SETS if name == properties.what)
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Select them."""
+        checked = mesh_layout.check(context.object)
+        taken = self._taken(context, checked) & ~selection.hidden(checked.obj)
+        before = selection.selected(checked.obj)
+        selection.select(checked.obj, picking.combined(before, taken, self.mode))
+        self.report({"INFO"}, f"{selection.count(checked.obj):,} splats are selected")
+        return {"FINISHED"}
+
+    def _taken(self, context: bpy.types.Context, checked: SplatObject) -> NDArray[np.bool_]:
+        """Return which splats are taken, (N,)."""
+        if self.what == "RANGE":
+            values, axis = quantity(checked, self.quantity)
+            return in_range(axis.places(values), self.low, self.high)
+        if self.what == "FLOATERS":
+            return floaters.mask(checked, context.scene.refine.reasons)
+        if self.what == "GOING":
+            if mesh_edit.REMOVE not in checked.mesh.attributes:
+                msg = f"object '{checked.obj.name}': nothing goes yet; score the splats first"
+                raise RefineError(msg)
+            return mesh_attributes.read_attribute(checked.mesh, mesh_edit.REMOVE) > 0
+        forced = Demands.of_scene(context.scene).forced(checked)
+        mask = forced.out if self.what == "OUTSIDE" else forced.protected
+        return np.zeros(len(checked), np.bool_) if mask is None else mask
+
+
+def quantity(checked: SplatObject, name: str) -> Quantity:
+    """Return one of `QUANTITIES` of an object.
+
+    Raises
+    ------
+    RefineError
+        If it is the score and there is none.
+    """
+    columns = mesh_attributes.stored_columns(checked)
+    if name == "OPACITY":
+        return Quantity(opacity(columns["opacity"]), Axis(0.0, 1.0))
+    if name == "SIZE":
+        logs = np.max([columns[f"scale_{axis}"] for axis in range(3)], axis=0)
+        sizes = np.exp(np.clip(logs.astype(np.float64), -80.0, 80.0))
+        return Quantity(sizes, Axis.of(sizes, logarithmic=True))
+    record = mesh_scores.record(checked.mesh)
+    if record is None:
+        msg = f"object '{checked.obj.name}': has no scores; score the splats first"
+        raise RefineError(msg)
+    values = mesh_attributes.read_attribute(checked.mesh, mesh_scores.SCORE)
+    by_place = record["settings"]["method"] != "closed-form"  # scores are then places in an order
+    return Quantity(values, Axis.of(values, logarithmic=not by_place))
+
+
+def in_range(places: NDArray[np.float64], low: float, high: float) -> NDArray[np.bool_]:
+    """Return which places on an axis, (N,), lie between two, whichever is the lower one."""
+    ends = sorted((low, high))
+    rounded = places.astype(np.float32)  # as Blender keeps the ends
+    return np.asarray((rounded >= ends[0]) & (rounded <= ends[1]))
+
+
+class REFINE_OT_grow_selection(OnThread, OnSplats, bpy.types.Operator):
+    """Select the neighbours of the selected splats too, or leave out those at the edge (Esc cancels)"""  # noqa: E501 - a tooltip is one line
+
+    bl_idname = "refine.grow_selection"
+    bl_label = "Grow Selection"
+    bl_options = {"REGISTER", "UNDO"}
+    doing = "Looking for neighbours"
+
+    shrink: BoolProperty(name="Shrink", description="Leave out those at the edge")
+
+    def prepare(
+        self, _context: bpy.types.Context, checked: SplatObject
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_], bool]:
+        """Read places and what is selected."""
+        mesh_edit.check_writable(checked.obj)
+        chosen = _some(checked.obj, selection.selected(checked.obj))
+        return mesh_attributes.read_attribute(checked.mesh, "position"), chosen, self.shrink
+
+    @staticmethod
+    def work(
+        job: tuple[NDArray[np.float32], NDArray[np.bool_], bool], progress: Progress
+    ) -> NDArray[np.bool_]:
+        """Find the neighbours."""
+        means, chosen, shrink = job
+        neighbours = picking.neighbours_of(means, progress=progress)
+        return (picking.shrunk if shrink else picking.grown)(neighbours, chosen)
+
+    def finish(
+        self,
+        _context: bpy.types.Context,
+        checked: SplatObject,
+        _job: object,
+        wanted: NDArray[np.bool_],
+    ) -> Answer:
+        """Select them."""
+        selection.select(checked.obj, wanted)
+        return {"FINISHED"}
+
+
+class REFINE_OT_delete_selected(AtOnce, OnSplats, bpy.types.Operator):
+    """Delete the selected splats, but for those that must stay"""
+
+    bl_idname = "refine.delete_selected"
+    bl_label = "Delete Selected"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Delete them."""
+        checked = mesh_layout.check(context.object)
+        going = _some(checked.obj, selection.selected(checked.obj))
+        protected = Demands.of_scene(context.scene).forced(checked).protected
+        going &= True if protected is None else ~protected
+        outcome = splat_object.delete_splats(checked, ~going)
+        _forget(context, checked)
+        self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, {outcome.kept:,} stay")
+        return {"FINISHED"}
+
+
+class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
+    """Make an object of its own of the selected splats"""
+
+    bl_idname = "refine.separate_selected"
+    bl_label = "Separate Selected"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Copy the object, and delete from each what the other holds."""
+        checked = mesh_layout.check(context.object)
+        chosen = _some(checked.obj, selection.selected(checked.obj))
+        mesh_edit.check_deletable(checked.obj)
+        if chosen.all():
+            msg = f"object '{checked.obj.name}': all splats are selected; none would be left"
+            raise RefineError(msg)
+        apart = checked.obj.copy()
+        apart.data = checked.mesh.copy()
+        for collection in checked.obj.users_collection:
+            collection.objects.link(apart)
+        try:
+            splat_object.delete_splats(mesh_layout.check(apart), chosen)
+            splat_object.delete_splats(checked, ~chosen)
+        except BaseException:
+            bpy.data.batch_remove([apart.data, apart])
+            raise
+        selection.select(apart, np.zeros(mesh_layout.splat_count(apart.data), np.bool_))
+        apart.select_set(True)
+        _forget(context, checked)
+        self.report({"INFO"}, f"'{apart.name}' has {mesh_layout.splat_count(apart.data):,} splats")
+        return {"FINISHED"}
+
+
+def _some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return a selection, (N,), or raise `RefineError` if it has no splat."""
+    if not chosen.any():
+        msg = f"object '{obj.name}': no splat is selected"
+        raise RefineError(msg)
+    return chosen
+
+
+def _forget(context: bpy.types.Context, checked: SplatObject) -> None:
+    """Drop the plan of an object that has other splats now."""
+    plans.forget(checked.mesh)
+    plans.refresh(context)

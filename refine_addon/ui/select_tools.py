@@ -1,0 +1,289 @@
+"""Tools of the toolbar that select the splats one sees: brush, lasso, box, sphere, colour."""
+
+# ruff: noqa: D400, N801, RUF012, TC002, TC003 - Blender's names and tooltips; annotations are run
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import gpu
+import numpy as np
+from bpy.props import EnumProperty
+from gpu_extras.batch import batch_for_shader
+
+from . import selecting
+from .operator_bases import FAILURES, Answer, Needing, fail, idle, on_splats
+from .selecting import How, Stroke
+
+if TYPE_CHECKING:
+    from ..core.picking import Mode
+
+SHAPES = (
+    ("BRUSH", "Brush", "Take the splats that a round brush covers"),
+    ("LASSO", "Lasso", "Take the splats inside a line around them"),
+    ("BOX", "Box", "Take the splats inside a rectangle"),
+    ("SPHERE", "Sphere", "Take the splats around the place where the mouse was pressed"),
+    ("COLOR", "Colour", "Take the splats of the colour under the mouse"),
+)
+
+MODES = (
+    ("SET", "Set", "Select these splats and no others", "SELECT_SET", 0),
+    ("ADD", "Add", "Select these splats as well (Shift)", "SELECT_EXTEND", 1),
+    ("SUBTRACT", "Subtract", "Select these splats no more (Ctrl)", "SELECT_SUBTRACT", 2),
+    (
+        "INTERSECT",
+        "Intersect",
+        "Of the selected splats leave these alone (Shift Ctrl)",
+        "SELECT_INTERSECT",
+        3,
+    ),
+)
+
+_KEYS: dict[Mode, dict[str, bool]] = {
+    "SET": {},
+    "ADD": {"shift": True},
+    "SUBTRACT": {"ctrl": True},
+    "INTERSECT": {"shift": True, "ctrl": True},
+}
+
+_STEP = 0.03
+"""Seconds between two looks at whether the thread knows what the view shows."""
+
+_LESS, _MORE = 1 / 1.2, 1.2
+"""Factors of the brush's radius at a key."""
+
+
+def _in_view(context: bpy.types.Context) -> str:
+    """Return that a 3D view is needed, "" in one."""
+    return "" if context.region_data else "Select over a 3D view"
+
+
+class REFINE_OT_select_stroke(Needing, bpy.types.Operator):
+    """Select splats by what the view shows; those that others hide only if the tool is told so"""
+
+    bl_idname = "refine.select_stroke"
+    bl_label = "Select Splats"
+    bl_options = {"UNDO"}
+    needs = (idle, on_splats, _in_view)
+
+    shape: EnumProperty(name="Shape", description="What takes splats", items=SHAPES)
+    mode: EnumProperty(name="Mode", description="What becomes of those taken", items=MODES)
+
+    _stroke: Stroke | None = None
+    _stop: Callable[[], None] | None = None
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+        """Begin a stroke."""
+        settings = context.scene.refine
+        how = How(
+            self.shape, self.mode, settings.select_hidden,
+            settings.select_radius, settings.select_tolerance,
+        )  # fmt: skip
+        try:
+            self._stroke = Stroke.begin(context, how, _place(context, event))
+        except FAILURES as error:
+            return fail(self, error)
+        self._stop = _watched(context, self._stroke)
+        context.window_manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+        """Follow the mouse until the button is released and it is known what the view shows."""
+        stroke = self._stroke
+        if stroke is None or event.type in {"ESC", "RIGHTMOUSE"}:
+            return self._over(context, kept=False)
+        if event.type == "MOUSEMOVE" and not stroke.released:
+            stroke.path.append(_place(context, event))
+        elif event.type == "LEFTMOUSE" and event.value == "RELEASE":
+            stroke.released = True
+        elif event.type != "TIMER" or (stroke.known and not stroke.released):
+            return {"RUNNING_MODAL"}
+        try:
+            known = stroke.follow()
+            context.area.tag_redraw()
+            if known:
+                context.area.header_text_set(stroke.sentence())
+            if known and stroke.released:
+                return self._over(context, kept=True)
+        except FAILURES as error:
+            self._over(context, kept=False)
+            return fail(self, error)
+        return {"RUNNING_MODAL"}
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """End where Blender ends the operator: its window is closed, or its file."""
+        self._over(context, kept=False)
+
+    def _over(self, context: bpy.types.Context, *, kept: bool) -> Answer:
+        stroke, self._stroke = self._stroke, None
+        stop, self._stop = self._stop, None
+        if stop is not None:
+            stop()
+        if context.area is not None:
+            context.area.header_text_set(None)
+            context.area.tag_redraw()
+        if stroke is not None and kept:
+            selecting.keep(stroke)
+            return {"FINISHED"}
+        if stroke is not None:
+            selecting.stop(stroke)
+        return {"CANCELLED"}
+
+
+def _place(context: bpy.types.Context, event: bpy.types.Event) -> tuple[float, float]:
+    """Return where the mouse is, from the upper left of the region, pixels."""
+    below = context.region.height - 1 - event.mouse_region_y
+    return event.mouse_region_x + 0.5, below + 0.5
+
+
+def _watched(context: bpy.types.Context, stroke: Stroke) -> Callable[[], None]:
+    """Draw a stroke's outline and have timer events come; return what ends both."""
+    space, manager, region = bpy.types.SpaceView3D, context.window_manager, context.region
+    timer = manager.event_timer_add(_STEP, window=context.window)
+    handle = space.draw_handler_add(_draw, (stroke, region.as_pointer()), "WINDOW", "POST_PIXEL")
+
+    def stop() -> None:
+        manager.event_timer_remove(timer)
+        space.draw_handler_remove(handle, "WINDOW")
+
+    return stop
+
+
+def _draw(stroke: Stroke, region: int) -> None:
+    """Draw a stroke's outline into its view: black beside white, to be seen on both."""
+    if bpy.context.region.as_pointer() != region:
+        return
+    height = bpy.context.region.height
+    for shift, shade in ((1.0, 0.0), (0.0, 1.0)):
+        line = [(x + shift, height - y - shift) for x, y in stroke.outline()]
+        _line(line, shade)
+
+
+def _line(places: list[tuple[float, float]], shade: float) -> None:
+    if not places:
+        return
+    program = gpu.shader.from_builtin("UNIFORM_COLOR")
+    program.uniform_float("color", (shade, shade, shade, 1.0))
+    batch_for_shader(program, "LINE_STRIP", {"pos": places}).draw(program)
+
+
+class REFINE_OT_brush_radius(bpy.types.Operator):
+    """Make the brush that selects splats smaller or larger"""
+
+    bl_idname = "refine.brush_radius"
+    bl_label = "Brush Radius"
+    bl_options = {"INTERNAL"}
+
+    larger: bpy.props.BoolProperty(name="Larger", description="Rather than smaller")
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Change it."""
+        context.scene.refine.select_radius *= _MORE if self.larger else _LESS
+        if context.area is not None:
+            context.area.tag_redraw()
+        return {"FINISHED"}
+
+
+def _strokes(shape: str) -> tuple[Any, ...]:
+    """Return the mouse of a tool: with Shift it adds, with Ctrl it subtracts."""
+    return tuple(
+        (
+            "refine.select_stroke",
+            {"type": "LEFTMOUSE", "value": "PRESS", **keys},
+            {"properties": [("shape", shape), ("mode", mode)]},
+        )
+        for mode, keys in _KEYS.items()
+    )
+
+
+def _key(name: str, kind: str, *values: tuple[str, Any], **held: bool) -> tuple[Any, ...]:
+    return (name, {"type": kind, "value": "PRESS", **held}, {"properties": [*values]})
+
+
+_BRUSH_KEYS = (
+    _key("refine.brush_radius", "LEFT_BRACKET", ("larger", False)),
+    _key("refine.brush_radius", "RIGHT_BRACKET", ("larger", True)),
+)
+
+_OBJECT_KEYS = (
+    _key("refine.select", "A", ("action", "ALL")),
+    _key("refine.select", "A", ("action", "NONE"), alt=True),
+    _key("refine.select", "I", ("action", "INVERT"), ctrl=True),
+    _key("refine.select", "H", ("action", "HIDE")),
+    _key("refine.select", "H", ("action", "ISOLATE"), shift=True),
+    _key("refine.select", "H", ("action", "REVEAL"), alt=True),
+    _key("refine.grow_selection", "NUMPAD_PLUS", ("shrink", False), ctrl=True),
+    _key("refine.grow_selection", "NUMPAD_MINUS", ("shrink", True), ctrl=True),
+    _key("refine.delete_selected", "DEL"),
+)
+"""Keys beside those of the mouse in object mode. Edit mode has its own for these."""
+
+_ICONS = {
+    "BRUSH": "ops.generic.select_circle",
+    "LASSO": "ops.generic.select_lasso",
+    "BOX": "ops.generic.select_box",
+    "SPHERE": "ops.mesh.primitive_sphere_add_gizmo",
+    "COLOR": "ops.sculpt.mask_by_color",
+}
+
+
+def _draw_settings(
+    context: bpy.types.Context, layout: bpy.types.UILayout, tool: bpy.types.WorkSpaceTool
+) -> None:
+    settings = context.scene.refine
+    if tool.idname.endswith("brush"):
+        layout.prop(settings, "select_radius")
+    if tool.idname.endswith("color"):
+        layout.prop(settings, "select_tolerance")
+    layout.prop(settings, "select_hidden")
+
+
+def _draw_brush(
+    context: bpy.types.Context, _tool: bpy.types.WorkSpaceTool, place: tuple[int, int]
+) -> None:
+    turns = np.linspace(0.0, 2.0 * np.pi, 49)
+    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1) * context.scene.refine.select_radius
+    for shift, shade in ((1.0, 0.0), (0.0, 1.0)):
+        _line((circle + place + (shift, -shift)).tolist(), shade)
+
+
+def _tool(shape: str, mode: str) -> type[bpy.types.WorkSpaceTool]:
+    """Return the tool of a shape in a mode of Blender."""
+    label, text = next((label, text) for name, label, text in SHAPES if name == shape)
+    keys = _strokes(shape)
+    keys += _BRUSH_KEYS if shape == "BRUSH" else ()
+    keys += _OBJECT_KEYS if mode == "OBJECT" else ()
+    body: dict[str, Any] = {
+        "bl_space_type": "VIEW_3D",
+        "bl_context_mode": mode,
+        "bl_idname": f"refine.select_{shape.lower()}",
+        "bl_label": f"Select Splats: {label}",
+        "bl_description": f"{text}.\nShift adds, Ctrl subtracts, both intersect",
+        "bl_icon": _ICONS[shape],
+        "bl_cursor": "EYEDROPPER" if shape == "COLOR" else "CROSSHAIR",
+        "bl_keymap": keys,
+        "draw_settings": staticmethod(_draw_settings),
+    }
+    if shape == "BRUSH":
+        body["draw_cursor"] = staticmethod(_draw_brush)
+    return type(f"REFINE_TOOL_{shape.lower()}_{mode.lower()}", (bpy.types.WorkSpaceTool,), body)
+
+
+_tools: list[type[bpy.types.WorkSpaceTool]] = []
+
+
+def register() -> None:
+    """Add the tools to the toolbar of object mode, and of edit mode of meshes."""
+    for mode in ("OBJECT", "EDIT_MESH"):
+        for number, (shape, *_) in enumerate(SHAPES):
+            tool = _tool(shape, mode)
+            bpy.utils.register_tool(tool, separator=number == 0)
+            _tools.append(tool)
+
+
+def unregister() -> None:
+    """Take the tools away."""
+    while _tools:
+        bpy.utils.unregister_tool(_tools.pop())
+    selecting.forget()

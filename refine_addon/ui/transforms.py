@@ -1,0 +1,204 @@
+"""Operators that move splats as a whole, and what is noticed of what others did to them."""
+
+# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import bpy
+from bpy.app.handlers import persistent
+from bpy.props import BoolProperty
+
+from ..core.errors import RefineError
+from ..mesh import drift as mesh_drift
+from ..mesh import layout as mesh_layout
+from ..objects import splat_group, transforms
+from . import plans, wrapped
+from .operator_bases import Answer, AtOnce, OnSplats, in_object_mode
+from .wrapped import counted
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from ..mesh.drift import Drift
+
+_SOON = 0.1
+"""Seconds until new splats are noted: Blender's operator that made them is over by then."""
+
+_known: dict[int, Drift | None] = {}
+"""What was found of each object's data, by its number in this session, until it changes."""
+
+
+class REFINE_OT_bake_transform(AtOnce, OnSplats, bpy.types.Operator):
+    """Move the splats themselves as their object is moved: sizes, rotations and colours follow"""
+
+    bl_idname = "refine.bake_transform"
+    bl_label = "Bake Transform"
+    bl_options = {"REGISTER", "UNDO"}
+    needs = (*OnSplats.needs, in_object_mode)
+
+    location: BoolProperty(
+        name="Location",
+        description="Also put the object's origin where that of the world is, or of its parent",
+        default=True,
+    )
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Bake the transforms of the selected objects."""
+        group = splat_group.members(context.view_layer, mesh_layout.check(context.object))
+        for note in transforms.bake(group, location=self.location):
+            self.report({"WARNING"}, note)
+        plans.refresh(context)
+        self.report({"INFO"}, f"Baked the transform of {counted(len(group), 'object')}")
+        return {"FINISHED"}
+
+
+def _several(context: bpy.types.Context) -> str:
+    """Return that several objects are needed, "" if they are selected."""
+    chosen = splat_group.chosen(context.view_layer, context.object)
+    return "" if len(chosen) > 1 else "Select several objects that hold splats"
+
+
+class REFINE_OT_join(AtOnce, OnSplats, bpy.types.Operator):
+    """Put the splats of the selected objects into the active one; they keep what they look like"""
+
+    bl_idname = "refine.join"
+    bl_label = "Join Splats"
+    bl_options = {"REGISTER", "UNDO"}
+    needs = (*OnSplats.needs, in_object_mode, _several)
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Join them."""
+        active = mesh_layout.check(context.object)
+        chosen = splat_group.chosen(context.view_layer, context.object)
+        others = [mesh_layout.check(obj) for obj in chosen if obj != active.obj]
+        for note in transforms.join(active, others):
+            self.report({"WARNING"}, note)
+        plans.refresh(context)
+        count = mesh_layout.splat_count(context.object.data)
+        self.report({"INFO"}, f"Joined {len(chosen)} objects: {count:,} splats; score them again")
+        return {"FINISHED"}
+
+
+class REFINE_OT_mend(AtOnce, OnSplats, bpy.types.Operator):
+    """Have sizes, rotations and colours follow what Blender's own tools did to the positions"""
+
+    bl_idname = "refine.mend"
+    bl_label = "Mend Splats"
+    bl_options = {"REGISTER", "UNDO"}
+    needs = (*OnSplats.needs, in_object_mode)
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Mend the selected objects."""
+        chosen = splat_group.chosen(context.view_layer, context.object)
+        drifted = {obj.data: obj for obj in chosen if of(obj)}
+        count = transforms.mend([mesh_layout.check(obj) for obj in drifted.values()])
+        plans.refresh(context)
+        self.report({"INFO"}, f"Mended {counted(count, 'splat')}")
+        return {"FINISHED"}
+
+
+def of(obj: bpy.types.Object) -> Drift | None:
+    """Return what others did to an object's splats, None if nothing; asked once for each change."""
+    if obj.mode == "EDIT":
+        return None
+    key = obj.data.session_uid
+    if key not in _known:
+        try:
+            _known[key] = mesh_drift.found(mesh_layout.check(obj).mesh)
+        except RefineError:
+            _known[key] = None
+    return _known[key]
+
+
+def draw(
+    layout: bpy.types.UILayout, context: bpy.types.Context, objects: Sequence[bpy.types.Object]
+) -> None:
+    """Draw what others did to the splats of objects, and the buttons that move splats."""
+    drifts = [drift for drift in map(of, objects) if drift]
+    for sentence in dict.fromkeys(s for drift in drifts for s in drift.sentences()):
+        wrapped.label(layout, context, sentence, icon="ERROR")
+    if any(drift.mendable for drift in drifts):
+        layout.operator("refine.mend", icon="MODIFIER")
+    several = len(objects) > 1
+    layout.operator("refine.join" if several else "refine.bake_transform")
+
+
+def _draw_apply(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
+    if mesh_layout.looks_like_splats(context.object):
+        menu.layout.separator()
+        menu.layout.operator("refine.bake_transform", text="Bake Transform of Splats")
+
+
+def _draw_object(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
+    if mesh_layout.looks_like_splats(context.object):
+        menu.layout.separator()
+        menu.layout.operator("refine.join")
+
+
+@persistent
+def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
+    """Look again at what changed; note soon where new splats are."""
+    for update in depsgraph.updates if depsgraph else ():
+        if update.is_updated_geometry:
+            data = getattr(update.id.original, "data", update.id.original)
+            _known.pop(getattr(data, "session_uid", 0), None)
+            if _is_new(data):
+                _note_soon()
+
+
+@persistent
+def _changed(*_: object) -> None:
+    """Look again at all."""
+    _known.clear()
+    if any(_is_new(data) for data in (*bpy.data.meshes, *bpy.data.pointclouds)):
+        _note_soon()
+
+
+def _is_new(data: object) -> bool:
+    """Tell whether an object's data holds splats of which nothing was noted."""
+    return (
+        isinstance(data, (bpy.types.Mesh, bpy.types.PointCloud))
+        and mesh_layout.holds_splats(data)
+        and not data.library
+        and not mesh_drift.is_stamped(data)
+    )
+
+
+def _note_soon() -> None:
+    """Note where new splats are, once Blender is idle: nothing is written while it works."""
+    if not bpy.app.background and not bpy.app.timers.is_registered(_note):
+        bpy.app.timers.register(_note, first_interval=_SOON)
+
+
+def _note() -> None:
+    for obj in bpy.data.objects:
+        if _is_new(obj.data) and obj.mode != "EDIT":
+            try:
+                mesh_drift.stamp(mesh_layout.check(obj).mesh)
+            except RefineError:
+                continue  # it only looks like splats
+
+
+_EVENTS = ("undo_post", "redo_post", "load_post")
+
+
+def register() -> None:
+    """Hear of changes, and have menus offer what splats follow."""
+    bpy.app.handlers.depsgraph_update_post.append(_updated)
+    for event in _EVENTS:
+        getattr(bpy.app.handlers, event).append(_changed)
+    bpy.types.VIEW3D_MT_object_apply.append(_draw_apply)
+    bpy.types.VIEW3D_MT_object.append(_draw_object)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    bpy.types.VIEW3D_MT_object.remove(_draw_object)
+    bpy.types.VIEW3D_MT_object_apply.remove(_draw_apply)
+    for event in _EVENTS:
+        getattr(bpy.app.handlers, event).remove(_changed)
+    bpy.app.handlers.depsgraph_update_post.remove(_updated)
+    if bpy.app.timers.is_registered(_note):
+        bpy.app.timers.unregister(_note)
+    _known.clear()

@@ -1,0 +1,462 @@
+"""Transforms that splats follow as a whole, and what is noticed of Blender's own tools."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import bpy
+import mathutils
+import numpy as np
+import pytest
+
+from benchmarks.renderer.rasterizer import render
+from tests.strategies import ply_of
+
+from .conftest import export
+from .test_native import as_blender_imports
+
+TURN = mathutils.Euler((0.4, -0.7, 1.1)).to_matrix().to_4x4()
+NOWHERE = mathutils.Matrix()
+SOMEWHERE = mathutils.Matrix.LocRotScale((1.0, -2.0, 0.5), TURN.to_quaternion(), (1.5, 1.5, 1.5))
+ELSEWHERE = mathutils.Matrix.LocRotScale(
+    (-0.3, 0.2, 0.1), mathutils.Euler((-1.0, 0.2, 0.3)), (-0.7, 0.7, 0.7)
+)
+
+
+@pytest.fixture
+def view(room_views):
+    """Return one view of the room, a third as large."""
+    camera = list(room_views)[11]
+    small = {name: getattr(camera, name) / 3 for name in ("fx", "fy", "cx", "cy")}
+    return replace(camera, **small, width=camera.width // 3, height=camera.height // 3)
+
+
+@pytest.fixture
+def imported(addon, quarter_file):  # noqa: ARG001
+    """Import every fourth splat of the room: 9,939."""
+    bpy.ops.refine.import_ply(filepath=str(quarter_file))
+    return bpy.context.object
+
+
+@pytest.fixture
+def seen(addon, view):
+    """Return a function that draws all splats of the scene as they stand in the world."""
+
+    def seen(within=NOWHERE):
+        bpy.context.view_layer.update()
+        check, objects = addon.mesh.layout.check, addon.objects
+        parts = [
+            addon.core.affine.transformed(
+                objects.splat_object.gather(check(obj), whole=True),
+                np.linalg.inv(np.array(within, np.float64)),
+            )
+            for obj in bpy.context.scene.objects
+            if addon.mesh.layout.looks_like_splats(obj)
+        ]
+        return render(addon.core.splats.joined(parts), view).clip(0.0, 1.0)
+
+    return seen
+
+
+def psnr(one, other):
+    """Return how alike two pictures are, in dB; 99 where they are the same."""
+    error = np.mean((one - other) ** 2)
+    return float(-10.0 * np.log10(error)) if error > 1e-9 else 99.0
+
+
+def told_of(addon, obj):
+    """Return what the panel says that others did to an object's splats."""
+    drift = addon.ui.transforms.of(obj)
+    return drift.sentences() if drift else []
+
+
+def select(*objects):
+    bpy.ops.object.select_all(action="DESELECT")
+    for obj in objects:
+        obj.select_set(True)
+    bpy.context.view_layer.objects.active = objects[0]
+
+
+def in_edit_mode(obj, which, turn):
+    """Select some vertices and turn them about the cursor, as R does in edit mode."""
+    obj.data.vertices.foreach_set("select", which)
+    select(obj)
+    bpy.ops.object.mode_set(mode="EDIT")
+    turn()
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+
+def test_an_import_notes_where_its_splats_are_and_finds_nothing(addon, imported):
+    """Nothing was done to them; an export does not write the notes."""
+    assert addon.mesh.drift.is_stamped(imported.data)
+    assert addon.mesh.drift.found(imported.data) is None
+    names = {column.name for column in addon.mesh.layout.check(imported).layout.columns}
+    assert not any(name.startswith("refine") for name in names)
+
+
+def test_apply_of_blender_is_named_and_mended_by_one_click(addon, imported, seen):
+    """Turned, scaled by 1.5 and moved, then Ctrl+A: a blur, and after the click as before."""
+    imported.matrix_world = SOMEWHERE
+    before = seen(SOMEWHERE)
+    bpy.ops.object.transform_apply()
+    assert psnr(seen(SOMEWHERE), before) < 30.0
+
+    (sentence,) = told_of(addon, imported)
+    assert "9,939 splats were transformed without their sizes, rotations and colours" in sentence
+    assert bpy.ops.refine.mend() == {"FINISHED"}
+
+    assert psnr(seen(SOMEWHERE), before) > 60.0
+    assert told_of(addon, imported) == []
+
+
+@pytest.mark.parametrize("location", [True, False])
+def test_bake_transform_keeps_what_is_seen_and_where_children_are(addon, imported, seen, location):
+    """Turned, scaled and moved below a parent that is, too; a mirror makes it harder."""
+    parent = bpy.data.objects.new("parent", None)
+    child = bpy.data.objects.new("child", None)
+    for obj in (parent, child):
+        bpy.context.scene.collection.objects.link(obj)
+    parent.matrix_world = ELSEWHERE
+    imported.parent, child.parent = parent, imported
+    imported.matrix_basis = SOMEWHERE
+    child.location = (1.0, 2.0, 3.0)
+    within = ELSEWHERE @ SOMEWHERE
+    before = seen(within)
+    place = child.matrix_world.copy()
+
+    assert bpy.ops.refine.bake_transform(location=location) == {"FINISHED"}
+
+    expected = mathutils.Matrix() if location else mathutils.Matrix.Translation((1.0, -2.0, 0.5))
+    np.testing.assert_allclose(imported.matrix_basis, expected, atol=1e-6)
+    np.testing.assert_allclose(child.matrix_world, place, atol=1e-5)
+    assert psnr(seen(within), before) > 60.0
+    assert addon.mesh.drift.found(imported.data) is None
+
+
+def test_an_uneven_scale_is_baked_as_near_as_harmonics_come(addon, imported, seen, view):
+    """Shapes as M covariance M'; colours are those that the 3D view draws, in M's frame."""
+    imported.scale = (1.0, 1.2, 1.0)
+    checked = addon.mesh.layout.check(imported)
+    shapes = addon.objects.splat_object.gather(checked)
+    arrays = addon.viewport.arrays
+    packed = arrays.pack(addon.mesh.attributes.splats_from_object(checked))
+    colors = arrays.colors(packed, arrays.Eye(None, view.center / [1.0, 1.2, 1.0], True))
+    dc = np.zeros((len(shapes), 3))
+    dc[packed.vertices] = (colors[:, :3] - 0.5) / addon.core.splats.SH_C0
+    drawn = replace(shapes, sh_dc=dc, sh_rest=np.zeros((len(shapes), 0, 3)))
+    before = render(drawn, view).clip(0.0, 1.0)
+
+    (note,) = addon.objects.transforms.bake([checked])
+
+    assert note.endswith("became the nearest")
+    assert psnr(seen(), before) > 48.0
+    got = addon.objects.splat_object.gather(addon.mesh.layout.check(imported))
+    np.testing.assert_allclose(got.means, shapes.means, rtol=1e-6)
+    covariances = [arrays.pack(splats).covariances for splats in (got, shapes)]
+    np.testing.assert_allclose(*covariances, rtol=1e-4, atol=2e-7)
+
+
+def test_scores_hold_when_a_transform_is_baked(addon, imported, room_cameras):  # noqa: ARG001
+    """The splats are where they were; the panel asks for no new scores."""
+    imported.matrix_world = SOMEWHERE
+    bpy.context.view_layer.update()
+    select(imported)
+    bpy.ops.refine.score()
+
+    bpy.ops.refine.bake_transform()
+
+    bpy.context.view_layer.update()
+    assert addon.ui.staleness.changes(bpy.context, imported) == []
+
+
+@pytest.mark.parametrize("what", ["shared", "animated", "shape keys"])
+def test_a_bake_that_is_refused_changes_nothing(imported, unchanged, what):
+    """Another user of the data would move; an animation would move the splats on."""
+    imported.matrix_world = SOMEWHERE
+    if what == "shared":
+        bpy.context.scene.collection.objects.link(imported.copy())
+    elif what == "animated":
+        imported.keyframe_insert("location")
+    else:
+        imported.shape_key_add()
+    bpy.context.view_layer.update()
+    unchanged.start()
+
+    with pytest.raises(RuntimeError, match=r"share their data|is animated|has shape keys"):
+        bpy.ops.refine.bake_transform()
+
+    unchanged()
+
+
+def parted(imported):
+    """Return a copy of an object, with data of its own."""
+    half = imported.copy()
+    half.data = imported.data.copy()
+    bpy.context.scene.collection.objects.link(half)
+    return half
+
+
+def test_join_splats_keeps_what_is_seen_of_objects_that_stand_apart(addon, imported, seen):
+    """A turned one, a mirrored one and one that Ctrl+A ruined: 3 x 9,939 splats."""
+    second, third = (parted(imported) for _ in range(2))
+    imported.matrix_world = mathutils.Matrix.Translation((0.1, 0.0, 0.0))
+    second.matrix_world, third.matrix_world = SOMEWHERE, ELSEWHERE
+    group = second.vertex_groups.new(name="mine")
+    group.add([5, 7], 0.25, "REPLACE")
+    mark = np.arange(9939) % 3 == 0
+    addon.mesh.edit.mark_protected(third, mark)
+    child = bpy.data.objects.new("child", None)
+    bpy.context.scene.collection.objects.link(child)
+    child.parent = second
+    bpy.context.view_layer.update()
+    place, before = child.matrix_world.copy(), seen()
+    select(third)
+    bpy.ops.object.transform_apply(scale=False, location=False)
+    select(imported, second, third)
+
+    assert bpy.ops.refine.join() == {"FINISHED"}
+
+    assert [obj for obj in bpy.data.objects if obj.type == "MESH"] == [imported]
+    assert len(imported.data.vertices) == 3 * 9939
+    assert psnr(seen(), before) > 60.0
+    assert addon.mesh.drift.found(imported.data) is None
+    weights = addon.mesh.edit.group_weights(imported, "mine")
+    assert sorted(np.flatnonzero(weights) - 9939) == [5, 7]
+    np.testing.assert_array_equal(
+        addon.mesh.edit.protected_mask(imported, ""), np.append(np.zeros(2 * 9939, bool), mark)
+    )
+    assert child.parent == imported
+    np.testing.assert_allclose(child.matrix_world, place, atol=1e-5)
+    assert len(bpy.data.meshes) == 1
+    assert "REFINE join" not in bpy.data.collections
+
+
+def file_of(addon, make_splats, path, count, degree, **more):
+    """Write random splats with further properties."""
+    columns = make_splats(count, degree=degree, seed=count) | more
+    path.write_bytes(ply_of(columns, comments=[f"of {path.name}"]))
+    bpy.ops.refine.import_ply(filepath=str(path))
+    return bpy.context.object, addon.core.read_ply(path)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_files_of_several_degrees_and_properties_become_one(addon, make_splats, tmp_path, order):
+    """Degrees 1 and 3; a property that one lacks is 0 there; one of two types takes the wider."""
+    made = [
+        file_of(
+            addon, make_splats, tmp_path / "a.ply", 40, 1,
+            mine=np.arange(40, dtype=np.uint8), id=np.arange(40, dtype=np.int32),
+        ),
+        file_of(addon, make_splats, tmp_path / "b.ply", 30, 3, mine=np.full(30, 0.5, np.float32)),
+    ]  # fmt: skip
+    (first, one), (second, other) = (made[index] for index in order)
+    select(first, second)
+    notes = addon.objects.transforms.join(
+        addon.mesh.layout.check(first), [addon.mesh.layout.check(second)]
+    )
+
+    export(addon, addon.mesh.layout.check(first), tmp_path / "joined.ply")
+    got = addon.core.read_ply(tmp_path / "joined.ply")
+
+    assert len(got) == 70
+    assert [note.split(":")[1].split(",")[0] for note in notes] == [" has no id"]
+    expected = addon.core.splats.joined([file.splats() for file in (one, other)])
+    for field in fields(expected):
+        np.testing.assert_array_equal(
+            getattr(got.splats(), field.name), getattr(expected, field.name), field.name
+        )
+    np.testing.assert_array_equal(
+        got.rows["mine"], np.concatenate([one.rows["mine"], other.rows["mine"]])
+    )
+    wide = dict.fromkeys(["a", "b"], np.zeros(30))
+    wide["a"] = np.arange(40)
+    ids = [wide["a"], wide["b"]]
+    np.testing.assert_array_equal(got.rows["id"], np.concatenate([ids[index] for index in order]))
+
+
+def test_point_clouds_and_meshes_are_joined_as_what_the_active_one_is(addon, seen, quarter_file):
+    """Blender's own splats keep what they look like, beside a mesh that was turned."""
+    bpy.ops.refine.import_ply(filepath=str(quarter_file))
+    mesh = bpy.context.object
+    rows = addon.core.read_ply(quarter_file).rows
+    cloud = as_blender_imports(rows, "cloud")
+    addon.mesh.drift.stamp(cloud.data)
+    mesh.matrix_world = SOMEWHERE
+    bpy.context.view_layer.update()
+    before = seen()
+    select(cloud, mesh)
+
+    assert bpy.ops.refine.join() == {"FINISHED"}
+
+    joined = bpy.context.object
+    assert (joined.type, joined.name) == ("POINTCLOUD", "cloud")
+    assert len(joined.data.attributes["position"].data) == 2 * len(rows)
+    assert psnr(seen(), before) > 55.0
+    assert addon.mesh.drift.found(joined.data) is None
+
+
+def test_a_join_that_fails_leaves_the_scene_as_it_was(addon, imported, monkeypatch, unchanged):
+    """Whatever was made by then is gone."""
+    second = parted(imported)
+    second.matrix_world = SOMEWHERE
+    select(imported, second)
+    bpy.context.view_layer.update()
+    unchanged.start()
+
+    def fail(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(addon.objects.transforms, "_as_one", fail)
+    with pytest.raises(RuntimeError, match="not enough memory"):
+        bpy.ops.refine.join()
+
+    unchanged()
+
+
+@pytest.mark.parametrize("degrees", [(3, 3), (1, 3), (3, 1)])
+def test_join_of_blender_is_named_and_mended(addon, make_splats, tmp_path, degrees):
+    """Ctrl+J of turned objects: harmonics of another degree are sorted out as well."""
+    one, two = (
+        file_of(addon, make_splats, tmp_path / f"{count}.ply", count, degree)[0]
+        for count, degree in zip((300, 200), degrees, strict=True)
+    )
+    one.matrix_world, two.matrix_world = SOMEWHERE, ELSEWHERE
+    bpy.context.view_layer.update()
+    gather, check = addon.objects.splat_object.gather, addon.mesh.layout.check
+    expected = addon.core.splats.joined([gather(check(obj), whole=True) for obj in (one, two)])
+    select(one, two)
+    bpy.ops.object.join()
+    told = told_of(addon, one)
+
+    assert bpy.ops.refine.mend() == {"FINISHED"}
+
+    assert "200 splats were joined without their sizes, rotations and colours" in told[0]
+    assert ("another SH degree" in " ".join(told)) == (degrees[0] != degrees[1])
+    got = gather(check(one), whole=True)
+    np.testing.assert_allclose(got.means, expected.means, rtol=1e-4, atol=1e-5)
+    pack = addon.viewport.arrays.pack
+    np.testing.assert_allclose(
+        pack(got).covariances, pack(expected).covariances, rtol=1e-3, atol=1e-5
+    )
+    np.testing.assert_allclose(got.sh_rest, expected.sh_rest, atol=1e-4)
+    assert told_of(addon, one) == []
+
+
+def test_a_turn_in_edit_mode_is_mended_and_a_move_is_not_mentioned(addon, imported, seen):
+    """A third is turned about the cursor: sizes and rotations follow by the click alone."""
+    which = np.arange(9939) % 3 == 0
+    in_edit_mode(imported, which, lambda: bpy.ops.transform.translate(value=(0.5, 0.0, 0.0)))
+    assert told_of(addon, imported) == []
+    in_edit_mode(imported, which, lambda: bpy.ops.transform.translate(value=(-0.5, 0.0, 0.0)))
+    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(imported), whole=True)
+    turned = addon.core.affine.transformed(splats.take(which), np.array(SOMEWHERE))
+    expected = addon.core.splats.joined([turned, splats.take(~which)])
+
+    places = np.array(splats.means, np.float32)
+    places[which] = turned.means
+    imported.data.attributes["position"].data.foreach_set("vector", places.ravel())
+    imported.data.update()
+    told = told_of(addon, imported)
+    bpy.ops.refine.mend()
+
+    assert "3,313 splats were transformed" in told[0]
+    got = addon.objects.splat_object.gather(addon.mesh.layout.check(imported), whole=True)
+    order = np.concatenate([np.flatnonzero(which), np.flatnonzero(~which)])
+    for field in fields(expected):
+        np.testing.assert_allclose(
+            np.abs(getattr(got, field.name)[order]), np.abs(getattr(expected, field.name)),
+            rtol=1e-3, atol=1e-3,
+        )  # fmt: skip
+    assert seen().shape
+
+
+def test_an_applied_mirror_is_mended(addon, imported, seen):
+    """The mirrored half is that of an object that was mirrored as a whole, which is drawn so."""
+    twin = parted(imported)
+    twin.matrix_world = mathutils.Matrix.Diagonal((-1.0, 1.0, 1.0, 1.0))
+    expected = seen()
+    bpy.data.objects.remove(twin)
+    modifier = imported.modifiers.new("Mirror", "MIRROR")
+    modifier.use_mirror_merge = False
+    select(imported)
+    bpy.ops.object.modifier_apply(modifier="Mirror")
+    (told,) = told_of(addon, imported)
+
+    bpy.ops.refine.mend()
+
+    assert "9,939 splats were mirrored" in told
+    assert len(imported.data.vertices) == 2 * 9939
+    assert psnr(seen(), expected) > 60.0
+
+
+def test_who_turns_sizes_and_rotations_as_well_is_left_alone(addon, imported):
+    """Another add-on that transforms all of a splat did it right; nothing is to be mended."""
+    checked = addon.mesh.layout.check(imported)
+    splats = addon.objects.splat_object.gather(checked, whole=True)
+    turned = addon.core.affine.transformed(splats, np.array(SOMEWHERE))
+    addon.mesh.attributes.write_columns(checked, addon.core.formats.ply.columns_from_splats(turned))
+
+    assert told_of(addon, imported) == []
+
+
+def test_absorbing_and_conversion_are_no_drift(addon, imported, room_cameras):  # noqa: ARG001
+    """Survivors move and grow; a point cloud holds other numbers. A drift from before stays one."""
+    select(imported)
+    bpy.context.scene.refine.absorb = True
+    bpy.ops.refine.score()
+    bpy.ops.refine.apply()
+    assert addon.mesh.drift.found(imported.data) is None
+    bpy.ops.refine.convert()
+    assert addon.mesh.drift.found(bpy.context.object.data) is None
+    bpy.ops.refine.convert()
+    imported = bpy.context.object
+    imported.matrix_world = SOMEWHERE
+    bpy.ops.object.transform_apply()
+    bpy.ops.refine.convert()
+
+    drift = addon.mesh.drift.found(bpy.context.object.data)
+
+    assert drift.turned == len(bpy.context.object.data.attributes["position"].data)
+
+
+def test_score_apply_and_export_say_what_was_done(
+    addon,
+    imported,
+    room_cameras,  # noqa: ARG001
+    room_views,
+    tmp_path,
+    capfd,
+):
+    """None of them is silent about splats that Ctrl+A ruined; nor is the command."""
+    imported.matrix_world = SOMEWHERE
+    bpy.context.view_layer.update()
+    select(imported)
+    bpy.ops.object.transform_apply()
+    for operator, options in (
+        (bpy.ops.refine.score, {}),
+        (bpy.ops.refine.apply, {}),
+        (bpy.ops.refine.export_ply, {"filepath": str(tmp_path / "out.ply")}),
+    ):
+        capfd.readouterr()
+        assert operator(**options) == {"FINISHED"}
+        said = capfd.readouterr()
+        assert "splats were transformed without" in said.out + said.err
+    core = addon.core
+    budget, settings = core.Budget(ratio=0.5), core.Settings("closed-form")
+    request = core.PruneRequest(room_views, budget, settings, dry_run=True)
+    report = addon.objects.operation.prune_object(imported.name, request)
+
+    assert "Mend Splats in the panel" in " ".join(report["notes"])
+
+
+def test_vertices_that_are_no_splats_are_named(addon, imported):
+    """A cube of 8 vertices in the room: nothing mends that but undo."""
+    bpy.ops.mesh.primitive_cube_add()
+    cube = bpy.context.object
+    select(imported, cube)
+    bpy.ops.object.join()
+
+    (told,) = told_of(addon, imported)
+
+    assert "8 vertices that are no splats" in told
+    assert not addon.ui.transforms.of(imported).mendable

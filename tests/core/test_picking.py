@@ -1,0 +1,284 @@
+"""Which splats a view shows, and which of them areas, places and colours take."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from refine_addon.core import picking, sight
+from refine_addon.core.picking import Axis
+from refine_addon.core.splats import SH_C0, Splats
+from refine_addon.core.views import View
+
+SIZE = 100
+
+
+def splats(means, colors=None, *, scale=0.02, logit=8.0):
+    """Return round splats, opaque but for e^-8, grey or of some colours."""
+    means = np.array(means, np.float32).reshape(-1, 3)
+    count = len(means)
+    colors = np.full((count, 3), 0.5) if colors is None else np.array(colors)
+    return Splats(
+        means=means,
+        log_scales=np.full((count, 3), math.log(scale), np.float32),
+        quaternions=np.tile(np.float32([1, 0, 0, 0]), (count, 1)),
+        opacity_logits=np.full(count, logit, np.float32),
+        sh_dc=((colors - 0.5) / SH_C0).astype(np.float32),
+        sh_rest=np.zeros((count, 0, 3), np.float32),
+    )
+
+
+def view(distance=0.0):
+    """Look along +z from -distance: 100 px wide, a slope of 1/2 at the edges."""
+    return View(np.eye(3), np.array([0, 0, -distance]), 100.0, 100.0, 50.0, 50.0, SIZE, SIZE)
+
+
+def wall(depth, edge=1.2, step=0.03):
+    """Return centres on a grid across the axis, at a depth."""
+    line = np.arange(-edge, edge, step)
+    across, down = (axis.ravel() for axis in np.meshgrid(line, line))
+    return np.stack([across, down, np.full_like(across, depth)], axis=1)
+
+
+def seen(scene, camera=None):
+    """Return what a view shows of splats."""
+    camera = camera or view()
+    return sight.look(sight.prepare(scene, camera), camera)
+
+
+@pytest.fixture(scope="module")
+def walls():
+    """Give two walls behind each other, at 2 and at 3, and what a view at 0 shows of them."""
+    near, far = wall(2.0), wall(3.0)
+    colors = np.concatenate([np.tile([0.9, 0.1, 0.1], (len(near), 1)), np.full((len(far), 3), 0.2)])
+    return len(near), seen(splats(np.concatenate([near, far]), colors))
+
+
+def everywhere():
+    """Return an area that is all of the image."""
+    return np.ones((SIZE, SIZE), np.bool_)
+
+
+def test_what_a_wall_hides_is_not_taken(walls):
+    """Splats 3 cm apart with sigmas of 2 cm leave no gap; told so, both walls are taken."""
+    count, shown = walls
+    taken = shown.in_area(everywhere())
+    through = shown.in_area(everywhere(), hidden=True)
+
+    assert taken[:count].any()
+    assert not taken[count:].any()
+    assert np.array_equal(through[:count], taken[:count])
+    assert through[count:].any()
+
+
+def test_a_splat_is_taken_where_its_centre_is(walls):
+    """The left 49 columns of the image hold the centres of the near wall with x < -.02."""
+    count, shown = walls
+    area = everywhere()
+    area[:, 49:] = False
+    taken = shown.in_area(area)[:count]
+    means = shown.prepared.splats.means[:count]
+    inner = (np.abs(means[:, :2]) < 0.99).all(axis=1)  # 50 px at depth 2 are 1
+
+    assert np.array_equal(taken[inner], means[inner, 0] < -0.02)
+
+
+def test_surfaces_lie_where_a_ray_has_lost_its_light():
+    """Walls of opacity .5 every .1 from 2 on, without gaps: a tenth is left behind the fourth.
+
+    Each takes 1 - a of the light, where a is nearly .5 only at centres; the reference sums along
+    the rays, splat by splat.
+    """
+    scene = splats(np.concatenate([wall(2.0 + 0.1 * k) for k in range(9)]), logit=0.0)
+    shown = seen(scene)
+    footprints = shown.footprints
+    depths = scene.means[shown.prepared.gaussians.index[footprints.index], 2]
+    found = sight.surfaces(footprints, depths, view(), 10)
+    covariances = [
+        np.outer(a, a) + np.outer(b, b)
+        for a, b in zip(footprints.major.T, footprints.minor.T, strict=True)
+    ]
+    for row, column in ((2, 3), (5, 5)):
+        away = np.array([[column * 10 + 5.5], [row * 10 + 5.5]]) - footprints.centers
+        inverse = np.linalg.inv(covariances)
+        squared = np.einsum("in,nij,jn->n", away, inverse, away)
+        alphas = 0.5 * np.exp(-squared / 2)
+        alphas[alphas < 1 / 255] = 0
+        left = np.cumprod(1 - alphas)
+
+        assert found[row, column] == depths[np.argmax(left < 0.1)]
+
+
+def test_a_veil_hides_nothing():
+    """Opacity .1 lets nine tenths of the light through, from one wall of it to the next."""
+    near, far = wall(2.0), wall(3.0)
+    scene = splats(np.concatenate([near, far]))
+    scene.opacity_logits[: len(near)] = -4.0
+    taken = seen(scene).in_area(everywhere())
+
+    assert taken[len(near) :].any()
+
+
+def test_splats_behind_the_view_and_beside_the_image_are_never_taken():
+    """One before the view, one behind it, one beside the image, one that is not finite."""
+    shown = seen(splats([[0, 0, 2], [0, 0, -2], [9, 0, 2], [np.nan, 0, 2]]))
+
+    taken = shown.in_area(everywhere(), hidden=True)
+    assert taken.tolist() == [True, False, False, False]
+
+
+def test_the_surface_under_a_pixel_is_that_of_the_near_wall(walls):
+    """At (60, 50) the ray is (.105, .005, 1): it meets the wall at 2, where 1 m takes 50 px."""
+    _, shown = walls
+    surface = shown.surface(60, 50)
+
+    np.testing.assert_allclose(surface.place, [0.21, 0.01, 2.0], atol=1e-6)
+    np.testing.assert_allclose(surface.color, [0.9, 0.1, 0.1], atol=0.01)
+    assert surface.scale == pytest.approx(50.0)
+
+
+def test_where_there_is_nothing_there_is_no_surface():
+    """One splat of 1 px in the middle: nothing is met in a corner."""
+    assert seen(splats([[0, 0, 2]])).surface(3, 3) is None
+
+
+def test_a_ball_takes_what_lies_around_its_middle(walls):
+    """Around (0, 0, 2), .3 wide: the far wall is 1 away."""
+    count, shown = walls
+    taken = shown.in_ball(np.array([0.0, 0.0, 2.0]), 0.3, hidden=True)
+    away = np.linalg.norm(shown.prepared.splats.means - [0.0, 0.0, 2.0], axis=1)
+
+    assert np.array_equal(taken[:count], away[:count] <= 0.3)
+    assert not taken[count:].any()
+
+
+def test_a_colour_takes_what_is_near_it(walls):
+    """.05 from the near wall's in each channel; the far wall is .7 away from it in red."""
+    count, shown = walls
+    near = shown.of_color(np.array([0.85, 0.1, 0.15]), 0.051, hidden=True)
+    none = shown.of_color(np.array([0.85, 0.1, 0.15]), 0.049, hidden=True)
+
+    assert near[:count].any()
+    assert not near[count:].any()
+    assert not none.any()
+
+
+@pytest.mark.parametrize(
+    ("mode", "expected"), [("SET", 0b1010), ("ADD", 0b1110), ("SUBTRACT", 0b0100), ("INTERSECT", 8)]
+)
+def test_modes_combine_two_selections(mode, expected):
+    """1100 before, 1010 taken: the four bits are all pairs there are."""
+    before, taken = (np.array([bit == "1" for bit in bits]) for bits in ("1100", "1010"))
+
+    found = picking.combined(before, taken, mode)
+    assert found.tolist() == [bit == "1" for bit in f"{expected:04b}"]
+
+
+def test_a_polygon_holds_the_pixels_that_angles_say_it_holds():
+    """The reference sums the angles to all corners: 2 pi times an odd number inside."""
+    rng = np.random.default_rng(0)
+    for corners in (rng.uniform(-5, 25, (7, 2)), rng.uniform(0, 20, (3, 2)), np.zeros((1, 2))):
+        area = picking.polygon(corners.tolist(), 20, 15)
+        x, y = np.meshgrid(np.arange(20) + 0.5, np.arange(15) + 0.5)
+        to = corners[:, 0, None, None] - x + 1j * (corners[:, 1, None, None] - y)
+        turns = np.angle(np.roll(to, -1, axis=0) / to).sum(axis=0) / (2 * np.pi)
+
+        assert np.array_equal(area, np.rint(turns).astype(int) % 2 == 1)
+
+
+def test_a_brush_paints_what_lies_near_its_way():
+    """From (3, 4) to (12, 8) with a radius of 2.5; distances to 1,000 points on the way."""
+    area = np.zeros((15, 20), np.bool_)
+    picking.paint(area, (3.0, 4.0), (12.0, 8.0), 2.5)
+    way = np.linspace([3.0, 4.0], [12.0, 8.0], 1000)
+    x, y = np.meshgrid(np.arange(20) + 0.5, np.arange(15) + 0.5)
+    away = np.sqrt((x[..., None] - way[:, 0]) ** 2 + (y[..., None] - way[:, 1]) ** 2).min(axis=2)
+
+    assert np.array_equal(area, away <= 2.5)
+    picking.paint(area, (-50.0, 4.0), (-40.0, 4.0), 2.5)  # outside: nothing more
+    assert np.array_equal(area, away <= 2.5)
+
+
+def test_a_selection_grows_by_neighbours_and_shrinks_back():
+    """On a line each point's 8 nearest are 4 to each side; at an end those that there are."""
+    line = np.stack([np.arange(60.0), np.zeros(60), np.zeros(60)], axis=1)
+    neighbours = picking.neighbours_of(line)
+    chosen = np.zeros(60, np.bool_)
+    chosen[28:32] = True
+    grown = picking.grown(neighbours, chosen)
+
+    assert np.flatnonzero(grown).tolist() == list(range(24, 36))
+    assert np.array_equal(picking.shrunk(neighbours, grown), chosen)
+
+
+def test_splats_that_are_not_finite_have_neighbours_that_do_no_harm():
+    """All of them NaN: nothing grows; some of them: an index each, within range."""
+    nothing = picking.neighbours_of(np.full((5, 3), np.nan))
+    some = picking.neighbours_of(np.array([[0, 0, 0], [1, 0, 0], [np.nan, 0, 0]]))
+
+    assert picking.grown(nothing, np.zeros(5, np.bool_)).sum() == 0
+    assert ((some >= 0) & (some < 3)).all()
+
+
+def test_an_axis_is_the_inverse_of_its_values():
+    """A logarithmic one from .001 to 10: .1 lies in its middle; 0 and NaN at its beginning."""
+    axis = Axis.of(np.geomspace(1e-3, 10.0, 1001), logarithmic=True)
+    places = axis.places(np.array([axis.value(0.25), axis.value(1.0), 0.0, np.nan, 1e9]))
+
+    np.testing.assert_allclose(places, [0.25, 1.0, 0.0, 0.0, 1.0], atol=1e-12)
+    assert Axis.of(np.array([np.nan, 4.0, 2.0])) == Axis(2.0, 4.0)
+    assert Axis.of(np.empty(0)) == Axis(0.0, 1.0)
+
+
+def opengl(camera, near=0.01, far=100.0):
+    """Return the projection matrix of a view in OpenGL's form."""
+    matrix = np.zeros((4, 4))
+    matrix[0, 0], matrix[1, 1] = 2 * camera.fx / camera.width, 2 * camera.fy / camera.height
+    matrix[0, 2] = 1 - 2 * camera.cx / camera.width
+    matrix[1, 2] = 2 * camera.cy / camera.height - 1
+    matrix[2, 2], matrix[2, 3] = -(far + near) / (far - near), -2 * far * near / (far - near)
+    matrix[3, 2] = -1
+    return matrix
+
+
+def to_camera(camera):
+    """Return a view's matrix in OpenGL's form."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.diag([1, -1, -1]) @ camera.rotation
+    matrix[:3, 3] = -matrix[:3, :3] @ camera.center
+    return matrix
+
+
+def test_the_view_of_opengls_matrices_is_the_one_they_were_made_of():
+    """Off the middle, turned by 30 degrees, moved; near is told by the matrix."""
+    c, s = math.cos(math.pi / 6), 0.5
+    turned = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    camera = View(turned, np.array([1.0, 2, 3]), 80.0, 90.0, 60.0, 45.0, 120, 100, 0.01)
+    found = sight.pinhole(to_camera(camera), opengl(camera), (120, 100), np.zeros((1, 3)))
+
+    np.testing.assert_allclose(found.rotation, camera.rotation, atol=1e-12)
+    np.testing.assert_allclose(found.center, camera.center, atol=1e-12)
+    for name in ("fx", "fy", "cx", "cy", "near"):
+        assert getattr(found, name) == pytest.approx(getattr(camera, name))
+
+
+def test_without_perspective_centres_lie_where_parallel_rays_meet_them():
+    """4 m fill 200 px: 50 px a metre, whatever the depth; the view's own middle is at (1, 0).
+
+    The rays of the far pinhole are off by a thousandth of the extent: .15 px here.
+    """
+    matrix = np.eye(4)
+    matrix[0, 3] = -1.0
+    projected = np.diag([0.5, 0.5, -0.01, 1.0])  # clips from -100 to 100
+    points = np.array([[1.0, 0, 0], [2, 1, -3], [0, -0.5, 2], [1.5, 0.5, 1]])
+    found = sight.pinhole(matrix, projected, (200, 200), points)
+    shown = seen(splats(points), found)
+    expected = [[100, 100], [150, 50], [50, 125], [125, 75]]
+
+    local = (points - found.center) @ found.rotation.T
+    across = found.fx * local[:, 0] / local[:, 2] + found.cx
+    down = found.fy * local[:, 1] / local[:, 2] + found.cy
+    np.testing.assert_allclose(np.stack([across, down], axis=1), expected, atol=0.2)
+    assert sorted(shown.rows.tolist()) == [0, 1, 2, 3]

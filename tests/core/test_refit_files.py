@@ -1,0 +1,186 @@
+"""Survivors that are refitted: from file to file, with levels, and what is said of it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from refine_addon.core import (
+    SURVIVORS,
+    Budget,
+    Levels,
+    PruneRequest,
+    RefineError,
+    Settings,
+    Splats,
+    ViewSet,
+    lod,
+    prune,
+    prune_file,
+    read_cameras,
+    read_ply,
+)
+from refine_addon.core.estimate.psnr import psnr_against
+from refine_addon.core.seeing.ray_sample import validation_rays
+from refine_addon.core.task import Task
+from refine_addon.core.work import Cancelled
+from tests.strategies import ply_of
+
+ROOM = Path(__file__).parents[1] / "data/room_small"
+FEW = Settings(views=12)
+HALF = Budget(ratio=0.5)
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def views():
+    names = json.loads((ROOM / "split.json").read_text())["train"]
+    return read_cameras(ROOM / "cameras.json").select(names)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """Every twentieth splat of the room, as a file."""
+    file, path = read_ply(ROOM / "point_cloud.ply"), tmp_path_factory.mktemp("small") / "small.ply"
+    keep = np.zeros(len(file), np.bool_)
+    keep[::20] = True
+    file.write(path, keep)
+    return path
+
+
+@pytest.fixture(scope="module")
+def refitted(small, views, tmp_path_factory):
+    """Return the file of the refitted half, and what was decided."""
+    path = tmp_path_factory.mktemp("refitted") / "out.ply"
+    return path, prune_file(small, path, PruneRequest(views, HALF, FEW, survivors="refit"))
+
+
+def test_refitting_comes_closer_than_absorbing_and_says_by_how_much(small, views, refitted):
+    """The same rows stay; rays that neither went by say that the pictures are closer."""
+    splats = read_ply(small).splats()
+    absorbed = prune(splats, views, HALF, FEW, survivors="absorb")
+    result, facts = refitted[1], refitted[1].report["refitted"]
+    used = views.spread(FEW.views)
+    rays = validation_rays(splats, used)
+
+    found = [psnr_against(rays, each.absorbed.splats, used) for each in (absorbed, result)]
+
+    assert np.array_equal(result.keep, absorbed.keep)
+    assert found[1] > found[0] + 1.0
+    assert facts["psnr"] > facts["psnr_before"] + 1.0
+    assert facts["rounds"] >= 1
+    assert 0 < facts["changed"] <= np.count_nonzero(result.absorbed.changed)
+    assert facts["seconds"] > 0.0
+    assert result.report["absorbed"] == absorbed.report["absorbed"]
+    assert any("survivors were refitted" in note for note in result.report["notes"])
+
+
+def test_the_file_holds_what_was_refitted_and_the_rest_bit_for_bit(small, refitted):
+    """Only what makes a splat may change, and only of survivors that the result names."""
+    path, result = refitted
+    before, after = read_ply(small), read_ply(path)
+
+    changed, kept = result.absorbed.changed, before.rows[result.keep]
+
+    assert after.rows[~changed].tobytes() == kept[~changed].tobytes()
+    for item in fields(Splats):
+        wanted = getattr(result.absorbed.splats, item.name).astype(np.float32)
+        np.testing.assert_array_equal(getattr(after.splats(), item.name), wanted)
+
+
+def test_doubles_stay_doubles_and_what_is_not_of_a_splat_stays(small, views, tmp_path):
+    """At an offset of 1e6, float32 knows steps of .0625: each survivor has a place of its own."""
+    rows = read_ply(small).rows
+    columns = {name: rows[name].astype("f8") for name in rows.dtype.names}
+    columns["x"] += 1e6
+    columns["mine"] = np.arange(len(rows), dtype="i4")
+    (tmp_path / "in.ply").write_bytes(ply_of(columns))
+    shift = np.array([1e6, 0.0, 0.0])
+    moved = ViewSet(tuple(replace(view, center=view.center + shift) for view in views))
+
+    request = PruneRequest(moved, HALF, FEW, survivors="refit")
+    result = prune_file(tmp_path / "in.ply", tmp_path / "out.ply", request)
+
+    written = read_ply(tmp_path / "out.ply")
+    np.testing.assert_array_equal(written.rows["mine"], np.flatnonzero(result.keep))
+    np.testing.assert_array_equal(written.splats().means, result.absorbed.splats.means)
+    assert written.splats().means.dtype == np.float64
+    assert len(np.unique(written.rows["x"])) > 100
+
+
+def test_protected_splats_keep_their_bits(small, views):
+    """Every third; beside them others are refitted."""
+    splats = read_ply(small).splats()
+    protected = np.arange(len(splats)) % 3 == 0
+
+    result = prune(splats, views, HALF, FEW, protected=protected, survivors="refit")
+
+    spared = protected[result.keep]
+    assert result.keep[protected].all()
+    assert not result.absorbed.changed[spared].any()
+    assert result.absorbed.changed[~spared].any()
+    for item in fields(Splats):
+        found = getattr(result.absorbed.splats, item.name)[spared]
+        np.testing.assert_array_equal(found, getattr(splats, item.name)[protected])
+
+
+def test_where_nothing_goes_nothing_is_refitted(small, views):
+    """All rows are what they were."""
+    splats = read_ply(small).splats()
+
+    result = prune(splats, views, Budget(ratio=0.0), FEW, survivors="refit")
+
+    assert not result.absorbed.changed.any()
+    assert "refitted" not in result.report
+
+
+def test_levels_are_refitted_to_the_original(small, views):
+    """The second, too, though it is made from the first: it is closer than without refitting."""
+    splats = read_ply(small).splats()
+
+    plain, better = (
+        lod(splats, views, Levels((0.5, 0.25), survivors=survivors), FEW)
+        for survivors in ("absorb", "refit")
+    )
+
+    for one, other in zip(plain, better, strict=True):
+        assert len(one.splats) == len(other.splats)
+        assert other.psnr > one.psnr + 0.5
+
+
+def test_progress_rises_and_can_end_while_refitting(small, views):
+    """Progress that refitting tells lies between those of absorbing and of the estimate."""
+    splats, told = read_ply(small).splats(), []
+
+    def listen(share, what):
+        told.append((share, what))
+        return what != "refitting"
+
+    with pytest.raises(Cancelled):
+        prune(splats, views, HALF, FEW, survivors="refit", progress=listen)
+
+    shares = [share for share, _ in told]
+    assert shares == sorted(shares)
+    assert told[-1][1] == "refitting"
+    assert 0.2 < told[-1][0] < 0.95
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        lambda views: PruneRequest(views, HALF, survivors="merge"),
+        lambda views: Task(HALF, survivors="merge", views=views),
+        lambda _: Levels((0.5,), survivors="merge"),
+    ],
+)
+def test_what_survivors_cannot_become_is_refused(views, asked):
+    """With what was got and what was expected."""
+    words = f"survivors is 'merge', expected one of {', '.join(SURVIVORS)}"
+
+    with pytest.raises(RefineError, match=words):
+        asked(views)

@@ -1,0 +1,77 @@
+"""What artists do to objects leaves splats as they look, or is said and mended by one click."""
+
+from __future__ import annotations
+
+import shutil
+from typing import TYPE_CHECKING
+
+import numpy as np
+from blenders import PROJECT
+from PIL import Image
+
+from refine_addon.core.formats.ply import read_ply
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from blenders import Binary
+
+PICTURES = PROJECT / "build" / "e2e"
+KEPT = {
+    *("apply mended", "undo", "redo", "baked", "duplicate", "linked duplicate", "single user"),
+    *("parent", "parent inverse", "mirror mended", "append", "link", "parted for join"),
+    *("parted for join mended", "join mended", "join", "edit mode", "reopened"),
+}
+"""Steps after which the picture is what it was at the start."""
+
+RUINED = {"ruined by apply", "ruined by mirror", "ruined by join", "ruined and reopened"}
+"""Steps after which it is not."""
+
+
+def test_splats_look_as_before_whatever_is_done_to_their_object(
+    binary: Binary, cloud: Path, cameras: Path
+):
+    """At least 45 dB between the window before and after, 8 bits each; nothing is said then.
+
+    What Blender's own operators ruin is below 35 dB, and the panel says so until it is mended.
+    """
+    few = binary.work / "few.ply"
+    file = read_ply(cloud)
+    file.write(few, np.arange(len(file)) % 4 == 0)
+    try:
+        told = binary.window_step(
+            "transforms",
+            size=(900, 600),
+            cloud=few,
+            cameras=cameras,
+            picture=binary.work / "transforms-{}.png",
+            blend=binary.work / "saved.blend",
+        )
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+
+    assert told["failure"] == ""
+    assert {name for name in KEPT if told[name]} == set()
+    assert {name for name in RUINED | {"turned", "turned back"} if not told[name]} == set()
+    start = _picture(binary.work, "start", told["region"])
+    close = {
+        name: _psnr(start, _picture(binary.work, name, told["region"])) for name in KEPT | RUINED
+    }
+    assert {name: db for name, db in close.items() if (db < 45.0) == (name in KEPT)} == {}
+    assert max(close[name] for name in RUINED) < 35.0
+
+
+def _picture(folder: Path, name: str, region: dict) -> np.ndarray:
+    """Return what the view shows in a picture of the screen, 0..1."""
+    (width, height), left, top = region["size"], region["left"], region["top"]
+    with Image.open(folder / f"transforms-{name}.png") as picture:
+        screen = np.asarray(picture.convert("RGB")) / 255.0
+    return screen[top : top + height, left : left + width]
+
+
+def _psnr(one: np.ndarray, other: np.ndarray) -> float:
+    """Return how close pictures are, dB; 99 if they are the same."""
+    error = np.mean((one - other) ** 2)
+    return float(-10.0 * np.log10(error)) if error else 99.0
