@@ -24,13 +24,14 @@ class Layout:
 
     column = grid_flow = row
 
-    def panel(self, _name):
+    def panel(self, _name, **_options):
         """Return itself as the header and the body of a part that is open."""
         return self, self
 
     def operator(self, name, **_options):
         """Note a button, and return something to set its properties on."""
-        assert bpy.ops.refine.__getattr__(name.split(".")[1]).get_rna_type()
+        module, call = name.split(".")
+        assert getattr(getattr(bpy.ops, module), call).get_rna_type()
         self.drawn.append(name)
         return SimpleNamespace()
 
