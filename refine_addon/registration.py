@@ -14,17 +14,19 @@ from .ui import (
     panel_cache,
     plans,
     price,
+    properties,
     render_notice,
     render_operators,
     running,
     select_tools,
     transforms,
 )
+from .ui.camera_import import REFINE_FH_cameras, REFINE_OT_import_cameras
 from .ui.camera_list import REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
 from .ui.export_operators import REFINE_OT_export_ply
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
-from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_cameras, REFINE_OT_import_ply
+from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_ply
 from .ui.operators import (
     REFINE_OT_apply,
     REFINE_OT_convert,
@@ -108,6 +110,7 @@ CLASSES = (
     REFINE_OT_leave_out,
     REFINE_OT_keep_unseen,
     REFINE_FH_ply,
+    REFINE_FH_cameras,
     REFINE_PT_splats,
     REFINE_PT_cameras,
     REFINE_UL_cameras,
@@ -138,8 +141,11 @@ def register() -> None:
     render_notice.register()
     camera_list.register()
     panel_cache.register()
+    properties.register()
     demand_changes.register()
     price.register()
+    plans.register()
+    draw.register()
     running.register()
     transforms.register()
     select_tools.register()
@@ -149,7 +155,7 @@ def register() -> None:
 
 def unregister() -> None:
     """Undo `register`, in reverse."""
-    draw.stop()
+    draw.unregister()
     bpy.utils.unregister_cli_command(_commands.pop())
     images.use(None)
     transforms.unregister()
@@ -158,6 +164,7 @@ def unregister() -> None:
     plans.unregister()
     price.unregister()
     demand_changes.unregister()
+    properties.unregister()
     panel_cache.unregister()
     camera_list.unregister()
     render_notice.unregister()

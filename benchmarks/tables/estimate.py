@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from refine_addon.core.splats import Splats
-    from refine_addon.core.survivor_choice import SurvivorChoice
+    from refine_addon.core.survivor_choice import Became
     from refine_addon.core.views import ViewSet
 
 DELETE, ABSORB, REFIT = "delete", "absorb", "refit"
-BECOMING: dict[str, SurvivorChoice] = {DELETE: "unchanged", ABSORB: "absorb", REFIT: "refit"}
+BECOMING: dict[str, Became] = {DELETE: "unchanged", ABSORB: "absorb", REFIT: "refit"}
 HEADING = (
     f"{'scene':12}{'':10}{'budget':>12}{'removed':>9}{'estimate':>10}{'truth':>8}{'off by':>8}"
     f"{'expected':>10}{'seconds':>9}"
@@ -123,7 +123,7 @@ def measure(
                 gone,
                 estimate,
                 renders.mean["psnr"],
-                result.report["estimated_psnr_absorbed"] if way == DELETE else None,
+                result.report["survivors"]["psnr"]["absorb"] if way == DELETE else None,
                 seconds,
                 guess - truth,
                 1 + int(np.count_nonzero(truth < truth[np.argmin(guess)])),

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
     import bpy
     from numpy.typing import NDArray
 
+_FEW = 16
+"""So many cameras at most are looked at to tell whether all are to be turned."""
+
 
 @dataclass(frozen=True)
 class CameraChoice:
@@ -92,6 +95,35 @@ class CameraChoice:
         depsgraph = context.evaluated_depsgraph_get()
         views = tuple(view_from_camera(camera, scene, depsgraph) for camera in cameras)
         return ViewSet(views, turn=_turn(cameras, views, splats, depsgraph))
+
+
+def known_turn(context: bpy.types.Context, splats: bpy.types.Object) -> int:
+    """Return by how many quarters about x the cameras that decide are to be turned.
+
+    Known from how splats and cameras were imported, before anything is scored.
+
+    Parameters
+    ----------
+    context : bpy.types.Context
+        Evaluated: matrices are read as they stand. The choice of cameras is that of its scene.
+    splats : bpy.types.Object
+
+    Returns
+    -------
+    {0, 1, -1}
+        See `ViewSet.turn`; 0 where it is not known, or a shot decides.
+    """
+    choice = CameraChoice.of_scene(context.scene)
+    if choice.source == "FRAMES":
+        return 0
+    cameras = choice.cameras(context)
+    cameras = cameras[:: len(cameras) // _FEW + 1]
+    depsgraph = context.evaluated_depsgraph_get()
+    try:
+        views = [view_from_camera(camera, context.scene, depsgraph) for camera in cameras]
+        return (_turn(cameras, views, splats, depsgraph) if cameras else None) or 0
+    except RefineError:  # which scoring reports
+        return 0
 
 
 def create_cameras(

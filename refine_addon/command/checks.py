@@ -11,7 +11,7 @@ from ..core.formats.registry import format_named, without_suffix
 from ..core.levels.files import MANIFEST, check_goal, is_manifest, level_paths
 from ..core.urls import Url, refuse_url
 from . import zones
-from .options import DEFAULT_LEVELS, budget, cleaning, levels, settings
+from .options import DEFAULT_LEVELS, budget, cleaning, levels, settings, survivors
 from .report import is_report
 from .zones import ROLES
 
@@ -217,11 +217,10 @@ def _check_together(parser: argparse.ArgumentParser, options: argparse.Namespace
         if getattr(options, name, None):
             option = "-o" if name == "output" else f"--{name.replace('_', '-')}"
             parser.error(f"{option} does not go with --together")
-    changes = options.survivors != "unchanged"
+    changes = survivors(options) in ("absorb", "refit")
     if options.psnr is not None and (changes or options.method == "closed-form"):
         parser.error(
-            "with --together, --psnr goes with --method auto or occlusion and unchanged survivors, "
-            "not --absorb"
+            "with --together, --psnr goes with --method auto or occlusion and unchanged survivors"
         )
     if options.workers is not None and options.scheduler:
         parser.error("expected --workers or --scheduler, and not both")

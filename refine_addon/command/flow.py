@@ -33,6 +33,10 @@ def run(arguments: Sequence[str], *, scene: bool) -> int:
     parser = make_parser()
     try:
         options = parser.parse_args(list(arguments), argparse.Namespace(scene=scene))
+        if scene:
+            from . import open_blend  # noqa: PLC0415 - needs Blender
+
+            open_blend.check()
         checks.check(parser, options)
         return DONE if runs.execute(options) else FAILED
     except SystemExit as leaving:  # argparse leaves the process; Blender wants a number

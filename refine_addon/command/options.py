@@ -6,7 +6,17 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from ..core import METHODS, REASONS, SURVIVORS, Budget, Cleaning, Levels, RefineError, Settings
+from ..core import (
+    CHOICES,
+    METHODS,
+    REASONS,
+    SURVIVORS,
+    Budget,
+    Cleaning,
+    Levels,
+    RefineError,
+    Settings,
+)
 from ..core.errors import printable
 from ..core.formats.registry import SUFFIXES
 from ..core.levels.files import GOAL
@@ -17,6 +27,8 @@ from . import zones
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
+    from ..core.survivor_choice import SurvivorChoice
 
 DEFAULT_RATIO = 0.5
 
@@ -147,12 +159,12 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     becoming = prune.add_mutually_exclusive_group()
     becoming.add_argument(
         "--survivors",
-        choices=SURVIVORS,
-        default=SURVIVORS[0],
+        choices=CHOICES,
         help="what those that stay may become: unchanged; absorb: they take over what is removed, "
-        "by what the cameras see of it, far better when much is removed, and slower (--method then "
-        "only matters with --threshold and --min-seen); refit: they are then fitted to what the "
-        f"unpruned ones look like, better still, and slower still (default {SURVIVORS[0]})",
+        "by what the cameras see of it, far better when much is removed (--method then only "
+        "matters with --threshold and --min-seen); refit: they are then fitted to what the "
+        "unpruned ones look like, better still, and slower; auto, the default: absorb, but "
+        "unchanged where that is as good; with --method, --threshold or --min-seen: unchanged",
     )
     becoming.add_argument(
         "--absorb",
@@ -382,9 +394,9 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         choices=METHODS,
-        default=METHODS[0],
-        help="default: auto, which knows what hides what, by no more views than --tolerance asks "
-        "for; occlusion uses all of them; closed-form takes nothing as hidden: far faster, worse",
+        help="how splats are scored; default: auto, which knows what hides what, by no more views "
+        "than --tolerance asks for; occlusion uses all of them; closed-form takes nothing as "
+        "hidden: far faster, worse",
     )
     parser.add_argument(
         "--tolerance",
@@ -489,7 +501,14 @@ def _path(text: str) -> Path:
 
 def settings(options: argparse.Namespace) -> Settings:
     """Return how to score, or raise `RefineError` where a value cannot be."""
-    return Settings(options.method, options.views, tolerance=options.tolerance)
+    method = options.method or Settings.method
+    return Settings(method, options.views, tolerance=options.tolerance)
+
+
+def survivors(options: argparse.Namespace) -> SurvivorChoice:
+    """Return what survivors may become; a method that is named says how to delete."""
+    chosen: SurvivorChoice | None = options.survivors
+    return chosen or ("unchanged" if options.method else CHOICES[0])
 
 
 def cleaning(options: argparse.Namespace) -> Cleaning:

@@ -11,8 +11,8 @@ from ..core.formats.registry import without_suffix
 from ..core.picture_files import PictureFiles
 from ..core.tiles.storage import located
 from . import zones
-from .options import budget, cleaning, settings
-from .words import by, sizes, written
+from .options import budget, cleaning, settings, survivors
+from .words import by, by_survivors, sizes, written
 
 if TYPE_CHECKING:
     import argparse
@@ -45,7 +45,7 @@ def _request(options: argparse.Namespace, views: ViewSet, name: str) -> PruneReq
         budget(options),
         settings(options),
         zones=() if options.object else zones.of_files(options),
-        survivors=options.survivors,
+        survivors=survivors(options),
         cleaning=cleaning(options) if options.clean else None,
         pictures=pictures,
         overwrite=options.overwrite,
@@ -136,14 +136,15 @@ def _say_result(run: Run, label: str, done: dict[str, Any]) -> None:
 
 def _quality(done: dict[str, Any]) -> str:
     """Return what is estimated of the pictures, in words; "" where nothing is."""
-    psnr, absorbed = done["estimated_psnr"], done["estimated_psnr_absorbed"]
+    psnr, survivors = done["estimated_psnr"], done["survivors"]
     if psnr is None:
         return ""
     words = f"{in_words(psnr)} in these views"
     if done.get("written_psnr") is not None:
         words += f", {in_words(done['written_psnr'])} as written"
-    if "absorbed" in done or psnr > UNSEEN:
+    if psnr > UNSEEN:
         return words
-    if absorbed is None:
-        return f"{words}; {done['estimated_psnr_absorbed_note']}"
-    return f"{words}; with --absorb {in_words(absorbed)}"
+    if survivors["note"]:
+        return f"{words}; {survivors['note']}"
+    others = by_survivors(survivors, survivors["became"])
+    return f"{words} (--survivors {others})" if others else words

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from ..core import ScoreRequest, file_to_file
 from . import zones
 from .options import settings
+from .words import by_survivors
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -52,5 +53,8 @@ def _said(run: Run, label: str, done: dict[str, Any]) -> dict[str, Any]:
         f"-> {run.options.output}"
     )
     run.say_what_decided(done)
+    for price in done["prices"]:
+        ways = by_survivors(price)
+        run.terminal.say(f"  {price['removed']:.0%} removed: {ways}")
     run.terminal.notes(done["notes"])
     return done

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from ..core.estimate.quality import in_words
+from ..core.pace import in_time
 from ..core.report import size_in_words, sizes_in_words
 
 if TYPE_CHECKING:
@@ -37,3 +39,27 @@ def sizes(before: int, after: int | None) -> str:
     if after is None:
         return f"of {size_in_words(before)}"
     return sizes_in_words(before, "->", after)
+
+
+def by_survivors(told: Mapping[str, Any], without: str = "") -> str:
+    """Return which quality and time what survivors may become is expected to come to.
+
+    Parameters
+    ----------
+    told : mapping
+        ``psnr`` and ``seconds`` of a report's ``survivors`` or ``prices``.
+    without : str
+        What of them is left out.
+
+    Examples
+    --------
+    >>> psnr = {"unchanged": 38.0, "absorb": 46.0, "refit": None}
+    >>> by_survivors({"psnr": psnr, "seconds": {"unchanged": 1.2, "absorb": 2.1, "refit": 8.0}})
+    'unchanged about 38 dB in 2 s, absorb about 46 dB in 3 s'
+    """
+    seconds = told.get("seconds") or {}
+    return ", ".join(
+        f"{way} {in_words(psnr)}" + (f" in {in_time(seconds[way])}" if seconds else "")
+        for way, psnr in told["psnr"].items()
+        if psnr is not None and way != without
+    )

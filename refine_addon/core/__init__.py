@@ -4,7 +4,8 @@ In short::
 
     file = read_splats("scene.ply")
     result = prune(file.splats(), read_cameras("cameras.json"), Budget(ratio=0.5))
-    file.write("pruned.ply", result.keep)
+    columns = survivor_columns(file.rows, result.absorbed)  # what survivors became
+    file.write("pruned.ply", result.keep, columns=columns)
 """
 
 from .cameras.read import read_cameras
@@ -24,7 +25,7 @@ from .scoring.occlusion import Occlusion
 from .selection import Budget, rank, select
 from .solid import Solid
 from .splats import Splats
-from .survivor_choice import SURVIVORS
+from .survivor_choice import CHOICES, SURVIVORS
 from .survivors import survivor_columns
 from .task import METHODS, Result, Settings
 from .tiles.prune import prune_tiles
@@ -33,6 +34,7 @@ from .volumes import Box, MovedVolume, Sphere, Zone, forced
 from .work import Cancelled
 
 __all__ = [
+    "CHOICES",
     "METHODS",
     "REASONS",
     "SURVIVORS",

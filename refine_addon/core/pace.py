@@ -55,12 +55,16 @@ class Pace:
         passed = self._clock() - self._start
         if passed < _EARLY or not 0.0 < done < total:
             return ""
-        rest = _in_words(passed * (total - done) / done)
+        rest = in_time(passed * (total - done) / done)
         return f"about {rest} left{' in all' if len(self._sizes) > 1 else ''}"
 
 
-def _in_words(seconds: float) -> str:
-    """Return a time in the unit that suits it, rounded up."""
+def in_time(seconds: float) -> str:
+    """Return a time in the unit that suits it, rounded up.
+
+    >>> in_time(2.1), in_time(61.0)
+    ('3 s', '2 min')
+    """
     if seconds <= _MINUTE:
         return f"{math.ceil(seconds)} s"
     hours, minutes = divmod(math.ceil(seconds / _MINUTE), 60)

@@ -9,22 +9,29 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .estimate.quality import FEWEST, out_of_reach
+from .estimate.cost import expected_seconds
+from .estimate.quality import FEWEST, expected, out_of_reach
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from _typeshed import DataclassInstance
     from numpy.typing import NDArray
 
     from .absorbing.absorb import Counts
+    from .estimate.quality import Quality
     from .formats.ply import SplatFile
     from .formats.registry import Packed
     from .scores import Scores
     from .selection import Budget
+    from .survivor_choice import Became
 
 
 SEES_TOO_LITTLE = "the views see too little for an estimate of the pictures' quality"
 NOT_ESTIMATED = "the closed form estimates the pictures' quality only if a PSNR is the budget"
-NOT_FORETOLD = f"what absorbing reaches is not foretold for fewer than {FEWEST:,} splats"
+NOT_FORETOLD = (
+    f"what absorbing and refitting reach is not foretold for fewer than {FEWEST:,} splats"
+)
 """Why there is no estimate: notes of the report."""
 
 MEASURES = "absorbing measures by occlusion: closed-form was not used"
@@ -214,7 +221,18 @@ def conclude(
     why : str
         See `remark`.
     """
-    facts |= _quality_facts(scores, keep, psnr, absorbed=absorbed is not None)
+    curve = scores.quality
+    gone = 0.0 if curve is None else 1.0 - float(np.mean(keep))
+    note = None
+    if psnr is None:
+        note = NOT_ESTIMATED if scores.ray_sample is None else SEES_TOO_LITTLE
+    became: Became = "unchanged" if absorbed is None else "absorb"
+    facts |= {
+        "estimated_psnr": None if psnr is None else round(psnr, 2),
+        "estimated_psnr_note": note,
+        "survivors": {"became": became, **expected_psnr(curve, gone, {became: psnr})},
+        "quality": None if curve is None else curve.facts(),
+    }
     if psnr is None and scores.ray_sample is not None:
         facts["notes"].append(SEES_TOO_LITTLE)
     facts["budget_remark"] = why
@@ -225,22 +243,55 @@ def conclude(
         facts["notes"].append(absorbed.note())
 
 
-def _quality_facts(
-    scores: Scores, keep: NDArray[np.bool_], psnr: float | None, *, absorbed: bool
+PRICED = (0.3, 0.5, 0.7, 0.9)
+"""Shares removed of which a scoring says what they would cost."""
+
+
+def prices(scores: Scores, scored: float) -> list[dict[str, Any]]:
+    """Return what pruning by some scores would cost, by the share removed and by survivors.
+
+    Parameters
+    ----------
+    scores : Scores
+        By *auto* or *occlusion*.
+    scored : float
+        How long scoring took, seconds.
+    """
+    curve = scores.quality
+    if curve is None:
+        return []
+    return [
+        {
+            "removed": share,
+            **expected_psnr(curve, share, {"unchanged": curve.at(share)}),
+            "seconds": in_tenths(expected_seconds(scored, share, once=False)),
+        }
+        for share in PRICED
+    ]
+
+
+def in_tenths(seconds: Mapping[Became, float]) -> dict[Became, float]:
+    """Return times as a report has them."""
+    return {way: round(value, 1) for way, value in seconds.items()}
+
+
+def expected_psnr(
+    curve: Quality | None, gone: float, measured: Mapping[Became, float | None]
 ) -> dict[str, Any]:
-    """Return what a report says about the quality of the pictures; see `conclude`."""
-    curve, other = scores.quality, psnr if absorbed else None
-    if curve is not None and curve.foretold and not absorbed:
-        other = curve.at(1.0 - float(np.mean(keep)), "absorb")
-    why = why_other = None
-    if psnr is None:
-        why = NOT_ESTIMATED if scores.ray_sample is None else SEES_TOO_LITTLE
-    if other is None:
-        why_other = NOT_FORETOLD if psnr is not None else why
+    """Return what a report says of how close the pictures stay by what survivors become.
+
+    Parameters
+    ----------
+    curve : Quality or None
+    gone : float
+        Share of the splats that goes.
+    measured : mapping of str to (float or None)
+        The estimates that were measured on rays, dB, by what survivors became.
+    """
+    told = expected(curve, gone, measured)
+    some = [psnr for psnr in measured.values() if psnr is not None]
+    foretold = told["absorb"] is not None or not some
     return {
-        "estimated_psnr": None if psnr is None else round(psnr, 2),
-        "estimated_psnr_absorbed": None if other is None else round(other, 2),
-        "estimated_psnr_note": why,
-        "estimated_psnr_absorbed_note": why_other,
-        "quality": curve.facts() if curve is not None else None,
+        "psnr": {way: None if psnr is None else round(psnr, 2) for way, psnr in told.items()},
+        "note": None if foretold else NOT_FORETOLD,
     }

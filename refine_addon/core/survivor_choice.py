@@ -6,16 +6,22 @@ from typing import Literal
 
 from .errors import RefineError
 
-SurvivorChoice = Literal["unchanged", "absorb", "refit"]
+Became = Literal["unchanged", "absorb", "refit"]
 
-SURVIVORS: tuple[SurvivorChoice, ...] = ("unchanged", "absorb", "refit")
-"""They stay what they are, to the bit; they absorb what goes; they absorb it, and are then refitted
-to what the unpruned splats look like. Each takes longer than the one before, and keeps the pictures
-closer."""
+SurvivorChoice = Literal["auto", "unchanged", "absorb", "refit"]
+
+SURVIVORS: tuple[Became, ...] = ("unchanged", "absorb", "refit")
+"""What survivors become: they stay what they are, to the bit; they absorb what goes; they absorb
+it, and are then refitted to what the unpruned splats look like. Each takes longer than the one
+before, and keeps the pictures closer."""
+
+CHOICES: tuple[SurvivorChoice, ...] = ("auto", *SURVIVORS)
+"""What may be asked. The first is the default: survivors absorb what goes, but stay unchanged where
+that is as good, and where the method or the budget says how to delete; see `Task.absorb`."""
 
 
-def refuse_unknown(survivors: str) -> None:
-    """Raise `RefineError` if `survivors` is none of `SURVIVORS`."""
-    if survivors not in SURVIVORS:
-        msg = f"survivors is {survivors!r}, expected one of {', '.join(SURVIVORS)}"
+def refuse_unknown(survivors: str, choices: tuple[str, ...] = CHOICES) -> None:
+    """Raise `RefineError` if `survivors` is none of the choices."""
+    if survivors not in choices:
+        msg = f"survivors is {survivors!r}, expected one of {', '.join(choices)}"
         raise RefineError(msg)

@@ -1,4 +1,4 @@
-"""Stored columns of splats, updated with the results of absorbing, for files and meshes.
+"""Stored columns of splats, updated with what survivors became, for files and meshes.
 
 This module stands above formats and absorbing, so that neither has to know the other.
 """
@@ -28,7 +28,9 @@ class Columns(Protocol):
 
 
 def survivor_columns(
-    stored: Columns | NDArray[Any], absorbed: Absorbed, matrix: NDArray[Any] | None = None
+    stored: Columns | NDArray[Any],
+    absorbed: Absorbed | None,
+    matrix: NDArray[Any] | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Return stored columns with the values of changed survivors put in.
 
@@ -36,8 +38,8 @@ def survivor_columns(
     ----------
     stored : mapping of str to (N,), or structured array
         All properties of the splats before absorbing, such as `SplatFile.rows`; not changed.
-    absorbed : Absorbed
-        Of these splats.
+    absorbed : Absorbed or None
+        Of these splats; None where survivors stay what they are: no column changes.
     matrix : (4, 4) floating, optional
         From the frame of the survivors to that of the columns; by default they are the same.
 
@@ -49,10 +51,13 @@ def survivor_columns(
 
     Examples
     --------
-    To write the survivors, with what they absorbed, to a file::
+    To write the survivors, as they became, to a file::
 
-        file.write("out.ply", absorbed.keep, columns=survivor_columns(file.rows, absorbed))
+        columns = survivor_columns(file.rows, result.absorbed)
+        file.write("out.ply", result.keep, columns=columns)
     """
+    if absorbed is None:
+        return {}
     changed = np.flatnonzero(absorbed.changed)
     rows = np.flatnonzero(absorbed.keep)[changed]
     survivors = absorbed.splats.take(changed)

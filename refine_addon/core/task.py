@@ -89,6 +89,22 @@ class Settings:
 DEFAULTS = Settings()
 
 
+def may_absorb(survivors: SurvivorChoice, settings: Settings, budget: Budget) -> bool:
+    """Return whether survivors may absorb others.
+
+    By default they may not where the method or the budget says how to delete.
+
+    Parameters
+    ----------
+    survivors : {"auto", "unchanged", "absorb", "refit"}
+    settings : Settings
+    budget : Budget
+    """
+    if survivors == "auto":
+        return settings.method == DEFAULTS.method and not budget.needs_scores
+    return survivors != "unchanged"
+
+
 @dataclass(frozen=True, eq=False)
 class Origin:
     """The splats that those of a task became of, by absorbing and refitting.
@@ -130,10 +146,10 @@ class Task:
         Splats that go before all others, whatever they are worth, and count as removed; those that
         are protected stay. The rest is scored without them, and is what the pictures of a PSNR are
         compared with; nothing absorbs them.
-    survivors : {"unchanged", "absorb", "refit"}
-        What survivors may become. If they absorb others, the budget only decides how many survive;
-        which ones, and their new values, come from merging, whatever the method. See
-        `survivor_choice.SURVIVORS`.
+    survivors : {"auto", "unchanged", "absorb", "refit"}
+        What survivors may become, see `survivor_choice`. If they absorb others, the budget only
+        decides how many survive; which ones, and their new values, come from merging, whatever the
+        method. By default they absorb, but stay unchanged where that is as good.
     row_bytes, fixed_bytes : float or (N,) int64, int
         See `Budget.removals`.
     origin : Origin or None
@@ -150,7 +166,7 @@ class Task:
     scores: Scores | None = None
     protected: NDArray[np.bool_] | None = None
     forced_out: NDArray[np.bool_] | None = None
-    survivors: SurvivorChoice = "unchanged"
+    survivors: SurvivorChoice = "auto"
     row_bytes: RowBytes = 0.0
     fixed_bytes: int = 0
     origin: Origin | None = None
@@ -168,8 +184,10 @@ class Task:
 
     @property
     def absorb(self) -> bool:
-        """Whether survivors absorb the splats that are removed."""
-        return self.survivors != "unchanged"
+        """Whether survivors may absorb the splats that are removed."""
+        if self.survivors == "auto" and self.splats is None:  # only their scores are known
+            return False
+        return may_absorb(self.survivors, self.settings, self.budget)
 
     def scene(self) -> tuple[Splats, ViewSet]:
         """Return splats and views.

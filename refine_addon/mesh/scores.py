@@ -72,6 +72,8 @@ class Provenance:
         What the scores are to be refined by, if that is still to come.
     together : Together, optional
         Where other objects were scored with them; the curve is that of all then.
+    seconds : float, optional
+        How long scoring took.
     """
 
     settings: Settings
@@ -80,6 +82,7 @@ class Provenance:
     protected: NDArray[np.bool_] | None = None
     asked: Settings | None = None
     together: Together | None = None
+    seconds: float | None = None
 
 
 def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
@@ -117,6 +120,7 @@ def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
             "cameras": provenance.cameras,
             "protected": digest(provenance.protected),
             "asked": asdict(asked) if asked else None,
+            "seconds": provenance.seconds,
             "together": together and {"id": together.id, "splats": together.splats},
         }
     )
@@ -128,6 +132,24 @@ def store(checked: SplatObject, scores: Scores, provenance: Provenance) -> None:
     scored = np.ones(len(checked), np.bool_) if scores.scored is None else scores.scored
     mesh_attributes.write_attribute(mesh, SCORED, "BOOLEAN", scored)
     mesh[RECORD] = new_record
+    mesh_attributes.updated(mesh)
+
+
+def forget(checked: SplatObject) -> None:
+    """Remove the scores of an object, with all that shows them and goes by them.
+
+    Raises
+    ------
+    RefineError
+        If the object cannot be written to.
+    """
+    mesh_edit.check_writable(checked.obj)
+    mesh = checked.mesh
+    for name in (SCORE, RANK, SEEN, SCORED, heat_map.HEAT, mesh_edit.REMOVE):
+        if name in mesh.attributes:
+            mesh.attributes.remove(mesh.attributes[name])
+    if RECORD in mesh:
+        del mesh[RECORD]
     mesh_attributes.updated(mesh)
 
 

@@ -24,7 +24,7 @@ def add_levels(checked: SplatObject, levels: Sequence[Level]) -> bpy.types.Colle
     """Make an object of each level, in a new collection of the scene; the original stays.
 
     The objects are copies of the original in all but the splats. They are named after it with
-    ``_lod1`` and so on.
+    ``_lod1`` and so on, and hidden, in renders too: all stand where the original does.
 
     Parameters
     ----------
@@ -52,6 +52,9 @@ def add_levels(checked: SplatObject, levels: Sequence[Level]) -> bpy.types.Colle
             facts = level.facts(GOAL)
             copy[FACTS] = {key: value for key, value in facts.items() if value is not None}
             copy.select_set(False)
+        for obj in collection.objects:  # all stand in one place
+            obj.hide_set(True)
+            obj.hide_render = True
     return collection
 
 

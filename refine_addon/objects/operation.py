@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -21,7 +21,14 @@ from ..mesh import layout as mesh_layout
 from ..mesh.layout import SplatObject, check
 from ..mesh.scores import Provenance, store
 from .demands import NONE, Demands
-from .splat_object import drift_notes, find, gather, modifier_notes, reduce_object
+from .splat_object import (
+    can_become,
+    drift_notes,
+    find,
+    gather,
+    modifier_notes,
+    reduce_object,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -72,6 +79,7 @@ def prune_object(
     """
     checked = check(find(name))
     save = save and not request.dry_run
+    request = replace(request, survivors=can_become([checked], request.survivors))
     # Where the scale is uneven there are no pictures, for which it is not refused.
     harmonics = True if request.absorb else None if request.compares_pictures else False
     demands += Demands(zones=tuple(request.zones))

@@ -101,6 +101,20 @@ def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
     return transformed(splats, matrix, rotate_sh=whole)
 
 
+def can_become(group: Sequence[SplatObject], survivors: SurvivorChoice) -> SurvivorChoice:
+    """Return what survivors may become: by default unchanged where the scale of any is uneven.
+
+    Parameters
+    ----------
+    group : sequence of SplatObject
+    survivors : {"auto", "unchanged", "absorb", "refit"}
+        What is asked.
+    """
+    graph = bpy.context.evaluated_depsgraph_get()
+    even = all(is_uniform(world_matrix(member.obj, graph)) for member in group)
+    return survivors if even or survivors != "auto" else "unchanged"
+
+
 def modifier_notes(obj: bpy.types.Object) -> list[str]:
     """Return a sentence if modifiers show the object otherwise than it is scored and exported."""
     drawing = ("REFINE", "KIRI")  # these draw splats and move none

@@ -6,12 +6,14 @@ Blender calls it in a thread of its own, on what it evaluated for this render.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, NamedTuple, cast
 
 import bpy
 import numpy as np
 
+from .. import main_thread
 from ..cameras.objects import FLIP
 from ..core.affine import transformed
 from ..core.drawing import draw, seen_from
@@ -19,9 +21,10 @@ from ..core.errors import RefineError
 from ..core.seeing.scene import scene_of
 from ..core.splats import Splats, drawable, joined
 from ..core.views import View, ViewSet
-from ..core.work import Cancelled, checkpoint
+from ..core.work import Cancelled, checked_by, checkpoint
 from ..mesh import attributes as mesh_attributes
 from ..mesh.layout import SplatObject, check, splat_count
+from . import card
 from .meshes import drawn_by_us
 
 if TYPE_CHECKING:
@@ -48,6 +51,8 @@ class Shared:
         What is rendered besides splats, of the next frame.
     transparent : bool
         Whether what lies behind everything is left transparent.
+    card : bool
+        Whether splats are drawn on the graphics card, by the main thread (`main_thread.serve`).
     finished : Path or None
         Folder of pictures that are drawn already, to be shown once more.
     splats : int
@@ -64,6 +69,7 @@ class Shared:
 
     layer: Layer | None = None
     transparent: bool = False
+    card: bool = False
     finished: Path | None = None
     splats: int = 0
     frames: list[int] = field(default_factory=list)
@@ -139,11 +145,20 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc] # noqa: N801 
             depths = np.where(layer.depths > 0.0, layer.depths + place.away, 0.0)
             layer = replace(layer, depths=depths)
         shared.splats = len(splats)
-        frame = scene_of(splats.means, drawable(splats), ViewSet((place.near,)))
-        picture = draw(splats, view, layer, frame, progress=self._progress)
+        if shared.card and not place.away and len(splats):
+            sheet = card.prepare(splats, view, layer)
+            with checked_by(self._check):
+                picture = main_thread.call(partial(card.paint, sheet, layer))
+        else:
+            frame = scene_of(splats.means, drawable(splats), ViewSet((place.near,)))
+            picture = draw(splats, view, layer, frame, progress=self._progress)
         if not shared.transparent:
             picture[3] = 1.0
         return picture
+
+    def _check(self) -> None:
+        if self.test_break():
+            raise Cancelled
 
     def _progress(self, fraction: float, what: str) -> bool:
         self.update_progress(fraction)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..core.estimate.quality import Quality
-    from ..core.survivor_choice import SurvivorChoice
+    from ..core.survivor_choice import Became
 
     Color = tuple[float, float, float]
     Box = tuple[float, float, float, float]  # left, top, right, bottom
@@ -110,7 +110,7 @@ class Place:
     """
 
     share: float
-    survivors: SurvivorChoice = "unchanged"
+    survivors: Became = "unchanged"
 
 
 def by_score(values: NDArray[np.float32]) -> Histogram:
@@ -141,7 +141,7 @@ def by_views(seen: NDArray[np.int32], views: int) -> Histogram:
     return Histogram(bins, np.bincount(bins, minlength=count + 1), ticks, "views")
 
 
-def _ways(quality: Quality) -> tuple[SurvivorChoice, ...]:
+def _ways(quality: Quality) -> tuple[Became, ...]:
     """Return of what survivors may become curves are drawn."""
     return SURVIVORS if quality.foretold else SURVIVORS[:1]
 

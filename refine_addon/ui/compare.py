@@ -3,9 +3,11 @@
 # ruff: noqa: D400, N801, RUF012 - Blender's names and tooltips
 from __future__ import annotations
 
+import json
+import zlib
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
@@ -17,7 +19,10 @@ from ..core.picture_files import KINDS
 from ..core.pictures import AMPLIFIED, Comparison, compare
 from ..core.views import ViewSet
 from ..core.work import part
+from ..mesh import scores as mesh_scores
+from ..mesh.records import parsed
 from ..objects import splat_group
+from . import plans
 from .images import put
 from .on_thread import OnThread
 from .operator_bases import Answer, OnScored
@@ -31,6 +36,9 @@ if TYPE_CHECKING:
 
 NAMES = {kind: f"Compare: {kind}" for kind in KINDS}
 """The pictures as images of the file, made anew by each comparison."""
+
+MEASURED = "refine_measured"
+"""Custom property of the mesh: what was measured last, and of which plan, as JSON."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +92,7 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
     ) -> Answer:
         """Put the pictures into images, show them, and say how close they are."""
         comparison, estimated = result
+        _note(context, comparison)
         images = [put(NAMES[kind], getattr(comparison, kind) / np.float32(255.0)) for kind in KINDS]
         if not bpy.app.background and context.window is not None:
             _show(context, images)
@@ -94,6 +103,33 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
             f"The difference is shown {AMPLIFIED} times as large",
         )
         return {"FINISHED"}
+
+
+def measured(obj: bpy.types.Object, settings: Any) -> str:  # noqa: ANN401 - RefineSettings
+    """Return a sentence on what was measured of the plan of the moment, "" if nothing was."""
+    try:
+        noted = parsed(obj.data[MEASURED])
+        plan = plans.stored(obj, settings)
+        if plan is not None and noted["of"] == _identity(obj, plan):
+            return f"Measured in '{noted['view']}': {noted['psnr']:.1f} dB"
+    except (KeyError, TypeError, ValueError):
+        pass
+    return ""
+
+
+def _note(context: bpy.types.Context, comparison: Comparison) -> None:
+    """Keep what was measured, for the panel to show as long as the plan is this one."""
+    obj = context.object
+    plan = plans.stored(obj, context.scene.refine)
+    if plan is not None and not obj.data.library:
+        noted = {"psnr": comparison.psnr, "view": comparison.view.name}
+        obj.data[MEASURED] = json.dumps(noted | {"of": _identity(obj, plan)})
+
+
+def _identity(obj: bpy.types.Object, plan: dict[str, Any]) -> list[Any]:
+    """Return what tells a plan, and the scores it goes by, from others."""
+    scoring = zlib.crc32(str(obj.data.get(mesh_scores.RECORD)).encode())
+    return [plan["key"], plan["splats"], scoring]
 
 
 def _show(context: bpy.types.Context, images: list[bpy.types.Image]) -> None:

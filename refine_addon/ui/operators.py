@@ -6,9 +6,10 @@ Read `REFINE_OT_apply` from `prepare` to `finish` to see what runs when *Apply* 
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import bpy
 import numpy as np
@@ -19,6 +20,7 @@ from ..core.estimate.quality import in_words
 from ..core.levels.lod import Level, Levels, lod
 from ..core.report import scoring_notes, sizes_in_words
 from ..core.seeing import frustum
+from ..core.task import may_absorb
 from ..core.work import part
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
@@ -68,14 +70,11 @@ def apply_task(
 
     `forced` is what must stay and what must go of each.
     """
-    settings = context.scene.refine
+    settings, budget = context.scene.refine, context.scene.refine.to_budget()
+    how, survivors = settings.to_settings(), splat_object.can_become(group, settings.survivors)
+    views = chosen_views(context) if may_absorb(survivors, how, budget) else None
     return splat_group.stored_task(
-        group,
-        settings.to_budget(),
-        forced,
-        settings=settings.to_settings(),
-        views=chosen_views(context) if settings.survivors != "unchanged" else None,
-        survivors=settings.survivors,
+        group, budget, forced, settings=how, views=views, survivors=survivors
     )
 
 
@@ -95,6 +94,14 @@ class _Scoring:
     quality: bool
     uids: tuple[int, ...]
     origins: list[dict[str, Any]]
+
+
+class _Scored(NamedTuple):
+    """Scores, how many splats lie in each view, (V,), and how many seconds scoring took."""
+
+    scores: Scores
+    counts: NDArray[np.int64]
+    seconds: float
 
 
 class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
@@ -143,30 +150,34 @@ class REFINE_OT_score(OnThread, OnSplats, bpy.types.Operator):
         plans.refresh(context)
 
     @staticmethod
-    def work(job: _Scoring, progress: Progress) -> tuple[Scores, NDArray[np.int64]]:
+    def work(job: _Scoring, progress: Progress) -> _Scored:
         """Score, and count how many splats lie in each view."""
-        forced_out, means = job.forced.out, job.splats.means
+        forced_out, means, start = job.forced.out, job.splats.means, time.perf_counter()
         scores = pipeline.score(
             job.splats, job.views, job.settings,
             protected=job.forced.protected, forced_out=forced_out,
             quality=job.quality, progress=part(progress, 0.0, _SCORED),
         )  # fmt: skip
+        seconds = time.perf_counter() - start
         means = means if forced_out is None else means[~forced_out]
-        return scores, frustum.census(means, job.views, progress=part(progress, _SCORED, 1.0))
+        counts = frustum.census(means, job.views, progress=part(progress, _SCORED, 1.0))
+        return _Scored(scores, counts, seconds)
 
     def finish(
         self,
         context: bpy.types.Context,
         checked: SplatObject,
         job: _Scoring,
-        result: tuple[Scores, NDArray[np.int64]],
+        result: _Scored,
     ) -> Answer:
         """Store the scores on the meshes and say what came of it."""
-        scores, counts = result
-        pairs = zip(job.views, counts.tolist(), strict=True)
+        scores = result.scores
+        pairs = zip(job.views, result.counts.tolist(), strict=True)
         cameras = [(view.name, count) for view, count in pairs if view.weight]
         group = splat_group.by_uids(job.uids, checked)
-        provenance = Provenance(job.settings, cameras=cameras, protected=job.forced.protected)
+        provenance = Provenance(
+            job.settings, cameras=cameras, protected=job.forced.protected, seconds=result.seconds
+        )
         splat_group.store(group, scores, provenance, job.origins)
         plans.refresh(context)
         self.report({"INFO"}, _scored_in_words(group, scores, job.forced.counts()["forced"]))
@@ -234,7 +245,8 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
 
         def call() -> Answer:
             """Go by what the panel says by now."""
-            changing = context.scene.refine.survivors != "unchanged"
+            settings = context.scene.refine
+            changing = may_absorb(settings.survivors, settings.to_settings(), settings.to_budget())
             return start(context, event) if changing else self.execute(context)
 
         return self.adjusted(context, call)
@@ -354,7 +366,8 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
             f"{len(level.splats):,}" + (f" ({in_words(level.psnr)})" if level.psnr else "")
             for level in levels
         ]
-        self.report({"INFO"}, f"'{collection.name}': {', '.join(counts)} splats")
+        told = f"'{collection.name}', hidden: {', '.join(counts)} splats"
+        self.report({"INFO"}, f"{told}; show one by its eye in the Outliner")
         for note in job.levels.notes({level.asked: level.remark for level in levels}):
             self.report({"WARNING"}, note)
         return {"FINISHED"}

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from ..cameras.sets import CameraChoice
+from ..cameras.sets import CameraChoice, known_turn
+from ..core.estimate.alignment import Alignment
 from ..core.report import size_in_words
 from ..mesh import edit as mesh_edit
 from ..mesh import floaters, native
@@ -18,6 +19,7 @@ from ..objects import demands, splat_group
 from ..viewport import draw as viewport_draw
 from . import (
     camera_list,
+    compare,
     plans,
     price,
     render_operators,
@@ -73,18 +75,17 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         objects = splat_group.chosen(context.view_layer, obj)
         count = sum(mesh_layout.splat_count(each.data) for each in objects)
         several = len(objects) > 1
-        name = counted(len(objects), "object") if several else obj.name
-        layout.label(text=name, icon="OUTLINER_OB_POINTCLOUD")
         degree = max(mesh_layout.sh_degree(each.data) for each in objects)
-        layout.label(text=f"{count:,} splats, SH degree {degree}")
+        text = f"{counted(len(objects), 'object') if several else obj.name}: {count:,} splats"
+        size = None
+        if not several:
+            size = cached("bytes", context, lambda: mesh_layout.export_bytes(obj))
+        text += f", SH degree {degree}" + (f", {size_in_words(size)}" if size is not None else "")
+        wrapped.label(layout, context, text, icon="OUTLINER_OB_POINTCLOUD")
         transforms.draw(layout, context, objects)
         if several:
             wrapped.label(layout, context, "Scored and pruned as one scene", icon="INFO")
             return
-        size = cached("bytes", context, lambda: mesh_layout.export_bytes(obj))
-        if size is not None:
-            layout.label(text=size_in_words(size))
-        layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
         _draw_progress(layout, context, "refine.import_ply")
 
 
@@ -96,16 +97,22 @@ class REFINE_PT_cameras(_InSidebar, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the choice of cameras."""
         layout, settings = _named_column(self.layout), context.scene.refine
-        layout.operator("refine.import_cameras", icon="IMPORT")
-        layout.operator("refine.add_ring", icon="OUTLINER_OB_CAMERA")
+        row = layout.row(align=True)
+        row.operator("refine.import_cameras", icon="IMPORT")
+        row.operator("refine.add_ring", text="Add a Ring", icon="OUTLINER_OB_CAMERA")
         layout.prop(settings, "source")
         if settings.source == "COLLECTION":
-            layout.prop(settings, "collection")
+            layout.prop(settings, "collection", text="")  # room for its name
         if settings.source == "FRAMES":
             _draw_frames(layout, settings, context.scene)
         elif settings.source != "ACTIVE":
             count = cached("cameras", context, lambda: len(_cameras(context)))
             layout.label(text=counted(count, "camera"), icon="CAMERA_DATA")
+        obj = context.object
+        if mesh_layout.looks_like_splats(obj) and _record(obj) is None:
+            turn = cached("turn", context, lambda: known_turn(context, obj))
+            if turn:
+                _draw_warning(self.layout, context, plans.turned(Alignment(turn, known=True)))
 
 
 class REFINE_PT_camera_list(_InSidebar, bpy.types.Panel):
@@ -262,6 +269,8 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
             _draw_price(layout, context)
             _draw_plan(layout, context, record)
             layout.operator("refine.compare", icon="IMAGE_DATA")
+            if text := compare.measured(obj, settings):
+                wrapped.label(layout, context, text, icon="CHECKMARK")
             _draw_progress(layout, context, "refine.compare")
         row = layout.row()
         row.enabled = record is not None
@@ -276,8 +285,10 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the buttons."""
-        layout, settings = self.layout, context.scene.refine
+        layout, settings, obj = self.layout, context.scene.refine, context.object
         layout.operator("refine.export_ply", icon="EXPORT")
+        if mesh_layout.looks_like_splats(obj):
+            layout.operator("refine.convert", text=f"Convert to {other_form(obj.data)}")
         column = _named_column(layout)
         column.prop(settings, "levels")
         column.prop(settings, "level_survivors")
@@ -369,12 +380,24 @@ def _draw_plan(
         text = plans.remark(plan, record) if waits else plan["error"]
         wrapped.label(layout, context, text, icon="INFO" if waits else "ERROR")
         return
-    wrapped.label(layout, context, plans.sentence(plan, settings.survivors))
+    wrapped.label(layout, context, plans.sentence(plan))
     if remark := plans.remark(plan, record):
         wrapped.label(layout, context, remark, icon="INFO")
     for warning in plans.warnings(plan, record):
-        wrapped.label(layout, context, warning.text, icon="ERROR")
-        if warning.remedy and not _changes(context, obj):  # else these may be put right
-            button = layout.operator(warning.remedy)
-            for name, value in warning.options.items():
-                setattr(button, name, value)
+        remedy = not _changes(context, obj)  # else it may be put right
+        _draw_warning(layout, context, warning, remedy=remedy)
+
+
+def _draw_warning(
+    layout: bpy.types.UILayout,
+    context: bpy.types.Context,
+    warning: plans.Warned,
+    *,
+    remedy: bool = True,
+) -> None:
+    """Draw a warning, with the button that helps."""
+    wrapped.label(layout, context, warning.text, icon="ERROR")
+    if warning.remedy and remedy:
+        button = layout.operator(warning.remedy)
+        for name, value in warning.options.items():
+            setattr(button, name, value)

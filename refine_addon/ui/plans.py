@@ -15,14 +15,18 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
+from bpy.app.handlers import persistent
 
 from ..core import pipeline
 from ..core.errors import RefineError
 from ..core.estimate.alignment import Alignment
+from ..core.estimate.cost import expected_seconds
 from ..core.estimate.quality import in_words, out_of_reach
+from ..core.pace import in_time
 from ..core.report import sizes_in_words
 from ..core.selection import Tally, quality_of
 from ..core.survivor_choice import SURVIVORS
+from ..core.task import may_absorb
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.records import parsed
@@ -36,7 +40,7 @@ if TYPE_CHECKING:
 
     from ..core.scores import Scores
     from ..core.selection import Budget
-    from ..core.survivor_choice import SurvivorChoice
+    from ..core.survivor_choice import Became, SurvivorChoice
     from ..core.task import Task
     from .chart import Histogram
 
@@ -66,6 +70,8 @@ class _Known:
         Splats whose centre lies in none of the views.
     forced : int
         Splats that go before all others, which all of the above leaves out.
+    scored_s : float or None
+        How long scoring them all took, seconds; None where that tells nothing of what else takes.
     """
 
     state: tuple[Any, ...]
@@ -75,6 +81,7 @@ class _Known:
     kinds: Histogram
     unseen: int
     forced: int
+    scored_s: float | None = None
 
     @property
     def count(self) -> int:
@@ -92,8 +99,16 @@ _tried: list[tuple[Any, ...]] = []
 """For what the panel last asked to have a plan made; one at most. Not each draw asks again."""
 
 
+def register() -> None:
+    """Hear of undo."""
+    for listening in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
+        listening.append(_undone)
+
+
 def unregister() -> None:
     """Forget all, and make no more plans."""
+    for listening in (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post):
+        listening.remove(_undone)
     if bpy.app.timers.is_registered(_rested):
         bpy.app.timers.unregister(_rested)
     for kept in (_known, _waiting, _tried):
@@ -103,7 +118,7 @@ def unregister() -> None:
 def key(settings: Any) -> str:  # noqa: ANN401 - RefineSettings, which imports this module
     """Return what a plan depends on; a stored plan of another key is out of date."""
     budget = f"{settings.budget} {getattr(settings, settings.budget)!r} {_demanded(settings)!r}"
-    return f"{budget} {settings.survivors}"
+    return f"{budget} {settings.survivors} {settings.method}"
 
 
 def changed(context: bpy.types.Context) -> None:
@@ -124,8 +139,8 @@ def at_once(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
         return
     plan = _noted(_known[0], settings) | {"key": _key(settings, objects)}
     mesh[PLAN] = json.dumps(plan | {"marked": False})
-    price.move(mesh, _place(plan, settings))
-    _tell_cameras(_known[0].tally.scores, plan, settings)
+    price.move(mesh, _place(plan))
+    _tell_cameras(_known[0].tally.scores, plan)
 
 
 def refresh(context: bpy.types.Context) -> None:
@@ -201,22 +216,20 @@ def forget(mesh: bpy.types.Mesh) -> None:
         del mesh[PLAN]
 
 
-def sentence(plan: dict[str, Any], survivors: SurvivorChoice) -> str:
+def sentence(plan: dict[str, Any]) -> str:
     """Return what a plan without an error comes to, as one sentence.
 
     Parameters
     ----------
     plan : dict
         See `stored`.
-    survivors : {"unchanged", "absorb", "refit"}
-        What they may become.
 
     Examples
     --------
     >>> plan = {"splats": 100, "kept": 50, "bytes_before": 5e6, "bytes_after": 2.5e6}
-    >>> known = {"psnr": 38.2, "psnr_absorbed": 45.9, "psnr_refitted": 48.9}
-    >>> sentence(plan | known, "unchanged")
-    'Keeps 50 of 100, 2.5 of 5.0 MB, about 38 dB in these views (Absorb: about 46, Refit: about 49)'
+    >>> plan |= {"psnr": 38.2, "psnr_absorbed": 45.9, "psnr_refitted": 48.9, "becomes": "absorb"}
+    >>> sentence(plan).removeprefix("Keeps 50 of 100, 2.5 of 5.0 MB, ")
+    'about 46 dB in these views (Unchanged: about 38, Refit: about 49)'
     """
     text = (
         f"Keeps {'about ' if plan.get('about') else ''}{plan['kept']:,} of {plan['splats']:,}, "
@@ -225,15 +238,19 @@ def sentence(plan: dict[str, Any], survivors: SurvivorChoice) -> str:
     if "psnr" not in plan:
         return text
     if "psnr_absorbed" not in plan:  # not foretold
-        unless = " if survivors stay unchanged" if survivors != "unchanged" else ""
+        unless = " if survivors stay unchanged" if plan["becomes"] != "unchanged" else ""
         return f"{text}, {in_words(plan['psnr'])} in these views{unless}"
     ways = dict(zip(SURVIVORS, ("psnr", "psnr_absorbed", "psnr_refitted"), strict=True))
-    here = in_words(plan[ways.pop(survivors)])
+    # Deleting is done at once.
+    taken = dict(plan.get("seconds", ()), unchanged=None)
+    times = {name: f" in {in_time(taken[name])}" if taken.get(name) else "" for name in SURVIVORS}
+    way = plan["becomes"]
+    here = f"{in_words(plan[ways.pop(way)])} in these views{times[way]}"
     others = ", ".join(
-        f"{name.capitalize()}: {in_words(plan[told]).removesuffix(' dB')}"
+        f"{name.capitalize()}: {in_words(plan[told]).removesuffix(' dB')}{times[name]}"
         for name, told in ways.items()
     )
-    return f"{text}, {here} in these views ({others})"
+    return f"{text}, {here} ({others})"
 
 
 def remark(plan: dict[str, Any], record: dict[str, Any]) -> str:
@@ -276,11 +293,8 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[Warned]:
     record : dict
         The record of the scoring.
     """
-    warned = []
     alignment = Alignment.from_facts(record.get("alignment"))
-    if alignment.turn:
-        options = {"quarter": str(alignment.turn)}
-        warned.append(Warned(_sentence(alignment.turned()), "refine.turn_cameras", options))
+    warned = [turned(alignment)] if alignment.turn else []
     if record["views_used"] == 1:
         text = "One camera decides: add others if the splats are seen from elsewhere too"
         warned.append(Warned(text, "refine.add_ring"))
@@ -298,6 +312,12 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[Warned]:
     return warned
 
 
+def turned(alignment: Alignment) -> Warned:
+    """Return the warning of cameras that are to be turned."""
+    options = {"quarter": str(alignment.turn)}
+    return Warned(_sentence(alignment.turned()), "refine.turn_cameras", options)
+
+
 def _sentence(note: str) -> str:
     """Return what core says as a sentence of the panel."""
     return note[:1].upper() + note[1:]
@@ -313,6 +333,14 @@ def _is_ours(obj: bpy.types.Object) -> bool:
     if not mesh_layout.looks_like_splats(obj) or obj.mode == "EDIT":
         return False
     return not obj.data.library and not obj.library
+
+
+@persistent
+def _undone(*_: object) -> None:
+    """Draw the chart anew after undo, which brings back the plan but not the picture of it."""
+    obj = getattr(bpy.context, "object", None)
+    if not bpy.app.background and obj is not None and _can_have(obj):
+        wait(bpy.context.scene, [obj], 0.0)
 
 
 def _rested() -> None:
@@ -339,14 +367,14 @@ def _refresh(scene: bpy.types.Scene, obj: bpy.types.Object) -> None:
         group = splat_group.members(bpy.context.view_layer, mesh_layout.check(obj))
         forced = splat_group.refresh(scene, group)
         task = splat_group.stored_task(group, settings.to_budget(), forced)
-        known = _know(task, _state(objects, settings))
+        known = _know(task, _state(objects, settings), _scored_s(mesh))
         plan = _noted(known, settings) | depends
         keep = pipeline.decide(task).keep
         splat_group.mark_removed(group, keep)
         keep = keep if task.forced_out is None else keep[~task.forced_out]
         plan["unseen_gone"] = int(np.count_nonzero(~keep & (known.tally.scores.seen == 0)))
-        price.show(mesh, known.tally.scores, known.kinds, _place(plan, settings), keep)
-        _tell_cameras(known.tally.scores, plan, settings)
+        price.show(mesh, known.tally.scores, known.kinds, _place(plan), keep)
+        _tell_cameras(known.tally.scores, plan)
     except RefineError as error:
         plan["error"] = str(error)
     mesh[PLAN] = json.dumps(plan)
@@ -363,7 +391,14 @@ def _key(settings: Any, objects: list[bpy.types.Object]) -> str:  # noqa: ANN401
     return " ".join([key(settings), *map(repr, others)])
 
 
-def _know(task: Task, state: tuple[Any, ...]) -> _Known:
+def _scored_s(mesh: bpy.types.Mesh) -> float | None:
+    """Return how long scoring by *auto* or *occlusion* took, seconds."""
+    record = mesh_scores.record(mesh) or {}
+    seconds = None if record.get("method") == "closed-form" else record.get("seconds")
+    return float(seconds) if isinstance(seconds, (int, float)) else None
+
+
+def _know(task: Task, state: tuple[Any, ...], scored_s: float | None) -> _Known:
     """Return what holds for any budget; what was known before, where it still does."""
     forced = task.forced()
     gone = 0 if forced is None else int(np.count_nonzero(forced))
@@ -375,7 +410,9 @@ def _know(task: Task, state: tuple[Any, ...]) -> _Known:
         return old
     kinds = price.histogram(scores)
     tally, unseen = Tally(scores, task.protected), int(np.count_nonzero(scores.seen == 0))
-    known = _Known(state, tally, int(task.row_bytes), task.fixed_bytes, kinds, unseen, gone)
+    known = _Known(
+        state, tally, int(task.row_bytes), task.fixed_bytes, kinds, unseen, gone, scored_s
+    )
     _known[:] = [known]
     return known
 
@@ -410,27 +447,40 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
     plan: dict[str, Any] = {"key": key(settings), "splats": count, "unseen": known.unseen}
     try:
         budget = settings.to_budget()
-        removed, about = _removed(known, budget, settings.survivors)
+        becomes = _may_become(settings, budget)
+        removed, about = _removed(known, budget, becomes)
     except RefineError as error:
         return plan | {"error": str(error)}
     if about:
         plan["about"] = True
     outcome = Outcome.of(count, rest - removed, known.row_bytes, known.fixed_bytes)
-    plan |= {**vars(outcome), "forced": known.forced}
     curve = known.tally.scores.quality
+    if settings.survivors == "auto" and (curve is None or curve.as_good(removed / rest)):
+        becomes = "unchanged"
+    plan |= {**vars(outcome), "forced": known.forced, "becomes": becomes}
     if curve is None:
         return plan
     plan["psnr"] = curve.at(removed / rest)
+    if known.scored_s is not None:
+        plan["seconds"] = expected_seconds(known.scored_s, removed / rest, once=False)
     if curve.foretold:
         plan["psnr_absorbed"] = curve.at(removed / rest, "absorb")
         plan["psnr_refitted"] = curve.at(removed / rest, "refit")
     if budget.psnr is not None:
-        psnr = curve.at(removed / rest, settings.survivors)
+        psnr = curve.at(removed / rest, becomes)
         plan["remark"] = _sentence(out_of_reach(budget.psnr, removed, rest, psnr))
     return plan
 
 
-def _removed(known: _Known, budget: Budget, survivors: SurvivorChoice) -> tuple[int, bool]:
+def _may_become(settings: Any, budget: Budget) -> Became:  # noqa: ANN401
+    """Return what survivors may become, by the settings of the panel."""
+    asked: SurvivorChoice = settings.survivors
+    if asked != "auto":
+        return asked
+    return "absorb" if may_absorb(asked, settings.to_settings(), budget) else "unchanged"
+
+
+def _removed(known: _Known, budget: Budget, survivors: Became) -> tuple[int, bool]:
     """Return how many splats a budget removes beside those forced out, and whether it is a guess.
 
     Raise `RefineError` if the budget means nothing to the scores.
@@ -443,18 +493,18 @@ def _removed(known: _Known, budget: Budget, survivors: SurvivorChoice) -> tuple[
     return known.tally.removed(left, known.row_bytes, known.fixed_bytes), False
 
 
-def _tell_cameras(scores: Scores, plan: dict[str, Any], settings: Any) -> None:  # noqa: ANN401
+def _tell_cameras(scores: Scores, plan: dict[str, Any]) -> None:
     """Have the list of the cameras say how much of each picture a plan changes."""
-    curve, place = scores.quality, _place(plan, settings)
+    curve, place = scores.quality, _place(plan)
     if curve is None or place is None:
         camera_list.tell({})
         return
-    survivors: SurvivorChoice = settings.survivors if curve.foretold else "unchanged"
+    survivors = place.survivors if curve.foretold else "unchanged"
     camera_list.tell(curve.of_views(place.share, survivors))
 
 
-def _place(plan: dict[str, Any], settings: Any) -> Place | None:  # noqa: ANN401
+def _place(plan: dict[str, Any]) -> Place | None:
     if "error" in plan:
         return None
     forced = plan["forced"]  # the chart is of the others
-    return Place((plan["removed"] - forced) / (plan["splats"] - forced), settings.survivors)
+    return Place((plan["removed"] - forced) / (plan["splats"] - forced), plan["becomes"])

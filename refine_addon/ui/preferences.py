@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import bpy
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty
 
-from .properties import AMOUNTS, METHODS, UPRIGHT_TEXT, VIEWS
+from .properties import AMOUNTS, METHODS, OLDER, UPRIGHT_TEXT, VIEWS, take_over
 
 if TYPE_CHECKING:
     from typing import Any
@@ -33,6 +33,7 @@ class RefinePreferences(bpy.types.AddonPreferences):
     percent: FloatProperty(**AMOUNTS["percent"])
     psnr: FloatProperty(**AMOUNTS["psnr"])
     survivors: EnumProperty(**AMOUNTS["survivors"])
+    absorb: BoolProperty(name="Absorb", description=OLDER, options={"HIDDEN"})
     upright: BoolProperty(name="Upright", description=UPRIGHT_TEXT)
 
     def draw(self, _context: bpy.types.Context) -> None:
@@ -70,4 +71,7 @@ def suggest(operator: Any, context: bpy.types.Context, name: str) -> None:  # no
 def _chosen(context: bpy.types.Context) -> RefinePreferences | None:
     """Return the preferences; None where the extension is not enabled as one."""
     addon = context.preferences.addons.get(PACKAGE)
-    return addon.preferences if addon else None
+    if addon is None:
+        return None
+    take_over(addon.preferences)
+    return addon.preferences

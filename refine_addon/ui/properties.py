@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 import numpy as np
+from bpy.app.handlers import persistent
 from bpy.props import (
     BoolProperty,
     CollectionProperty,
@@ -56,6 +57,11 @@ BUDGETS = (
 """Kinds of budget, by the names that core gives them."""
 
 SURVIVORS = (
+    (
+        "auto",
+        "Auto",
+        "Absorb, but unchanged where that is as good, or another method than Auto scores",
+    ),
     ("unchanged", "Unchanged", "They stay what they are, to the bit"),
     (
         "absorb",
@@ -74,6 +80,8 @@ UPRIGHT_TEXT = (
     "Turn the object, not the data, a quarter about X: from the y-down world of COLMAP to the "
     "z-up world of Blender"
 )
+
+OLDER = "What files and preferences of before say in place of Survivors"
 
 VIEWS: dict[str, Any] = {
     "name": "Views",
@@ -124,7 +132,7 @@ AMOUNTS: dict[str, dict[str, Any]] = {
         "max": 100.0,
     },
     "psnr": {
-        "name": "PSNR",
+        "name": "PSNR (dB)",
         "description": "How close the pictures of the cameras stay to those of all splats, in dB: "
         "40 is hard to tell apart, 30 is visible",
         "default": 40.0,
@@ -207,13 +215,42 @@ def decimal(value: float) -> float:
     return float(str(np.float32(value)))
 
 
+def take_over(settings: Any) -> None:  # noqa: ANN401 - RefineSettings, or the preferences
+    """Set what survivors may become by what was stored before there was that choice."""
+    for older, name, chosen in (
+        ("absorb", "survivors", ("unchanged", "absorb")),
+        ("nested", "level_survivors", ("absorb", "unchanged")),
+    ):
+        if older in settings.bl_rna.properties and settings.is_property_set(older):
+            if not settings.is_property_set(name):
+                setattr(settings, name, chosen[getattr(settings, older)])
+            settings.property_unset(older)
+
+
+@persistent
+def _loaded(_path: str) -> None:
+    for scene in bpy.data.scenes:
+        if not scene.library:
+            take_over(scene.refine)
+
+
+def register() -> None:
+    """Take over what files of before say, when they are loaded."""
+    bpy.app.handlers.load_post.append(_loaded)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    bpy.app.handlers.load_post.remove(_loaded)
+
+
 class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     """Settings of the panel, at ``scene.refine``."""
 
     method: EnumProperty(name="Method", description="How splats are scored", items=METHODS)
     views: IntProperty(**VIEWS)
     tolerance: FloatProperty(
-        name="Tolerance",
+        name="Tolerance (dB)",
         description="By how much the PSNR of the pictures may be lower than by Occlusion, in dB",
         default=Settings.tolerance,
         min=0.0,
@@ -254,6 +291,8 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     min_seen: FloatProperty(**AMOUNTS["min_seen"], update=_plan_again)
     psnr: FloatProperty(**AMOUNTS["psnr"], update=_plan_again)
     survivors: EnumProperty(**AMOUNTS["survivors"], update=_plan_again)
+    absorb: BoolProperty(name="Absorb", description=OLDER, options={"HIDDEN"})
+    nested: BoolProperty(name="Nested", description=OLDER, options={"HIDDEN"})
     protect: StringProperty(
         name="Protect",
         description="Vertex group, or boolean or float point attribute: the splats in it stay",
@@ -273,7 +312,7 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     level_survivors: EnumProperty(
         name="Survivors",
         description="What the splats that stay in a level may become",
-        items=SURVIVORS,
+        items=SURVIVORS[1:],
         default=Levels.survivors,
     )
 

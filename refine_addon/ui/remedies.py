@@ -49,7 +49,7 @@ class _Bounds(NamedTuple):
 
 
 class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
-    """Turn the cameras that decide a quarter about the world's X axis"""
+    """Turn the cameras that decide a quarter about the world's X axis, and drop their scores"""
 
     bl_idname = "refine.turn_cameras"
     bl_label = "Turn the Cameras"
@@ -79,6 +79,9 @@ class REFINE_OT_turn_cameras(AtOnce, OnSplats, bpy.types.Operator):
         if moving:
             _turn_animated(context, moving, turn)
         context.view_layer.update()
+        for obj in splat_group.chosen(context.view_layer, context.object):
+            mesh_scores.forget(mesh_layout.check(obj))  # of cameras that stood elsewhere
+            plans.forget(obj.data)
         self.report({"INFO"}, f"Turned {counted(len(cameras), 'camera')}; score again")
         return {"FINISHED"}
 

@@ -10,8 +10,9 @@ import bpy
 import numpy as np
 from bpy.props import BoolProperty
 
+from .. import main_thread
 from ..core.work import Cancelled
-from ..render import frames
+from ..render import card, frames
 from ..render.engine import Shared
 from .images import put
 from .operator_bases import FAILURES, Answer, Needing, fail, idle
@@ -80,8 +81,10 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         """Start the next render when one is over."""
         if event.type == "ESC" and event.value == "PRESS":
             self._escaped = True  # Blender ends its render by itself
-        elif event.type == "TIMER" and not bpy.app.is_job_running("RENDER"):
-            return self._go_on(context)
+        elif event.type == "TIMER":
+            main_thread.serve()
+            if not bpy.app.is_job_running("RENDER"):
+                return self._go_on(context)
         return {"PASS_THROUGH"}
 
     def cancel(self, context: bpy.types.Context) -> None:
@@ -93,7 +96,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         chosen = [scene.frame_current]
         if self.animation:
             chosen = [*range(scene.frame_start, scene.frame_end + 1, scene.frame_step)]
-        self._shared, self._frames = Shared(), chosen
+        self._shared, self._frames = Shared(card=card.available()), chosen
         self._steps = frames.steps(scene, chosen, self._shared, write=self.animation)
         self._started, self._escaped, self._timer = time.monotonic(), False, None
         self._opened = False

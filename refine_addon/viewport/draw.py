@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 MODES = ("OFF", "SCENE", "HEAT", "STAYS", "GOES")
 """What can be drawn: nothing, all as it is, coloured by rank, what Apply leaves, what it takes."""
 
+SHOWN = "refine_shown"
+"""Custom property of the scene: which of `MODES` was shown when the file was saved."""
+
 _TICK = 0.03
 """Seconds between two looks at whether the thread has sorted more splats."""
 
@@ -104,6 +107,19 @@ def stop() -> None:
     shader.forget()
     points.show()
     _redraw()
+
+
+def register() -> None:
+    """Have files keep what is shown, and show it again."""
+    bpy.app.handlers.save_pre.append(_saving)
+    bpy.app.handlers.load_post.append(_opened)
+
+
+def unregister() -> None:
+    """Draw nothing, and let files be."""
+    stop()
+    bpy.app.handlers.load_post.remove(_opened)
+    bpy.app.handlers.save_pre.remove(_saving)
 
 
 def _forget() -> None:
@@ -250,6 +266,25 @@ def _regions() -> list[bpy.types.Region]:
 
 
 @persistent
+def _saving(*_: object) -> None:
+    """Note in the file what is shown, where that says anything of its splats."""
+    if bpy.app.background:
+        return
+    for scene in bpy.data.scenes:
+        if not scene.library and any(looks_like_splats(obj) for obj in scene.objects):
+            scene[SHOWN] = _state.mode
+
+
+@persistent
+def _opened(*_: object) -> None:
+    """Show what was shown when the file was saved."""
+    wanted = bpy.context.scene.get(SHOWN) if not bpy.app.background else None
+    if wanted in MODES:
+        show(wanted)
+        _loaded()
+
+
+@persistent
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     if depsgraph is None:
         return
@@ -278,5 +313,7 @@ def _leaving(*_: object) -> None:
 
 @persistent
 def _loaded(*_: object) -> None:
+    for window in bpy.context.window_manager.windows:
+        window.view_layer.update()  # what is not evaluated yet would be drawn as points once
     _hide_points()
     _redraw()

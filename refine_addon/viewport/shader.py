@@ -38,7 +38,7 @@ struct ViewData {
 };
 """
 """size: pixels across, pixels up, near, texels of depth per pixel. choices: perspective, whether
-depth is tested, 0, 0."""
+depth is tested, whether what is behind the tested depth is drawn and not what is in front, 0."""
 
 _SPLAT_VERTEX = """
 #define value_at(values, row) texelFetch(values, ivec2((row) % WIDTH, (row) / WIDTH), 0)
@@ -121,7 +121,8 @@ void main()
   }
   if (view_data.choices.y > 0.5) {
     ivec2 texel = ivec2(gl_FragCoord.xy * view_data.size.w);
-    if (gl_FragCoord.z > texelFetch(depths, min(texel, textureSize(depths, 0) - 1), 0).r) {
+    float limit = texelFetch(depths, min(texel, textureSize(depths, 0) - 1), 0).r;
+    if ((gl_FragCoord.z > limit) != (view_data.choices.z > 0.5)) {
       discard;
     }
   }
@@ -204,6 +205,39 @@ def texture(values: NDArray[np.float32], channels: int, kind: str) -> gpu.types.
     size = (values.shape[1] // channels, values.shape[0])
     flat = np.ascontiguousarray(values, np.float32).reshape(-1)
     return gpu.types.GPUTexture(size, format=kind, data=gpu.types.Buffer("FLOAT", len(flat), flat))
+
+
+def blend(
+    frame: gpu.types.GPUFrameBuffer,
+    textures: dict[str, gpu.types.GPUTexture],
+    numbers: NDArray[np.float32],
+    count: int,
+) -> None:
+    """Draw splats into a cleared framebuffer.
+
+    Parameters
+    ----------
+    frame : gpu.types.GPUFrameBuffer
+    textures : dict of str to gpu.types.GPUTexture
+        What the shader of `splats` reads; held by the caller until they are drawn.
+    numbers : (24,) float32
+        ``ViewData``.
+    count : int
+        How many splats of the order.
+    """
+    block = gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", len(numbers), numbers))
+    with frame.bind():
+        frame.clear(color=(0.0, 0.0, 0.0, 0.0))
+        if count:
+            program, quad = splats()
+            gpu.state.blend_set("ALPHA_PREMULT")
+            gpu.state.depth_test_set("NONE")
+            program.bind()
+            program.uniform_block("view_data", block)
+            for name, texture in textures.items():
+                program.uniform_sampler(name, texture)
+            quad.draw_instanced(program, instance_count=count)
+            gpu.state.blend_set("NONE")
 
 
 def _program(

@@ -283,20 +283,8 @@ class View:
             "matrices": shader.texture(_matrix_rows(shown), 4, "RGBA32F"),
             "depths": shader.texture(occluders, 1, "R32F"),
         }  # held until they are drawn: the shader does not keep what it is given
-        block = _view_data(camera, size, solid=solid)
         frame = gpu.types.GPUFrameBuffer(color_slots=self._picture)
-        with frame.bind():
-            frame.clear(color=(0.0, 0.0, 0.0, 0.0))
-            if self._order.count:
-                program, quad = shader.splats()
-                gpu.state.blend_set("ALPHA_PREMULT")
-                gpu.state.depth_test_set("NONE")
-                program.bind()
-                program.uniform_block("view_data", block)
-                for name, texture in textures.items():
-                    program.uniform_sampler(name, texture)
-                quad.draw_instanced(program, instance_count=self._order.count)
-                gpu.state.blend_set("NONE")
+        shader.blend(frame, textures, _view_data(camera, size, solid=solid), self._order.count)
 
 
 def _matrix_rows(shown: list[Shown]) -> NDArray[np.float32]:
@@ -307,13 +295,13 @@ def _matrix_rows(shown: list[Shown]) -> NDArray[np.float32]:
     return rows
 
 
-def _view_data(camera: Camera, size: tuple[int, int], *, solid: bool) -> gpu.types.GPUUniformBuf:
+def _view_data(camera: Camera, size: tuple[int, int], *, solid: bool) -> NDArray[np.float32]:
     """Return what the shader knows of a view as ``ViewData``, for a picture of this size."""
     numbers = np.zeros(24, np.float32)
     numbers[:16] = camera.projection.T.reshape(-1)
     numbers[16:20] = (*size, camera.near, camera.size[0] / size[0])
     numbers[20:22] = (camera.perspective, solid)
-    return gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", len(numbers), numbers))
+    return numbers
 
 
 def _parts(shown: Iterable[Shown], camera: Camera) -> list[_Part]:

@@ -1,4 +1,4 @@
-"""Absorbing through the panel and through the command's object path: the same splats as in core."""
+"""Absorbing and refitting through the panel and the command's objects: the splats of core."""
 
 from __future__ import annotations
 
@@ -19,19 +19,24 @@ def few(addon, room, room_cameras):  # noqa: ARG001
     return room, core.Budget(ratio=0.6)
 
 
-def absorbed_in_core(addon, obj, views, budget):
+BOTH = pytest.mark.parametrize("survivors", ["absorb", "refit"])
+
+
+def absorbed_in_core(addon, obj, views, budget, survivors="absorb"):
     return addon.core.prune(
         addon.objects.splat_object.gather(addon.mesh.layout.check(obj), whole=True),
         views,
         budget,
-        survivors="absorb",
+        survivors=survivors,
     )
 
 
-def test_apply_with_absorb_leaves_what_core_says(addon, few, room_views):
+@BOTH
+def test_apply_leaves_what_core_says(addon, few, room_views, survivors):
     """Survivors, changed or not, equal to the last bit: the object stands where its data is."""
     room, budget = few
-    expected = absorbed_in_core(addon, room, room_views, budget).absorbed
+    bpy.context.scene.refine.survivors = survivors
+    expected = absorbed_in_core(addon, room, room_views, budget, survivors).absorbed
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
 
@@ -78,23 +83,27 @@ def test_uneven_scale_is_refused_and_nothing_changes(addon, few):
     room.scale = (1, 1, 1)
 
 
-def test_the_command_on_an_object_writes_the_same_survivors(addon, few, room_views, tmp_path):
+@BOTH
+def test_the_command_on_an_object_writes_the_same_survivors(
+    addon, few, room_views, tmp_path, survivors
+):
     """Exported without touching the object."""
     room, budget = few
-    expected = absorbed_in_core(addon, room, room_views, budget).absorbed
+    expected = absorbed_in_core(addon, room, room_views, budget, survivors)
     count = len(room.data.vertices)
     out = tmp_path / "out.ply"
 
     report = addon.objects.operation.prune_object(
         room.name,
-        addon.core.PruneRequest(room_views, budget, addon.core.Settings(), survivors="absorb"),
+        addon.core.PruneRequest(room_views, budget, addon.core.Settings(), survivors=survivors),
         output=out,
     )
 
     written = addon.core.read_ply(out).splats()
-    wanted = expected.splats.means.astype(np.float32)
+    wanted = expected.absorbed.splats.means.astype(np.float32)
     np.testing.assert_array_equal(np.asarray(written.means), wanted)
-    assert report["absorbed"] == expected.facts()
+    assert report["absorbed"] == expected.report["absorbed"]
+    assert ("refitted" in report) == (survivors == "refit")
     assert len(room.data.vertices) == count
 
 
@@ -133,3 +142,25 @@ def test_protected_splats_neither_vanish_nor_change(addon, few):
     still = addon.mesh.attributes.read_attribute(room.data, "mine")
 
     np.testing.assert_array_equal(after[still], before)
+
+
+@pytest.mark.parametrize(("scale", "becomes"), [(1.0, "absorb"), (2.0, "unchanged")])
+def test_by_default_survivors_absorb_unless_the_scale_is_uneven(
+    addon, few, room_views, scale, becomes
+):
+    """The panel, as the command: colours cannot follow a stretch, so that rows stay then."""
+    room, budget = few
+    bpy.context.scene.refine.property_unset("survivors")
+    bpy.context.scene.refine.method = "auto"
+    room.scale = (1.0, scale, 1.0)
+    bpy.context.view_layer.update()
+    request = addon.core.PruneRequest(room_views, budget, dry_run=True)
+
+    told = addon.objects.operation.prune_object(room.name, request)["survivors"]
+    bpy.ops.refine.score()
+    before = len(room.data.vertices)
+    bpy.ops.refine.apply()
+
+    room.scale = (1.0, 1.0, 1.0)
+    assert told["became"] == becomes
+    assert len(room.data.vertices) == before - before * 6 // 10

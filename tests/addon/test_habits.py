@@ -17,7 +17,7 @@ def preferred(addon):
     """Return the extension's preferences; unset again afterwards."""
     preferences = bpy.context.preferences.addons[addon.__name__].preferences
     yield preferences
-    for name in (*addon.ui.preferences.DEFAULTS, "upright"):
+    for name in (*addon.ui.preferences.DEFAULTS, "upright", "absorb"):
         preferences.property_unset(name)
 
 
@@ -36,6 +36,26 @@ def test_preferences_are_the_defaults_of_what_a_scene_has_not_set(addon, preferr
     )
     assert settings.ratio == pytest.approx(0.7)
     assert settings.views == 64
+
+
+@pytest.mark.parametrize(("absorb", "becomes"), [(True, "absorb"), (False, "unchanged")])
+def test_what_was_stored_before_there_was_a_choice_holds(
+    addon, preferred, tmp_path, absorb, becomes
+):
+    """*Absorb* and *Nested* of a file, and *Absorb* of the preferences, are taken over once."""
+    settings, preferred.absorb = bpy.context.scene.refine, absorb
+    addon.ui.preferences.fill(settings, addon.ui.preferences._chosen(bpy.context))
+    by_preferences = settings.survivors
+    settings.property_unset("survivors")
+    settings.absorb, settings.nested = absorb, True
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "older.blend"))
+
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "older.blend"))
+
+    settings = bpy.context.scene.refine
+    assert by_preferences == becomes
+    assert (settings.survivors, settings.level_survivors) == (becomes, "unchanged")
+    assert not settings.is_property_set("absorb")
 
 
 def test_scripts_get_what_they_ask_for(preferred):
@@ -77,7 +97,7 @@ def test_cameras_are_looked_for_where_the_splats_came_from(addon, tmp_path, came
     shutil.copy(ROOM / "point_cloud.ply", place)
     (tmp_path / cameras).write_text("[]")
     bpy.ops.refine.import_ply(filepath=str(place / "point_cloud.ply"))
-    find = addon.ui.import_operators._capture_folder
+    find = addon.ui.camera_import.capture_folder
 
     assert find(bpy.context.object) == tmp_path / expected
     bpy.context.object["refine_folder"] = str(tmp_path / "gone")

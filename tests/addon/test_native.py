@@ -283,6 +283,7 @@ def test_the_command_prunes_a_point_cloud(addon, cloud, room_cameras, tmp_path):
     export(addon, addon.mesh.layout.check(cloud), tmp_path / "all.ply")
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
     words = ["prune", "--object", "room", "-o", str(tmp_path / "out.ply"), "--save", "--quiet"]
+    words += ["--survivors", "unchanged"]
 
     assert addon.command.main(words, scene=True) == 0
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "scene.blend"))
@@ -559,7 +560,7 @@ def test_blenders_own_import_is_what_these_tests_build(addon, core, file, tmp_pa
     assert bpy.context.object.data.type == "GAUSSIAN_SPLAT"
 
 
-@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb", "refit"])
 def test_levels_of_detail_of_native_splats_are_native(addon, cloud, room_cameras, survivors):  # noqa: ARG001
     """Copies reduced by the same apply: points of .1 and .05 of 9,939, rounded up."""
     addon.mesh.edit.delete_vertices(cloud, np.arange(39755) % 4 != 0)

@@ -22,7 +22,11 @@ class Layout:
         """Return itself, as a part of the layout."""
         return self
 
-    column = grid_flow = row
+    column = row
+
+    def grid_flow(self, **_options):
+        """Return itself."""
+        return self
 
     def panel(self, _name, **_options):
         """Return itself as the header and the body of a part that is open."""
@@ -30,8 +34,8 @@ class Layout:
 
     def operator(self, name, **_options):
         """Note a button, and return something to set its properties on."""
-        module, call = name.split(".")
-        assert getattr(getattr(bpy.ops, module), call).get_rna_type()
+        room, _, operator = name.partition(".")
+        assert getattr(getattr(bpy.ops, room), operator).get_rna_type()
         self.drawn.append(name)
         return SimpleNamespace()
 
@@ -112,13 +116,12 @@ def test_each_step_shows_what_came_of_it(draw, room, room_cameras):  # noqa: ARG
     bpy.ops.refine.apply()
     applied = draw()
 
-    assert "39,755 splats, SH degree 3" in imported
-    assert "9.9 MB" in imported
+    assert "room: 39,755 splats, SH degree 3, 9.9 MB" in " ".join(imported)
     assert "72 cameras" in imported
     assert "Scored by 64 of 72 views" in scored
     assert "Keeps 19,878 of 39,755, 4.9 of 9.9 MB" in " ".join(scored)
     assert "chart" in scored
-    assert "19,878 splats, SH degree 3" in applied
+    assert "room: 19,878 splats, SH degree 3" in " ".join(applied)
     assert not [text for text in applied if text.startswith(("Keeps", "chart", "Scored"))]
 
 
@@ -129,7 +132,7 @@ def test_a_point_cloud_is_drawn_as_a_mesh_is(draw, room, room_cameras):  # noqa:
     bpy.ops.refine.convert()
 
     assert draw() == mesh
-    assert "39,755 splats, SH degree 3" in mesh
+    assert "room: 39,755 splats, SH degree 3" in " ".join(mesh)
     assert "Keeps 19,878 of 39,755, 4.9 of 9.9 MB" in " ".join(mesh)
 
 
@@ -226,7 +229,7 @@ def test_each_camera_is_listed_with_what_it_sees(draw, addon, room, room_cameras
     there = (local[2] > 0) & (x >= 0) & (x <= room_views[0].width) & (y >= 0)
     sees = int((there & (y <= room_views[0].height)).sum())
 
-    assert not any(": " in text for text in before)
+    assert not [text for text in before if text.startswith("0") and ": " in text]
     assert len(lines) == 72
     assert counts == sorted(counts)
     assert counts[0] == 0 < counts[1]

@@ -263,14 +263,14 @@ def test_the_sentence_tells_all_three_ways(addon):
     seen = dict.fromkeys(("psnr", "psnr_absorbed", "psnr_refitted"), 70.0)
     start = "Keeps 19,878 of 39,755, 4.9 of 9.9 MB"
 
-    assert sentence(plan, "absorb") == start
+    assert sentence(plan | {"becomes": "absorb"}) == start
     for survivors, words in (
         ("unchanged", "about 38 dB in these views (Absorb: about 46, Refit: about 49)"),
         ("absorb", "about 46 dB in these views (Unchanged: about 38, Refit: about 49)"),
         ("refit", "about 49 dB in these views (Unchanged: about 38, Absorb: about 46)"),
     ):
-        assert sentence(known, survivors) == f"{start}, {words}"
-    assert sentence(plan | seen, "unchanged").endswith(
+        assert sentence(known | {"becomes": survivors}) == f"{start}, {words}"
+    assert sentence(plan | seen | {"becomes": "unchanged"}).endswith(
         "more than 60 dB in these views (Absorb: more than 60, Refit: more than 60)"
     )
 
@@ -291,9 +291,9 @@ def test_what_absorbing_reaches_of_few_splats_is_neither_told_nor_drawn(addon, c
     ]
 
     assert drawn == [True, False]
-    assert sentence(plan, "unchanged") == f"{start}, about 38 dB in these views"
+    assert sentence(plan | {"becomes": "unchanged"}) == f"{start}, about 38 dB in these views"
     unless = "about 38 dB in these views if survivors stay unchanged"
-    assert sentence(plan, "absorb") == f"{start}, {unless}"
+    assert sentence(plan | {"becomes": "absorb"}) == f"{start}, {unless}"
 
 
 def test_a_quality_out_of_reach_is_said(addon, room, room_cameras):  # noqa: ARG001
@@ -326,7 +326,7 @@ def test_a_quality_with_absorb_counts_on_what_absorbing_reaches(addon, room, roo
 
     assert absorbed["removed"] > 1.2 * deleted["removed"]
     assert absorbed["psnr_absorbed"] == pytest.approx(35.0, abs=0.01)
-    assert plans.sentence(absorbed, survivors="absorb").startswith("Keeps about ")
+    assert plans.sentence(absorbed).startswith("Keeps about ")
 
 
 def test_scores_without_an_estimate_say_how_to_get_one(addon, room, room_cameras):  # noqa: ARG001
@@ -337,7 +337,7 @@ def test_scores_without_an_estimate_say_how_to_get_one(addon, room, room_cameras
     plan = plans.stored(room, settings)
 
     assert plans.remark(plan, record) == "Score with Auto, or with Quality as the budget, to see dB"
-    assert "dB" not in plans.sentence(plan, survivors="unchanged")
+    assert "dB" not in plans.sentence(plan)
 
 
 def test_what_the_cameras_do_not_know_is_said_beside_apply(addon, room, room_cameras):

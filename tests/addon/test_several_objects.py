@@ -108,14 +108,14 @@ def test_marks_and_sentence_are_those_of_the_selection(addon, halves):
         ]
 
     assert sum(marked()) == 19_877
-    assert "of 39,755" in plans.sentence(plans.stored(halves[1], settings), survivors="unchanged")
+    assert "of 39,755" in plans.sentence(plans.stored(halves[1], settings))
 
     halves[0].select_set(False)
     assert plans.stored(halves[1], settings) is None  # of both, not of this one
     plans.refresh(bpy.context)
 
     assert marked()[1] == 9_877
-    assert "of 19,755" in plans.sentence(plans.stored(halves[1], settings), survivors="unchanged")
+    assert "of 19,755" in plans.sentence(plans.stored(halves[1], settings))
 
 
 def test_the_curve_is_that_of_all_and_of_no_part(addon, halves):

@@ -402,7 +402,7 @@ def test_who_turns_sizes_and_rotations_as_well_is_left_alone(addon, imported):
 def test_absorbing_and_conversion_are_no_drift(addon, imported, room_cameras):  # noqa: ARG001
     """Survivors move and grow; a point cloud holds other numbers. A drift from before stays one."""
     select(imported)
-    bpy.context.scene.refine.absorb = True
+    bpy.context.scene.refine.survivors = "absorb"
     bpy.ops.refine.score()
     bpy.ops.refine.apply()
     assert addon.mesh.drift.found(imported.data) is None

@@ -86,7 +86,7 @@ def test_a_tile_that_is_missing_stops_all(folder, capsys):
             [*CLOSED, "--output-dir", "out", "--psnr", "40"],
             "--psnr goes with --method auto or occlusion",
         ),
-        (["--output-dir", "out", "--psnr", "40", "--absorb"], "not --absorb"),
+        (["--output-dir", "out", "--psnr", "40", "--absorb"], "unchanged survivors"),
         (
             [*CLOSED, "--output-dir", "out", "--protect", "sphere:0,0,0,1"],
             "--protect does not go with --together",

@@ -135,7 +135,7 @@ def test_scores_of_what_is_left_decide_as_well_as_a_pruning_that_scores(
     task = Task(budget, settings, scores=scores, forced_out=removed)
 
     assert np.array_equal(scores.values == 0.0, removed)
-    expected = prune(splats, views, budget, settings, forced_out=removed)
+    expected = prune(splats, views, budget, settings, forced_out=removed, survivors="unchanged")
     for given in (scores, replace(scores, ray_sample=None)):
         assert np.array_equal(decide(replace(task, scores=given)).keep, expected.keep)
 

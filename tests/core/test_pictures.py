@@ -268,5 +268,5 @@ def test_what_absorbs_is_drawn_as_it_became():
     result = prune(splats, views, Budget(ratio=0.6), survivors="absorb")
 
     assert result.survivors(splats) is result.absorbed.splats
-    plain = prune(splats, views, Budget(ratio=0.6))
+    plain = prune(splats, views, Budget(ratio=0.6), survivors="unchanged")
     assert np.array_equal(plain.survivors(splats).means, splats.means[plain.keep])

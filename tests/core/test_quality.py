@@ -417,7 +417,8 @@ def test_scores_without_an_estimate_cannot_keep_a_psnr():
 @pytest.mark.parametrize("goal", [20.0, 35.0])
 def test_every_method_reaches_a_psnr(method, goal):
     """To half a dB by its own estimate, with one splat more it would be above."""
-    result = prune(cloud(), ring(), Budget(psnr=goal), Settings(method))
+    budget, settings = Budget(psnr=goal), Settings(method)
+    result = prune(cloud(), ring(), budget, settings, survivors="unchanged")
 
     assert result.report["estimated_psnr"] == pytest.approx(goal, abs=0.6)
     assert result.report["budget"] == {"psnr": goal}
@@ -442,7 +443,7 @@ def test_absorbing_reaches_a_psnr_with_fewer(goal):
     merged = prune(splats, views, Budget(psnr=goal), survivors="absorb")
 
     assert merged.report["estimated_psnr"] == pytest.approx(goal, abs=1.5)
-    assert merged.report["estimated_psnr_absorbed"] == merged.report["estimated_psnr"]
+    assert merged.report["survivors"]["psnr"]["absorb"] == merged.report["estimated_psnr"]
     assert merged.keep.sum() < plain.keep.sum()
 
 
@@ -465,7 +466,11 @@ def test_the_report_has_the_estimate_and_the_curve():
 
     at = done["quality"]["shares"].index(0.5)
     assert done["estimated_psnr"] == pytest.approx(done["quality"]["psnr"][at], abs=0.01)
-    assert done["estimated_psnr_absorbed"] is None
+    assert done["survivors"]["psnr"] == {
+        "unchanged": done["estimated_psnr"],
+        "absorb": None,
+        "refit": None,
+    }
     json.dumps(done, allow_nan=False)
 
 
@@ -481,11 +486,13 @@ def test_what_absorbing_would_reach_is_told_of_many_splats_alone():
     told = [decide(Task(Budget(ratio=0.5), scores=scores)).report for scores in (few.scores, many)]
     done = prune(splats, views, Budget(ratio=0.5), Settings("occlusion"), survivors="absorb").report
 
-    assert told[0]["estimated_psnr_absorbed"] is None
-    assert "fewer than 20,000 splats" in told[0]["estimated_psnr_absorbed_note"]
-    assert told[1]["estimated_psnr_absorbed"] > told[1]["estimated_psnr"]
-    assert told[1]["estimated_psnr_absorbed_note"] is None
-    assert done["estimated_psnr_absorbed"] == done["estimated_psnr"]
+    few_told, many_told, reached = (each["survivors"] for each in (*told, done))
+    assert few_told["psnr"]["absorb"] is None
+    assert "fewer than 20,000 splats" in few_told["note"]
+    assert many_told["psnr"]["unchanged"] < many_told["psnr"]["absorb"]
+    assert many_told["psnr"]["absorb"] < many_told["psnr"]["refit"]
+    assert many_told["note"] is None
+    assert reached["psnr"]["absorb"] == done["estimated_psnr"]
     assert not Quality.from_facts(curve.facts()).foretold
     old = {name: value for name, value in curve.facts().items() if name != "foretold"}
     assert Quality.from_facts(old).foretold

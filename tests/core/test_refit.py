@@ -138,6 +138,32 @@ def test_refitted_survivors_are_nearer_to_what_the_views_see():
     assert every.splats.sh_rest is survivors.sh_rest
 
 
+def test_a_round_that_loses_is_undone_and_the_next_damped_more(monkeypatch):
+    """What the validation rays say is given: a gain, a loss, a gain, and a gain too small to go on.
+
+    After the first gain the next round knows what its rays told; after the loss no more than that.
+    """
+    said = iter([30.0, 31.0, 29.0, 32.0, 32.01])
+    monkeypatch.setattr(round_rays.RoundRays, "psnr", lambda *_: next(said))
+    damped, solve = [], refit._Solver.solve
+
+    def spy(self, damping, known, progress):
+        damped.append((damping, known.sum()))
+        return solve(self, damping, known, progress)
+
+    monkeypatch.setattr(refit._Solver, "solve", spy)
+    splats = cloud(60)
+
+    found = list(refit.refit_rounds(splats.take(np.arange(30)), splats, ring()))
+
+    assert [(each.rounds, each.psnr) for each in found] == [
+        (0, 30.0), (1, 31.0), (2, 32.0), (3, 32.01)
+    ]  # fmt: skip
+    assert [damping for damping, _ in damped] == [1.0, 1.0, refit.MORE_DAMPING, refit.MORE_DAMPING]
+    known = [told for _, told in damped]
+    assert known[0] == 0.0 < known[1] == known[2] < known[3]
+
+
 @pytest.mark.slow
 def test_protected_and_unseen_survivors_keep_their_bits():
     """Also where their quaternions are not of length 1."""
@@ -190,10 +216,9 @@ def test_rays_of_one_round_are_not_next_to_those_of_another():
     number.
     """
     view = replace(ring()[0], width=1000, height=1000)
-    none = projection.front_to_back([])
     for number in range(0, 200, 7):
         window = round_rays.Window(view, number, 1.0, 100.0, 1e9)
-        places = [pixels(view, number, 100.0)] + [window.pixels(none, k) for k in range(7)]
+        places = [pixels(view, number, 100.0)] + [window.pixels(0.0, k) for k in range(7)]
         first = np.array([(columns[0], rows[0]) for columns, rows in places])
 
         apart = np.abs((first[:, None] - first + 50) % 100 - 50)  # around the edge of a cell

@@ -20,7 +20,7 @@ CHANGING = ["--survivors", "refit", "--clean", "--ratio", ".3"]
 RUNS = {
     "prune": [
         ["-o", "a.splat", *CHANGING, *CAMERAS],
-        ["--dry-run", "--max-mb", "9", "--pictures", "shots", *CAMERAS],
+        ["--dry-run", "--survivors", "unchanged", "--max-mb", "9", "--pictures", "shots", *CAMERAS],
         ["--together", "--dry-run", "--method", "closed-form", *CAMERAS],
     ],
     "score": [["-o", "scored.ply", *CAMERAS]],

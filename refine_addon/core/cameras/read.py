@@ -63,24 +63,42 @@ def read_cameras(path: Path | str) -> ViewSet:
     return _read_json_cameras(path)
 
 
-def _read_folder(folder: Path) -> ViewSet:
-    """Read the preferred cameras of a folder; the note names the others."""
+def cameras_in(folder: Path) -> list[Path]:
+    """Return what of a folder holds cameras: JSON files, then the folder of a COLMAP model.
+
+    Parameters
+    ----------
+    folder : Path
+
+    Returns
+    -------
+    list of Path
+        Judged by names alone; the first is what `read_cameras` reads of the folder.
+    """
     files = [folder / name for name in JSON_NAMES if is_file(folder / name)]
     colmap = find_colmap(folder)
-    if not files and not colmap:
+    return [*files, colmap[0]] if colmap else files
+
+
+def _read_folder(folder: Path) -> ViewSet:
+    """Read the preferred cameras of a folder; the note names the others."""
+    found = cameras_in(folder)
+    if not found:
         CameraPlace(folder).fail(
             f"no cameras in this folder, expected {', '.join(JSON_NAMES)}, or a COLMAP model "
             "(cameras and images, both .bin or both .txt) in it, sparse/0 or sparse"
         )
-    if not files and colmap:
+    colmap = find_colmap(folder)
+    if colmap and found == [colmap[0]]:
         return read_colmap(*colmap)
-    views = _read_json_cameras(files[0])
-    others = [file.name for file in files[1:]]
-    if colmap:
-        others.append(f"COLMAP model in {colmap[0].relative_to(folder).as_posix()}")
+    views = _read_json_cameras(found[0])
+    others = [
+        f"COLMAP model in {each.relative_to(folder).as_posix()}" if is_folder(each) else each.name
+        for each in found[1:]
+    ]
     if not others:
         return views
-    unused = f"read {files[0].name}, not {', '.join(others)}"
+    unused = f"read {found[0].name}, not {', '.join(others)}"
     return replace(views, note="; ".join(filter(None, (views.note, unused))))
 
 

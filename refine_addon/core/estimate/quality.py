@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..survivor_choice import SURVIVORS
+
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from ..survivor_choice import SurvivorChoice
+    from ..survivor_choice import Became
 
 PSNR_CAP = 100.0
 """PSNR of equal pictures, dB, and the highest that an estimate may be."""
@@ -46,10 +48,14 @@ PLAIN = 0.1
 """Share removed up to which absorbing is plain deletion."""
 
 REFITTED = 3.0
-"""About what refitting gains over absorbing, dB; less where little is removed, see `Quality.at`."""
+"""About what refitting gains over absorbing, dB."""
 
 UNSEEN = 60.0
 """PSNR in dB above which pictures are the same to the eye: rounding to 8 bits alone makes 59."""
+
+AS_GOOD = 0.5
+"""By so much more, dB, absorbing has to reach than plain deletion, or deletion is as good: nobody
+sees a difference so small, and rows that stay to the bit can be compared with the original's."""
 
 _LEAST_SHARE = 1e-6  # the place of "nothing removed" on the curve's axis, where that is infinite
 
@@ -84,7 +90,7 @@ class Quality:
     foretold: bool = True
     views: dict[str, NDArray[np.float64]] = field(default_factory=dict)
 
-    def at(self, share: float, survivors: SurvivorChoice = "unchanged") -> float:
+    def at(self, share: float, survivors: Became = "unchanged") -> float:
         """Return the PSNR with a share of the splats removed, dB; if survivors may change, about.
 
         Between the shares of the curve the PSNR is taken as linear in the logarithm of the odds
@@ -92,7 +98,7 @@ class Quality:
         """
         return float(np.interp(_log_odds(share), self._odds(), self._curve(survivors)))
 
-    def of_views(self, share: float, survivors: SurvivorChoice = "unchanged") -> dict[str, float]:
+    def of_views(self, share: float, survivors: Became = "unchanged") -> dict[str, float]:
         """Return the PSNR of single views with a share of the splats removed, dB.
 
         Absorbing and refitting are taken to gain as much in each view as in all together.
@@ -111,7 +117,7 @@ class Quality:
             for name, psnr in self.views.items()
         }
 
-    def share(self, psnr: float, survivors: SurvivorChoice = "unchanged") -> float:
+    def share(self, psnr: float, survivors: Became = "unchanged") -> float:
         """Return the largest share that can go while the PSNR is at least `psnr`, dB; or 0.
 
         It is at most the last share of the curve.
@@ -126,7 +132,7 @@ class Quality:
         place = odds[right] + step * (odds[right + 1] - odds[right])
         return float(1.0 / (1.0 + np.exp(-place)))
 
-    def _curve(self, survivors: SurvivorChoice) -> NDArray[np.float64]:
+    def _curve(self, survivors: Became) -> NDArray[np.float64]:
         """Return the PSNR with its beginning, where nothing is removed."""
         if survivors == "unchanged":
             return _with_start(self.psnr)
@@ -135,6 +141,11 @@ class Quality:
 
     def _odds(self) -> NDArray[np.float64]:
         return np.array([_log_odds(share) for share in (0.0, *self.shares.tolist())])
+
+    def as_good(self, share: float) -> bool:
+        """Return whether plain deletion of a share is about as good as absorbing, as foretold."""
+        plain = self.at(share)
+        return deletion_will_do(plain) or plain > self.at(share, "absorb") - AS_GOOD
 
     def facts(self) -> dict[str, Any]:
         """Return the curve as plain JSON values; those of single views to hundredths of a dB."""
@@ -160,6 +171,47 @@ class Quality:
         whole = len(shares) and all(curve.shape == (len(shares),) for curve in curves)
         foretold = bool((facts or {}).get("foretold", True))
         return cls(shares, psnr, absorbed, foretold, views) if whole else None
+
+
+def expected(
+    curve: Quality | None, share: float, measured: Mapping[Became, float | None]
+) -> dict[Became, float | None]:
+    """Return about which PSNR is reached by what survivors become, dB; None where nothing tells it.
+
+    Parameters
+    ----------
+    curve : Quality or None
+    share : float
+        Of the splats that goes.
+    measured : mapping of str to (float or None)
+        The estimates that were measured, dB: these are returned.
+
+    Examples
+    --------
+    >>> expected(None, 0.5, {"absorb": 46.0})
+    {'unchanged': None, 'absorb': 46.0, 'refit': 49.0}
+    """
+    told: dict[Became, float | None] = {}
+    for way in SURVIVORS:
+        told[way] = measured.get(way)
+        if told[way] is None and curve is not None and (curve.foretold or way == "unchanged"):
+            told[way] = curve.at(share, way)
+    absorbed = told["absorb"]
+    if measured.get("refit") is None and absorbed is not None:
+        told["refit"] = min(absorbed + REFITTED, PSNR_CAP)
+    return told
+
+
+def deletion_will_do(psnr: float | None) -> bool:
+    """Return whether nobody would see what absorbing gains over plain deletion.
+
+    Parameters
+    ----------
+    psnr : float or None
+        The estimate with splats deleted, dB; None where the views see too little, so that nothing
+        tells of a gain.
+    """
+    return psnr is None or psnr > UNSEEN
 
 
 def needed(gone: int | None, count: int) -> int | None:

@@ -18,7 +18,7 @@ from ..estimate.quality import PSNR_CAP
 from ..pipeline import decide, score
 from ..selection import Budget
 from ..splats import among_all
-from ..survivor_choice import refuse_unknown
+from ..survivor_choice import SURVIVORS, refuse_unknown
 from ..task import DEFAULTS, Origin, Task
 from ..work import Progress, part, silent
 from .distance import OriginalPictures
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ..absorbing.absorb import Absorbed
     from ..scores import Scores
     from ..splats import Splats
-    from ..survivor_choice import SurvivorChoice
+    from ..survivor_choice import Became
     from ..task import Result, Settings
     from ..views import ViewSet
     from .distance import Reach
@@ -68,7 +68,7 @@ class Levels:
 
     shares: tuple[float, ...] = ()
     psnr: tuple[float, ...] = ()
-    survivors: SurvivorChoice = "absorb"
+    survivors: Became = "absorb"
 
     def __post_init__(self) -> None:
         """Check the values.
@@ -78,7 +78,7 @@ class Levels:
         RefineError
             With the value and what was expected.
         """
-        refuse_unknown(self.survivors)
+        refuse_unknown(self.survivors, SURVIVORS)
         for name in ("shares", "psnr"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         if bool(self.shares) == bool(self.psnr):

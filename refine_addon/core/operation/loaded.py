@@ -120,6 +120,4 @@ class Loaded:
 
     def columns(self, absorbed: Absorbed | None) -> dict[str, NDArray[Any]]:
         """Return the stored properties with what survivors became; none if they did not change."""
-        if absorbed is None:
-            return {}
         return survivor_columns(self.stored, absorbed, np.linalg.inv(self.matrix))

@@ -11,9 +11,9 @@ import numpy as np
 from ..cleaning.clean import Cleaning, clean
 from ..formats.registry import refuse_unknown_size
 from ..pipeline import decide, score
-from ..report import kept_and_removed, scoring_notes, seen_by, what_was_seen
+from ..report import kept_and_removed, prices, scoring_notes, seen_by, what_was_seen
 from ..survivor_choice import refuse_unknown
-from ..task import DEFAULTS, Settings, Task
+from ..task import DEFAULTS, Settings, Task, may_absorb
 from .run import DECIDED, Request
 from .written import written_facts, written_splats
 
@@ -55,7 +55,7 @@ class PruneRequest(Request["Loaded", "Result"]):
         How to score.
     zones, overwrite, dry_run
         See `Request`.
-    survivors : {"unchanged", "absorb", "refit"}
+    survivors : {"auto", "unchanged", "absorb", "refit"}
         What survivors may become; see `Task`.
     cleaning : Cleaning or None
         What to clean away first. The budget then counts what is left.
@@ -67,7 +67,7 @@ class PruneRequest(Request["Loaded", "Result"]):
     budget: Budget
     settings: Settings = DEFAULTS
     zones: Sequence[Zone] = ()
-    survivors: SurvivorChoice = "unchanged"
+    survivors: SurvivorChoice = "auto"
     cleaning: Cleaning | None = None
     pictures: PictureFiles | None = None
     overwrite: bool = False
@@ -85,8 +85,8 @@ class PruneRequest(Request["Loaded", "Result"]):
 
     @property
     def absorb(self) -> bool:
-        """Whether survivors absorb the splats that are removed."""
-        return self.survivors != "unchanged"
+        """Whether survivors may absorb the splats that are removed."""
+        return may_absorb(self.survivors, self.settings, self.budget)
 
     @property
     def compares_pictures(self) -> bool:
@@ -301,6 +301,7 @@ class ScoreRequest(Request["Loaded", Kept]):
             "settings": asdict(self.settings),
             "volumes": loaded.volumes,
             "weights": scores.facts,
+            "prices": prices(scores, runtime.clock.timings["score_s"]),
             "notes": scoring_notes(scores),
         }
         keep = np.ones(len(loaded.splats), np.bool_)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ..scores import Scores
     from ..seeing.measuring import Measured
     from ..splats import Splats
+    from ..survivor_choice import Became
     from ..task import Task
     from ..views import ViewSet
 
@@ -128,12 +129,13 @@ def _absorb_to_psnr(
     if scores.quality is None:
         scores = with_quality(scores, protected=task.protected, threads=threads)
     curve = quality_of(scores)
+    way: Became = "refit" if task.survivors == "refit" else "absorb"
     # By how much results are closer than the curve expects, dB.
     offset = 0.0 if task.origin is None else goal - left_to_lose(goal, task.origin.psnr)
     best: Made | None = None
     missed = math.inf
     for number in range(TRIES):
-        count = total - math.floor(curve.share(goal - offset, task.survivors) * total)
+        count = total - math.floor(curve.share(goal - offset, way) * total)
         try_progress = part(progress, number / TRIES, (number + 1) / TRIES)
         made = _absorb_to_count(task, count, known, try_progress, threads)
         if made.psnr is None:
@@ -143,7 +145,7 @@ def _absorb_to_psnr(
         if missed <= CLOSE:
             break
         gone = 1.0 - len(made.absorbed.splats) / total
-        offset = made.psnr - curve.at(gone, task.survivors)
+        offset = made.psnr - curve.at(gone, way)
     assert best is not None  # noqa: S101 - every try gives one
     return best
 

@@ -12,12 +12,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .. import selection
+from ..estimate.cost import expected_seconds
 from ..estimate.psnr import psnr_kept
-from ..estimate.quality import needed
-from ..report import MEASURES, Clock, conclude, make_report, remark
+from ..estimate.quality import AS_GOOD, PLAIN, deletion_will_do, needed
+from ..report import MEASURES, Clock, conclude, expected_psnr, in_tenths, make_report, remark
 from ..task import DEFAULTS, Result, Settings, Task
 from ..work import Progress, part, report, silent
 from .absorb_splats import absorb_task
+from .refit_splats import unchanged_note
 from .score_splats import score, score_once, with_quality
 
 if TYPE_CHECKING:
@@ -27,8 +29,9 @@ if TYPE_CHECKING:
     from ..seeing.measuring import Measured
     from ..selection import Budget, RowBytes
     from ..splats import Splats
-    from ..survivor_choice import SurvivorChoice
+    from ..survivor_choice import Became, SurvivorChoice
     from ..views import ViewSet
+    from .refit_splats import Made
 
 
 def prune(  # noqa: PLR0913 - the main function of core; all but three are optional
@@ -39,7 +42,7 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
     *,
     protected: NDArray[np.bool_] | None = None,
     forced_out: NDArray[np.bool_] | None = None,
-    survivors: SurvivorChoice = "unchanged",
+    survivors: SurvivorChoice = "auto",
     row_bytes: RowBytes = 0.0,
     fixed_bytes: int = 0,
     progress: Progress = silent,
@@ -57,7 +60,7 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
         Splats that are neither removed nor changed.
     forced_out : (N,) bool, optional
         Splats that go in any case, unless they are protected; see `Task`.
-    survivors : {"unchanged", "absorb", "refit"}
+    survivors : {"auto", "unchanged", "absorb", "refit"}
         What survivors may become; see `Task`.
     row_bytes, fixed_bytes
         See `Budget.removals`.
@@ -137,30 +140,30 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
         scores = with_quality(scores, protected=task.protected, threads=threads)
     clock.lap("score_s")
     report(progress, scored, "selecting")
-    if task.absorb and task.budget.psnr is not None:
-        keep = np.ones(len(scores.values), np.bool_)  # how many survive is found by absorbing
-    else:
-        keep = selection.select(
-            scores,
-            task.budget,
-            protected=task.protected,
-            row_bytes=task.row_bytes,
-            fixed_bytes=task.fixed_bytes,
-        )
+    keep, plain = _deleting(task, scores, threads)
     clock.lap("select_s")
-    made = None
-    if task.absorb:
+    made = tried = None
+    if task.absorb and not _will_do(task, scores, plain):
         count = int(np.count_nonzero(keep))
-        made = absorb_task(task, count, known, part(progress, 0.2, 1.0), threads)
-        keep, psnr = made.absorbed.keep, made.psnr
+        made = tried = absorb_task(task, count, known, part(progress, 0.2, 1.0), threads)
         clock.lap("absorb_s")
-    else:
-        psnr = _estimated(scores, keep, threads)
+        if task.survivors == "auto" and _as_good(task, keep, plain, made):
+            made = None
+    psnr = plain if made is None else made.psnr
+    keep = keep if made is None else made.absorbed.keep
     facts = make_report(scores, keep, task.budget, task.settings, clock)
     size = int(np.broadcast_to(task.row_bytes, len(keep)).sum() + task.fixed_bytes)
     gone = len(keep) - int(np.count_nonzero(keep))
     why = remark(task.budget, gone, len(keep), psnr, size)
     conclude(facts, scores, keep, psnr, None if made is None else made.absorbed, why)
+    facts["survivors"] = {
+        "asked": task.survivors,
+        "became": "unchanged" if made is None else made.became,
+        **expected_psnr(scores.quality, gone / len(keep), _measured(task, plain, tried, made)),
+        "seconds": _seconds(task, clock, gone / len(keep), once=known is not None),
+    }
+    if task.survivors == "auto" and task.absorb and made is None and gone:
+        facts["notes"].append(unchanged_note(plain, tried))
     if made is None:
         return Result(keep, scores, facts)
     facts |= made.facts()
@@ -168,6 +171,82 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     if known and task.settings.method == "closed-form":
         facts["notes"].append(MEASURES)
     return Result(keep, scores, facts, made.survivors)
+
+
+def _measured(
+    task: Task, plain: float | None, tried: Made | None, made: Made | None
+) -> dict[Became, float | None]:
+    """Return the estimates of the PSNR that were measured, by what survivors became, dB.
+
+    Parameters
+    ----------
+    task : Task
+    plain : float or None
+        With splats deleted.
+    tried, made : Made or None
+        By absorbing; the second is None where plain deletion is as good.
+    """
+    if task.budget.psnr is None:
+        return {"unchanged": plain, **({} if tried is None else tried.measured())}
+    # The others keep another number of splats.
+    return {"unchanged": plain} if made is None else made.measured()
+
+
+def _seconds(task: Task, clock: Clock, share: float, *, once: bool) -> dict[Became, float] | None:
+    """Return about how long it takes by what survivors become; None where scoring tells nothing."""
+    if task.scores is not None or not (once or task.settings.estimates):
+        return None
+    return in_tenths(expected_seconds(clock.timings["score_s"], share, once=once))
+
+
+def _deleting(
+    task: Task, scores: Scores, threads: int | None
+) -> tuple[NDArray[np.bool_], float | None]:
+    """Return which splats plain deletion keeps, (N,), and the estimated PSNR, dB.
+
+    All splats where survivors absorb in any case to reach a PSNR: how many survive is found by
+    absorbing.
+    """
+    if task.absorb and task.survivors != "auto" and task.budget.psnr is not None:
+        return np.ones(len(scores.values), np.bool_), None
+    keep = selection.select(
+        scores,
+        task.budget,
+        protected=task.protected,
+        row_bytes=task.row_bytes,
+        fixed_bytes=task.fixed_bytes,
+    )
+    return keep, _estimated(scores, keep, threads)
+
+
+def _will_do(task: Task, scores: Scores, plain: float | None) -> bool:
+    """Return whether absorbing need not be tried, given what plain deletion reaches, dB."""
+    goal = task.budget.psnr
+    if task.survivors != "auto":
+        return False
+    if goal is None:
+        return deletion_will_do(plain)
+    return selection.quality_of(scores).share(goal, "absorb") <= PLAIN
+
+
+def _as_good(task: Task, keep: NDArray[np.bool_], plain: float | None, made: Made) -> bool:
+    """Return whether plain deletion is about as good as what was made by absorbing.
+
+    Parameters
+    ----------
+    task : Task
+    keep : (N,) bool
+        Which splats plain deletion keeps.
+    plain : float or None
+        The estimate with the others deleted, dB.
+    made : Made
+    """
+    if plain is None or made.psnr is None:
+        return True
+    fewer = np.count_nonzero(keep) - len(made.absorbed.splats)
+    if task.budget.psnr is not None:  # both keep it
+        return bool(fewer <= 0)
+    return plain > made.psnr - AS_GOOD
 
 
 def _estimated(scores: Scores, keep: NDArray[np.bool_], threads: int | None) -> float | None:

@@ -6,11 +6,13 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from ..estimate.quality import in_words
 from ..refitting.refit import refit
 
 if TYPE_CHECKING:
     from ..absorbing.absorb import Absorbed
     from ..refitting.refit import Refitted
+    from ..survivor_choice import Became
     from ..task import Task
     from ..work import Progress
 
@@ -37,6 +39,17 @@ class Made:
     seconds: float = 0.0
 
     @property
+    def became(self) -> Became:
+        """What survivors became."""
+        return "absorb" if self.refitted is None else "refit"
+
+    def measured(self) -> dict[Became, float | None]:
+        """Return the estimates of the PSNR by what survivors became, dB."""
+        if self.refitted is None:
+            return {"absorb": self.psnr}
+        return {"absorb": self.refitted.psnr_before, "refit": self.psnr}
+
+    @property
     def survivors(self) -> Absorbed:
         """The survivors as they became in the end."""
         if self.refitted is None:
@@ -51,6 +64,24 @@ class Made:
     def notes(self) -> list[str]:
         """Return the same as sentences, for the user."""
         return [] if self.refitted is None else [self.refitted.note(self.seconds)]
+
+
+def unchanged_note(plain: float | None, tried: Made | None) -> str:
+    """Return why survivors stay unchanged by default, for the user.
+
+    Parameters
+    ----------
+    plain : float or None
+        The estimated PSNR with splats deleted, dB.
+    tried : Made or None
+        What absorbing made; None where it was not tried.
+    """
+    why = "the views see too little to tell what absorbing would gain"
+    if tried is not None and tried.psnr is not None:
+        why = f"absorbing reaches {in_words(tried.psnr)}, hardly more"
+    elif plain is not None:
+        why = "nobody would see what absorbing gains"
+    return f"survivors stay unchanged: {why}"
 
 
 def refit_absorbed(task: Task, made: Made, progress: Progress, threads: int | None) -> Made:

@@ -16,6 +16,10 @@ along the splat's axis j, whose scale is s_j and the longest of which is s::
 
 That J changes with the mean, and the colour with the direction of view, is left out. Parameters are
 those of the splat's own axes, so results turn and grow with the scene.
+
+With ``e = A d``, h_j is ``r_j e``, r_j the splat's axis in the image, in pixels. So the ten
+derivatives of alpha are alpha times polynomials of degree 2 in the two numbers of e: a hit keeps
+alpha and e, a splat the coefficients.
 """
 
 from __future__ import annotations
@@ -27,7 +31,7 @@ import numpy as np
 
 from ..rendering import ALPHA_MAX
 from ..seeing import projection
-from ..seeing.ray_sums import behind, in_front
+from ..seeing.ray_sums import in_front
 from ..seeing.rays import LEAST_LEFT, LOG_OPAQUE
 from ..splats import SH_C0, rotation_matrices
 
@@ -91,21 +95,27 @@ class LinearView:
         What the rays see now, 0..1.
     ray, owner : (h,) int64
         Of each hit: its ray, and the splat as a place in `rows`.
-    by_color : (3, h) float32
-        How each channel changes with the same channel of the constant of the harmonics.
+    weight : (h,) float32
+        T a.
     by_alpha : (3, h) float32
         How the colour changes with alpha, ``T (c - B)``.
-    alpha_by : (10, h) float32
-        How alpha changes with the parameters behind the first three.
+    alpha : (h,) float32
+        0 where it is clipped, and does not change.
+    steepness : (2, h) float32
+        ``A d`` across and down, 1/px.
+    slopes : Slopes
+        Of the splats that are hit.
     """
 
     rows: NDArray[np.int64]
     colors: NDArray[np.float64]
     ray: NDArray[np.int64]
     owner: NDArray[np.int64]
-    by_color: NDArray[np.float32]
+    weight: NDArray[np.float32]
     by_alpha: NDArray[np.float32]
-    alpha_by: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+    steepness: NDArray[np.float32]
+    slopes: Slopes
 
     def forward(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return by how much the colours change, (3, P), to first order.
@@ -116,12 +126,22 @@ class LinearView:
             Of the parameters of all splats.
         """
         mine = change[:, self.rows]
-        alpha = np.zeros(len(self.owner), np.float32)
-        for by, values in zip(self.alpha_by, mine[OPACITY.start :], strict=True):
-            alpha += by * values.take(self.owner)
+        constant, x, y, xx, xy, yy = self.slopes.polynomials(mine)
+        across, down = self.steepness
+        alpha = x.take(self.owner)
+        alpha += across * xx.take(self.owner)
+        alpha += down * xy.take(self.owner)
+        alpha *= across
+        by_down = y.take(self.owner)
+        by_down += down * yy.take(self.owner)
+        by_down *= down
+        alpha += by_down
+        alpha += constant.take(self.owner)
+        alpha *= self.alpha
         result = np.empty((3, self.colors.shape[1]), np.float32)
         for channel in range(3):
-            light = self.by_color[channel] * mine[channel].take(self.owner)
+            light = (self.slopes.light[channel] * mine[channel]).take(self.owner)
+            light *= self.weight
             light += self.by_alpha[channel] * alpha
             result[channel] = np.bincount(self.ray, light, self.colors.shape[1])
         return result
@@ -133,25 +153,109 @@ class LinearView:
         ----------
         errors : (3, P) float32
         """
-        count = len(self.rows)
-        result = np.empty((COUNT, count))
-        alpha = np.zeros(len(self.owner), np.float32)
+        result = np.empty((COUNT, len(self.rows)))
+        value = np.zeros(len(self.owner), np.float32)
         for channel in range(3):
             error = errors[channel].take(self.ray)
-            alpha += self.by_alpha[channel] * error
-            result[channel] = np.bincount(self.owner, self.by_color[channel] * error, count)
-        for row, by in enumerate(self.alpha_by, OPACITY.start):
-            result[row] = np.bincount(self.owner, by * alpha, count)
+            value += self.by_alpha[channel] * error
+            error *= self.weight
+            result[channel] = self.slopes.light[channel] * self._sum(error)
+        value *= self.alpha
+        across, down = self.steepness
+        x, y = value * across, value * down
+        moments = (value, x, y, x * across, x * down, y * down)
+        result[OPACITY.start :] = self.slopes.gradients([self._sum(each) for each in moments])
         return result
 
     def diagonal(self) -> NDArray[np.float64]:
         """Return the squared length of each column, that is of each parameter, (13, u)."""
-        count = len(self.rows)
-        squares = np.square(self.by_alpha).sum(axis=0)
-        return np.stack(
-            [np.bincount(self.owner, np.square(by), count) for by in self.by_color]
-            + [np.bincount(self.owner, np.square(by) * squares, count) for by in self.alpha_by]
+        result = np.empty((COUNT, len(self.rows)))
+        result[COLOR] = np.square(self.slopes.light) * self._sum(np.square(self.weight))
+        value = np.square(self.by_alpha).sum(axis=0) * np.square(self.alpha)
+        result[OPACITY.start] = np.square(self.slopes.opacity) * self._sum(value)
+        x, y = self.steepness
+        squares = (x * x, x * y, y * y)
+        second = [value * each for each in squares]
+        fourth = [each * squares[0] for each in second[:2]] + [each * squares[2] for each in second]
+        result[MEAN] = self.slopes.squared_linear([self._sum(each) for each in second])
+        result[SCALE.start :] = self.slopes.squared_quadratic([self._sum(each) for each in fourth])
+        return result
+
+    def _sum(self, values: NDArray[np.float32]) -> NDArray[np.float64]:
+        """Return the sum of values of hits over the hits of each splat, (u,)."""
+        return np.asarray(np.bincount(self.owner, values, len(self.rows)), np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Slopes:
+    """How alpha of the hits of u splats changes with their parameters, as polynomials of ``A d``.
+
+    Attributes
+    ----------
+    light : (3, u) float32
+        How the colour changes with the constant of the harmonics; 0 where it is clipped.
+    opacity : (u,) float32
+        ``1 - o``.
+    linear : (3, 2, u) float32
+        Of the mean along each axis: coefficients of x and y.
+    quadratic : (6, 3, u) float32
+        Of scales and turns: coefficients of x^2, x y and y^2.
+    """
+
+    light: NDArray[np.float32]
+    opacity: NDArray[np.float32]
+    linear: NDArray[np.float32]
+    quadratic: NDArray[np.float32]
+
+    def polynomials(self, change: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+        """Return the coefficients of 1, x, y, x^2, x y, y^2 of changed splats, (u,) each.
+
+        Parameters
+        ----------
+        change : (13, u) float32
+        """
+        return [
+            self.opacity * change[OPACITY][0],
+            *np.einsum("kiu,ku->iu", self.linear, change[MEAN]),
+            *np.einsum("kiu,ku->iu", self.quadratic, change[SCALE.start :]),
+        ]
+
+    def gradients(self, moments: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return the transpose of `polynomials`: ten parameters of six sums, (10, u)."""
+        return np.concatenate(
+            [
+                (self.opacity * moments[0])[None],
+                np.einsum("kiu,iu->ku", self.linear, np.stack(moments[1:3])),
+                np.einsum("kiu,iu->ku", self.quadratic, np.stack(moments[3:])),
+            ]
         )
+
+    def squared_linear(self, sums: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return the sums over hits of squared polynomials of the mean, (3, u).
+
+        Parameters
+        ----------
+        sums : list of (u,) float64
+            Of x^2, x y and y^2 over the hits of each splat.
+        """
+        a, b = np.moveaxis(self.linear.astype(np.float64), 1, 0)  # (3, u) each
+        result = a * a * sums[0] + 2.0 * a * b * sums[1] + b * b * sums[2]
+        return np.asarray(np.maximum(result, 0.0), np.float64)
+
+    def squared_quadratic(self, sums: list[NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return the sums over hits of squared polynomials of scales and turns, (6, u).
+
+        Parameters
+        ----------
+        sums : list of (u,) float64
+            Of x^4, x^3 y, x^2 y^2, x y^3 and y^4 over the hits of each splat.
+        """
+        a, b, c = np.moveaxis(self.quadratic.astype(np.float64), 1, 0)  # (6, u) each
+        weights = (a * a, 2.0 * a * b, b * b + 2.0 * a * c, 2.0 * b * c, c * c)
+        result = np.zeros(a.shape)
+        for weight, of_power in zip(weights, sums, strict=True):
+            result += weight * of_power
+        return np.maximum(result, 0.0)
 
 
 def linear_view(
@@ -179,71 +283,62 @@ def linear_view(
     log_front = in_front(rays.log_passed.astype(np.float64), counts)
     transmittance = np.exp(np.where(log_front > LOG_OPAQUE, log_front, -np.inf)).astype(np.float32)
     weight = transmittance * rays.alpha
-    left = np.maximum(transmittance - weight, np.float32(LEAST_LEFT))
     kept = np.flatnonzero((weight > _LEAST_WEIGHT) & (rays.owner < movable))
     owner, ray = rays.owner[kept].astype(np.intp), rays.ray[kept].astype(np.intp)
-    by_color, by_alpha = np.empty((2, 3, len(kept)), np.float32)
-    for channel, of_splats in enumerate(colors):
-        mine = of_splats.astype(np.float32).take(rays.owner)
-        light = weight * mine
-        background = behind(light.astype(np.float64), counts).astype(np.float32) / left
-        by_alpha[channel] = (transmittance * (mine - background))[kept]
-        unclipped = (of_splats > 0.0) & (of_splats < projection.BRIGHTEST)
-        by_color[channel] = weight[kept] * unclipped.take(owner) * np.float32(SH_C0)
-    rows = shapes.gaussians.index[rays.hit[:movable]]
-    alpha_by = _alpha_by(replace(rays, hit=rays.hit[:movable]), kept, footprints, shapes, view)
-    return LinearView(rows, rays.colors(colors), ray, owner, by_color, by_alpha, alpha_by)
-
-
-def _alpha_by(
-    rays: Rays,
-    kept: NDArray[np.int64],
-    footprints: Footprints,
-    shapes: Shapes,
-    view: View,
-) -> NDArray[np.float32]:
-    """Return how alpha of some hits changes with ten parameters, (10, h); see the top of this file.
-
-    Parameters
-    ----------
-    rays, footprints, shapes, view
-        See `linear_view`.
-    kept : (h,) int64
-        Which hits.
-    """
-    owner = rays.owner[kept].astype(np.intp)
+    left = np.maximum((transmittance - weight)[kept], np.float32(LEAST_LEFT))
+    ends = np.cumsum(counts)
+    last = np.repeat(ends, counts)[kept]  # behind the last hit of the same ray
+    hitting = rays.ray.take(ends - 1)
+    seen, by_alpha = np.zeros((3, rays.count)), np.empty((3, len(kept)), np.float32)
+    for channel, of_splats in enumerate(colors.astype(np.float32)):
+        sums = np.zeros(len(weight) + 1)  # of what all hits in front have of the colours of rays
+        np.cumsum(weight * of_splats.take(rays.owner), dtype=np.float64, out=sums[1:])
+        seen[channel, hitting] = sums.take(ends) - sums.take(ends - counts)
+        background = (sums.take(last) - sums.take(kept + 1)).astype(np.float32) / left
+        by_alpha[channel] = transmittance[kept] * (of_splats.take(owner) - background)
     alpha = rays.alpha[kept]
     alpha = np.where(alpha < ALPHA_MAX, alpha, np.float32(0.0))  # clipped: it does not change
-    across, down = _steepness(rays, kept, footprints)  # (h,) each, A d
-    hit = shapes.gaussians.take(rays.hit)
-    rows, columns = projection.jacobian(
-        hit, shapes.scene, view
-    )  # (u, 3) each, of J W in the scene's frame
-    axes = shapes.axes[rays.hit]  # (u, 3, 3)
-    scales = shapes.scales[rays.hit].astype(np.float32)  # (u, 3)
-    along_row, along_column = (
-        np.einsum("ui,uij->uj", each, axes).astype(np.float32) for each in (rows, columns)
+    unclipped = (colors > 0.0) & (colors < projection.BRIGHTEST)
+    hit = rays.hit[:movable]
+    return LinearView(
+        shapes.gaussians.index[hit], seen.clip(0.0, 1.0), ray, owner, weight[kept], by_alpha, alpha,
+        _steepness(replace(rays, hit=hit), kept, footprints),
+        _slopes(hit, unclipped[:, :movable], shapes, view),
+    )  # fmt: skip
+
+
+def _slopes(
+    hit: NDArray[np.int64], unclipped: NDArray[np.bool_], shapes: Shapes, view: View
+) -> Slopes:
+    """Return how alpha changes with the parameters of the Gaussians hit; see the top of this file.
+
+    `unclipped`, (3, u), is where their colours are not clipped.
+    """
+    gaussians, scales = shapes.gaussians.take(hit), shapes.scales[hit]  # (u, 3)
+    in_image = projection.jacobian(gaussians, shapes.scene, view)  # rows of J W, (u, 3) each
+    x, y = (np.einsum("ui,uij->ju", each, shapes.axes[hit]) for each in in_image)  # (3, u) each
+    longest, squared = scales.max(axis=1), np.square(scales).T  # (u,), (3, u)
+    after, last = [1, 2, 0], [2, 0, 1]
+    turned = squared[after] - squared[last]
+    scaled = np.stack([squared * x * x, 2.0 * squared * x * y, squared * y * y], axis=1)
+    turns = np.stack(
+        [
+            turned * x[after] * x[last],
+            turned * (x[after] * y[last] + y[after] * x[last]),
+            turned * y[after] * y[last],
+        ],
+        axis=1,
     )
-    slope = [  # (h,) each, h_j
-        along_row[:, axis].take(owner) * across + along_column[:, axis].take(owner) * down
-        for axis in range(3)
-    ]
-    longest, squared = scales.max(axis=1), scales * scales
-    result = np.empty((COUNT - OPACITY.start, len(owner)), np.float32)
-    result[0] = alpha * (np.float32(1.0) - hit.alphas).take(owner)
-    for axis in range(3):
-        after, last = (axis + 1) % 3, (axis + 2) % 3
-        result[1 + axis] = alpha * longest.take(owner) * slope[axis]
-        result[4 + axis] = alpha * np.square(scales[:, axis].take(owner) * slope[axis])
-        difference = (squared[:, after] - squared[:, last]).take(owner)
-        result[7 + axis] = alpha * difference * slope[after] * slope[last]
-    return result
+    return Slopes(
+        unclipped * np.float32(SH_C0),
+        np.float32(1.0) - gaussians.alphas,
+        (longest * np.stack([x, y], axis=1)).astype(np.float32),
+        np.concatenate([scaled, turns]).astype(np.float32),
+    )
 
 
-def _steepness(
-    rays: Rays, kept: NDArray[np.int64], footprints: Footprints
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return ``A d`` of some hits, across and down, (h,) each, 1/px."""
+def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> NDArray[np.float32]:
+    """Return ``A d`` of some hits, across and down, (2, h), 1/px."""
     place = np.empty(int(footprints.index.max(initial=-1)) + 1, np.intp)
     place[footprints.index] = np.arange(len(footprints.index))
     mine = footprints.take(place[rays.hit])
@@ -253,11 +348,11 @@ def _steepness(
         (at + np.float32(0.5) - center.take(owner)).astype(np.float32)
         for at, center in zip(pixel, mine.centers, strict=True)
     ]
-    across, down = np.zeros((2, len(owner)), np.float32)
+    result = np.zeros((2, len(owner)), np.float32)
     for axes, sigma in zip((mine.major, mine.minor), mine.sigmas, strict=True):
         inverse = (1.0 / np.square(np.square(sigma.astype(np.float64)))).astype(np.float32)
         along = step[0] * axes[0].take(owner) + step[1] * axes[1].take(owner)
         along *= inverse.take(owner)
-        across += along * axes[0].take(owner)
-        down += along * axes[1].take(owner)
-    return across, down
+        result[0] += along * axes[0].take(owner)
+        result[1] += along * axes[1].take(owner)
+    return result

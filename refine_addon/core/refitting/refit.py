@@ -5,21 +5,22 @@ gave them. On rays it is known what the unpruned splats look like, and how the c
 every parameter of the survivors (`linear`). So in rounds, each on rays through other pixels, the
 squared difference of colours is made small by damped least squares (Levenberg, Marquardt)::
 
-    minimise over x   |J x - r|^2  +  sum over parameters p of  (DAMPING D_p + PRIOR m_p) x_p^2
+    minimise over x   |J x - r|^2  +  sum over parameters p of  (k (D_p + m_p) + K_p) x_p^2
 
-r is the difference on all rays, D the diagonal of J'J and m_p the median of D over all splats that
-are hit, for each kind of parameter. So what few rays tell of a splat moves it little. The sum is
-made small by a few steps of conjugate gradients, preconditioned by the diagonal.
+r is the difference on all rays, D the diagonal of J'J, m_p the median of D over all splats that are
+hit, for each kind of parameter, and K the sum of D over the rounds before. So what few rays tell of
+a splat moves it little, and rounds together learn from the rays of all of them, not from the last
+alone: each has a share in what a parameter becomes. The sum is made small by a few steps of
+conjugate gradients, preconditioned by the diagonal.
 
-The rays of a round, before anything is learned from them, are a measurement that nothing was fitted
-to: on them, survivors before and after the round before are compared. Rounds end where little is
-gained, and a round that loses is undone.
+Validation rays, which nothing is learned from, compare survivors before and after a round. One that
+loses is undone, and the next is damped more (k, at first 1). Rounds end where little is gained.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -36,17 +37,16 @@ if TYPE_CHECKING:
 
     from ..splats import Splats
     from ..views import ViewSet
-
-Found = TypeVar("Found")
+    from .round_rays import Truth
 
 STEPS = 4
 """Steps of conjugate gradients in a round."""
 
-DAMPING, PRIOR = 1.0, 1.0
-"""Of the diagonal, and of its median over splats; see the top of this file."""
+MORE_DAMPING = 8.0
+"""Factor of k after a round that lost; see the top of this file."""
 
 LEAST_GAIN = 0.05
-"""Rounds end where the PSNR of fresh rays rises by less, dB."""
+"""Rounds end where the PSNR of the validation rays rises by less, dB."""
 
 MAX_STEP = {"color": 0.5, "opacity": 1.0, "mean": 0.5, "scale": 0.3, "turn": 0.3}
 """How far a parameter moves in a round: as `linear` has them, means by the longest scale."""
@@ -119,8 +119,7 @@ class Refitted(Gains):
     rounds : int
         How many rounds made them so.
     psnr_before, psnr : float
-        Of the survivors as given, and as they are now, dB: each round's gain is measured on rays
-        that nothing was fitted to, and added.
+        Of the survivors as given, and as they are now, dB, on rays that nothing was learned from.
     """
 
     splats: Splats
@@ -160,7 +159,7 @@ def refit(  # noqa: PLR0913 - all but three are optional
     Returns
     -------
     Refitted
-        Never below what it began with, on rays that nothing was fitted to.
+        Never below what it began with, on rays that nothing was learned from.
 
     Raises
     ------
@@ -169,7 +168,7 @@ def refit(  # noqa: PLR0913 - all but three are optional
 
     Notes
     -----
-    Memory: about 200 bytes a survivor, 12 bytes for each ray of all rounds, and 80 bytes for each
+    Memory: about 700 bytes a survivor, 12 bytes for each ray of all rounds, and 50 bytes for each
     hit of a round, see `round_rays.MAX_HITS`.
     """
     *_, last = refit_rounds(
@@ -217,113 +216,112 @@ def refit_on(
     movable = moving[:, None] & ~(
         np.zeros(len(survivors), np.bool_) if protected is None else protected
     )
-    solver = _Solver(rays, len(survivors), threads)
-    best = Refitted(survivors, np.zeros(len(survivors), np.bool_), 0, 0.0, 0.0)
-    trial, share = survivors, 1.0 / (settings.rounds + 1)
-    for number in range(settings.rounds + 1):
-        begin = share * number
-        seeing = part(progress, begin, begin + share / 2)
-        last = number == settings.rounds
-        # After the last round nothing is learned, so derivatives are not needed.
-        linear = [] if last else rays.linear(trial, number, seeing)
-        seen = rays.colors(trial, number, seeing) if last else [view.colors for view in linear]
-        psnr = rays.psnr(seen, number)
-        if not number:
-            best = replace(best, psnr_before=psnr, psnr=psnr)
-        else:
-            gain = psnr - rays.psnr(rays.colors(best.splats, number), number)
-            if gain <= 0.0:
-                return
-            changed = ~_same(survivors, trial)
-            best = Refitted(trial, changed, number, best.psnr_before, best.psnr + gain)
-        yield best
-        if last or (number and gain < LEAST_GAIN):
-            return
-        change = solver.solve(
-            linear, number, movable, part(progress, begin + share / 2, begin + share)
+    psnr = rays.psnr(survivors, part(progress, 0.0, 0.04))
+    best = Refitted(survivors, np.zeros(len(survivors), np.bool_), 0, psnr, psnr)
+    yield best
+    known, damping = np.zeros((COUNT, len(survivors))), 1.0
+    for number in range(1, settings.rounds + 1):
+        begin, middle, near, end = (
+            0.04 + 0.96 * (number - 1 + share) / settings.rounds for share in (0.0, 0.4, 0.9, 1.0)
         )
-        trial = _moved(trial, change)
+        linear = rays.linear(best.splats, number, part(progress, begin, middle))
+        solver = _Solver(linear, rays.truths(number), movable, threads)
+        change, told = solver.solve(damping, known, part(progress, middle, near))
+        del linear, solver  # the hits, before those of the next round
+        if not change.any():
+            return
+        trial = _moved(best.splats, change)
+        psnr = rays.psnr(trial, part(progress, near, end))
+        gain = psnr - best.psnr
+        if gain > 0.0:
+            known += told
+            changed = ~_same(survivors, trial)
+            best = Refitted(trial, changed, best.rounds + 1, best.psnr_before, psnr)
+            yield best
+            if gain < LEAST_GAIN:
+                return
+        elif damping > 1.0:
+            return
+        else:
+            damping *= MORE_DAMPING
 
 
 class _Solver:
-    """Solves the least squares of a round.
+    """Solves the least squares of a round, of N survivors.
 
     Parameters
     ----------
-    rays : RoundRays
-    count : int
-        How many survivors there are.
+    linear : list of LinearView
+    truths : list of Truth
+        Of the same views.
+    movable : (13, N) bool
+        Which parameters may change.
     threads : int, optional
     """
 
-    def __init__(self, rays: RoundRays, count: int, threads: int | None) -> None:
-        self._rays, self._count, self._threads = rays, count, threads
-
-    def solve(
+    def __init__(
         self,
         linear: list[LinearView],
-        round_: int,
+        truths: list[Truth],
         movable: NDArray[np.bool_],
-        progress: Progress,
-    ) -> NDArray[np.float64]:
-        """Return by how much to change the parameters of all survivors, (13, N).
+        threads: int | None,
+    ) -> None:
+        self._linear, self._truths = linear, truths
+        self._movable, self._threads = movable, threads
+
+    def solve(
+        self, damping: float, known: NDArray[np.float64], progress: Progress
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return by how much to change the parameters of survivors, and what rays tell of them.
 
         Parameters
         ----------
-        linear : list of LinearView
-        round_ : int
-        movable : (13, N) bool
-            Which parameters may change.
+        damping : float
+            k; see the top of this file.
+        known : (13, N) float64
+            What the rounds before have told: K.
         progress : callable
+
+        Returns
+        -------
+        change, diagonal : (13, N) float64
+            x and D.
         """
         steps = [part(progress, k / (STEPS + 2), (k + 1) / (STEPS + 2)) for k in range(STEPS + 2)]
 
-        truths = self._rays.truths(round_)
+        def errors(view: LinearView, truth: Truth) -> NDArray[np.float64]:
+            return view.backward(truth.colors - view.colors.astype(np.float32))
 
-        def errors(number: int) -> NDArray[np.float64]:
-            view = linear[number]
-            return view.backward(truths[number].colors - view.colors.astype(np.float32))
-
-        residual = self._sum(linear, errors, steps[0]) * movable
-        diagonal = self._sum(linear, lambda number: linear[number].diagonal(), steps[1]) * movable
-        damping = DAMPING * diagonal + PRIOR * _medians(diagonal)[:, None]
-        inverse = np.divide(
-            1.0, diagonal + damping, out=np.zeros_like(diagonal), where=movable & (diagonal > 0.0)
-        )
+        residual = self._sum(errors, steps[0])
+        diagonal = self._sum(lambda view, _: view.diagonal(), steps[1])
+        damped = damping * (diagonal + _medians(diagonal)[:, None]) + known
+        inverse = np.divide(1.0, diagonal + damped, out=np.zeros_like(damped), where=diagonal > 0.0)
 
         def product(direction: NDArray[np.float64], step: Progress) -> NDArray[np.float64]:
             small = direction.astype(np.float32)
+            return self._sum(lambda view, _: view.backward(view.forward(small)), step) + (
+                damped * direction
+            )
 
-            def of_view(number: int) -> NDArray[np.float64]:
-                return linear[number].backward(linear[number].forward(small))
-
-            return self._sum(linear, of_view, step) * movable + damping * direction
-
-        return _conjugate_gradients(product, residual, inverse, steps[2:])
+        return _conjugate_gradients(product, residual, inverse, steps[2:]), diagonal
 
     def _sum(
-        self,
-        linear: list[LinearView],
-        work: Callable[[int], NDArray[np.float64]],
-        progress: Progress,
+        self, work: Callable[[LinearView, Truth], NDArray[np.float64]], progress: Progress
     ) -> NDArray[np.float64]:
         """Return the sum over views, one after the other, of values of the splats hit, (13, N)."""
-        total = np.zeros((COUNT, self._count))
-        with np.errstate(under="ignore"):
-            of_views = self._each(lambda piece: work(piece.start), progress)
-            for view, values in zip(linear, of_views, strict=True):
-                total[:, view.rows] += values
-        return total
+        total = np.zeros(self._movable.shape)
 
-    def _each(self, work: Callable[[slice], Found], progress: Progress) -> list[Found]:
-        return for_chunks(
-            work,
-            len(self._rays.windows),
-            1,
-            progress=progress,
-            what="refitting",
-            threads=self._threads,
-        )
+        def of_view(piece: slice) -> NDArray[np.float64]:
+            with np.errstate(under="ignore"):
+                return work(self._linear[piece.start], self._truths[piece.start])
+
+        of_views = for_chunks(
+            of_view, len(self._linear), 1,
+            progress=progress, what="refitting", threads=self._threads,
+        )  # fmt: skip
+        for view, values in zip(self._linear, of_views, strict=True):
+            total[:, view.rows] += values
+        return total * self._movable
 
 
 def _medians(diagonal: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,5 +1,8 @@
 """The rays of all rounds of refitting: what the unpruned splats look like on them, and survivors.
 
+Each round learns from rays through other pixels. Validation rays, which no round learns from, tell
+what a round has gained.
+
 Views are cast in processes of their own, as they are measured (`processes`).
 """
 
@@ -17,7 +20,7 @@ from ..seeing import projection
 from ..seeing.cast import cast, depth_complexity, pixels
 from ..seeing.ray_sample import MAX_RAYS_OF_VIEW, colors_from
 from ..views import ViewSet
-from ..work import Progress, part, silent
+from ..work import Progress, part
 from .linear import LinearView, Shapes, linear_view
 
 if TYPE_CHECKING:
@@ -40,12 +43,13 @@ MIN_RAYS = 1 << 16
 
 MAX_HITS = 1 << 25
 """About how many hits the rays of a round may have on the unpruned splats. Survivors have fewer,
-and those that hardly show are left out: some 80 bytes are taken for every third."""
+and those that hardly show are left out: some 50 bytes are taken for at most every second."""
 
 SECONDS, SECONDS_OF_RAY = 2.5e-7, 4e-6
 """About how long one core takes to project a splat into a view, and to cast a ray, to tell what is
 worth a process."""
 
+_EVERY = 2  # validation rays go through every second column and row of a round's rays
 _LEAST_ERROR = 10.0 ** (-PSNR_CAP / 10.0)
 
 
@@ -87,24 +91,23 @@ class Window:
             width=self.width, height=self.height,
         )  # fmt: skip
 
-    def pixels(
-        self, footprints: Footprints, number: int
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def pixels(self, hits: float, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the columns and rows that the rays of a round go through.
 
-        Rounds follow the validation rays of the view in the R2 sequence (`cast.pixels`), so that
-        the rays of one are not next to those of another.
+        Rounds follow the rays that an estimate uses in the R2 sequence (`cast.pixels`), so that the
+        rays of one are not next to those of another.
 
         Parameters
         ----------
-        footprints : Footprints
-            Of the unpruned splats.
+        hits : float
+            About how many hits a ray has on the unpruned splats.
         number : int
-            Of the round.
+            0 for validation rays, 1 for the first round.
         """
-        depth = max(depth_complexity(footprints, self.part), 1.0)
-        count = min(self.rays, self.hits / depth, MAX_RAYS_OF_VIEW)
+        count = min(self.rays, self.hits / max(hits, 1.0), MAX_RAYS_OF_VIEW)
         columns, rows = pixels(self.part, self.number + 1 + number, count)
+        if not number:
+            columns, rows = columns[::_EVERY], rows[::_EVERY]
         return columns + self.left, rows + self.top
 
 
@@ -177,8 +180,7 @@ class RoundRays:
     scene : Scene
         Of the unpruned splats; also an attribute.
     truths : sequence of sequence of Truth
-        Of each window, the rays of each round; there is one round more than are refitted, to
-        measure the last.
+        Of each window, the validation rays and the rays of each round.
     threads : int, optional
     """
 
@@ -236,7 +238,7 @@ class RoundRays:
         return cls(windows, scene, truths, threads)
 
     def truths(self, number: int) -> list[Truth]:
-        """Return the rays of a round, of each view."""
+        """Return the rays of a round, of each view; those of round 0 validate."""
         return [of_rounds[number] for of_rounds in self._truths]
 
     def linear(self, splats: Splats, number: int, progress: Progress) -> list[LinearView]:
@@ -247,28 +249,21 @@ class RoundRays:
         splats : Splats
             The survivors.
         number : int
-            Of the round.
+            Of the round, from 1.
         progress : callable
         """
         gaussians = self._gaussians(splats, part(progress, 0.0, 0.1))
         shapes = Shapes.of(splats, gaussians, self.scene)
-        work = _Linearize(self.target(splats, gaussians), self.windows, self.truths(number), shapes)
-        return self._each(work, len(splats), part(progress, 0.1, 1.0))
+        truths = self.truths(number)
+        work = _Linearize(self.target(splats, gaussians), self.windows, truths, shapes)
+        return self._each(work, truths, len(splats), part(progress, 0.1, 1.0))
 
-    def colors(
-        self, splats: Splats, number: int, progress: Progress = silent
-    ) -> list[NDArray[np.float64]]:
-        """Return what the rays of each view see of survivors, (3, P); parameters as `linear`."""
+    def psnr(self, splats: Splats, progress: Progress) -> float:
+        """Return the mean PSNR of survivors on validation rays, weighted as the views are, dB."""
         gaussians = self._gaussians(splats, part(progress, 0.0, 0.1))
-        work = _CastColors(self.target(splats, gaussians), self.windows, self.truths(number))
-        return self._each(work, len(splats), part(progress, 0.1, 1.0))
-
-    def psnr(self, colors: Sequence[NDArray[np.float64]], number: int) -> float:
-        """Return the mean PSNR of what the rays of each view see, weighted as the views are, dB."""
-        errors = [
-            max(float(np.mean(np.square(truth.colors - seen))), _LEAST_ERROR)
-            for truth, seen in zip(self.truths(number), colors, strict=True)
-        ]
+        truths = self.truths(0)
+        work = _CastErrors(self.target(splats, gaussians), self.windows, truths)
+        errors = self._each(work, truths, len(splats), part(progress, 0.1, 1.0))
         weights = [window.weight for window in self.windows]
         return float(np.average(-10.0 * np.log10(errors), weights=weights))
 
@@ -283,9 +278,15 @@ class RoundRays:
         )
         return prepared[0]
 
-    def _each(self, work: Callable[[int], Result], count: int, progress: Progress) -> list[Result]:
-        """Return what is found in each view, of `count` survivors."""
-        rays = sum(truth.colors.shape[1] for truth in self.truths(0))
+    def _each(
+        self,
+        work: Callable[[int], Result],
+        truths: Sequence[Truth],
+        count: int,
+        progress: Progress,
+    ) -> list[Result]:
+        """Return what is found on the rays of each view, of `count` survivors."""
+        rays = sum(truth.colors.shape[1] for truth in truths)
         seconds = SECONDS * (count + self.around) * len(self.windows) + SECONDS_OF_RAY * rays
         return [
             *for_each(
@@ -305,7 +306,7 @@ class CastTruth:
         The unpruned splats.
     windows : sequence of Window
     rounds : sequence of int
-        Their numbers.
+        Their numbers; 0 for the validation rays.
     """
 
     target: Target
@@ -315,23 +316,18 @@ class CastTruth:
     def __call__(self, place: int) -> list[Truth]:
         """Return the rays of a view, of each round."""
         window = self.windows[place]
+        truths = []
         with np.errstate(under="ignore"):
             footprints = self.target.footprints(window)
-            return [
-                self._truth(window.view, footprints, *window.pixels(footprints, number))
-                for number in self.rounds
-            ]
-
-    def _truth(
-        self,
-        view: View,
-        footprints: Footprints,
-        columns: NDArray[np.int64],
-        rows: NDArray[np.int64],
-    ) -> Truth:
-        rays = cast(footprints, columns, rows)
-        colors = rays.colors(self.target.colors(rays.hit, view))
-        return Truth(columns, rows, colors.astype(np.float32))
+            # It counts footprints beyond the image in full, so the first round says better.
+            hits = depth_complexity(footprints, window.part)
+            for number in self.rounds:
+                columns, rows = window.pixels(hits, number)
+                rays = cast(footprints, columns, rows)
+                colors = rays.colors(self.target.colors(rays.hit, window.view))
+                truths.append(Truth(columns, rows, colors.astype(np.float32)))
+                hits = len(rays.ray) / max(rays.count, 1)
+        return truths
 
 
 def cast_truths(
@@ -349,19 +345,20 @@ def cast_truths(
 
 
 @dataclass(frozen=True, eq=False)
-class _CastColors:
-    """Casts the rays of a round of a view into survivors; any process can."""
+class _CastErrors:
+    """Casts rays of a view into survivors, and compares colours; any process can."""
 
     target: Target
     windows: Sequence[Window]
     truths: Sequence[Truth]
 
-    def __call__(self, number: int) -> NDArray[np.float64]:
-        """Return what the rays of a view see, (3, P)."""
+    def __call__(self, number: int) -> float:
+        """Return the mean squared error of the colours that the rays of a view see."""
         window, truth = self.windows[number], self.truths[number]
         with np.errstate(under="ignore"):
             rays = cast(self.target.footprints(window), truth.columns, truth.rows)
-            return rays.colors(self.target.colors(rays.hit, window.view))
+            seen = rays.colors(self.target.colors(rays.hit, window.view))
+        return float(max(np.mean(np.square(truth.colors - seen)), _LEAST_ERROR))
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,8 +76,8 @@ def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
 
 def prepare(scene: bpy.types.Scene) -> None:
     """Put a red cube without shading in front of the splats, to the left."""
-    place = scene.camera.matrix_world @ Vector((-0.35, 0.0, -1.2))
-    bpy.ops.mesh.primitive_cube_add(size=0.3, location=place)
+    place = scene.camera.matrix_world @ Vector((-0.15, 0.0, -0.5))
+    bpy.ops.mesh.primitive_cube_add(size=0.12, location=place)
     material = bpy.data.materials.new("red")
     material.use_nodes = True
     tree = material.node_tree

@@ -95,7 +95,7 @@ def price(name: str) -> dict[str, Any]:
     return {
         "percent": settings.percent,
         "ratio": settings.to_budget().ratio,
-        "sentence": ui.plans.sentence(plan, settings.survivors) if plan else "",
+        "sentence": ui.plans.sentence(plan) if plan else "",
         "rested": bool(plan) and plan.get("marked", True),
         "marked": sum(mark.value for mark in marks),
         "chart": ui.price.shows(obj.data) and ui.price.icon() > 0,

@@ -1,0 +1,47 @@
+"""About how long it takes to prune, by what survivors become, once splats were scored."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ..survivor_choice import Became
+
+ROUNDS = 2.5
+"""Scoring by *auto* or *occlusion* takes so many times as long as measuring all splats once."""
+
+SHARES = (0.1, 0.3, 0.5, 0.55, 0.7, 0.9)
+"""Shares removed for which the next two hold; between them they are interpolated."""
+
+ABSORBING = (0.1, 0.5, 1.1, 1.6, 2.0, 2.6)
+"""How many times as long as measuring once absorbing takes after that: more stages, more time."""
+
+REFITTING = (8.0, 7.0, 6.0, 6.0, 5.0, 4.0)
+"""The same of refitting."""
+
+
+def expected_seconds(scored: float, share: float, *, once: bool) -> dict[Became, float]:
+    """Return about how long pruning takes, by what survivors become; seconds, without files.
+
+    Parameters
+    ----------
+    scored : float
+        How long scoring took, seconds.
+    share : float
+        Of the splats that goes.
+    once : bool
+        Whether all splats were measured once; else they were scored by *auto* or *occlusion*.
+
+    Examples
+    --------
+    >>> expected_seconds(1.0, 0.5, once=True)
+    {'unchanged': 2.5, 'absorb': 2.1, 'refit': 8.1}
+    """
+    measured = scored if once else scored / ROUNDS
+    absorbing, refitting = (
+        measured * float(np.interp(share, SHARES, times)) for times in (ABSORBING, REFITTING)
+    )
+    absorb = measured + absorbing
+    return {"unchanged": ROUNDS * measured, "absorb": absorb, "refit": absorb + refitting}

@@ -1,0 +1,223 @@
+"""Cameras from files: as objects of the scene, by themselves or with the splats they lie beside."""
+
+# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty, CollectionProperty, StringProperty
+from bpy_extras.io_utils import ImportHelper
+
+from ..cameras.objects import SHEAR, SOURCE, UPRIGHT
+from ..cameras.sets import create_cameras, known_turn
+from ..core.cameras.read import cameras_in, read_cameras
+from ..core.errors import RefineError
+from ..core.estimate.alignment import Alignment
+from ..mesh import layout as mesh_layout
+from . import preferences
+from .on_thread import AskedFirst
+from .operator_bases import Answer, Needing, idle, in_object_mode
+from .properties import UPRIGHT_TEXT
+from .wrapped import counted
+
+if TYPE_CHECKING:
+    from ..core.views import ViewSet
+    from ..core.work import Progress
+
+FOLDER = "refine_folder"
+"""Custom property of an imported object: the folder of its file."""
+
+SET_RESOLUTION: dict[str, Any] = {
+    "name": "Set Render Size",
+    "description": "Give the scene the image size of the first camera, and make that the active "
+    "one, so that renders show what the camera saw",
+    "options": {"SKIP_SAVE"},
+}
+"""A property of the operators that import cameras."""
+
+_ABOVE = 3  # folders above the splats in which their cameras are looked for
+
+_DEFAULT_SIZE = (1920, 1080, 100)  # of Blender's factory settings, with the percentage
+
+_OF_MODELS = {".bin", ".txt"}  # several files of one folder are a COLMAP model
+
+_USUAL_NAMES = {"cameras", "images", "transforms", "transforms_train"}  # of any capture
+
+
+class REFINE_OT_import_cameras(AskedFirst, Needing, bpy.types.Operator, ImportHelper):
+    """Import cameras as objects: Inria cameras.json, nerfstudio transforms.json or COLMAP"""
+
+    # On a thread not for its time alone. What the file browser calls is put down as the last
+    # operation only where it goes on after that: else the box *Adjust Last Operation* would stay
+    # that of the splats before, and adjusting them would undo these cameras.
+    bl_idname = "refine.import_cameras"
+    bl_label = "Import Cameras"
+    bl_options = {"REGISTER", "UNDO", "PRESET"}
+    needs = (idle, in_object_mode)
+
+    filename_ext = ".json"
+    filter_glob: StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})
+    files: CollectionProperty(  # without it Blender cannot ask about files that are dropped
+        type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"}
+    )
+    upright: BoolProperty(
+        name="Upright",
+        description=UPRIGHT_TEXT + ". Choose what you chose for the splats",
+    )
+    set_resolution: BoolProperty(**SET_RESOLUTION)
+
+    doing = "Reading cameras"
+    reads_object = False
+
+    def ask(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
+        """Ask for the file; upright by default where the splats are."""
+        obj = _imported_splats(context)
+        if obj is None:
+            preferences.suggest(self, context, "upright")
+        elif not self.properties.is_property_set("upright"):
+            self.upright = _is_upright(obj)
+        suggest_resolution(self, context)
+        folder = None if self.properties.is_property_set("filepath") else capture_folder(obj)
+        if folder is None:
+            return self.invoke_popup(context)
+        self.filepath = os.path.join(folder, "")  # noqa: PTH118 - ends in a separator
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def prepare(self, _context: bpy.types.Context, _checked: None) -> Path:
+        """Note which file to read."""
+        path = Path(bpy.path.abspath(self.filepath))
+        if len(self.files) > 1 and path.suffix not in _OF_MODELS:
+            msg = f"got {len(self.files)} files, expected one of cameras"
+            raise RefineError(msg)
+        return path
+
+    @staticmethod
+    def work(path: Path, _progress: Progress) -> ViewSet:
+        """Read the file, or of a COLMAP model all of its folder."""
+        return read_cameras(path.parent if path.suffix in _OF_MODELS else path)
+
+    def finish(
+        self, context: bpy.types.Context, _checked: None, path: Path, views: ViewSet
+    ) -> Answer:
+        """Import the cameras into a collection of their own."""
+        collection = add_cameras(self, context, views, path)
+        if (splats := _imported_splats(context)) is not None:
+            warn_of_turn(self, context, splats)
+        self.report({"INFO"}, f"Imported {counted(len(views), 'camera')} into '{collection.name}'")
+        return {"FINISHED"}
+
+
+class REFINE_FH_cameras(bpy.types.FileHandler):
+    """Lets camera files be dropped on the 3D view."""
+
+    bl_idname = "REFINE_FH_cameras"
+    bl_label = "Splat Cameras (REFINE)"
+    bl_import_operator = "refine.import_cameras"
+    bl_file_extensions = ".json;.bin;.txt"
+
+    @classmethod
+    def poll_drop(cls, context: bpy.types.Context) -> bool:
+        """Tell whether files can be dropped here."""
+        return context.area is not None and context.area.type == "VIEW_3D"
+
+
+def add_cameras(
+    operator: Any,  # noqa: ANN401 - either of the operators that import cameras
+    context: bpy.types.Context,
+    views: ViewSet,
+    path: Path,
+) -> bpy.types.Collection:
+    """Make objects of cameras, in a collection of their own, and have these decide.
+
+    Parameters
+    ----------
+    operator : bpy.types.Operator
+        With the properties ``upright`` and ``set_resolution``.
+    context : bpy.types.Context
+    views : ViewSet
+    path : Path
+        Where they come from.
+    """
+    scene = context.scene
+    name = "Cameras" if path.is_dir() or path.stem in _USUAL_NAMES else f"Cameras {path.stem}"
+    collection = bpy.data.collections.new(name)
+    target_collection(context).children.link(collection)
+    cameras = create_cameras(views, collection, upright=operator.upright)
+    scene.refine.collection = collection
+    scene.refine.source = "COLLECTION"
+    if operator.set_resolution:
+        scene.render.resolution_x = views[0].width
+        scene.render.resolution_y = views[0].height
+        scene.render.resolution_percentage = 100
+    if operator.set_resolution or scene.camera is None:
+        scene.camera = cameras[0]
+    if views.note:
+        operator.report({"WARNING"}, views.note)
+    return collection
+
+
+def suggest_resolution(operator: Any, context: bpy.types.Context) -> None:  # noqa: ANN401
+    """Have an operator that asks set the render size where nobody has chosen size or camera."""
+    if not operator.properties.is_property_set("set_resolution"):
+        operator.set_resolution = _is_untouched(context.scene)
+
+
+def warn_of_turn(
+    operator: bpy.types.Operator, context: bpy.types.Context, splats: bpy.types.Object
+) -> None:
+    """Report if only one of splats and the cameras that decide was imported upright."""
+    context.view_layer.update()  # or what was just made stands at the origin
+    if turn := known_turn(context, splats):
+        operator.report({"WARNING"}, Alignment(turn, known=True).turned())
+
+
+def target_collection(context: bpy.types.Context) -> bpy.types.Collection:
+    """Return the active collection, or the scene's where that one belongs to a library."""
+    active = context.collection
+    return context.scene.collection if active is None or active.library else active
+
+
+def cameras_beside(folder: Path) -> Path | None:
+    """Return what holds the cameras of splats in a folder: there, or in the folders above.
+
+    Trained scenes have their splats some folders below their cameras, in
+    ``point_cloud/iteration_30000``.
+    """
+    places = (folder, *folder.parents[:_ABOVE])
+    return next((found[0] for place in places if (found := cameras_in(place))), None)
+
+
+def capture_folder(obj: bpy.types.Object | None) -> Path | None:
+    """Return where to look for the cameras of a splat object; None where nothing tells."""
+    stored = obj.get(FOLDER) if obj is not None else None
+    if not isinstance(stored, str) or not stored or not os.path.isdir(stored):  # noqa: PTH112
+        return None
+    found = cameras_beside(Path(stored))
+    return Path(stored) if found is None else found if found.is_dir() else found.parent
+
+
+def _imported_splats(context: bpy.types.Context) -> bpy.types.Object | None:
+    """Return the splats that cameras are imported for: the active ones, else any imported ones."""
+    if mesh_layout.looks_like_splats(context.object):
+        return context.object
+    splats = (obj for obj in context.scene.objects if FOLDER in obj)
+    return next((obj for obj in splats if mesh_layout.looks_like_splats(obj)), None)
+
+
+def _is_upright(obj: bpy.types.Object) -> bool:
+    """Tell whether an object stands as *Upright* turns it; float32 leaves 7.5e-8 of the zeros."""
+    return np.allclose(np.array(obj.matrix_world)[:3, :3], UPRIGHT[:3, :3], atol=SHEAR)
+
+
+def _is_untouched(scene: bpy.types.Scene) -> bool:
+    """Tell whether a scene has the size and no more than the camera that Blender starts with."""
+    render = scene.render
+    size = (render.resolution_x, render.resolution_y, render.resolution_percentage)
+    cameras = [obj for obj in scene.objects if obj.type == "CAMERA"]
+    moved = any(obj.animation_data or SOURCE in obj for obj in cameras)
+    return size == _DEFAULT_SIZE and len(cameras) <= 1 and not moved

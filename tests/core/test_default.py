@@ -1,0 +1,167 @@
+"""By default survivors absorb what goes, and stay unchanged where that is as good."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from refine_addon.command import main
+from refine_addon.core import (
+    Budget,
+    PruneRequest,
+    Settings,
+    Splats,
+    prune,
+    prune_file,
+    read_cameras,
+    read_ply,
+    score,
+)
+from refine_addon.core.estimate.quality import AS_GOOD, expected
+from refine_addon.core.pipeline import decide
+from refine_addon.core.task import Task
+
+ROOM = Path(__file__).parents[1] / "data/room_small"
+FEW = Settings(views=12)
+HALF = Budget(ratio=0.5)
+
+
+@pytest.fixture(scope="module")
+def views():
+    names = json.loads((ROOM / "split.json").read_text())["train"]
+    return read_cameras(ROOM / "cameras.json").select(names)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """Every twentieth splat of the room, as a file."""
+    file, path = read_ply(ROOM / "point_cloud.ply"), tmp_path_factory.mktemp("small") / "in.ply"
+    keep = np.zeros(len(file), np.bool_)
+    keep[::20] = True
+    file.write(path, keep)
+    return path
+
+
+@pytest.fixture(scope="module")
+def splats(small):
+    return read_ply(small).splats()
+
+
+@pytest.mark.slow
+def test_it_absorbs_where_that_is_better(splats, views):
+    """To the bit as where absorbing is asked for; the report says what each comes to."""
+    wanted = prune(splats, views, HALF, FEW, survivors="absorb")
+
+    result = prune(splats, views, HALF, FEW)
+
+    told = result.report["survivors"]
+    np.testing.assert_array_equal(result.keep, wanted.keep)
+    for item in fields(Splats):
+        found = getattr(result.absorbed.splats, item.name)
+        np.testing.assert_array_equal(found, getattr(wanted.absorbed.splats, item.name))
+    assert (told["asked"], told["became"]) == ("auto", "absorb")
+    assert told["psnr"]["absorb"] == result.report["estimated_psnr"]
+    assert told["psnr"]["absorb"] > told["psnr"]["unchanged"] + AS_GOOD
+    assert told["psnr"]["refit"] > told["psnr"]["absorb"]
+    assert set(told["seconds"]) == {"unchanged", "absorb", "refit"}
+
+
+@pytest.mark.slow
+def test_hidden_copies_are_deleted_and_rows_stay(small, views, tmp_path):
+    """A copy of half opacity in the place of each splat: a quarter can go by deletion alone.
+
+    Here splats are copied four times and made all but opaque, so that what lies behind hides.
+    """
+    file = read_ply(small)
+    rows = np.concatenate([file.rows] * 4)
+    rows["opacity"] = 6.0
+    path = tmp_path / "copies.ply"
+    columns = {name: rows[name] for name in rows.dtype.names}
+    from tests.strategies import ply_of  # noqa: PLC0415 - here alone
+
+    path.write_bytes(ply_of(columns))
+
+    result = prune_file(path, tmp_path / "out.ply", PruneRequest(views, Budget(ratio=0.3), FEW))
+
+    told = result.report["survivors"]
+    assert (told["asked"], told["became"]) == ("auto", "unchanged")
+    assert result.absorbed is None
+    kept = read_ply(path).rows[result.keep]
+    assert read_ply(tmp_path / "out.ply").rows.tobytes() == kept.tobytes()
+    assert any("survivors stay unchanged" in note for note in result.report["notes"])
+
+
+@pytest.mark.slow
+def test_a_psnr_that_a_tenth_is_enough_for_is_kept_by_deletion(splats, views):
+    """Absorbing deletes the first tenth, too."""
+    told = prune(splats, views, Budget(psnr=70.0), FEW)
+
+    assert told.absorbed is None
+    assert told.report["survivors"]["became"] == "unchanged"
+
+
+@pytest.mark.parametrize(
+    ("settings", "budget"),
+    [
+        (Settings("closed-form"), HALF),
+        (Settings("closed-form"), Budget(threshold=0.5)),
+        (Settings(views=12), Budget(min_seen=60.0)),
+    ],
+)
+def test_who_says_how_to_delete_gets_rows(splats, views, settings, budget):
+    """A method other than auto, and a budget of scores or views."""
+    result = prune(splats, views, budget, settings)
+
+    assert result.absorbed is None
+    assert result.report["survivors"]["became"] == "unchanged"
+    assert not any("survivors" in note for note in result.report["notes"])
+
+
+def test_scores_alone_can_only_delete(splats, views):
+    """A task of stored scores has no splats that could absorb."""
+    scores = score(splats, views, Settings("closed-form"))
+
+    result = decide(Task(HALF, scores=scores))
+
+    assert result.absorbed is None
+    assert np.count_nonzero(result.keep) == len(splats) - len(splats) // 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "became"),
+    [
+        ([], "absorb"),
+        (["--method", "auto"], "unchanged"),
+        (["--method", "auto", "--survivors", "refit"], "refit"),
+        (["--survivors", "auto", "--method", "auto"], "absorb"),
+        (["--absorb"], "absorb"),
+    ],
+)
+def test_the_command_deletes_where_a_method_is_named(small, tmp_path, capsys, options, became):
+    """Whoever names one says how to delete, unless survivors are named too."""
+    words = [str(small), "--cameras", str(ROOM / "cameras.json"), "--views", "16", *options]
+    report = tmp_path / "r.json"
+
+    assert main(["prune", *words, "-o", str(tmp_path / "o.ply"), "--report", str(report)]) == 0
+
+    (entry,) = json.loads(report.read_text())["results"]
+    assert entry["survivors"]["became"] == became
+    assert "quality: about" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("measured", "told"),
+    [
+        ({"unchanged": 38.0, "absorb": 46.0, "refit": 50.0}, (38.0, 46.0, 50.0)),
+        ({"unchanged": 38.0}, (38.0, None, None)),
+        ({}, (None, None, None)),
+    ],
+)
+def test_what_was_measured_is_told_before_what_is_expected(measured, told):
+    """Without a curve nothing else is known."""
+    assert tuple(expected(None, 0.5, measured).values()) == told
