@@ -46,6 +46,16 @@ def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
     found["alike"] = [settings(scene) == before]
     save(bpy.data.images[IMAGE], f"{pictures}/rendered.npy")
 
+    card = importlib.import_module(f"{extension.MODULE}.render.card")
+    card.available, real = (lambda: True), card.available
+    name = bpy.data.images[IMAGE].session_uid
+    invoke()
+    yield from until(
+        lambda: bpy.data.images[IMAGE].session_uid != name and not rendering(), "again"
+    )
+    save(bpy.data.images[IMAGE], f"{pictures}/by_card.npy")
+    card.available = real
+
     scene.frame_end = 2
     before = settings(scene)
     invoke(animation=True)
