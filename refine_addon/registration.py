@@ -27,6 +27,7 @@ from .ui.compare import REFINE_OT_compare
 from .ui.export_operators import REFINE_OT_export_ply
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_ply
+from .ui.instances import REFINE_OT_make_real, REFINE_PT_instances
 from .ui.operators import (
     REFINE_OT_apply,
     REFINE_OT_convert,
@@ -87,6 +88,7 @@ CLASSES = (
     REFINE_OT_add_volume,
     REFINE_OT_drop_volume,
     REFINE_OT_crop,
+    REFINE_OT_make_real,
     REFINE_OT_select_stroke,
     REFINE_OT_brush_radius,
     REFINE_OT_select,
@@ -112,6 +114,7 @@ CLASSES = (
     REFINE_FH_ply,
     REFINE_FH_cameras,
     REFINE_PT_splats,
+    REFINE_PT_instances,
     REFINE_PT_cameras,
     REFINE_UL_cameras,
     REFINE_PT_camera_list,

@@ -136,9 +136,11 @@ def _caught(copy: Path, stage: list[str]) -> str:
     """Return the first of some tests that fails in a copy of the project, or ""."""
     tests = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *stage]
     limit = SECONDS_ALONE if len(stage) == 1 and "::" in stage[0] else SECONDS
+    # pytest rewrites Hypothesis each time, for 2 s, unless it may keep the bytecode.
+    kept = {**os.environ, "PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": _bytecode().name}
     try:
         done = subprocess.run(
-            tests, cwd=copy, capture_output=True, text=True, check=False, timeout=limit
+            tests, cwd=copy, capture_output=True, text=True, check=False, timeout=limit, env=kept
         )
     except subprocess.TimeoutExpired:
         return f"{stage[0]}: more than {limit} s"
@@ -148,6 +150,12 @@ def _caught(copy: Path, stage: list[str]) -> str:
         raise ValueError(done.stdout[-2000:])  # a test that cannot be collected catches nothing
     failed = re.search(r"^FAILED \S*?/?([^/\s]+?)(?:\[| |$)", done.stdout, re.MULTILINE)
     return failed[1] if failed else done.stdout[-200:]
+
+
+@functools.cache
+def _bytecode() -> tempfile.TemporaryDirectory[str]:
+    """Make a folder for bytecode, which goes with this process."""
+    return tempfile.TemporaryDirectory(prefix="mutants-")
 
 
 def main() -> int:

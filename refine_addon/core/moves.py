@@ -29,8 +29,8 @@ _FLAT = 1e-5
 _SAMPLE, _FITTED = 2048, 16384
 """Points by which candidates are compared, and to which a map is fitted at last; evenly spread."""
 
-_TRIES, _DRAWN = 120, 6
-"""Candidates for each map, and points that each is fitted to."""
+_TRIES, _DRAWN = 240, 4
+"""Candidates for each map, and points that each is fitted to: the fewest that determine one."""
 
 _BLOCKS = (1.0, 0.1, 0.01)
 """Shares of the points, in a row, from which a candidate draws: what was joined or copied lies
@@ -108,7 +108,7 @@ def _best(
     best, most = None, LEAST - 1
     for drawn in _draws(len(before), random):
         matrix = _fitted(before[drawn], after[drawn])
-        if matrix is None or not _fits(matrix, before[drawn], after[drawn]).all():
+        if matrix is None:
             continue
         # Few points tell a map less exactly than all that agree with it.
         agree = _fits(matrix, before[some], after[some], slack=100.0)

@@ -129,7 +129,7 @@ def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.f
     (N, K, 3) float64
     """
     degree = math.isqrt(sh_rest.shape[1] + 1) - 1
-    rotated = np.empty(sh_rest.shape)
+    rotated = np.empty_like(sh_rest, np.float64)
     # A rotation maps each band to itself. Its matrix is fitted to more directions than it has rows.
     points = np.random.default_rng(0).normal(size=(64, 3))
     points /= np.linalg.norm(points, axis=1, keepdims=True)
@@ -138,9 +138,17 @@ def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.f
         columns = slice(band * band, (band + 1) ** 2)
         matrix = np.linalg.lstsq(here[:, columns], before[:, columns], rcond=None)[0]
         stored = slice(columns.start - 1, columns.stop - 1)
-        for rows in chunks(len(rotated), _CHUNK):
-            rotated[rows, stored] = np.einsum("ij,njc->nic", matrix, sh_rest[rows, stored])
+        _map(matrix, sh_rest[:, stored], rotated[:, stored])
     return rotated
+
+
+def _map(
+    matrix: NDArray[np.float64], coefficients: NDArray[Any], result: NDArray[np.float64]
+) -> None:
+    """Write a matrix, (B, B), times the coefficients of each splat and channel, (N, B, 3)."""
+    for rows in chunks(len(coefficients), _CHUNK):
+        planes = np.ascontiguousarray(coefficients[rows].transpose(2, 1, 0), np.float64)
+        result[rows] = (matrix @ planes).transpose(2, 1, 0)
 
 
 def stretched(
@@ -170,8 +178,6 @@ def stretched(
     before = here @ np.linalg.inv(linear).T
     before /= np.linalg.norm(before, axis=1, keepdims=True)
     matrix = np.linalg.lstsq(basis(here, degree), basis(before, degree), rcond=None)[0]
-    result = np.empty((len(sh_rest), sh_rest.shape[1] + 1, 3))
-    for rows in chunks(len(result), _CHUNK):
-        old = np.concatenate([sh_dc[rows, None], sh_rest[rows]], axis=1, dtype=np.float64)
-        result[rows] = np.einsum("ij,njc->nic", matrix, old)
+    result = np.concatenate([sh_dc[:, None], sh_rest], axis=1, dtype=np.float64)
+    _map(matrix, result, result)
     return result[:, 0], result[:, 1:]

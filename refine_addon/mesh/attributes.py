@@ -55,22 +55,10 @@ def import_notes(source: SplatFile) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def mesh_from_file(source: SplatFile, name: str = "") -> bpy.types.Mesh:
-    """Make a mesh with a vertex a splat and an attribute a property.
-
-    Parameters
-    ----------
-    source : SplatFile
-    name : str
-        Of the mesh; by default the file's.
-
-    Returns
-    -------
-    bpy.types.Mesh
-        With no user yet.
-    """
+def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
+    """Make a mesh with a vertex a splat and an attribute a property; it has no user yet."""
     rows = source.rows
-    mesh = bpy.data.meshes.new(name or source.path.stem)
+    mesh = bpy.data.meshes.new(source.path.stem)
     try:
         add_vertices(mesh, len(rows))
         columns = add_attributes(mesh, rows.dtype, source.header)

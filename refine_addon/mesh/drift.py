@@ -36,6 +36,9 @@ _DEGREE, _OBJECT, _ORIGIN, _CHECKSUM = 0x7, 0xFFF8, 0xFFFF, 16
 _MIX = np.uint32(0x9E3779B1)
 """An odd number near 2^32 over the golden ratio, as multiplicative hashing takes it."""
 
+_FEW, _FEW_SHARE = 100, 0.01
+"""Splats that may have been moved each by itself without a word: so many, or this share of all."""
+
 _SHOWN = 1 << 15
 """Splats that are looked at, evenly spread, for what the panel says."""
 
@@ -56,6 +59,8 @@ class Drift:
         Splats whose harmonics stand under the names of another degree.
     unlisted : tuple of str
         Properties of joined splats that an export would leave out.
+    bent : int
+        Splats that were moved each by itself, as by a modifier; 0 for a few, moved by hand.
     strangers : int
         Vertices of which nothing was noted, among others of which it was.
     """
@@ -65,12 +70,13 @@ class Drift:
     sources: int
     regrouped: int
     unlisted: tuple[str, ...]
+    bent: int
     strangers: int
 
     @property
     def mendable(self) -> bool:
-        """Whether anything can be put right."""
-        return bool(self.turned or self.regrouped or self.unlisted)
+        """Whether anything can be put right, or has to be taken as it is."""
+        return bool(self.turned or self.regrouped or self.unlisted or self.bent)
 
     def sentences(self) -> list[str]:
         """Return what was done, each in a sentence."""
@@ -89,6 +95,11 @@ class Drift:
         if self.unlisted:
             names = ", ".join(self.unlisted)
             told.append(f"Joined splats have properties that an export leaves out: {names}")
+        if self.bent:
+            told.append(
+                f"{self.bent:,} splats were moved each by itself, as by a modifier, without their "
+                "sizes and rotations: undo that, or Mend Splats takes it as it is"
+            )
         if self.strangers:
             told.append(
                 f"{self.strangers:,} vertices that are no splats, or of an object never seen here, "
@@ -124,9 +135,10 @@ def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
     if notes.undisturbed():
         return None
     step = max(1, len(notes.codes) // _SHOWN)
-    moves = notes.moves(step)
+    moves, loose = notes.moves(step)
     drift = Drift(
         turned=min(step * sum(len(move.rows) for move in moves), len(notes.codes)),
+        bent=step * loose if step * loose > max(_FEW, _FEW_SHARE * len(notes.codes)) else 0,
         mirrored=any(move.mirrors for move in moves),
         sources=len(notes.objects()),
         regrouped=len(notes.regrouped()),
@@ -138,7 +150,7 @@ def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
 
 def turned(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[Move]:
     """Return by what maps which splats were moved that did not follow, but in their positions."""
-    return _Notes(mesh).moves() if is_stamped(mesh) else []
+    return _Notes(mesh).moves()[0] if is_stamped(mesh) else []
 
 
 def regrouped(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[tuple[int, NDArray[np.int64]]]:
@@ -197,16 +209,23 @@ class _Notes:
         """Return the numbers of the objects that the splats came from."""
         return [int(number) for number in np.unique(self.codes & _OBJECT) if number]
 
-    def moves(self, step: int = 1) -> list[Move]:
-        """Return the maps that splats did not follow; one splat of `step` is looked at."""
+    def moves(self, step: int = 1) -> tuple[list[Move], int]:
+        """Return the maps that splats did not follow, and how many were moved each by itself.
+
+        One splat of `step` is looked at.
+        """
         rows = np.arange(0, len(self.codes), step)
         codes = self.codes[rows]
         rows = rows[(codes >> _CHECKSUM == _checksums(self.mesh, step)) & (codes != 0)]
-        moves = []
+        moves, loose = [], 0
         for number in self.objects():
             own = rows[self.codes[rows] & _OBJECT == number]
-            moves += _followed(own, affine_moves(self.home[own], self.position[own]))
-        return [move for move in moves if not move.shifts]
+            home, position = self.home[own], self.position[own]
+            of_object = affine_moves(home, position)
+            finite = np.isfinite(home + position).all(axis=1)
+            loose += int(np.count_nonzero(finite)) - sum(len(move.rows) for move in of_object)
+            moves += _followed(own, of_object)
+        return [move for move in moves if not move.shifts], loose
 
     def regrouped(self) -> NDArray[np.int64]:
         """Return the splats whose harmonics stand under the names of another degree."""

@@ -15,9 +15,10 @@ from ..cameras.objects import snapped, world_matrix
 from ..core.affine import baked, is_flat, is_uniform
 from ..core.errors import RefineError
 from ..core.formats.ply import REST_COUNTS
+from ..core.formats.ply_columns import values_by_name
 from ..core.moves import Move
-from ..core.splats import above_constant, joined
-from ..core.survivors import columns_with
+from ..core.splats import above_constant
+from ..core.work import for_chunks
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
@@ -33,7 +34,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..core.splats import Splats
     from ..mesh.layout import SplatObject
+
+_ROWS = 1 << 14
+"""Splats that are moved at a time, on one thread."""
 
 _UNMOVED = {
     "location": (0.0, 0.0, 0.0),
@@ -77,9 +82,8 @@ def moved_columns(checked: SplatObject, moves: Sequence[Move]) -> dict[str, NDAr
 
     Returns
     -------
-    dict of str to (N,)
-        Those that change: positions, scales, rotations, harmonics and normals, not rounded where
-        that would lose anything. All others of the splats keep their bits.
+    dict of str to (N,) float32
+        Those that change: positions, scales, rotations, harmonics and normals.
 
     Raises
     ------
@@ -87,17 +91,29 @@ def moved_columns(checked: SplatObject, moves: Sequence[Move]) -> dict[str, NDAr
         See `refine_addon.core.affine.baked`.
     """
     splats = mesh_attributes.splats_from_object(checked)
-    stored = mesh_attributes.stored_columns(checked)
-    rows = np.concatenate([move.rows for move in moves])
-    parts = [baked(splats.take(move.rows), move.matrix) for move in moves]
-    columns = columns_with(stored, rows, joined(parts))
+    columns = {name: np.array(column) for name, column in values_by_name(splats).items()}
     del columns["opacity"]
+    for move in moves:
+        _move_rows(splats, columns, move)
     if {"nx", "ny", "nz"} <= {column.name for column in checked.layout.columns}:
         normals = mesh_attributes.normals(checked)
         for move in moves:
             normals[move.rows] = _turned_normals(normals[move.rows], move.matrix)
         columns.update(zip(("nx", "ny", "nz"), normals.T, strict=True))
     return columns
+
+
+def _move_rows(splats: Splats, columns: dict[str, NDArray[Any]], move: Move) -> None:
+    """Write into columns what some splats become."""
+
+    def move_some(part: slice) -> None:
+        rows = part if len(move.rows) == len(splats) else move.rows[part]
+        values = values_by_name(baked(splats.take(rows), move.matrix))
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
+            for name, column in columns.items():
+                column[rows] = values[name]
+
+    for_chunks(move_some, len(move.rows), _ROWS)
 
 
 def _turned_normals(

@@ -86,6 +86,7 @@ def prepare(splats: Splats, view: View, layer: Layer | None) -> Sheet:
     numbers = np.zeros(24, np.float32)
     numbers[:16] = projection.T.reshape(-1)
     numbers[16:21] = (view.width, view.height, view.near, 1.0, 1.0)
+    nothing = np.ones((1, 4), np.float32)
     textures = {
         "order": (as_texture(order), 1, "R32F"),
         "means": (as_texture(means), 4, "RGBA32F"),
@@ -95,6 +96,8 @@ def prepare(splats: Splats, view: View, layer: Layer | None) -> Sheet:
         "selection": (as_texture(np.zeros(len(packed), np.float32)), 1, "R32F"),
         "matrices": (matrix.astype(np.float32).reshape(1, 12), 4, "RGBA32F"),
         "depths": (limits, 1, "R32F"),
+        "veils": (nothing, 4, "RGBA16F"),  # what the 3D view sees through
+        "veil_depths": (nothing, 4, "RGBA16F"),
     }
     return Sheet(textures, len(order), numbers, (view.width, view.height))
 
@@ -120,7 +123,7 @@ def _drawn(sheet: Sheet, textures: dict[str, Any], which: int) -> NDArray[np.flo
     """Return some of the splats, (4, H, W), colours times alpha, the top row first."""
     width, height = sheet.size
     numbers = sheet.numbers.copy()
-    numbers[21:23] = (which != _ALL, which == _BEHIND)
+    numbers[21], numbers[23] = which != _ALL, which == _BEHIND
     picture = gpu.types.GPUTexture(sheet.size, format="RGBA32F")
     frame = gpu.types.GPUFrameBuffer(color_slots=picture)
     shader.blend(frame, textures, numbers, sheet.count)

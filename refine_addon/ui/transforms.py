@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import bpy
+import mathutils
 from bpy.app.handlers import persistent
 from bpy.props import BoolProperty
 
@@ -13,6 +14,7 @@ from ..core.errors import RefineError
 from ..mesh import drift as mesh_drift
 from ..mesh import layout as mesh_layout
 from ..objects import splat_group, transforms
+from ..viewport import draw as viewport_draw
 from . import plans, wrapped
 from .operator_bases import Answer, AtOnce, OnSplats, in_object_mode
 from .wrapped import counted
@@ -111,6 +113,15 @@ def of(obj: bpy.types.Object) -> Drift | None:
     return _known[key]
 
 
+def _in_view(context: bpy.types.Context) -> list[str]:
+    """Return a line for each object in a view that is to be mended: the panel may be closed."""
+    return [
+        f"'{obj.name}' was transformed by Blender's own tools: Mend Splats in the tab REFINE"
+        for obj in context.visible_objects
+        if mesh_layout.looks_like_splats(obj) and (drift := of(obj)) and drift.mendable
+    ]
+
+
 def draw(
     layout: bpy.types.UILayout, context: bpy.types.Context, objects: Sequence[bpy.types.Object]
 ) -> None:
@@ -120,8 +131,10 @@ def draw(
         wrapped.label(layout, context, sentence, icon="ERROR")
     if any(drift.mendable for drift in drifts):
         layout.operator("refine.mend", icon="MODIFIER")
-    several = len(objects) > 1
-    layout.operator("refine.join" if several else "refine.bake_transform")
+    if len(objects) > 1:
+        layout.operator("refine.join", icon="SELECT_EXTEND")
+    elif objects[0].matrix_basis != mathutils.Matrix():
+        layout.operator("refine.bake_transform", icon="OBJECT_ORIGIN")
 
 
 def _draw_apply(menu: bpy.types.Menu, context: bpy.types.Context) -> None:
@@ -185,6 +198,7 @@ _EVENTS = ("undo_post", "redo_post", "load_post")
 
 def register() -> None:
     """Hear of changes, and have menus offer what splats follow."""
+    viewport_draw.warned_by.append(_in_view)
     bpy.app.handlers.depsgraph_update_post.append(_updated)
     for event in _EVENTS:
         getattr(bpy.app.handlers, event).append(_changed)
@@ -199,6 +213,7 @@ def unregister() -> None:
     for event in _EVENTS:
         getattr(bpy.app.handlers, event).remove(_changed)
     bpy.app.handlers.depsgraph_update_post.remove(_updated)
+    viewport_draw.warned_by.remove(_in_view)
     if bpy.app.timers.is_registered(_note):
         bpy.app.timers.unregister(_note)
     _known.clear()

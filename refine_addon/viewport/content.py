@@ -18,7 +18,7 @@ from . import background, points, shader
 from .arrays import MARKS, MOST, Packed, as_texture, first_of_each, most_important_first, pack, same
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterable
     from concurrent.futures import Future
 
     import bpy
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..mesh.layout import SplatObject
+    from .placing import Placing
 
 
 @dataclass(eq=False)
@@ -97,7 +98,7 @@ class Atlas:
     Attributes
     ----------
     slots : mapping of (int, int) to Slot
-        By the identities of object and mesh.
+        By the keys of `Placing`.
     means, covariances, more_covariances : GPUTexture
         A texel a splat: place and number of the slot; xx, xy, xz, yy; yz, zz.
     """
@@ -174,25 +175,25 @@ class Content:
         return any(held.future and held.future.done() for held in self._held.values())
 
     def update(
-        self, objects: list[bpy.types.Object], existing: Callable[[], set[tuple[int, int]]]
-    ) -> dict[tuple[int, int], bpy.types.Object]:
-        """Make what is needed to draw some objects.
+        self, places: Iterable[Placing], existing: Callable[[], set[tuple[int, int]]]
+    ) -> dict[tuple[int, int], NDArray[np.float64]]:
+        """Make what is needed to draw splats.
 
         Parameters
         ----------
-        objects : list of bpy.types.Object
-            That hold splats. Of those in edit mode it is drawn what `read_edited` read last.
+        places : iterable of Placing
+            Of objects in edit mode it is drawn what `read_edited` read last.
         existing : callable
-            Gives the identities of all objects of the file and their meshes.
+            Gives the keys of all splats of the file.
 
         Returns
         -------
-        mapping of (int, int) to bpy.types.Object
-            Those that can be drawn by now, by their place in `atlas`.
+        mapping of (int, int) to (4, 4) float64
+            Matrices to the world of those that can be drawn by now, by their place in `atlas`.
         """
         wanted = {}
-        for obj in objects:
-            mesh = obj.data.session_uid
+        for key, obj, matrix in places:
+            mesh = key[1]
             if mesh in self.refused:
                 continue
             if points.is_edited(obj):
@@ -210,7 +211,7 @@ class Content:
                 held.packed, held.future, held.important = held.future.result(), None, None
                 self._mark(held)
             if held.packed is not None:
-                wanted[obj.session_uid, mesh] = obj
+                wanted[key] = matrix
         self._place(set(wanted), existing)
         return wanted
 

@@ -14,12 +14,12 @@ from bpy.app.handlers import persistent
 
 from ..core.errors import RefineError
 from ..mesh.layout import looks_like_splats, splat_count
-from . import background, legend, points, shader
+from . import background, legend, outlines, placing, points, shader, veils
 from .content import Content
 from .view import Camera, View
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -39,6 +39,10 @@ _VIEWS = 16
 """Regions whose pictures are kept on the graphics card."""
 
 
+warned_by: list[Callable[[bpy.types.Context], Sequence[str]]] = []
+"""Who is asked, whenever a view is drawn, for warnings that are written into it."""
+
+
 class _State:
     """What is kept while splats are drawn, in memory alone."""
 
@@ -50,6 +54,7 @@ class _State:
         self.handles: list[Any] = []
         self.edited_at = 0.0
         self.reads = False
+        self.updates = 0
 
 
 _state = _State()
@@ -105,6 +110,7 @@ def stop() -> None:
     background.stop()
     _forget()
     shader.forget()
+    veils.forget()
     points.show()
     _redraw()
 
@@ -177,9 +183,9 @@ def _guarded(work: Callable[[], None]) -> None:
 def _draw() -> None:
     context = bpy.context
     region, region_3d, space = context.region, context.region_data, context.space_data
-    objects = [obj for obj in context.view_layer.objects if _is_drawn(obj, space)]
+    visible = [obj for obj in context.view_layer.objects if obj.visible_get(viewport=space)]
     refused = len(_state.content.refused)
-    placed = _state.content.update(objects, _existing)
+    placed = _state.content.update(placing.placings(visible), placing.every)
     if len(_state.content.refused) > refused:  # Blender shows these as it did before
         bpy.app.timers.register(_hide_points, first_interval=0.0)
     key = region.as_pointer()
@@ -192,25 +198,22 @@ def _draw() -> None:
         np.array(region_3d.window_matrix, np.float64),
         (region.width, region.height),
     )
-    solid = any(obj not in objects for obj in context.visible_objects)
-    view.draw(_state.content, placed, camera, _state.mode, solid=solid)
+    solid = not all(looks_like_splats(obj) for obj in context.visible_objects)
+    meshes = veils.seen_through(context.visible_objects, space.shading)
+    layer = None
+    if meshes:
+        matrices = camera.view, camera.projection
+        work = partial(veils.draw, meshes, context.evaluated_depsgraph_get(), matrices, camera.size)
+        layer = (_state.updates, repr(meshes)), work
+    view.draw(_state.content, placed, camera, _state.mode, solid=solid, veils=layer)
+    outlines.draw(context)
     if view.waits() and not bpy.app.timers.is_registered(_tick):
         bpy.app.timers.register(_tick, first_interval=_TICK)
 
 
-def _is_drawn(obj: bpy.types.Object, space: bpy.types.SpaceView3D) -> bool:
-    if not looks_like_splats(obj) or not splat_count(obj.data):
-        return False
-    return obj.visible_get(viewport=space)
-
-
-def _existing() -> set[tuple[int, int]]:
-    splats = (obj for obj in bpy.data.objects if looks_like_splats(obj))
-    return {(obj.session_uid, obj.data.session_uid) for obj in splats}
-
-
 def _draw_legend() -> None:
-    legend.draw(bpy.context, _state.mode, _state.content.marks())
+    warnings = [text for tell in warned_by for text in tell(bpy.context)]
+    legend.draw(bpy.context, _state.mode, _state.content.marks(), warnings)
 
 
 def _tick() -> float | None:
@@ -288,6 +291,7 @@ def _opened(*_: object) -> None:
 def _updated(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph | None = None) -> None:
     if depsgraph is None:
         return
+    _state.updates += 1
     for update in depsgraph.updates:
         if update.is_updated_geometry:
             data = getattr(update.id.original, "data", update.id.original)

@@ -30,12 +30,21 @@ _WIDE, _HIGH, _EDGE, _FONT = 220, 10, 16, 12  # pixels at scale 1
 _GAP = 6  # between the bar and the words above it
 
 _WHITE, _BLACK = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 1.0)
+_WARNING = (1.0, 0.8, 0.2, 1.0)
 _BLUR = 5  # of the shadow: 0, 3 or 5
 
 
-def draw(context: bpy.types.Context, mode: str, marks: Collection[int] = ()) -> None:
-    """Draw the legend of a mode, and of marks that splats have (`MARKED`), into a view."""
-    if mode not in WORDS and not marks:
+def draw(
+    context: bpy.types.Context,
+    mode: str,
+    marks: Collection[int] = (),
+    warnings: Collection[str] = (),
+) -> None:
+    """Draw the legend of a mode, and of marks that splats have (`MARKED`), into a view.
+
+    Warnings stand above it, a line each.
+    """
+    if mode not in WORDS and not marks and not warnings:
         return
     scale = context.preferences.system.ui_scale
     x, y = _beside_tools(context) + _EDGE * scale, _EDGE * scale
@@ -56,6 +65,11 @@ def draw(context: bpy.types.Context, mode: str, marks: Collection[int] = ()) -> 
             blf.draw(0, text)
             _swatch(x, line, scale, MARKS[mark])
             line += 2 * _HIGH * scale
+    blf.color(0, *_WARNING)
+    for text in warnings:
+        blf.position(0, x, line, 0.0)
+        blf.draw(0, text)
+        line += 2 * _HIGH * scale
     blf.disable(0, blf.SHADOW)
 
 

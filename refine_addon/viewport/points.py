@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..mesh.layout import looks_like_splats
+from . import placing
 
 if TYPE_CHECKING:
     from collections.abc import Container, Iterator
@@ -50,8 +51,8 @@ def _copies(
 ) -> Iterator[tuple[bpy.types.Object, bpy.types.Object]]:
     if depsgraph is None or depsgraph.mode != "VIEWPORT":
         return
-    for obj in depsgraph.scene.objects:
-        original = obj.original
+    objects = [obj.original for obj in depsgraph.scene.objects]
+    for original in {*objects, *placing.instanced(objects)}:
         if looks_like_splats(original):
             evaluated = original.evaluated_get(depsgraph)
             if evaluated.is_evaluated:

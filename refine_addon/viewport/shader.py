@@ -26,6 +26,7 @@ _CONSTANTS = f"""
 #define ALPHA_MAX {ALPHA_MAX}
 #define ALPHA_CUT {ALPHA_CUT}
 #define BEYOND 0.3
+#define SAME_DEPTH 1e-5
 #define SELECTED vec3{SELECTED}
 #define SELECTED_SHARE {SELECTED_SHARE}
 """
@@ -38,7 +39,8 @@ struct ViewData {
 };
 """
 """size: pixels across, pixels up, near, texels of depth per pixel. choices: perspective, whether
-depth is tested, whether what is behind the tested depth is drawn and not what is in front, 0."""
+depth is tested, whether there are veils, whether what is behind the tested depth is drawn and not
+what is in front."""
 
 _SPLAT_VERTEX = """
 #define value_at(values, row) texelFetch(values, ivec2((row) % WIDTH, (row) / WIDTH), 0)
@@ -121,12 +123,24 @@ void main()
   }
   if (view_data.choices.y > 0.5) {
     ivec2 texel = ivec2(gl_FragCoord.xy * view_data.size.w);
-    float limit = texelFetch(depths, min(texel, textureSize(depths, 0) - 1), 0).r;
-    if ((gl_FragCoord.z > limit) != (view_data.choices.z > 0.5)) {
+    float occluder = texelFetch(depths, min(texel, textureSize(depths, 0) - 1), 0).r;
+    if (view_data.choices.z > 0.5) {
+      float veil = texelFetch(veil_depths, min(texel, textureSize(veil_depths, 0) - 1), 0).r;
+      /* Blender 5 gives meshes a depth that X-ray shows transparent. */
+      occluder = abs(occluder - veil) < SAME_DEPTH ? 1.0 : occluder;
+    }
+    if ((gl_FragCoord.z > occluder) != (view_data.choices.w > 0.5)) {
       discard;
     }
   }
-  color = vec4(paint.rgb * alpha, alpha);
+  vec3 shown = paint.rgb;
+  if (view_data.choices.z > 0.5) {
+    ivec2 texel = min(ivec2(gl_FragCoord.xy * view_data.size.w), textureSize(veil_depths, 0) - 1);
+    vec4 veil = texelFetch(veils, texel, 0);
+    float before = step(texelFetch(veil_depths, texel, 0).r, gl_FragCoord.z);
+    shown = mix(shown, veil.rgb, veil.a * before);
+  }
+  color = vec4(shown * alpha, alpha);
 }
 """
 
@@ -166,7 +180,7 @@ def splats() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
     info.uniform_buf(0, "ViewData", "view_data")
     names = (
         *("order", "means", "covariances", "more_covariances", "colors", "selection"),
-        *("matrices", "depths"),
+        *("matrices", "depths", "veils", "veil_depths"),
     )
     for slot, name in enumerate(names):
         info.sampler(slot, "FLOAT_2D", name)

@@ -28,12 +28,12 @@ from .arrays import (
     same,
     tinted,
 )
+from .veils import Veils
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
     from concurrent.futures import Future
 
-    import bpy
     from numpy.typing import NDArray
 
     from .content import Atlas, Content, Slot
@@ -163,33 +163,34 @@ class View:
     def draw(
         self,
         content: Content,
-        objects: dict[tuple[int, int], bpy.types.Object],
+        places: dict[tuple[int, int], NDArray[np.float64]],
         camera: Camera,
         mode: str,
         *,
         solid: bool,
+        veils: tuple[object, Callable[[], Veils]] | None = None,
     ) -> None:
         """Draw some objects into the framebuffer of the view.
 
         Parameters
         ----------
         content : Content
-        objects : mapping of (int, int) to bpy.types.Object
+        places : mapping of (int, int) to (4, 4) float64
             See `Content.update`.
         camera : Camera
         mode : str
             One of `draw.MODES`.
         solid : bool
             Whether anything but splats is in the view.
+        veils : (object, callable), optional
+            Draws the meshes that are seen through, if there are any, and what tells them from what
+            they were.
         """
         atlas = content.atlas
-        if atlas is None or not objects:
+        if atlas is None or not places:
             self.complete, self.count = not content.pending(), 0
             return
-        shown = [
-            Shown(atlas.slots[key], camera.view @ np.array(obj.matrix_world, np.float64))
-            for key, obj in objects.items()
-        ]
+        shown = [Shown(atlas.slots[key], camera.view @ matrix) for key, matrix in places.items()]
         matrices = b"".join(s.matrix.tobytes() for s in shown)
         moving = self._moves(camera.key() + matrices)
         full = (atlas, content.changes, mode, matrices, camera.perspective, camera.near)
@@ -205,7 +206,8 @@ class View:
         if self._order is None or self._colors is None:
             return
         self.count = self._order.count
-        self._paint(content, shown, camera, 1 if self.complete else least.pixels, solid=solid)
+        pixels = 1 if self.complete else least.pixels
+        self._paint(content, shown, camera, pixels, solid=solid, veils=veils)
         _put(self._picture)
 
     def _moves(self, key: bytes) -> bool:
@@ -260,14 +262,24 @@ class View:
             self._order = _Order(shader.texture(as_texture(order), 1, "R32F"), len(order), key)
 
     def _paint(
-        self, content: Content, shown: list[Shown], camera: Camera, pixels: int, *, solid: bool
+        self,
+        content: Content,
+        shown: list[Shown],
+        camera: Camera,
+        pixels: int,
+        *,
+        solid: bool,
+        veils: tuple[object, Callable[[], Veils]] | None,
     ) -> None:
         """Draw the splats into the picture, unless it shows them already."""
         depths = _depths(camera.size) if solid else None
         size = (max(1, camera.size[0] // pixels), max(1, camera.size[1] // pixels))
-        wanted = (self._order.key, self._colors_key, self._camera_key, size, content.selections)
+        look = (self._order.key, self._colors_key, self._camera_key, size)
+        wanted = (*look, content.selections, veils and veils[0])
         if self._picture and wanted == self._drawn and same(depths, self._depths):
             return
+        nothing = shader.texture(np.ones((1, 4), np.float32), 4, "RGBA16F")
+        layer = veils[1]() if veils else Veils(nothing, nothing)
         self._drawn, self._depths = wanted, depths
         if not self._picture or (self._picture.width, self._picture.height) != size:
             self._picture = gpu.types.GPUTexture(size, format="RGBA16F")
@@ -282,9 +294,12 @@ class View:
             "selection": content.selection(),
             "matrices": shader.texture(_matrix_rows(shown), 4, "RGBA32F"),
             "depths": shader.texture(occluders, 1, "R32F"),
+            "veils": layer.colors,
+            "veil_depths": layer.depths,
         }  # held until they are drawn: the shader does not keep what it is given
+        numbers = _view_data(camera, size, solid=depths is not None, veiled=veils is not None)
         frame = gpu.types.GPUFrameBuffer(color_slots=self._picture)
-        shader.blend(frame, textures, _view_data(camera, size, solid=solid), self._order.count)
+        shader.blend(frame, textures, numbers, self._order.count)
 
 
 def _matrix_rows(shown: list[Shown]) -> NDArray[np.float32]:
@@ -295,12 +310,14 @@ def _matrix_rows(shown: list[Shown]) -> NDArray[np.float32]:
     return rows
 
 
-def _view_data(camera: Camera, size: tuple[int, int], *, solid: bool) -> NDArray[np.float32]:
+def _view_data(
+    camera: Camera, size: tuple[int, int], *, solid: bool, veiled: bool
+) -> NDArray[np.float32]:
     """Return what the shader knows of a view as ``ViewData``, for a picture of this size."""
     numbers = np.zeros(24, np.float32)
     numbers[:16] = camera.projection.T.reshape(-1)
     numbers[16:20] = (*size, camera.near, camera.size[0] / size[0])
-    numbers[20:22] = (camera.perspective, solid)
+    numbers[20:23] = (camera.perspective, solid, veiled)
     return numbers
 
 
@@ -390,12 +407,16 @@ def _wanted(
     return going[rows] if mode == "GOES" else ~going[rows]
 
 
-def _depths(size: tuple[int, int]) -> NDArray[np.float32]:
-    """Return the depths that Blender has drawn in the view, (H, W)."""
+def _depths(size: tuple[int, int]) -> NDArray[np.float32] | None:
+    """Return the depths that Blender has drawn in the view, (H, W), None where it kept none.
+
+    EEVEE of 4.3 leaves zeros where overlays are off.
+    """
     width, height = size
     buffer = gpu.types.Buffer("FLOAT", width * height)
     gpu.state.active_framebuffer_get().read_depth(0, 0, width, height, data=buffer)
-    return np.frombuffer(memoryview(buffer), np.float32).reshape(height, width)
+    depths = np.frombuffer(memoryview(buffer), np.float32).reshape(height, width)
+    return depths if depths.any() else None
 
 
 def _put(picture: gpu.types.GPUTexture) -> None:

@@ -204,7 +204,7 @@ def test_join_splats_keeps_what_is_seen_of_objects_that_stand_apart(addon, impor
     group = second.vertex_groups.new(name="mine")
     group.add([5, 7], 0.25, "REPLACE")
     mark = np.arange(9939) % 3 == 0
-    addon.mesh.edit.mark_protected(third, mark)
+    addon.mesh.edit.mark_by_hand(third, mark)
     child = bpy.data.objects.new("child", None)
     bpy.context.scene.collection.objects.link(child)
     child.parent = second
@@ -387,6 +387,43 @@ def test_an_applied_mirror_is_mended(addon, imported, seen):
     assert "9,939 splats were mirrored" in told
     assert len(imported.data.vertices) == 2 * 9939
     assert psnr(seen(), expected) > 60.0
+
+
+@pytest.mark.parametrize(("share", "said"), [(0.005, False), (0.5, True)])
+def test_splats_that_are_bent_are_named_and_a_few_that_are_moved_are_not(
+    addon, imported, share, said
+):
+    """No map explains them; the click takes them as they are."""
+    places = addon.mesh.attributes.read_attribute(imported.data, "position")
+    which = np.arange(len(places)) < share * len(places)
+    places[which] += np.sin(7.0 * places[which][:, ::-1])
+    imported.data.attributes["position"].data.foreach_set("vector", places.ravel())
+    imported.data.update()
+    before = addon.mesh.attributes.digest(addon.mesh.layout.check(imported))
+
+    told = told_of(addon, imported)
+
+    expected = [f"{which.sum():,} splats were moved each by itself"] if said else []
+    assert [sentence.partition(", as by")[0] for sentence in told] == expected
+    bpy.ops.refine.mend()
+    assert told_of(addon, imported) == []
+    assert addon.mesh.attributes.digest(addon.mesh.layout.check(imported)) == before
+
+
+def test_splats_of_another_importer_are_noted_as_soon_as_they_are_seen(addon, room):
+    """So what is done to them later is noticed; what only looks like splats is left alone."""
+    other = bpy.data.meshes.new("other")
+    other.vertices.add(3)
+    for name in ("opacity", "f_dc_0"):
+        other.attributes.new(name, "FLOAT", "POINT")
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("other", other))
+    assert not addon.mesh.drift.is_stamped(room.data)
+
+    addon.ui.transforms._note()
+
+    assert addon.mesh.drift.is_stamped(room.data)
+    assert addon.mesh.drift.found(room.data) is None
+    assert not addon.mesh.drift.is_stamped(other)
 
 
 def test_who_turns_sizes_and_rotations_as_well_is_left_alone(addon, imported):

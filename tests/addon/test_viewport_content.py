@@ -42,11 +42,11 @@ def content(addon, packing, monkeypatch):  # noqa: ARG001
     return addon.viewport.content.Content()
 
 
-def drawn(content, obj):
+def drawn(addon, content, obj):
     """Return what is drawn of an object, looked at again."""
     content.has_changed()
     key = (obj.session_uid, obj.data.session_uid)
-    found = content.update([obj], lambda: {key})
+    found = content.update(addon.viewport.placing.placings([obj]), lambda: {key})
     return content.atlas.slots[key] if found else None
 
 
@@ -54,20 +54,20 @@ def drawn(content, obj):
 def test_ranks_wait_until_the_splats_that_they_belong_to_are_packed(addon, room, content, packing):
     """1,000 splats deleted: the old ones are drawn meanwhile, with as many ranks as they are."""
     bpy.ops.refine.score()
-    assert drawn(content, room) is None
+    assert drawn(addon, content, room) is None
     packing.run()
-    slot = drawn(content, room)
+    slot = drawn(addon, content, room)
     count, ranks = len(room.data.vertices), slot.held.ranks
     keep = np.ones(count, np.bool_)
     keep[:1000] = False
 
     addon.objects.splat_object.delete_splats(addon.mesh.layout.check(room), keep)
 
-    slot = drawn(content, room)
+    slot = drawn(addon, content, room)
     assert slot.packed.vertices.max() == count - 1
     np.testing.assert_array_equal(slot.held.ranks, ranks)
     packing.run()
-    slot = drawn(content, room)
+    slot = drawn(addon, content, room)
     assert slot.packed.vertices.max() == count - 1001
     np.testing.assert_array_equal(slot.held.ranks, ranks[keep])
 
@@ -76,12 +76,12 @@ def test_ranks_wait_until_the_splats_that_they_belong_to_are_packed(addon, room,
 def test_new_ranks_of_the_same_splats_are_drawn_anew(addon, room, content, packing):
     """Nothing else tells a view that *Heat* is to be coloured again; the same ranks do not."""
     bpy.ops.refine.score()
-    drawn(content, room)
+    drawn(addon, content, room)
     packing.run()
-    before = drawn(content, room).held.scored
+    before = drawn(addon, content, room).held.scored
 
-    assert drawn(content, room).held.scored == before
+    assert drawn(addon, content, room).held.scored == before
     ranks = room.data.attributes[addon.mesh.scores.RANK].data
     ranks[0].value = 1.0 - ranks[0].value
 
-    assert drawn(content, room).held.scored == before + 1
+    assert drawn(addon, content, room).held.scored == before + 1

@@ -85,9 +85,13 @@ def test_a_killed_worker_changes_no_byte(tmp_path, tiles, workers, moment):
 
 
 @needs_dask
-@pytest.mark.parametrize("moment", [0.2, 0.5, 0.7], ids=["measuring", "absorbing", "again"])
-def test_a_worker_killed_while_absorbing_changes_no_byte(
-    tmp_path, tiles, workers, monkeypatch, moment
+@pytest.mark.parametrize(
+    ("survivors", "moment"),
+    [("absorb", 0.2), ("absorb", 0.5), ("absorb", 0.7), ("refit", 0.6)],
+    ids=["measuring", "absorbing", "again", "refitting"],
+)
+def test_a_worker_killed_while_survivors_change_changes_no_byte(
+    tmp_path, tiles, workers, monkeypatch, survivors, moment
 ):
     """Blocks of views and regions are done again by others, as runs of rows are."""
     monkeypatch.setattr(absorbing, "REGION", 1500)
@@ -98,13 +102,13 @@ def test_a_worker_killed_while_absorbing_changes_no_byte(
             killed.append(next(iter(workers._client.run(os.getpid).values())))
             os.kill(killed[0], signal.SIGKILL)
 
-    settings = Settings(method="occlusion", views=8)
+    settings = Settings(method="occlusion", views=4 if survivors == "refit" else 8)
     found = prune(
-        tiles, tmp_path / "out", settings, survivors="absorb", workers=workers, progress=progress
+        tiles, tmp_path / "out", settings, survivors=survivors, workers=workers, progress=progress
     )
 
     assert killed
-    assert found == prune(tiles, tmp_path / "here", settings, survivors="absorb")
+    assert found == prune(tiles, tmp_path / "here", settings, survivors=survivors)
     assert len(list((tmp_path / "out").iterdir())) == len(tiles)
 
 

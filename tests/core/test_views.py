@@ -237,4 +237,4 @@ def test_points_are_counted_in_each_view():
     views = ViewSet((view(), view(near=3.0), view([0, 0, 2.5]), view([2.1, 0, 0])))
 
     assert census(points, views).tolist() == [1, 0, 0, 1]
-    assert census(points, views.take([0, 0, 3]), threads=1).tolist() == [1, 1, 1]
+    assert census(points, views.take([0, 0, 3])).tolist() == [1, 1, 1]

@@ -246,7 +246,6 @@ def lod_file(
     request: LevelsRequest,
     *,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> dict[str, Any]:
     """Make levels of detail of a file of splats: a file each, and `MANIFEST`, written last.
 
@@ -258,7 +257,7 @@ def lod_file(
         Where the files go, named as by `level_paths`; made if it is not there.
     request : LevelsRequest
         What is asked.
-    progress, threads
+    progress : callable, optional
         See `operation.run.run`.
 
     Returns
@@ -274,7 +273,7 @@ def lod_file(
     """
     sink = LevelSink(expanded(source), expanded(folder), request)
     read = FileSource(source, request.zones)
-    return run(read, request, sink, progress=progress, threads=threads).report
+    return run(read, request, sink, progress=progress).report
 
 
 def _write(

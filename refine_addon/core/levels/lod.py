@@ -215,7 +215,6 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     protected: NDArray[np.bool_] | None = None,
     forced_out: NDArray[np.bool_] | None = None,
     progress: Progress = silent,
-    threads: int | None = None,
 ) -> list[Level]:
     """Make levels of detail.
 
@@ -235,7 +234,6 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
         are compared with the pictures of the others.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
-    threads : int, optional
 
     Returns
     -------
@@ -258,7 +256,7 @@ def lod(  # noqa: PLR0913 - as `pipeline.prune`
     scene = Task(
         Budget(ratio=0.0), settings, splats, views, protected=protected, forced_out=forced_out
     )
-    return list(each_level(scene, levels, progress=progress, threads=threads))
+    return list(each_level(scene, levels, progress=progress))
 
 
 def each_level(
@@ -270,8 +268,9 @@ def each_level(
     ----------
     scene : Task
         Splats, views, settings, what is protected and what goes; its budget does not matter.
-    levels, progress, threads
+    levels, progress
         See `lod`.
+    threads : int, optional
     """
     total, forced = len(scene.scene()[0]), scene.forced()
     scene = replace(scene, forced_out=None) if forced is None else scene.without(forced)

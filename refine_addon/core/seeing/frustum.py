@@ -116,7 +116,7 @@ class Frustums:
         self.beyond_per_unit = np.hypot(1.0, slope)
         planes = np.array([clip_planes(view, near) for view in views])
         self._near, self._far = planes[:, :1], planes[:, 1:]
-        self._ends = bool(np.isfinite(self._far).any())
+        self._has_far = bool(np.isfinite(self._far).any())
         # One buffer a thread is reused, since allocating one costs as much as the product.
         self._buffers = threading.local()
 
@@ -197,7 +197,7 @@ class Frustums:
         beyond = np.maximum(across[:count], across[count:], out=across[:count])
         beyond -= depth[:count]
         between = depth[:count] >= self._near[views[:count]]
-        if self._ends:
+        if self._has_far:
             between &= depth[:count] <= self._far[views[:count]]
         return depth, beyond, between
 
@@ -211,11 +211,7 @@ class Frustums:
 
 
 def census(
-    points: NDArray[np.floating[Any]],
-    views: ViewSet,
-    *,
-    progress: Progress = silent,
-    threads: int | None = None,
+    points: NDArray[np.floating[Any]], views: ViewSet, *, progress: Progress = silent
 ) -> NDArray[np.int64]:
     """Return how many of N points lie in each of V views, (V,); those not finite lie in none.
 
@@ -227,7 +223,6 @@ def census(
         A view without a near plane of its own begins at its centre.
     progress : callable, optional
         ``progress(fraction, what)``; returning ``False`` cancels.
-    threads : int, optional
 
     Raises
     ------
@@ -248,9 +243,7 @@ def census(
             inside = between & (beyond <= 0.0)
         counts[piece.start // _POINTS] = np.count_nonzero(inside, axis=1)
 
-    for_chunks(
-        count_in_views, len(points), _POINTS, progress=progress, what="counting", threads=threads
-    )
+    for_chunks(count_in_views, len(points), _POINTS, progress=progress, what="counting")
     return np.asarray(counts.sum(axis=0))
 
 

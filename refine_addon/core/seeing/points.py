@@ -197,6 +197,19 @@ def _patches(
     rows = np.repeat(np.arange(len(kinds)), count)  # (q,)
     before = np.cumsum(count) - count - table.first.take(kinds)  # (n,)
     patches = np.arange(len(rows)) - before.take(rows)  # (q,)
+    touching, whole = _boxes_inside(frame, rows, patches)
+    kept = np.flatnonzero(touching)
+    return rows.take(kept), patches.take(kept), whole.take(kept)
+
+
+def _boxes_inside(
+    frame: _CellFrame, rows: NDArray[np.int64], patches: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return which patches may reach into the image, and which lie in it, (q,) each.
+
+    By the box around each patch; `rows` and `patches`, (q,), are as `_patches` returns them.
+    """
+    table = lattice_table()
     middle, half = table.middle.take(patches, axis=1), table.half.take(patches, axis=1)  # (2, q)
     touching = np.ones(len(rows), np.bool_)
     whole = np.ones(len(rows), np.bool_)
@@ -208,8 +221,7 @@ def _patches(
         low, high = center - extent, center + extent
         touching &= (high >= 0.0) & (low < size)
         whole &= (low >= 0.0) & (high < size)
-    kept = np.flatnonzero(touching)
-    return rows.take(kept), patches.take(kept), whole.take(kept)
+    return touching, whole
 
 
 def _lay_out(

@@ -170,13 +170,20 @@ def _stage(
 
 def _save_regions(stage: StageContext, left: _Left, number: int, runner: Runner) -> list[int]:
     """Divide the splats that are left; return how many each region has."""
-    steps = [SaveMeans(source) for source in left.sources]
-    Runner(runner.workers).run_all(stage, steps, "absorbing")
-    means = stage.folder.joined((source.index for source in left.sources), "means")
-    boxes = divided(means[left.rows], REGION, number)
+    boxes = boxes_of(stage, left.rows, REGION, number, runner)
     for index, places in enumerate(boxes):
         _save_region(stage.folder, index, left, places)
     return [*map(len, boxes)]
+
+
+def boxes_of(
+    stage: StageContext, rows: NDArray[np.int64], most: int, number: int, runner: Runner
+) -> list[NDArray[np.int64]]:
+    """Divide some splats of the sources of a stage, given their rows; see `divided`."""
+    steps = [SaveMeans(source) for source in stage.sources]
+    Runner(runner.workers).run_all(stage, steps, "reading")
+    means = stage.folder.joined((source.index for source in stage.sources), "means")
+    return divided(means[rows], most, number)
 
 
 def _save_region(folder: Folder, index: int, left: _Left, places: NDArray[np.int64]) -> None:
@@ -254,12 +261,22 @@ def settle(
     return runner.run(folder, steps, "selecting")
 
 
-def estimated(tiles: MeasuredTiles, survivors: Survivors, runner: Runner) -> float | None:
-    """Return the estimated PSNR of survivors that changed, dB; None if too little is seen."""
-    context = replace(tiles.context, folder=survivors.regions[0].folder.inner("after"))
-    gaussians, _ = store_gaussians(context, survivors.regions, runner.part(0.0, 0.5))
-    after = StoredRays(context, runner, survivors.regions, gaussians)
-    return tiles.rays.psnr_against(after, runner.part(0.5, 1.0))
+def estimated(
+    tiles: MeasuredTiles, regions: Sequence[Region], runner: Runner
+) -> tuple[SceneContext, float | None]:
+    """Store the Gaussians of survivors that changed, and estimate their PSNR.
+
+    Returns
+    -------
+    context : SceneContext
+        Of their Gaussians.
+    psnr : float or None
+        In dB; None if too little is seen.
+    """
+    context = replace(tiles.context, folder=regions[0].folder.inner("after"))
+    gaussians, _ = store_gaussians(context, regions, runner.part(0.0, 0.5))
+    after = StoredRays(context, runner, regions, gaussians)
+    return context, tiles.rays.psnr_against(after, runner.part(0.5, 1.0))
 
 
 def divided(means: NDArray[np.float32], most: int, stage: int) -> list[NDArray[np.int64]]:

@@ -50,17 +50,34 @@ class SceneContext:
     def footprints(self, view: View) -> tuple[projection.Footprints, NDArray[np.float32]]:
         """Return the n footprints in a view, front to back, and their colours, (n, 3)."""
         pieces, colors = [], [np.empty((0, 3), np.float32)]
-        boxes = self.folder.noted("boxes")[1]
         with np.errstate(under="ignore"):
-            for number in np.flatnonzero(projection.boxes_touch(boxes, self.scene, view)).tolist():
-                chunk = self.chunk(number)
-                found, depth = projection.footprints_and_depths(chunk, self.scene, view)
-                colors.append(chunk.colors[found.index])
-                pieces.append((replace(found, index=found.index + number * CHUNK), depth))
-            footprints = projection.front_to_back(pieces)
+            for footprints, depth, of_each in self._of_chunks(view, view):
+                colors.append(of_each)
+                pieces.append((footprints, depth))
+            sorted_footprints = projection.front_to_back(pieces)
         # Ascending, since chunks are.
         rows = np.concatenate([np.empty(0, np.int64), *(piece.index for piece, _ in pieces)])
-        return footprints, np.concatenate(colors)[np.searchsorted(rows, footprints.index)]
+        places = np.searchsorted(rows, sorted_footprints.index)
+        return sorted_footprints, np.concatenate(colors)[places]
+
+    def footprints_and_depths(
+        self, view: View, window: View
+    ) -> Iterator[tuple[projection.Footprints, NDArray[np.float32]]]:
+        """Yield `projection.footprints_and_depths` of each chunk that a window may show."""
+        for footprints, depth, _ in self._of_chunks(view, window):
+            yield footprints, depth
+
+    def _of_chunks(
+        self, view: View, window: View
+    ) -> Iterator[tuple[projection.Footprints, NDArray[np.float32], NDArray[np.float32]]]:
+        """Yield `footprints_and_depths`, and the colours of the footprints, (n, 3)."""
+        boxes = self.folder.noted("boxes")[1]
+        touching = projection.boxes_touch(boxes, self.scene, view, window)
+        for number in np.flatnonzero(touching).tolist():
+            chunk = self.chunk(number)
+            footprints, depth = projection.footprints_and_depths(chunk, self.scene, view, window)
+            index = footprints.index + number * CHUNK
+            yield replace(footprints, index=index), depth, chunk.colors[footprints.index]
 
     def chunk(self, number: int) -> Gaussians:
         """Return the Gaussians of a chunk."""
@@ -148,12 +165,13 @@ class StoredGaussians:
     ----------
     folder : Folder
     index : (M,) int64
-        Rows of the splats, see `Gaussians`; also an attribute.
+        Rows of the splats, see `Gaussians`; also an attribute, and noted in the folder.
     """
 
     def __init__(self, folder: Folder, index: NDArray[np.int64]) -> None:
         self.index, self._folder = index, folder
         folder.note("count", np.array(len(index)))
+        folder.note("index", index)
 
     def __len__(self) -> int:
         """Return how many there are."""

@@ -6,6 +6,7 @@ import contextlib
 import functools
 import hashlib
 import tempfile
+import time
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,8 @@ from ..estimate.psnr import psnr_kept
 from ..estimate.quality import needed
 from ..formats.ply_header import with_count
 from ..operation.run import Request, Written, run
+from ..pipeline.absorb_splats import ABSORBED
+from ..refitting.refit import Refit
 from ..report import MEASURES, conclude, files_facts, make_report, remark
 from ..scoring.closed_form_block import ROWS
 from ..selection import refuse_none_left
@@ -26,6 +29,7 @@ from ..work import Cancelled, Progress, silent
 from . import absorbing
 from .closed_form import ClosedFormContext, by_closed_form
 from .folder import Folder, Interrupted
+from .refitting import refit_survivors
 from .scoring import by_occlusion, measured_once
 from .selecting import ChooseByScore, removals, rule_of
 from .storage import located, new_folder
@@ -41,6 +45,7 @@ if TYPE_CHECKING:
     from ..formats.format import Format
     from ..operation.requests import PruneRequest
     from ..operation.run import Runtime
+    from ..refitting.refit import Gains
     from ..scores import Scores
     from ..selection import Budget
     from .absorbing import Survivors
@@ -78,8 +83,8 @@ def prune_tiles(
         URL, the folder of the job is in the current directory, files are copied to the URL under
         other names, and renamed at the end.
     request : PruneRequest
-        What is asked. To absorb, up to `absorbing.REGION` splats survivors are those of one file;
-        more are absorbed region by region.
+        What is asked. Up to `absorbing.REGION` splats, survivors that change are those of one file;
+        more are absorbed and refitted region by region.
     progress, threads
         See `operation.run.run`.
     workers : Workers, optional
@@ -164,13 +169,24 @@ class TileDecision:
     counts : (tiles, 2) int64
         Of each tile, how many splats stay, and how many lie in no view.
     changed : bool
-        Whether survivors may have absorbed others.
+        Whether survivors may have changed.
     report : dict
     """
 
     counts: NDArray[np.int64]
     changed: bool
     report: dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class _Made:
+    """What survivors became: see `pipeline.refit_splats.Made`."""
+
+    absorbed: Survivors  # by absorbing alone
+    survivors: Survivors  # in the end
+    refitted: Gains | None = None
+    seconds: float = 0.0
+    psnr: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,9 +218,6 @@ class TilesRequest(Request[TileScene, TileDecision]):
         if budget.psnr is not None and not settings.estimates:
             msg = f"over tiles {settings.method} estimates no PSNR: choose auto or occlusion"
             raise RefineError(msg)
-        if self.prune.survivors == "refit":
-            msg = "over tiles survivors are not refitted yet: choose absorb or unchanged"
-            raise RefineError(msg)
         budget.refuse_meaningless(settings.method, frustum=settings.frustum)
 
     def decide(self, scene: TileScene, runtime: Runtime) -> TileDecision:
@@ -222,11 +235,15 @@ class TilesRequest(Request[TileScene, TileDecision]):
         runtime.clock.lap("score_s")
         counts = _select(scene, asked.budget, scores, runner.part(SCORED, SCORED))
         runtime.clock.lap("select_s")
-        survivors, psnr = None, None
+        made = None
         if measured is not None:
-            survivors, psnr, counts = self._absorb(scene, measured, counts, runner)
+            made = self._made(measured, int(counts[:, 0].sum()), runner)
+            last = runner.part(SCORED, SCORED)
+            settled = absorbing.settle(made.survivors, scene.units, scene.folder, last)
+            counts = _counted(scene, settled)
             runtime.clock.lap("absorb_s")
-        changed = survivors is not None and bool(survivors.regions)
+        changed = made is not None and bool(made.survivors.regions)
+        psnr = made.psnr if made else None
         keep = np.empty(0, np.bool_)
         if scores.ray_sample is not None:
             load = scene.folder.load
@@ -236,9 +253,13 @@ class TilesRequest(Request[TileScene, TileDecision]):
         kept, unseen = counts.sum(axis=0).tolist()
         size, removed = sum(tile.size for tile in scene.tiles), scene.total - kept
         why = remark(asked.budget, removed, scene.total, psnr, size)
-        conclude(facts, scores, keep, psnr, survivors, why)
-        if survivors is not None and asked.settings.method == "closed-form":
-            facts["notes"].append(MEASURES)
+        conclude(facts, scores, keep, psnr, made.absorbed if made else None, why)
+        if made is not None:
+            if made.refitted is not None:
+                facts["refitted"] = made.refitted.facts(made.seconds)
+                facts["notes"].append(made.refitted.note(made.seconds))
+            if asked.settings.method == "closed-form":
+                facts["notes"].append(MEASURES)
         facts["splats"] |= {"before": scene.total, "kept": kept, "removed": removed}
         facts["splats"] |= {"unseen": unseen, "left_out": 0, "protected": 0, "forced": 0}
         return TileDecision(counts, changed, facts)
@@ -260,30 +281,22 @@ class TilesRequest(Request[TileScene, TileDecision]):
             settled = needed(removed.amount, scene.total)
         return by_occlusion(closed_form, scene.units, settings, settled, runner), None
 
-    def _absorb(
-        self,
-        scene: TileScene,
-        measured: MeasuredTiles,
-        counts: NDArray[np.int64],
-        runner: Runner,
-    ) -> tuple[Survivors, float | None, NDArray[np.int64]]:
-        """Absorb to as many survivors as were selected; the units then say which stay, and as what.
-
-        Returns
-        -------
-        survivors : Survivors
-        psnr : float or None
-            Estimated, of the survivors, dB, if some of them changed.
-        counts : (tiles, 2) int64
-            See `TileDecision`.
-        """
-        kept, last = int(counts[:, 0].sum()), runner.part(0.95 * SCORED, SCORED)
-        ahead = runner.part(0.3 * SCORED, 0.95 * SCORED)
-        survivors = absorbing.absorb(measured, kept, self.prune.settings, ahead)
-        settled = absorbing.settle(survivors, scene.units, scene.folder, last.part(0.0, 0.0))
-        counts = _counted(scene, settled)
-        psnr = absorbing.estimated(measured, survivors, last) if survivors.regions else None
-        return survivors, psnr, counts
+    def _made(self, measured: MeasuredTiles, kept: int, runner: Runner) -> _Made:
+        """Return what so many survivors become."""
+        settings, refits = self.prune.settings, self.prune.survivors == "refit"
+        runner, absorbed_at = runner.part(0.3 * SCORED, SCORED), ABSORBED if refits else 0.95
+        absorbed = absorbing.absorb(measured, kept, settings, runner.part(0.0, absorbed_at))
+        made = _Made(absorbed, absorbed)
+        if refits and kept < len(measured.measured.seen):
+            start = time.perf_counter()
+            done = refit_survivors(measured, absorbed, Refit(), runner.part(absorbed_at, 0.95))
+            if done is not None:
+                made = _Made(absorbed, done.survivors, done, time.perf_counter() - start)
+        if not made.survivors.regions:
+            return made
+        last = runner.part(0.95, 1.0)
+        _, psnr = absorbing.estimated(measured, made.survivors.regions, last)
+        return replace(made, psnr=psnr)
 
 
 def _select(scene: TileScene, budget: Budget, scores: Scores, runner: Runner) -> NDArray[np.int64]:

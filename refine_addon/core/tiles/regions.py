@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -55,7 +56,7 @@ class Region:
         return self.count
 
     def splats(self) -> Splats:
-        """Return its splats, in float64."""
+        """Return its splats, without reading them yet."""
         return unpacked(self.table())
 
     def table(self) -> NDArray[np.float64]:
@@ -266,16 +267,25 @@ class SettleUnit:
         rows, changed_here = origin[here] - self.begin, changed[here]
         keep = np.zeros(len(self.unit), np.bool_)
         keep[rows] = True
-        became = self._table(place[here][changed_here])
+        became = packed(taken(self.regions, place[here][changed_here]))
         folder.save(self.unit.index, {"changed": rows[changed_here], "became": became})
         return save_kept(self.unit, folder, keep)
 
-    def _table(self, places: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the table of some survivors, given their places among those of all regions."""
-        starts = np.cumsum([0, *map(len, self.regions)])
-        region = np.searchsorted(starts, places, side="right") - 1
-        table = np.empty((len(places), self.regions[0].table().shape[1] if self.regions else 0))
-        for index in np.unique(region).tolist():
-            here = region == index
-            table[here] = self.regions[index].table()[places[here] - starts[index]]
-        return table
+
+def taken(regions: Sequence[Region], rows: NDArray[np.int64]) -> Splats:
+    """Return some splats of all regions, by their rows among those, (n,).
+
+    Of a degree that holds the numbers of all regions that they lie in.
+    """
+    begins, order = np.cumsum([0, *map(len, regions)]), np.argsort(rows, kind="stable")
+    edges = np.searchsorted(rows[order], begins)
+    pieces = [
+        unpacked(region.table()[rows[order[start:stop]] - begin])
+        for region, begin, (start, stop) in zip(
+            regions, begins.tolist(), itertools.pairwise(edges.tolist()), strict=False
+        )
+        if stop > start
+    ]
+    back = np.empty_like(order)
+    back[order] = np.arange(len(order))
+    return joined(pieces).take(back) if pieces else unpacked(np.empty((0, 14)))

@@ -321,9 +321,9 @@ def pieces_of(tiles: Sequence[Tile], units: Sequence[Unit]) -> list[list[Piece]]
 
 def packed(splats: Splats) -> NDArray[np.float64]:
     """Return splats as one table, (n, 14 + 3 K), for harmonics of K coefficients a channel."""
-    count = len(splats)
+    harmonics = splats.sh_rest.reshape(len(splats), 3 * splats.sh_rest.shape[1])
     columns = [splats.means, splats.log_scales, splats.quaternions]
-    columns += [splats.opacity_logits[:, None], splats.sh_dc, splats.sh_rest.reshape(count, -1)]
+    columns += [splats.opacity_logits[:, None], splats.sh_dc, harmonics]
     with np.errstate(invalid="ignore"):  # signalling NaN
         return np.concatenate([np.asarray(values, np.float64) for values in columns], axis=1)
 

@@ -1,0 +1,71 @@
+"""Splats that stand in the scene as instances of a collection, perhaps a linked one."""
+
+# ruff: noqa: D400, N801, RUF012 - Blender's names and tooltips
+from __future__ import annotations
+
+import bpy
+from mathutils import Matrix
+
+from ..mesh.layout import looks_like_splats, splat_count
+from ..viewport.placing import placings
+from . import wrapped
+from .operator_bases import Answer, AtOnce, Needing, idle, in_object_mode
+
+
+def _instances(context: bpy.types.Context) -> str:
+    """Return that the active object must instance splats, "" if it does."""
+    obj = context.object
+    if obj is not None and not looks_like_splats(obj) and any(placings([obj])):
+        return ""
+    return "Select an empty that instances a collection with splats"
+
+
+class REFINE_OT_make_real(AtOnce, Needing, bpy.types.Operator):
+    """Make objects of the scene of the splats that the active object instances, to be scored"""
+
+    bl_idname = "refine.make_real"
+    bl_label = "Make Splats Real"
+    bl_options = {"REGISTER", "UNDO"}
+    needs = (idle, in_object_mode, _instances)
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Copy them with their data to where they are seen; the instance is shown no more."""
+        empty, real = context.object, []
+        for place in list(placings([empty])):
+            copy = place.obj.copy()
+            copy.data = place.obj.data.copy()
+            copy.animation_data_clear()
+            copy.constraints.clear()
+            copy.parent = None
+            copy.matrix_world = Matrix(place.matrix)
+            for collection in empty.users_collection:
+                collection.objects.link(copy)
+            real.append(copy)
+        empty.instance_type = "NONE"
+        empty.select_set(False)
+        for copy in real:
+            copy.select_set(True)
+        context.view_layer.objects.active = real[0]
+        return {"FINISHED"}
+
+
+class REFINE_PT_instances(bpy.types.Panel):
+    """What can be done with instances."""
+
+    bl_space_type = "VIEW_3D"
+    bl_region_type = "UI"
+    bl_category = "REFINE"
+    bl_label = "Instances"
+    bl_parent_id = "REFINE_PT_splats"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        """Tell whether the active object instances splats."""
+        return not _instances(context)
+
+    def draw(self, context: bpy.types.Context) -> None:
+        """Draw what they are, and the button."""
+        count = sum(splat_count(place.obj.data) for place in placings([context.object]))
+        text = f"{count:,} splats of collection '{context.object.instance_collection.name}'"
+        wrapped.label(self.layout, context, text, icon="OUTLINER_OB_GROUP_INSTANCE")
+        self.layout.operator("refine.make_real")

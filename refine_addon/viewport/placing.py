@@ -1,0 +1,69 @@
+"""Where splats stand in a view: objects of the view layer, and instances of collections."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ..mesh.layout import looks_like_splats, splat_count
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+_DEEPEST = 8
+"""Collections that stand in each other as instances, at most; Blender draws no more."""
+
+
+class Placing(NamedTuple):
+    """Splats at a place.
+
+    Attributes
+    ----------
+    key : (int, int)
+        Tells this place of these splats from others: the identities of what instances the object,
+        if anything, and of the object, in one number; the identity of the mesh.
+    obj : bpy.types.Object
+    matrix : (4, 4) float64
+        To the world.
+    """
+
+    key: tuple[int, int]
+    obj: bpy.types.Object
+    matrix: NDArray[np.float64]
+
+
+def placings(objects: list[bpy.types.Object]) -> Iterator[Placing]:
+    """Give the splats among some objects of a scene, and among those that they instance."""
+    for obj in objects:
+        yield from _placed(obj, obj.matrix_world, 0, 0)
+
+
+def instanced(objects: list[bpy.types.Object]) -> set[bpy.types.Object]:
+    """Return the splat objects that some objects instance."""
+    return {place.obj for place in placings(objects)} - set(objects)
+
+
+def every() -> set[tuple[int, int]]:
+    """Return the keys of all splats of the file."""
+    return {placing.key for placing in placings(list(bpy.data.objects))}
+
+
+def _placed(obj: bpy.types.Object, matrix: Matrix, chain: int, depth: int) -> Iterator[Placing]:
+    """Give an object's own splats, or those of its instances, given the matrix to the world."""
+    chain = (chain << 32) + obj.session_uid
+    if looks_like_splats(obj):
+        if splat_count(obj.data):
+            yield Placing((chain, obj.data.session_uid), obj, np.array(matrix, np.float64))
+        return
+    collection = obj.instance_collection if obj.instance_type == "COLLECTION" else None
+    if collection is None or depth == _DEEPEST:
+        return
+    base = matrix @ Matrix.Translation(-collection.instance_offset)
+    for member in collection.all_objects:
+        if not member.hide_viewport:
+            yield from _placed(member, base @ member.matrix_world, chain, depth + 1)

@@ -1,0 +1,111 @@
+"""Apply and join objects of splats as Blender does, mend them, and join them ourselves."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import bpy
+import extension
+import mathutils
+import numpy as np
+
+PLACES = [
+    mathutils.Matrix.LocRotScale((1, -2, 0.5), mathutils.Euler((0.4, -0.7, 1.1)), (1.3, 1.3, 1.3)),
+    mathutils.Matrix.LocRotScale((0, 1, 0), mathutils.Euler((-1.0, 0.2, 0.3)), (-0.7, 0.7, 0.7)),
+]
+
+
+def main(cloud: str) -> dict[str, Any]:
+    """Return how far shapes and colours are off after each step, and what was said of it.
+
+    Parameters
+    ----------
+    cloud
+        A file of splats.
+    """
+    found = {}
+    for form in ("MESH", "POINTCLOUD"):
+        for step in (blenders_apply, blenders_join, ours):
+            bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+            extension.enable()
+            objects = [imported(cloud, form, place) for place in PLACES]
+            before = seen(objects)
+            said = step(objects)
+            if said is not None:
+                left = [obj for obj in bpy.context.scene.objects if obj.type == form]
+                found[f"{form} {step.__name__}"] = [said, apart(before, seen(left))]
+    return found
+
+
+def imported(cloud: str, form: str, place: mathutils.Matrix) -> bpy.types.Object:
+    """Import a file into an object of a type that stands somewhere."""
+    bpy.ops.refine.import_ply(filepath=cloud)
+    bpy.context.object.matrix_world = place
+    if form == "POINTCLOUD":
+        bpy.ops.refine.convert()
+    bpy.context.view_layer.update()
+    return bpy.context.object
+
+
+def blenders_apply(objects: list[bpy.types.Object]) -> list[str]:
+    """Ctrl+A."""
+    select(objects)
+    bpy.ops.object.transform_apply()
+    return mended(objects)
+
+
+def blenders_join(objects: list[bpy.types.Object]) -> list[str] | None:
+    """Ctrl+J, where this Blender joins such objects."""
+    select(objects)
+    if not bpy.ops.object.join.poll():
+        return None
+    try:
+        bpy.ops.object.join()
+    except RuntimeError:
+        return None
+    return mended([bpy.context.object])
+
+
+def ours(objects: list[bpy.types.Object]) -> list[str]:
+    """*Bake Transform* of one, then *Join Splats*."""
+    select(objects[:1])
+    bpy.ops.refine.bake_transform()
+    select(objects)
+    bpy.ops.refine.join()
+    return mended([bpy.context.object])
+
+
+def mended(objects: list[bpy.types.Object]) -> list[str]:
+    """Mend objects; return what was said before, and what is said still."""
+    drift = importlib.import_module(f"{extension.MODULE}.ui.transforms")
+    said = [sentence for obj in objects if drift.of(obj) for sentence in drift.of(obj).sentences()]
+    if said:
+        select(objects)
+        bpy.ops.refine.mend()
+        said += [f"still {obj.name}" for obj in objects if drift.of(obj)]
+    return said
+
+
+def select(objects: list[bpy.types.Object]) -> None:
+    """Select objects; the first is the active one."""
+    bpy.ops.object.select_all(action="DESELECT")
+    for obj in objects:
+        obj.select_set(True)
+    bpy.context.view_layer.objects.active = objects[0]
+
+
+def seen(objects: list[bpy.types.Object]) -> Any:
+    """Return the splats of objects as they stand in the world."""
+    package = importlib.import_module(extension.MODULE)
+    check, gather = package.mesh.layout.check, package.objects.splat_object.gather
+    bpy.context.view_layer.update()
+    return package.core.splats.joined([gather(check(obj), whole=True) for obj in objects])
+
+
+def apart(one: Any, other: Any) -> float:
+    """Return the largest difference of means, covariances and harmonics."""
+    package = importlib.import_module(extension.MODULE)
+    pairs = [(one.means, other.means), (one.sh_rest, other.sh_rest)]
+    shapes = [package.viewport.arrays.pack(splats).covariances for splats in (one, other)]
+    return max(float(np.abs(a - b).max()) for a, b in [*pairs, shapes])
