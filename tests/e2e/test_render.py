@@ -63,3 +63,19 @@ def _psnr(picture: np.ndarray, cloud: Path, cameras: Path) -> float:
         red[:, 1:] |= red[:, :-1]
         red[:, :-1] |= red[:, 1:]
     return float(-10.0 * np.log10(np.mean((picture - expected)[~red] ** 2)))
+
+
+def test_the_command_renders_without_a_window(
+    binary: Binary, blend: Path, cloud: Path, cameras: Path
+):
+    """The current frame, 1, where ``-o`` says; at least 40 dB from the reference renderer."""
+    done = binary.blender(
+        *(blend, "--render-output", binary.work / "shot_##", "--command", "refine", "render")
+    )
+
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert f"frame 1: {binary.work / 'shot_01.png'}" in done.stdout
+    picture = np.asarray(Image.open(binary.work / "shot_01.png"))[..., :3] / 255.0
+    view, splats = read_cameras(cameras)[0], read_ply(cloud).splats()
+    expected = render(splats, view, near=0.1).clip(0.0, 1.0)
+    assert -10.0 * np.log10(np.mean((picture - expected) ** 2)) > 40.0
