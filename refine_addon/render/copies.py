@@ -31,7 +31,11 @@ def copied(scene: bpy.types.Scene, name: str) -> bpy.types.Scene:
 
 def remove_all() -> None:
     """Remove all copies."""
-    for scene in [scene for scene in bpy.data.scenes if MARK in scene]:
+    found = [scene for scene in bpy.data.scenes if MARK in scene]
+    if bpy.context.window is None:  # as in a command: `remove` of 4.3 crashes without a window
+        bpy.data.batch_remove(found)
+        return
+    for scene in found:
         bpy.data.scenes.remove(scene)
 
 
