@@ -145,7 +145,8 @@ def _check(matrix: NDArray[np.float64], *, with_sh: bool) -> None:
     if with_sh and not is_uniform(matrix):
         msg = (
             f"the transform scales directions differently ({scales.round(6).tolist()}); splat "
-            "colours cannot follow that: make the object's scale uniform first"
+            "colours cannot follow that exactly: bake the object's transform (Bake Transform), or "
+            "make its scale uniform first"
         )
         raise RefineError(msg)
 

@@ -259,9 +259,7 @@ def _remembered(mesh: bpy.types.Mesh) -> Layout | None:
         layout = Layout(columns, header, native.is_native(mesh))
         # Join adds harmonics of a higher degree.
         if rest_count(mesh) > sum(column.name.startswith("f_rest_") for column in columns):
-            layout = _with(
-                layout, splat_count(mesh), _unlisted_harmonics(layout, mesh)
-            )  # of a joined object
+            layout = _with(layout, splat_count(mesh), _unlisted_harmonics(layout, mesh))
         described = layout.row_dtype.itemsize > 0
     except (AttributeError, KeyError, TypeError, ValueError):
         # Another program may have written there: what does not describe a file is no layout.

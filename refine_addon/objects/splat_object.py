@@ -15,12 +15,14 @@ import bpy
 import numpy as np
 
 from ..cameras.objects import world_matrix
-from ..core.affine import is_uniform, transformed
+from ..core.affine import baked, is_uniform, transformed
 from ..core.errors import RefineError
-from ..core.formats.ply import columns_from_splats
+from ..core.formats.ply_columns import values_by_name
+from ..core.moves import Move
 from ..core.survivors import survivor_columns
 from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.volumes import FREE, Forced
+from ..core.work import for_chunks
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
@@ -41,6 +43,10 @@ if TYPE_CHECKING:
     from ..core.survivor_choice import SurvivorChoice
     from ..core.views import ViewSet
     from ..mesh.layout import SplatObject
+
+
+_ROWS = 1 << 14
+"""Splats that are moved at a time, on one thread."""
 
 
 @dataclass(frozen=True)
@@ -287,10 +293,34 @@ def exported_file(checked: SplatObject, *, apply_transform: bool = False) -> Spl
     Raises
     ------
     RefineError
-        If the object's scale is uneven and is to be applied.
+        If the transform is to be applied and cannot be, being flat.
     """
-    columns = _world_columns(checked) if apply_transform else None
+    columns = None
+    if apply_transform:
+        matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
+        if not np.array_equal(matrix, np.eye(4)):
+            columns = moved_columns(checked, [Move(np.arange(len(checked)), matrix)])
     return mesh_attributes.file_from_object(checked, columns)
+
+
+def export_notes(checked: SplatObject, *, apply_transform: bool = False) -> list[str]:
+    """Return what is to be said of an exported object; see `drift_notes`, `uneven_notes`."""
+    notes = drift_notes(checked)
+    if apply_transform:
+        matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
+        notes += uneven_notes(checked, matrix)
+    return notes
+
+
+def uneven_notes(checked: SplatObject, matrix: NDArray[np.float64]) -> list[str]:
+    """Return a sentence if colours cannot follow a matrix, (4, 4), exactly."""
+    if is_uniform(matrix) or not mesh_layout.sh_degree(checked.mesh):
+        return []
+    note = (
+        f"object '{checked.obj.name}': the scale is uneven, which harmonics cannot follow exactly: "
+        "colours that change with the direction became the nearest"
+    )
+    return [note]
 
 
 def _outcome(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
@@ -298,19 +328,58 @@ def _outcome(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
     return Outcome.of(len(keep), kept, *mesh_attributes.file_size(checked))
 
 
-def _world_columns(checked: SplatObject) -> dict[str, NDArray[Any]]:
-    """Return the columns that the object's matrix changes, as they are in the world."""
-    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
-    if np.array_equal(matrix, np.eye(4)):
-        return {}
-    moved = transformed(mesh_attributes.splats_from_object(checked), matrix)
-    columns: dict[str, NDArray[Any]] = dict(columns_from_splats(moved))
+def moved_columns(checked: SplatObject, moves: Sequence[Move]) -> dict[str, NDArray[Any]]:
+    """Return an object's columns as they are once some splats were moved as a whole.
+
+    Parameters
+    ----------
+    checked : SplatObject
+    moves : sequence of Move
+        Which splats, and by which maps in the object's frame.
+
+    Returns
+    -------
+    dict of str to (N,) float32
+        Those that change: positions, scales, rotations, harmonics and normals.
+
+    Raises
+    ------
+    RefineError
+        See `refine_addon.core.affine.baked`.
+    """
+    splats = mesh_attributes.splats_from_object(checked)
+    columns = {name: np.array(column) for name, column in values_by_name(splats).items()}
+    del columns["opacity"]
+    for move in moves:
+        _move_rows(splats, columns, move)
     if {"nx", "ny", "nz"} <= {column.name for column in checked.layout.columns}:
-        normals = mesh_attributes.normals(checked) @ np.linalg.inv(matrix[:3, :3])
-        lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-        normals = normals / np.where(lengths > 0.0, lengths, 1.0)  # most files store zeros
+        normals = mesh_attributes.normals(checked)
+        for move in moves:
+            normals[move.rows] = _turned_normals(normals[move.rows], move.matrix)
         columns.update(zip(("nx", "ny", "nz"), normals.T, strict=True))
     return columns
+
+
+def _move_rows(splats: Splats, columns: dict[str, NDArray[Any]], move: Move) -> None:
+    """Write into columns what some splats become."""
+
+    def move_some(part: slice) -> None:
+        rows = part if len(move.rows) == len(splats) else move.rows[part]
+        values = values_by_name(baked(splats.take(rows), move.matrix))
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
+            for name, column in columns.items():
+                column[rows] = values[name]
+
+    for_chunks(move_some, len(move.rows), _ROWS)
+
+
+def _turned_normals(
+    normals: NDArray[np.float32], matrix: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return normals, (M, 3), of surfaces that a matrix moved; zeros, as most files have, stay."""
+    turned = normals @ np.linalg.inv(matrix[:3, :3])
+    lengths = np.linalg.norm(turned, axis=1, keepdims=True)
+    return np.asarray(turned / np.where(lengths > 0.0, lengths, 1.0))
 
 
 def find(name: str) -> bpy.types.Object:

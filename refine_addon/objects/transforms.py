@@ -6,19 +6,17 @@ Each does all it says, or raises `RefineError` and leaves the scene as it was.
 from __future__ import annotations
 
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import bpy
 import numpy as np
 
 from ..cameras.objects import snapped, world_matrix
-from ..core.affine import baked, is_flat, is_uniform
+from ..core.affine import is_flat
 from ..core.errors import RefineError
 from ..core.formats.ply import REST_COUNTS
-from ..core.formats.ply_columns import values_by_name
 from ..core.moves import Move
 from ..core.splats import above_constant
-from ..core.work import for_chunks
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
@@ -28,17 +26,14 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
 from . import demands
+from .splat_object import moved_columns, uneven_notes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
-    from ..core.splats import Splats
     from ..mesh.layout import SplatObject
-
-_ROWS = 1 << 14
-"""Splats that are moved at a time, on one thread."""
 
 _UNMOVED = {
     "location": (0.0, 0.0, 0.0),
@@ -63,66 +58,6 @@ _OF_ALL = (
     mesh_edit.FORCE,
 )
 """Attributes that say something of a splat among all others of its scene."""
-
-UNEVEN = (
-    "the scale is uneven, which harmonics cannot follow exactly: colours that change with the "
-    "direction became the nearest"
-)
-"""A note."""
-
-
-def moved_columns(checked: SplatObject, moves: Sequence[Move]) -> dict[str, NDArray[Any]]:
-    """Return an object's columns as they are once some splats were moved as a whole.
-
-    Parameters
-    ----------
-    checked : SplatObject
-    moves : sequence of Move
-        Which splats, and by which maps in the object's frame.
-
-    Returns
-    -------
-    dict of str to (N,) float32
-        Those that change: positions, scales, rotations, harmonics and normals.
-
-    Raises
-    ------
-    RefineError
-        See `refine_addon.core.affine.baked`.
-    """
-    splats = mesh_attributes.splats_from_object(checked)
-    columns = {name: np.array(column) for name, column in values_by_name(splats).items()}
-    del columns["opacity"]
-    for move in moves:
-        _move_rows(splats, columns, move)
-    if {"nx", "ny", "nz"} <= {column.name for column in checked.layout.columns}:
-        normals = mesh_attributes.normals(checked)
-        for move in moves:
-            normals[move.rows] = _turned_normals(normals[move.rows], move.matrix)
-        columns.update(zip(("nx", "ny", "nz"), normals.T, strict=True))
-    return columns
-
-
-def _move_rows(splats: Splats, columns: dict[str, NDArray[Any]], move: Move) -> None:
-    """Write into columns what some splats become."""
-
-    def move_some(part: slice) -> None:
-        rows = part if len(move.rows) == len(splats) else move.rows[part]
-        values = values_by_name(baked(splats.take(rows), move.matrix))
-        with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
-            for name, column in columns.items():
-                column[rows] = values[name]
-
-    for_chunks(move_some, len(move.rows), _ROWS)
-
-
-def _turned_normals(
-    normals: NDArray[np.float32], matrix: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return normals, (M, 3), of surfaces that a matrix moved; zeros, as most files have, stay."""
-    turned = normals @ np.linalg.inv(matrix[:3, :3])
-    lengths = np.linalg.norm(turned, axis=1, keepdims=True)
-    return np.asarray(turned / np.where(lengths > 0.0, lengths, 1.0))
 
 
 def mend(group: Sequence[SplatObject]) -> int:
@@ -202,16 +137,14 @@ def bake(group: Sequence[SplatObject], *, location: bool = True) -> list[str]:
     Raises
     ------
     RefineError
-        See `mesh.edit.check_deletable`, `mend` and `moved_columns`; also if an object is animated
-        or constrained.
+        See `mesh.edit.check_deletable`, `mend` and `splat_object.moved_columns`; also if an object
+        is animated or constrained.
     """
     notes = []
     for checked in group:
         mesh_edit.check_deletable(checked.obj)
         _check_still(checked.obj)
-        matrix = _own_matrix(checked.obj, location=location)
-        if not is_uniform(matrix) and mesh_layout.sh_degree(checked.mesh):
-            notes.append(f"object '{checked.obj.name}': {UNEVEN}")
+        notes += uneven_notes(checked, _own_matrix(checked.obj, location=location))
     with ExitStack() as stack:
         for checked in group:
             stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
@@ -295,17 +228,14 @@ def join(active: SplatObject, others: Sequence[SplatObject]) -> list[str]:
     Raises
     ------
     RefineError
-        See `mesh.edit.check_changeable` and `moved_columns`; also if Blender fails.
+        See `mesh.edit.check_changeable` and `splat_object.moved_columns`; also if Blender fails.
     """
     group = [active, *others]
     for member in group:
         mesh_edit.check_changeable(member.obj)
     matrices = _to_first(group)
-    notes = [
-        f"object '{member.obj.name}': {UNEVEN}"
-        for member, matrix in zip(group, matrices, strict=True)
-        if not is_uniform(matrix) and mesh_layout.sh_degree(member.mesh)
-    ]
+    pairs = zip(group, matrices, strict=True)
+    notes = [note for member, matrix in pairs for note in uneven_notes(member, matrix)]
     with _workbench() as bench:
         parts = [_copied(member, bench) for member in group]
         for part, matrix in zip(parts, matrices, strict=True):

@@ -101,7 +101,8 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
         target = expanded(bpy.path.abspath(self.filepath))
         refuse_existing(target, overwrite=self.overwrite)
         file = splat_object.exported_file(checked, apply_transform=self.apply_transform)
-        return _Export(file, target, self.overwrite, splat_object.drift_notes(checked))
+        notes = splat_object.export_notes(checked, apply_transform=self.apply_transform)
+        return _Export(file, target, self.overwrite, notes)
 
     @staticmethod
     def work(job: _Export, progress: Progress) -> SplatFile | Packed:

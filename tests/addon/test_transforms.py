@@ -146,8 +146,11 @@ def test_an_uneven_scale_is_baked_as_near_as_harmonics_come(addon, imported, see
     drawn = replace(shapes, sh_dc=dc, sh_rest=np.zeros((len(shapes), 0, 3)))
     before = render(drawn, view).clip(0.0, 1.0)
 
+    assert addon.objects.splat_object.export_notes(checked) == []
+    notes = addon.objects.splat_object.export_notes(checked, apply_transform=True)
     (note,) = addon.objects.transforms.bake([checked])
 
+    assert notes == [note]
     assert note.endswith("became the nearest")
     assert psnr(seen(), before) > 48.0
     got = addon.objects.splat_object.gather(addon.mesh.layout.check(imported))

@@ -111,7 +111,7 @@ def test_apply_is_adjusted_as_the_last_operation(binary: Binary, blend: Path):
         "again": 39_755 - 23_853,
     }
     assert found["less"]["panel"][:2] == ["ratio", 30.0]
-    assert found["absorbed"]["panel"] == ["keep", 30.0, 4000, True]
+    assert found["absorbed"]["panel"] == ["keep", 30.0, 4000, "absorb"]
     assert {told["last"] for told in found.values()} == {"REFINE_OT_apply"}
 
 
@@ -302,7 +302,7 @@ def test_splats_stand_among_other_objects(binary: Binary, cloud: Path):
     edges = np.abs(shown["crop"] - (0.0, 0.9, 0.8)).max(axis=2) < 0.1
     assert edges.sum() > 100
     for name in ("instance", "linked"):
-        assert np.sqrt(np.mean((shown[name] - plain) ** 2)) < 0.01
+        assert np.sqrt(np.mean((shown[name] - plain) ** 2)) < 0.005  # 46 dB
     assert found["real"] == 9_939
 
 

@@ -171,6 +171,8 @@ def edited(steps: Steps) -> Generator[float, None, None]:
         yield 0.5
         steps.told[name] = steps.said()
         steps.do(bpy.ops.refine.mend)
+    select_vertices(obj, np.zeros(len(obj.data.vertices), np.bool_))  # selected ones are tinted
+    obj.data.update()
     yield from steps.look("edit mode")
 
 
