@@ -30,7 +30,7 @@ def render(run: Run) -> None:
     except RuntimeError as error:  # what Blender reports
         raise RefineError(str(error).strip()) from error
     if shared.engine and shared.engine != scene.render.engine:
-        run.terminal.say(f"  all but splats by {shared.engine}: there is no graphics card here")
+        run.terminal.say(f"  all but splats by {shared.engine} in place of {scene.render.engine}")
     for frame in dict.fromkeys(shared.frames):
         run.terminal.say(f"frame {frame}: {scene.render.frame_path(frame=frame)}")
     among = f" among what {shared.engine} rendered" if shared.engine else ""
