@@ -52,7 +52,29 @@ def select(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:
     RefineError
         If the object belongs to a library.
     """
-    _store(obj, wanted & ~hidden(obj), hidden(obj))
+    away = hidden(obj)
+    _store(obj, wanted & ~away, away)
+
+
+def change(obj: bpy.types.Object, before: NDArray[np.bool_], wanted: NDArray[np.bool_]) -> None:
+    """Select as `select` does, (N,) bool, given what is selected: in edit mode far quicker.
+
+    None of the splats that are wanted may be hidden.
+
+    Raises
+    ------
+    RefineError
+        If the object belongs to a library.
+    """
+    if not _in_edit_mode(obj):
+        select(obj, wanted)
+        return
+    check_writable(obj)
+    vertices = bmesh.from_edit_mesh(obj.data).verts
+    vertices.ensure_lookup_table()
+    for row in np.flatnonzero(before != wanted).tolist():
+        vertices[row].select = bool(wanted[row])
+    bmesh.update_edit_mesh(obj.data, loop_triangles=False, destructive=False)
 
 
 def hide(obj: bpy.types.Object, wanted: NDArray[np.bool_]) -> None:

@@ -64,7 +64,7 @@ class Look:
         else:
             blue, orange, green, red, grey = 0x005A9C, 0xA85400, 0x00704F, 0xB5300F, 0x6A6A6A
         named = {"unchanged": blue, "absorb": orange, "refit": green, "goes": red, "stays": grey}
-        named["in range"] = blue
+        named |= {"in range": blue, "others": grey}
         return {name: _rgb(value) for name, value in named.items()}
 
 
@@ -255,8 +255,10 @@ class Chart:
         tops = bottom - np.where(total > 0, np.maximum(total * height, self._scale), 0.0)
         split = bottom - np.where(going > 0, np.maximum(going * height, self._scale), 0.0)
         colors = self.look.colors
-        canvas.columns(columns, tops[bars], split[bars], colors["stays"])
-        canvas.columns(columns, split[bars], np.full(len(bars), bottom), colors["goes"])
+        canvas.columns(columns, tops[bars], split[bars], colors[self.histogram.parts[1]])
+        canvas.columns(
+            columns, split[bars], np.full(len(bars), bottom), colors[self.histogram.parts[0]]
+        )
 
     def _draw_place(self, strip: _Canvas, x: float, quality: Quality, place: Place) -> None:
         half, (top, bottom) = 0.5 * self._scale, (_TOP * self._scale, _MIDDLE * self._scale)

@@ -14,7 +14,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh import selection
 from . import price, wrapped
 from .chart import BINS, Chart, Histogram
-from .panel_cache import cached
+from .panel_cache import cached, cached_soon
 from .select_operators import ACTIONS, QUANTITIES, SETS, in_range, quantity
 from .select_tools import MODES, SHAPES
 
@@ -118,9 +118,11 @@ def _draw_range(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     header.label(text="Histogram")
     if not body:
         return
-    settings, obj = context.scene.refine, context.object
-    body.prop(settings, "select_by", expand=True)
-    shown = cached("histogram", context, lambda: _shown(obj, settings))
+    settings = context.scene.refine
+    body.row(align=True).prop(settings, "select_by", expand=True)
+    shown = cached_soon("histogram", context, _shown)
+    if shown is None:  # drawn again when it is known
+        return
     if isinstance(shown, str):
         wrapped.label(body, context, shown, icon="INFO")
         return
@@ -160,7 +162,7 @@ def _histogram(found: Quantity, places: NDArray[np.float64], name: str) -> Histo
     bins = (places * BINS).clip(0, BINS - 1).astype(np.uint8)
     ticks = tuple((place, f"{found.axis.value(place):.2g}") for place in (0.0, 0.5, 1.0))
     total = np.bincount(bins, minlength=BINS)
-    return Histogram(bins, total, ticks, name, ("in range", "stays"))
+    return Histogram(bins, total, ticks, name, ("in range", "others"))
 
 
 def _draw_uses(layout: bpy.types.UILayout) -> None:

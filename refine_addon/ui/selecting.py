@@ -86,6 +86,8 @@ class _Job:
     ----------
     splats, view : object
         What tells them from others.
+    selected : (N,) bool
+        What is selected by now.
     source : Splats or Prepared or Sight
         What is known already: splats in their own frame, at least.
     matrix : (4, 4) float64
@@ -96,6 +98,7 @@ class _Job:
 
     splats: object
     view: object
+    selected: NDArray[np.bool_]
     source: Splats | Prepared | Sight
     matrix: NDArray[np.float64]
     camera: tuple[NDArray[np.float64], NDArray[np.float64], tuple[int, int]]
@@ -128,7 +131,7 @@ def _job(context: bpy.types.Context) -> _Job:
         (region.width, region.height),
     )
     with readable(obj) as checked:
-        away = _not_drawn(checked)
+        away, selected = _not_drawn(checked), selection.selected(checked.obj)
         digest = mesh_attributes.digest(checked)
         splats = (obj.data.session_uid, digest, matrix.tobytes(), away.tobytes())
         view = (splats, camera[0].tobytes(), camera[1].tobytes(), camera[2])
@@ -139,7 +142,7 @@ def _job(context: bpy.types.Context) -> _Job:
         else:
             _kept.clear()
             source = _drawn(checked, away)
-    return _Job(splats, view, source, matrix, camera)
+    return _Job(splats, view, selected, source, matrix, camera)
 
 
 def _drawn(checked: SplatObject, away: NDArray[np.bool_]) -> Splats:
@@ -197,7 +200,7 @@ class Stroke:
             See `_job`.
         """
         job, obj = _job(context), context.object
-        return cls(obj, how, [at], selection.selected(obj), job.camera[2], Worker(job))
+        return cls(obj, how, [at], job.selected, job.camera[2], Worker(job))
 
     @property
     def known(self) -> bool:
@@ -288,6 +291,6 @@ def stop(stroke: Stroke) -> None:
 def keep(stroke: Stroke) -> None:
     """Select what a stroke covers, which is known."""
     if stroke.selected is not None:
-        selection.select(stroke.obj, stroke.selected)
+        selection.change(stroke.obj, stroke.before, stroke.selected)
     if viewport_draw.mode() == "OFF" and stroke.obj.mode != "EDIT":
         viewport_draw.show("SCENE")  # or nobody would see it

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 WORDS = {"HEAT": ("goes first", "goes last"), "STAYS": ("What stays",), "GOES": ("What goes",)}
 """What is written in a view, by mode; of the heat map at both ends of its bar."""
 
-MARKED = {STAYS: "Protected", GOES: "Goes by a volume"}
+MARKED = {STAYS: "Protected", GOES: "Must go"}
 """What is written beside the tint of what stays and goes in any case."""
 
 _REDUNDANT = {(STAYS, "GOES"), (GOES, "STAYS")}

@@ -170,7 +170,8 @@ def test_scores_older_than_a_change_ask_to_be_made_again(draw, room, room_camera
     old = draw()
     bpy.ops.refine.score()
 
-    added = [text for text in old if text not in fresh]
+    # An object that stands elsewhere can be baked besides.
+    added = [text for text in old if text not in (*fresh, "refine.bake_transform")]
     assert " ".join(added) == "Score again: object moved, settings changed"
     assert not [text for text in draw() if text.startswith("Score again")]
 

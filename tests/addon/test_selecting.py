@@ -197,6 +197,22 @@ def test_all_splats_are_not_parted_from_none(chosen, room, unchanged):
 
 
 @pytest.mark.usefixtures("room_cameras")
+def test_each_histogram_is_drawn_with_its_range(addon, chosen, room):
+    """Every name and number has its letters; the count beside it is what the button takes."""
+    settings = bpy.context.scene.refine
+    settings.select_by = "SCORE"
+    assert "score the splats first" in addon.ui.select_panel._shown(room, settings)
+    bpy.ops.refine.score()
+    for name in ("SCORE", "OPACITY", "SIZE"):
+        settings.select_by, settings.select_low, settings.select_high = name, 0.5, 0.9
+        low, high, count = addon.ui.select_panel._shown(room, settings)
+        bpy.ops.refine.select_by(what="RANGE", quantity=name, low=0.5, high=0.9)
+        assert low < high
+        assert len(chosen.read(room)) == count
+    assert addon.ui.pixel_font.drawn("1.2e+05").any()
+
+
+@pytest.mark.usefixtures("room_cameras")
 def test_what_is_marked_to_go_goes_before_all_others(addon, chosen, room):
     """The 100 best of 39,755 are marked; of those that 19,877 remove they are 100.
 

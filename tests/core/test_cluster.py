@@ -203,6 +203,7 @@ class FakeCluster:
         self.closed = True
 
 
+@pytest.mark.slow
 def test_ctrl_c_while_workers_start_waits_for_them_and_closes_them(monkeypatch):
     """Dask cannot close workers that are half started: it printed an AssertionError at the end."""
     distributed = pytest.importorskip("distributed")

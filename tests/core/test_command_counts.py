@@ -136,6 +136,7 @@ def test_a_limit_that_is_met_already_says_so(files, capsys):  # noqa: F811
     assert "already" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("psnr", "words"),
     [("99", "by the estimate nothing can go at 99 dB"), ("1", "the estimate ends at 95% removed")],

@@ -22,8 +22,9 @@ from refine_addon.core import (
     score,
 )
 from refine_addon.core.estimate.quality import AS_GOOD, expected
-from refine_addon.core.pipeline import decide
+from refine_addon.core.pipeline import decide, decide_task
 from refine_addon.core.task import Task
+from tests.strategies import ply_of
 
 ROOM = Path(__file__).parents[1] / "data/room_small"
 FEW = Settings(views=12)
@@ -71,18 +72,29 @@ def test_it_absorbs_where_that_is_better(splats, views):
 
 
 @pytest.mark.slow
-def test_hidden_copies_are_deleted_and_rows_stay(small, views, tmp_path):
-    """A copy of half opacity in the place of each splat: a quarter can go by deletion alone.
+def test_where_absorbing_gains_hardly_anything_rows_stay(splats, views, monkeypatch):
+    """It was tried, and the report says what it reached; the rows are those of deletion."""
+    monkeypatch.setattr(decide_task, "AS_GOOD", 50.0)
 
-    Here splats are copied four times and made all but opaque, so that what lies behind hides.
-    """
+    result = prune(splats, views, HALF, FEW)
+
+    wanted = prune(splats, views, HALF, FEW, survivors="unchanged")
+    told = result.report["survivors"]
+    np.testing.assert_array_equal(result.keep, wanted.keep)
+    assert (result.absorbed, told["became"]) == (None, "unchanged")
+    assert told["psnr"]["absorb"] > told["psnr"]["unchanged"]
+    assert told["psnr"]["unchanged"] == wanted.report["estimated_psnr"]
+    assert any("hardly more" in note for note in result.report["notes"])
+
+
+@pytest.mark.slow
+def test_hidden_copies_are_deleted_and_rows_stay(small, views, tmp_path):
+    """Of four splats in one place, each all but opaque, three are hidden: .3 of all can go."""
     file = read_ply(small)
     rows = np.concatenate([file.rows] * 4)
     rows["opacity"] = 6.0
     path = tmp_path / "copies.ply"
     columns = {name: rows[name] for name in rows.dtype.names}
-    from tests.strategies import ply_of  # noqa: PLC0415 - here alone
-
     path.write_bytes(ply_of(columns))
 
     result = prune_file(path, tmp_path / "out.ply", PruneRequest(views, Budget(ratio=0.3), FEW))
@@ -90,6 +102,8 @@ def test_hidden_copies_are_deleted_and_rows_stay(small, views, tmp_path):
     told = result.report["survivors"]
     assert (told["asked"], told["became"]) == ("auto", "unchanged")
     assert result.absorbed is None
+    named = prune(read_ply(path).splats(), views, Budget(ratio=0.3), FEW, survivors="unchanged")
+    np.testing.assert_array_equal(result.keep, named.keep)
     kept = read_ply(path).rows[result.keep]
     assert read_ply(tmp_path / "out.ply").rows.tobytes() == kept.tobytes()
     assert any("survivors stay unchanged" in note for note in result.report["notes"])

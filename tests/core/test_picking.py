@@ -85,6 +85,7 @@ def test_a_splat_is_taken_where_its_centre_is(walls):
     assert np.array_equal(taken[inner], means[inner, 0] < -0.02)
 
 
+@pytest.mark.slow
 def test_surfaces_lie_where_a_ray_has_lost_its_light():
     """Walls of opacity .5 every .1 from 2 on, without gaps: a tenth is left behind the fourth.
 

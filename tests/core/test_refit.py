@@ -15,6 +15,7 @@ from refine_addon.core.seeing.cast import cast, pixels
 from refine_addon.core.seeing.ray_sample import colors_from
 from refine_addon.core.splats import SH_C0, rotation_matrices
 from refine_addon.core.work import Cancelled
+from tests.core.test_invariance import moved, rotation
 from tests.core.test_occlusion import cloud, ring
 
 COLUMNS, ROWS = np.arange(3, 78, 8), np.arange(4, 58, 8)
@@ -147,9 +148,9 @@ def test_a_round_that_loses_is_undone_and_the_next_damped_more(monkeypatch):
     monkeypatch.setattr(round_rays.RoundRays, "psnr", lambda *_: next(said))
     damped, solve = [], refit._Solver.solve
 
-    def spy(self, damping, known, progress):
-        damped.append((damping, known.sum()))
-        return solve(self, damping, known, progress)
+    def spy(self, damping, before, progress):
+        damped.append((damping, before.diagonal.sum()))
+        return solve(self, damping, before, progress)
 
     monkeypatch.setattr(refit._Solver, "solve", spy)
     splats = cloud(60)
@@ -159,7 +160,8 @@ def test_a_round_that_loses_is_undone_and_the_next_damped_more(monkeypatch):
     assert [(each.rounds, each.psnr) for each in found] == [
         (0, 30.0), (1, 31.0), (2, 32.0), (3, 32.01)
     ]  # fmt: skip
-    assert [damping for damping, _ in damped] == [1.0, 1.0, refit.MORE_DAMPING, refit.MORE_DAMPING]
+    least, more = refit.LEAST_DAMPING, refit.LEAST_DAMPING * refit.MORE_DAMPING
+    assert [damping for damping, _ in damped] == [least, least, more, more]
     known = [told for _, told in damped]
     assert known[0] == 0.0 < known[1] == known[2] < known[3]
 
@@ -278,6 +280,45 @@ def test_the_unit_of_the_scene_changes_nothing(size):
     )
 
     assert there.psnr == pytest.approx(here.psnr, abs=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [np.array([-3.0, 5.0, 9.0]), np.array([1e6, -1e6, 1e6])])
+def test_a_motion_of_the_scene_moves_what_was_learned(step):
+    """Turned by 111 degrees, and moved, by up to a million scene sizes: means go along.
+
+    In doubles; a scene so far away keeps 1e-10 of 1e6 of a position.
+    """
+    splats, views = cloud(200), ring()
+    survivors = np.arange(100)
+    matrix = np.eye(4)
+    there, from_there = moved(splats, views, rotation([3, -1, 2], 111.0), step)
+    matrix[:3, :3], matrix[:3, 3] = rotation([3, -1, 2], 111.0), step
+
+    one = refit.refit(splats.take(survivors), splats, views, refit.Refit(rounds=1))
+    other = refit.refit(there.take(survivors), there, from_there, refit.Refit(rounds=1))
+
+    assert one.psnr > one.psnr_before + 0.5
+    assert other.psnr == pytest.approx(one.psnr, abs=0.05)
+    expected = one.splats.means @ matrix[:3, :3].T + matrix[:3, 3]
+    away = np.linalg.norm(other.splats.means - expected, axis=1)
+    assert np.median(away) < 1e-4
+    learned = np.linalg.norm(one.splats.means - splats.means[survivors], axis=1)
+    assert np.median(learned) > 0.005
+
+
+@pytest.mark.slow
+def test_the_order_of_splats_does_not_count():
+    """Sums differ in their last bits alone."""
+    splats, views = cloud(200), ring()
+    order = np.random.default_rng(5).permutation(100)
+    one = refit.refit(splats.take(np.arange(100)), splats, views, refit.Refit(rounds=1))
+
+    other = refit.refit(splats.take(order), splats.take(slice(None, None, -1)), views,
+                        refit.Refit(rounds=1))  # fmt: skip
+
+    np.testing.assert_allclose(other.splats.means, one.splats.means[order], atol=1e-5)
+    assert other.psnr == pytest.approx(one.psnr, abs=1e-3)
 
 
 @pytest.mark.slow

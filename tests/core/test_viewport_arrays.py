@@ -165,3 +165,16 @@ def test_a_covariance_is_turned_as_its_splat():
     expected = [4.0, 0.0, 0.0, 9.0, 0.0, 1.0]
 
     np.testing.assert_allclose(arrays.pack(splats).covariances[0], expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("mode", ["SCENE", "HEAT"])
+@pytest.mark.parametrize("mark", [arrays.STAYS, arrays.GOES])
+@pytest.mark.parametrize("ground", [0.0, 0.5, 1.0])
+def test_tints_are_seen_on_black_grey_and_white(mode, mark, ground):
+    """A channel changes by more than .15, 38 of 255; white, a tint before, changed no white."""
+    rgba = np.array([[ground, ground, ground, 1.0]], np.float32)
+    tinted = arrays.marked(rgba, np.array([mark]), mode)
+
+    assert np.abs(tinted - rgba).max() > 0.15
+    selected = arrays.tinted(rgba, arrays.SELECTED, arrays.SELECTED_SHARE)
+    assert np.abs(selected - rgba).max() > 0.25

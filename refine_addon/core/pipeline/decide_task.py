@@ -7,7 +7,8 @@ splats are merged until as many are left as were selected, and those are refitte
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from .score_splats import score, score_once, with_quality
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ..absorbing.absorb import Absorbed
     from ..scores import Scores
     from ..seeing.measuring import Measured
     from ..selection import Budget, RowBytes
@@ -133,68 +135,115 @@ def decide(
 
 def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -> Result:
     """Decide on a task from which nothing has to go in any case."""
-    scored = 0.2 if task.absorb else 0.95
-    scores, known = _scores_of(task, part(progress, 0.0, scored), threads)
-    if not (task.scores is None or task.budget.psnr is None or task.protected is None):
-        # Others may have been protected when these were scored.
-        scores = with_quality(scores, protected=task.protected, threads=threads)
-    clock.lap("score_s")
-    report(progress, scored, "selecting")
-    keep, plain = _deleting(task, scores, threads)
+    if not task.absorb:
+        return _delete(task, clock, progress, threads)
+    by_default = task.survivors == "auto"
+    # Stored scores rank otherwise, and must not change what is chosen by default.
+    trial = replace(task, scores=None) if by_default else task
+    scores, known = _scored(trial, clock, part(progress, 0.0, 0.2), threads)
+    keep, plain = _deleting(trial, scores, threads)
     clock.lap("select_s")
-    made = tried = None
-    if task.absorb and not _will_do(task, scores, plain):
+    made = None
+    if not (by_default and _will_do(task, scores, plain)):
         count = int(np.count_nonzero(keep))
-        made = tried = absorb_task(task, count, known, part(progress, 0.2, 1.0), threads)
+        made = absorb_task(task, count, known, part(progress, 0.2, 1.0), threads)
         clock.lap("absorb_s")
-        if task.survivors == "auto" and _as_good(task, keep, plain, made):
-            made = None
-    psnr = plain if made is None else made.psnr
-    keep = keep if made is None else made.absorbed.keep
-    facts = make_report(scores, keep, task.budget, task.settings, clock)
-    size = int(np.broadcast_to(task.row_bytes, len(keep)).sum() + task.fixed_bytes)
-    gone = len(keep) - int(np.count_nonzero(keep))
-    why = remark(task.budget, gone, len(keep), psnr, size)
-    conclude(facts, scores, keep, psnr, None if made is None else made.absorbed, why)
+        if not (by_default and _as_good(task, keep, plain, made)):
+            return _absorbed(task, scores, plain, made, clock)
+    rest = part(progress, 0.2 if made is None else 0.95, 1.0)
+    result = _delete(replace(task, survivors="unchanged"), clock, rest, threads)
+    facts, psnr = result.report, result.report["estimated_psnr"]
+    measured: dict[Became, float | None] = {"unchanged": psnr}
+    if made is not None and task.budget.psnr is None:  # of as many survivors
+        measured |= made.measured()
+    gone = facts["splats"]["removed"] / len(result.keep)
+    facts["survivors"] |= {"asked": "auto", **expected_psnr(scores.quality, gone, measured)}
+    if gone:
+        facts["notes"].append(unchanged_note(psnr, made))
+    return result
+
+
+def _delete(task: Task, clock: Clock, progress: Progress, threads: int | None) -> Result:
+    """Decide by scores alone."""
+    scores, _ = _scored(task, clock, part(progress, 0.0, 0.95), threads)
+    keep, psnr = _deleting(task, scores, threads)
+    clock.lap("select_s")
+    facts = _facts(task, scores, keep, psnr, clock)
+    gone = facts["splats"]["removed"] / len(keep)
     facts["survivors"] = {
         "asked": task.survivors,
-        "became": "unchanged" if made is None else made.became,
-        **expected_psnr(scores.quality, gone / len(keep), _measured(task, plain, tried, made)),
-        "seconds": _seconds(task, clock, gone / len(keep), once=known is not None),
+        "became": "unchanged",
+        **expected_psnr(scores.quality, gone, {"unchanged": psnr}),
+        "seconds": _seconds(task, clock, gone, once=False),
     }
-    if task.survivors == "auto" and task.absorb and made is None and gone:
-        facts["notes"].append(unchanged_note(plain, tried))
-    if made is None:
-        return Result(keep, scores, facts)
-    facts |= made.facts()
-    facts["notes"] += made.notes()
-    if known and task.settings.method == "closed-form":
-        facts["notes"].append(MEASURES)
-    return Result(keep, scores, facts, made.survivors)
+    return Result(keep, scores, facts)
 
 
-def _measured(
-    task: Task, plain: float | None, tried: Made | None, made: Made | None
-) -> dict[Became, float | None]:
-    """Return the estimates of the PSNR that were measured, by what survivors became, dB.
+def _absorbed(task: Task, scores: Scores, plain: float | None, made: Made, clock: Clock) -> Result:
+    """Return the result of what survivors became.
 
     Parameters
     ----------
     task : Task
+    scores : Scores
+        Those that decided how many survive, or what was deleted first.
     plain : float or None
-        With splats deleted.
-    tried, made : Made or None
-        By absorbing; the second is None where plain deletion is as good.
+        The estimate for plain deletion, dB.
+    made : Made
+    clock : Clock
     """
-    if task.budget.psnr is None:
-        return {"unchanged": plain, **({} if tried is None else tried.measured())}
-    # The others keep another number of splats.
-    return {"unchanged": plain} if made is None else made.measured()
+    absorbed = made.absorbed
+    facts = _facts(task, scores, absorbed.keep, made.psnr, clock, absorbed)
+    gone = facts["splats"]["removed"] / len(absorbed.keep)
+    measured = made.measured()
+    if task.budget.psnr is None:  # else deletion keeps another number of splats
+        measured["unchanged"] = plain
+    once = task.survivors == "auto" or (task.scores is None and not task.budget.needs_scores)
+    facts["survivors"] = {
+        "asked": task.survivors,
+        "became": made.became,
+        **expected_psnr(scores.quality, gone, measured),
+        "seconds": _seconds(task, clock, gone, once=once),
+    }
+    facts |= made.facts()
+    facts["notes"] += made.notes()
+    if once and task.settings.method == "closed-form":
+        facts["notes"].append(MEASURES)
+    return Result(absorbed.keep, scores, facts, made.survivors)
+
+
+def _facts(
+    task: Task,
+    scores: Scores,
+    keep: NDArray[np.bool_],
+    psnr: float | None,
+    clock: Clock,
+    absorbed: Absorbed | None = None,
+) -> dict[str, Any]:
+    """Return the report, but for what survivors may become."""
+    facts = make_report(scores, keep, task.budget, task.settings, clock)
+    size = int(np.broadcast_to(task.row_bytes, len(keep)).sum() + task.fixed_bytes)
+    why = remark(task.budget, facts["splats"]["removed"], len(keep), psnr, size)
+    conclude(facts, scores, keep, psnr, absorbed, why)
+    return facts
+
+
+def _scored(
+    task: Task, clock: Clock, progress: Progress, threads: int | None
+) -> tuple[Scores, tuple[Scores, Measured] | None]:
+    """Return the scores that decide, and `known` of `absorb_removed` if that came with them."""
+    scores, known = _scores_of(task, progress, threads)
+    if not (task.scores is None or task.budget.psnr is None or task.protected is None):
+        # Others may have been protected when these were scored.
+        scores = with_quality(scores, protected=task.protected, threads=threads)
+    clock.lap("score_s")
+    report(progress, 1.0, "selecting")
+    return scores, known
 
 
 def _seconds(task: Task, clock: Clock, share: float, *, once: bool) -> dict[Became, float] | None:
     """Return about how long it takes by what survivors become; None where scoring tells nothing."""
-    if task.scores is not None or not (once or task.settings.estimates):
+    if not once and (task.scores is not None or not task.settings.estimates):
         return None
     return in_tenths(expected_seconds(clock.timings["score_s"], share, once=once))
 

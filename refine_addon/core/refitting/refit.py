@@ -11,16 +11,19 @@ r is the difference on all rays, D the diagonal of J'J, m_p the median of D over
 hit, for each kind of parameter, and K the sum of D over the rounds before. So what few rays tell of
 a splat moves it little, and rounds together learn from the rays of all of them, not from the last
 alone: each has a share in what a parameter becomes. The sum is made small by a few steps of
-conjugate gradients, preconditioned by the diagonal.
+conjugate gradients, preconditioned by the diagonal. What these and the damping leave of J'r, half
+of it is added to that of the next round.
+
+k is `DAMPING` over how many rays there are for each survivor: the more rays, the less damping.
 
 Validation rays, which nothing is learned from, compare survivors before and after a round. One that
-loses is undone, and the next is damped more (k, at first 1). Rounds end where little is gained.
+loses is undone, and the next is damped more. Rounds end where little is gained.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -39,8 +42,15 @@ if TYPE_CHECKING:
     from ..views import ViewSet
     from .round_rays import Truth
 
-STEPS = 4
+STEPS = 8
 """Steps of conjugate gradients in a round."""
+
+DAMPING, LEAST_DAMPING = 4.0, 0.1
+"""Damping counts as so many rays for each survivor: k is this over how many there are, but at least
+so much, as colours change with parameters in straight lines near by alone."""
+
+CARRIED = 0.5
+"""How much of what a round leaves of J'r counts in the next one."""
 
 MORE_DAMPING = 8.0
 """Factor of k after a round that lost; see the top of this file."""
@@ -64,7 +74,7 @@ class Refit:
         Whether means, scales and rotations are refitted too, or colours and opacities alone.
     """
 
-    rounds: int = 6
+    rounds: int = 4
     geometry: bool = True
 
     def __post_init__(self) -> None:
@@ -219,14 +229,15 @@ def refit_on(
     psnr = rays.psnr(survivors, part(progress, 0.0, 0.04))
     best = Refitted(survivors, np.zeros(len(survivors), np.bool_), 0, psnr, psnr)
     yield best
-    known, damping = np.zeros((COUNT, len(survivors))), 1.0
+    before, more = _Told(*np.zeros((2, COUNT, len(survivors)))), 1.0
     for number in range(1, settings.rounds + 1):
         begin, middle, near, end = (
             0.04 + 0.96 * (number - 1 + share) / settings.rounds for share in (0.0, 0.4, 0.9, 1.0)
         )
         linear = rays.linear(best.splats, number, part(progress, begin, middle))
         solver = _Solver(linear, rays.truths(number), movable, threads)
-        change, told = solver.solve(damping, known, part(progress, middle, near))
+        damping = more * max(DAMPING * len(survivors) / rays.count(number), LEAST_DAMPING)
+        change, told = solver.solve(damping, before, part(progress, middle, near))
         del linear, solver  # the hits, before those of the next round
         if not change.any():
             return
@@ -234,16 +245,31 @@ def refit_on(
         psnr = rays.psnr(trial, part(progress, near, end))
         gain = psnr - best.psnr
         if gain > 0.0:
-            known += told
+            before = told
             changed = ~_same(survivors, trial)
             best = Refitted(trial, changed, best.rounds + 1, best.psnr_before, psnr)
             yield best
             if gain < LEAST_GAIN:
                 return
-        elif damping > 1.0:
+        elif more > 1.0:
             return
         else:
-            damping *= MORE_DAMPING
+            more *= MORE_DAMPING
+
+
+class _Told(NamedTuple):
+    """What rounds have told of the parameters of N survivors, and the next one goes on from.
+
+    Attributes
+    ----------
+    diagonal : (13, N) float64
+        K; see the top of this file.
+    left : (13, N) float64
+        What is left of J'r.
+    """
+
+    diagonal: NDArray[np.float64]
+    left: NDArray[np.float64]
 
 
 class _Solver:
@@ -270,31 +296,27 @@ class _Solver:
         self._movable, self._threads = movable, threads
 
     def solve(
-        self, damping: float, known: NDArray[np.float64], progress: Progress
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return by how much to change the parameters of survivors, and what rays tell of them.
+        self, damping: float, before: _Told, progress: Progress
+    ) -> tuple[NDArray[np.float64], _Told]:
+        """Return by how much to change the parameters of survivors, (13, N), and what rays told.
 
         Parameters
         ----------
         damping : float
             k; see the top of this file.
-        known : (13, N) float64
-            What the rounds before have told: K.
+        before : _Told
+            By the rounds before.
         progress : callable
-
-        Returns
-        -------
-        change, diagonal : (13, N) float64
-            x and D.
         """
         steps = [part(progress, k / (STEPS + 2), (k + 1) / (STEPS + 2)) for k in range(STEPS + 2)]
 
         def errors(view: LinearView, truth: Truth) -> NDArray[np.float64]:
             return view.backward(truth.colors - view.colors.astype(np.float32))
 
-        residual = self._sum(errors, steps[0])
+        residual = self._sum(errors, steps[0]) + CARRIED * before.left
         diagonal = self._sum(lambda view, _: view.diagonal(), steps[1])
-        damped = damping * (diagonal + _medians(diagonal)[:, None]) + known
+        prior = damping * (diagonal + _medians(diagonal)[:, None])
+        damped = prior + before.diagonal
         inverse = np.divide(1.0, diagonal + damped, out=np.zeros_like(damped), where=diagonal > 0.0)
 
         def product(direction: NDArray[np.float64], step: Progress) -> NDArray[np.float64]:
@@ -303,7 +325,8 @@ class _Solver:
                 damped * direction
             )
 
-        return _conjugate_gradients(product, residual, inverse, steps[2:]), diagonal
+        change, residual = _conjugate_gradients(product, residual, inverse, steps[2:])
+        return change, _Told(before.diagonal + diagonal, residual + prior * change)
 
     def _sum(
         self, work: Callable[[LinearView, Truth], NDArray[np.float64]], progress: Progress
@@ -334,8 +357,10 @@ def _conjugate_gradients(
     residual: NDArray[np.float64],
     inverse: NDArray[np.float64],
     steps: list[Progress],
-) -> NDArray[np.float64]:
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return about the solution x of ``product(x) = residual``, by a few steps from 0.
+
+    And what it leaves of the residual.
 
     Parameters
     ----------
@@ -359,7 +384,7 @@ def _conjugate_gradients(
         after = float(np.vdot(residual, preconditioned))
         direction = preconditioned + after / before * direction
         before = after
-    return solution
+    return solution, residual
 
 
 def _moved(splats: Splats, change: NDArray[np.float64]) -> Splats:

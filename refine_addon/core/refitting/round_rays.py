@@ -18,10 +18,10 @@ from ..estimate.quality import PSNR_CAP
 from ..processes import for_each
 from ..seeing import projection
 from ..seeing.cast import cast, depth_complexity, pixels
-from ..seeing.ray_sample import MAX_RAYS_OF_VIEW, colors_from
+from ..seeing.ray_sample import MAX_HITS_OF_VIEW, MAX_RAYS_OF_VIEW, colors_from
 from ..views import ViewSet
 from ..work import Progress, part
-from .linear import LinearView, Shapes, linear_view
+from .linear import LEAST_WEIGHT, LinearView, Shapes, linear_view
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -35,15 +35,15 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-RAYS_OF_SPLAT = 4.0
+RAYS_OF_SPLAT = 8.0
 """Rays of a round for each survivor: with fewer, survivors learn them by heart."""
 
-MIN_RAYS = 1 << 16
+MIN_RAYS = 1 << 17
 """Rays of a round where that would be fewer."""
 
-MAX_HITS = 1 << 25
-"""About how many hits the rays of a round may have on the unpruned splats. Survivors have fewer,
-and those that hardly show are left out: some 50 bytes are taken for at most every second."""
+MAX_HITS = 3 << 21
+"""About how many hits of a round may show in the unpruned splats (`linear.LEAST_WEIGHT`). Survivors
+have fewer; each takes 48 bytes."""
 
 SECONDS, SECONDS_OF_RAY = 2.5e-7, 4e-6
 """About how long one core takes to project a splat into a view, and to cast a ray, to tell what is
@@ -65,7 +65,7 @@ class Window:
     weight : float
         How much it counts for the PSNR.
     rays, hits : float
-        About how many rays there are, and how many hits they may have on the unpruned splats.
+        About how many rays there are, and how many hits on the unpruned splats may show.
     left, top, width, height : int
         The part of the image that they go through, pixels; by default all of it.
     """
@@ -100,7 +100,7 @@ class Window:
         Parameters
         ----------
         hits : float
-            About how many hits a ray has on the unpruned splats.
+            About how many hits on the unpruned splats a ray shows.
         number : int
             0 for validation rays, 1 for the first round.
         """
@@ -241,6 +241,10 @@ class RoundRays:
         """Return the rays of a round, of each view; those of round 0 validate."""
         return [of_rounds[number] for of_rounds in self._truths]
 
+    def count(self, number: int) -> int:
+        """Return how many rays a round has."""
+        return sum(truth.colors.shape[1] for truth in self.truths(number))
+
     def linear(self, splats: Splats, number: int, progress: Progress) -> list[LinearView]:
         """Return how the colours of each view's rays change with survivors as they are now.
 
@@ -319,14 +323,16 @@ class CastTruth:
         truths = []
         with np.errstate(under="ignore"):
             footprints = self.target.footprints(window)
-            # It counts footprints beyond the image in full, so the first round says better.
-            hits = depth_complexity(footprints, window.part)
+            # Casting takes memory for all hits, also hidden ones, but for one view at a time.
+            share = window.hits / MAX_HITS_OF_VIEW
+            hits = share * depth_complexity(footprints, window.part)
             for number in self.rounds:
                 columns, rows = window.pixels(hits, number)
                 rays = cast(footprints, columns, rows)
                 colors = rays.colors(self.target.colors(rays.hit, window.view))
                 truths.append(Truth(columns, rows, colors.astype(np.float32)))
-                hits = len(rays.ray) / max(rays.count, 1)
+                shown = np.count_nonzero(rays.contributions()[2] > LEAST_WEIGHT)
+                hits = max(shown, share * len(rays.ray)) / max(rays.count, 1)
         return truths
 
 

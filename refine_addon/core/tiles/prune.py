@@ -21,7 +21,7 @@ from ..formats.ply_header import with_count
 from ..operation.run import Request, Written, run
 from ..pipeline.absorb_splats import ABSORBED
 from ..refitting.refit import Refit
-from ..report import MEASURES, conclude, files_facts, make_report, remark
+from ..report import MEASURES, conclude, expected_psnr, files_facts, make_report, remark
 from ..scoring.closed_form_block import ROWS
 from ..selection import refuse_none_left
 from ..urls import Url
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from ..refitting.refit import Gains
     from ..scores import Scores
     from ..selection import Budget
+    from ..survivor_choice import Became
     from .absorbing import Survivors
     from .scoring import MeasuredTiles
     from .units import Tile, Unit
@@ -254,8 +255,16 @@ class TilesRequest(Request[TileScene, TileDecision]):
         size, removed = sum(tile.size for tile in scene.tiles), scene.total - kept
         why = remark(asked.budget, removed, scene.total, psnr, size)
         conclude(facts, scores, keep, psnr, made.absorbed if made else None, why)
+        facts["survivors"]["asked"] = asked.survivors
         if made is not None:
             if made.refitted is not None:
+                told: dict[Became, float | None] = {
+                    "absorb": made.refitted.psnr_before,
+                    "refit": psnr,
+                }
+                share = removed / scene.total
+                facts["survivors"] |= expected_psnr(scores.quality, share, told)
+                facts["survivors"]["became"] = "refit"
                 facts["refitted"] = made.refitted.facts(made.seconds)
                 facts["notes"].append(made.refitted.note(made.seconds))
             if asked.settings.method == "closed-form":

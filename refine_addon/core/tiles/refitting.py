@@ -128,7 +128,7 @@ class PassContext:
     before: StoredSplats  # the unpruned splats
     after: StoredSplats  # survivors, as the pass before left them
     settings: Refit
-    first: int  # number of its first round
+    first: int  # how many rounds there were before
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,8 @@ class RefitRegion:
     def _refitted(self, context: PassContext, runtime: Runtime) -> NDArray[np.int64]:
         rows, settings = context.folder.load(self.index, ["rows"])["rows"], context.settings
         splats, changed, rounds = context.after.take(rows), np.zeros(len(rows), np.bool_), 0
-        numbers = range(context.first, context.first + settings.rounds + 1)
+        first = context.first + 1
+        numbers = [0, *range(first, first + settings.rounds)]
         rays = RegionRays(
             splats, rows, context.before, context.after, numbers, runtime.part(0.0, 0.3)
         )

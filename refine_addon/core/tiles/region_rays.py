@@ -121,7 +121,7 @@ class RegionRays(RoundRays):
     before, after : StoredSplats
         The unpruned splats, and the survivors of all regions.
     rounds : sequence of int
-        The numbers of the rounds, and of one more to measure the last.
+        Their numbers, see `CastTruth`.
     runtime : Runtime
     """
 
