@@ -76,7 +76,7 @@ def picture(name: str, mode: str) -> Path:
 
 
 def side_by_side(pictures: list[Path], target: Path) -> None:
-    """Join pictures of one size from left to right: the README's picture."""
+    """Join pictures of one size from left to right."""
     pixels = []
     for path in pictures:
         image = bpy.data.images.load(str(path))

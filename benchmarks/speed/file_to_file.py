@@ -1,9 +1,10 @@
 """How long a prune takes from file to file, and what memory it needs.
 
     python -m benchmarks.speed.file_to_file [--splats 3000000] [--runs 5]
-    python -m benchmarks.speed.file_to_file --absorb --splats 1900000 --runs 3
+    python -m benchmarks.speed.file_to_file --survivors absorb --splats 1900000 --runs 3
+    python -m benchmarks.speed.file_to_file --survivors absorb refit --splats 160000 --runs 1
 
-The first is against copying the file; the second, with survivors that absorb, against
+The first is against copying the file; the others, with survivors that change, against
 splat-transform's decimation to the same number of splats, where that is installed.
 
 The input is the committed room's rows, repeated, each copy a little elsewhere and so much smaller
@@ -33,7 +34,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from refine_addon.core import Budget, read_ply
+from refine_addon.core import SURVIVORS, Budget, read_ply
 from refine_addon.core.formats.ply_header import with_count
 
 from ..baselines import splat_transform
@@ -95,10 +96,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--splats", type=int, default=3_000_000)
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--ratio", default="0.5")
-    parser.add_argument("--absorb", action="store_true", help="against a decimation by merging")
+    parser.add_argument(
+        "--survivors", nargs="+", choices=SURVIVORS[1:], default=[],
+        help="what they may become, one prune each: against a decimation by merging",
+    )  # fmt: skip
     parser.add_argument("--folder", type=Path, help="on the disk to measure; default the system's")
     options = parser.parse_args(arguments)
-    other = "decimate" if options.absorb else "copy"
+    other = "decimate" if options.survivors else "copy"
     with tempfile.TemporaryDirectory(dir=options.folder) as made:
         source, output, report = (
             Path(made) / name for name in ("in.ply", "out.ply", "report.json")
@@ -107,11 +111,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"{options.splats:,} splats, {source.stat().st_size / 1e6:.0f} MB, {made}")
         prune = [sys.executable, "-m", "refine_addon", "prune", source, "-o", output, "--ratio"]
         prune += [options.ratio, "--cameras", ROOM / "cameras.json", "--report", report]
-        commands = {
-            "start": [sys.executable, "-m", "refine_addon", "--version"],
-            "prune": [*prune, *(["--absorb"] if options.absorb else ["--method", "closed-form"])],
-        }
-        if not options.absorb:
+        commands = {"start": [sys.executable, "-m", "refine_addon", "--version"]}
+        commands |= {name: [*prune, "--survivors", name] for name in options.survivors}
+        if not options.survivors:
+            commands["prune"] = [*prune, "--survivors", "unchanged", "--method", "closed-form"]
             commands["copy"] = ["cp", source, output]
         elif splat_transform.find():
             left = options.splats - Budget(ratio=float(options.ratio)).removals(options.splats)
@@ -122,7 +125,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         seconds: dict[str, list[float]] = {name: [] for name in commands}
         busy: dict[str, list[float]] = {name: [] for name in commands}
         peaks: dict[str, float] = dict.fromkeys(commands, 0.0)
-        parts: list[dict[str, float]] = []
+        pruning = options.survivors or ["prune"]
+        parts: dict[str, list[dict[str, float]]] = {name: [] for name in pruning}
         for turn in range(options.runs + 1):
             for name, command in commands.items():
                 took, worked, peak = run(command)
@@ -131,8 +135,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
                     busy[name].append(worked)
                     peaks[name] = max(peaks[name], peak)
                 output.unlink(missing_ok=True)
-            parts.append(json.loads(report.read_text())["results"][0]["timings"])
-            report.unlink()
+                if name in parts:
+                    parts[name].append(json.loads(report.read_text())["results"][0]["timings"])
+                    report.unlink()
     medians = {name: statistics.median(values) for name, values in seconds.items()}
     for name, values in seconds.items():
         every = " ".join(f"{value:.2f}" for value in values)
@@ -140,12 +145,29 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"{name:8} {medians[name]:6.2f} s ({every}), {statistics.median(busy[name]):.2f} s of "
             f"the processor, peak {peaks[name]:.0f} MB of its own"
         )
-    for name in parts[0]:
-        print(f"    {name:9} {statistics.median(part[name] for part in parts[1:]):6.2f}")
-    if other in medians:
-        ratio = medians["prune"] / medians[other]
-        print(f"prune / {other}: {ratio:.2f}, target at most {TARGET_RATIO[other]:g}")
-    print(f"memory: {peaks['prune']:.0f} MB, target at most {TARGET_MEMORY[other]:g}")
+    for name, of_runs in parts.items():
+        tell(name, of_runs[1:], medians[name], medians.get(other), other)
+        print(f"{name}: memory {peaks[name]:.0f} MB, target at most {TARGET_MEMORY[other]:g}")
+
+
+def tell(
+    name: str, runs: Sequence[dict[str, float]], seconds: float, others: float | None, other: str
+) -> None:
+    """Print the medians of a prune's steps, and its time against that of another command.
+
+    Parameters
+    ----------
+    name, other : str
+        Of the two.
+    runs : sequence of dict
+        Seconds of each step.
+    seconds, others : float or None
+        Of both; None if the other was not run.
+    """
+    for step in runs[0]:
+        print(f"    {name:8} {step:9} {statistics.median(run[step] for run in runs):6.2f}")
+    if others is not None:
+        print(f"{name} / {other}: {seconds / others:.2f}, target at most {TARGET_RATIO[other]:g}")
 
 
 if __name__ == "__main__":
