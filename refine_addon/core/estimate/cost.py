@@ -15,12 +15,12 @@ ROUNDS = 2.5
 SHARES = (0.1, 0.3, 0.5, 0.55, 0.7, 0.9)
 """Shares removed for which the next two hold; between them they are interpolated."""
 
-ABSORBING = (0.1, 0.5, 0.65, 1.4, 1.6, 2.3)
+ABSORBING = (0.1, 0.5, 0.65, 1.4, 1.8, 2.4)
 """How many times as long as measuring once absorbing takes after that: more stages, more time.
 
 These and the next are processor times of `room_small`, of one thread."""
 
-REFITTING = (23.0, 20.0, 14.0, 14.0, 13.0, 10.0)
+REFITTING = (23.0, 20.0, 14.0, 14.0, 10.0, 7.0)
 """The same of refitting."""
 
 
