@@ -37,8 +37,10 @@ import bpy  # noqa: E402
 import numpy as np  # noqa: E402
 
 import refine_addon  # noqa: E402
+from refine_addon.core.splats import SH_C0  # noqa: E402
 from refine_addon.mesh import scores as mesh_scores  # noqa: E402
-from refine_addon.ui import preview  # noqa: E402
+from refine_addon.mesh.attributes import read_attribute, write_attribute  # noqa: E402
+from refine_addon.ui.render_operators import IMAGE  # noqa: E402
 
 
 def training_cameras(path: Path) -> int:
@@ -64,19 +66,31 @@ def quiet() -> Iterator[None]:
         os.close(kept)
 
 
-def picture(name: str, mode: str) -> Path:
+def picture(name: str) -> Path:
     """Render what the camera sees of the splats into ``out/``; return the file."""
-    scene, obj = bpy.context.scene, bpy.context.object
-    preview.show(obj, mode)
-    scene.render.filepath = str(OUT / name)
     with quiet():
-        bpy.ops.render.render(write_still=True)
-    preview.hide(obj)
+        bpy.ops.refine.render()
+    bpy.data.images[IMAGE].save(filepath=str(OUT / name))
     return OUT / name
 
 
+def heat_map(name: str) -> Path:
+    """Do the same with each splat in the colour of its rank."""
+    obj, own = bpy.context.object, bpy.context.object.data
+    obj.data = own.copy()
+    colors = read_attribute(obj.data, "refine_heat")
+    for channel in range(3):
+        coefficients = (colors[:, channel] - 0.5) / SH_C0
+        write_attribute(obj.data, f"f_dc_{channel}", "FLOAT", coefficients)
+    for attribute in [a.name for a in obj.data.attributes if a.name.startswith("f_rest_")]:
+        write_attribute(obj.data, attribute, "FLOAT", np.zeros(len(colors)))
+    path = picture(name)
+    obj.data = own
+    return path
+
+
 def side_by_side(pictures: list[Path], target: Path) -> None:
-    """Join pictures of one size from left to right: the README's picture."""
+    """Join pictures of one size from left to right."""
     pixels = []
     for path in pictures:
         image = bpy.data.images.load(str(path))
@@ -107,19 +121,18 @@ def main() -> None:
     scene = bpy.context.scene
     scene.camera = bpy.data.objects[CAMERA]
     scene.render.resolution_percentage = PERCENTAGE
-    preview.set_up_render(scene)
 
     scored = time.perf_counter()
     bpy.ops.refine.score()
     scored = time.perf_counter() - scored
     record = mesh_scores.record(splats.data)
     print(f"scored by {record['views_used']} views in {scored:.2f} s")
-    pictures = [picture("before.png", "COLOR"), picture("heat_map.png", "HEAT")]
+    pictures = [picture("before.png"), heat_map("heat_map.png")]
 
     scene.refine.ratio = 0.5
     bpy.ops.refine.apply()
     after = len(splats.data.vertices)
-    pictures.append(picture("after.png", "COLOR"))
+    pictures.append(picture("after.png"))
     bpy.ops.refine.export_ply(filepath=str(OUT / "room_half.ply"), overwrite=True)
     before_after = [pictures[0], pictures[2], pictures[1]]
     side_by_side(before_after, OUT / "demo.jpg")

@@ -15,6 +15,8 @@ from .ui import (
     plans,
     price,
     properties,
+    render_notice,
+    render_operators,
     running,
     select_tools,
     transforms,
@@ -52,6 +54,7 @@ from .ui.remedies import (
     REFINE_OT_leave_out,
     REFINE_OT_turn_cameras,
 )
+from .ui.render_operators import REFINE_OT_render
 from .ui.select_operators import (
     REFINE_OT_delete_selected,
     REFINE_OT_grow_selection,
@@ -62,7 +65,7 @@ from .ui.select_operators import (
 from .ui.select_panel import REFINE_PT_select
 from .ui.select_tools import REFINE_OT_brush_radius, REFINE_OT_select_stroke
 from .ui.transforms import REFINE_OT_bake_transform, REFINE_OT_join, REFINE_OT_mend
-from .ui.view_operators import REFINE_OT_preview, REFINE_OT_view
+from .ui.view_operators import REFINE_OT_view
 from .ui.volumes import (
     REFINE_OT_add_volume,
     REFINE_OT_crop,
@@ -96,8 +99,8 @@ CLASSES = (
     REFINE_OT_score,
     REFINE_OT_apply,
     REFINE_OT_compare,
-    REFINE_OT_preview,
     REFINE_OT_view,
+    REFINE_OT_render,
     REFINE_OT_convert,
     REFINE_OT_bake_transform,
     REFINE_OT_join,
@@ -137,6 +140,8 @@ def register() -> None:
     bpy.types.Scene.refine = PointerProperty(type=RefineSettings)
     bpy.types.TOPBAR_MT_file_import.append(_draw_import)
     bpy.types.TOPBAR_MT_file_export.append(_draw_export)
+    bpy.types.TOPBAR_MT_render.append(render_operators.draw_menu)
+    render_notice.register()
     camera_list.register()
     panel_cache.register()
     properties.register()
@@ -165,6 +170,8 @@ def unregister() -> None:
     properties.unregister()
     panel_cache.unregister()
     camera_list.unregister()
+    render_notice.unregister()
+    bpy.types.TOPBAR_MT_render.remove(render_operators.draw_menu)
     bpy.types.TOPBAR_MT_file_export.remove(_draw_export)
     bpy.types.TOPBAR_MT_file_import.remove(_draw_import)
     del bpy.types.Scene.refine

@@ -31,6 +31,19 @@ def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     RefineError
         If a file that would be replaced cannot be looked into.
     """
+    if options.command == "render":
+        _check_render(parser, options)
+    else:
+        _check_splats(parser, options)
+
+
+def _check_render(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    if not options.scene:
+        parser.error("render needs Blender: blender -b scene.blend --command refine render")
+
+
+def _check_splats(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Do what `check` does for subcommands that go from splats to splats."""
     if options.command == "prune" and not options.together:
         _refuse_urls(parser, options)
     _check_report(parser, options)

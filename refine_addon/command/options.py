@@ -70,6 +70,11 @@ EXAMPLES = {
     ),
     "convert": ("refine convert in.ply out.spz",),
     "info": ("refine info in.ply", "refine info *.ply --report report.json"),
+    "render": (
+        f"{BLENDER}refine render",
+        f"{BLENDER}refine render --animation",
+        f"{BLENDER}refine render --frames 1:250:10",
+    ),
 }
 """Under the help of each subcommand."""
 
@@ -104,6 +109,7 @@ def make_parser() -> argparse.ArgumentParser:
     info = _add(commands, "info", "say what is in files of splats")
     info.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help="files of splats")
     _add_common(info)
+    _add_render(commands)
     return parser
 
 
@@ -303,6 +309,22 @@ def _add_convert(commands: Any) -> None:  # noqa: ANN401 - argparse does not nam
     convert.add_argument("inputs", nargs=1, type=_given, metavar="IN", help="known by its content")
     convert.add_argument("output", type=_path, metavar="OUT", help=f"by its suffix: {FORMATS}")
     _add_common(convert)
+
+
+def _add_render(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
+    render = _add(commands, "render", "render the open scene with splats, by its output settings")
+    chosen = render.add_mutually_exclusive_group()
+    chosen.add_argument(
+        "--animation", action="store_true", help="all frames of the scene, not only the current one"
+    )
+    chosen.add_argument(
+        "--frames",
+        type=_frames,
+        metavar="A:B:STEP",
+        help="frame A and every STEP-th after it to B (every one without STEP)",
+    )
+    render.add_argument("--quiet", action="store_true", help="print errors only")
+    render.set_defaults(inputs=[], report=None)
 
 
 def _add_object(parser: argparse.ArgumentParser) -> None:

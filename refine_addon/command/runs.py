@@ -16,6 +16,13 @@ from .score import score
 if TYPE_CHECKING:
     import argparse
 
+
+def _render(run: Run) -> None:
+    from .render import render  # noqa: PLC0415 - needs Blender
+
+    render(run)
+
+
 SUBCOMMANDS = {
     "prune": prune,
     "score": score,
@@ -23,6 +30,7 @@ SUBCOMMANDS = {
     "lod": lod,
     "convert": convert,
     "info": info,
+    "render": _render,
 }
 
 

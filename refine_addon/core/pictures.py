@@ -1,8 +1,6 @@
 """Pictures of views before and after pruning, drawn on the processor: a truth beside the estimate.
 
-Every pixel is computed as a ray is (`seeing.cast`): footprints by EWA splatting, blended front to
-back, colours of the direction of view. Pictures agree with those of the reference renderer of the
-benchmarks to 75 dB and more.
+How they are drawn is said in `drawing`.
 """
 
 from __future__ import annotations
@@ -12,22 +10,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .drawing import picture
 from .estimate.psnr import psnr_of
 from .rendering import NEAR_RELATIVE
 from .seeing import frustum, projection
-from .seeing.cast import hits
 from .seeing.ray_sample import colors_from
-from .seeing.ray_sums import in_front
-from .seeing.rays import LOG_OPAQUE
 from .views import ViewSet
-from .work import Progress, for_chunks, part, silent
+from .work import Progress, part, silent
 
 if TYPE_CHECKING:
-    from typing import Any
-
     from numpy.typing import NDArray
 
-    from .seeing.projection import Footprints, Gaussians
+    from .seeing.projection import Gaussians
     from .seeing.scene import Scene
     from .splats import Splats
     from .views import View
@@ -40,9 +34,6 @@ CAMERAS = 3
 
 AMPLIFIED = 8
 """Factor by which the difference of two pictures is shown larger."""
-
-_PIXELS = 1 << 15  # drawn at a time, about, which limits temporary memory
-_PAIRS = 1 << 18  # pairs of footprint and pixel at a time
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,75 +158,9 @@ def _pictures(
         with np.errstate(under="ignore"):
             footprints = projection.project(gaussians, scene, view)
             colors = colors_from(splats, gaussians.index[footprints.index], view)
-        pictures.append(_picture(footprints, colors, view, progress_of_view, threads))
+        drawn = picture(footprints, colors, view, progress=progress_of_view, threads=threads)
+        pictures.append(drawn[:3])
     return pictures
-
-
-def _picture(
-    footprints: Footprints,
-    colors: NDArray[np.float64],
-    view: View,
-    progress: Progress,
-    threads: int | None,
-) -> NDArray[np.float64]:
-    """Return a picture, (3, H, W), 0..1, of footprints of these colours, (3, n), in a view."""
-
-    def work(piece: slice) -> NDArray[np.float64]:
-        rows = np.arange(piece.start, piece.stop)
-        with np.errstate(under="ignore"):
-            strip = _strip(footprints, colors, np.arange(view.width), rows)
-        return strip.reshape(3, len(rows), view.width)
-
-    rows = max(_PIXELS // view.width, 1)
-    strips = for_chunks(work, view.height, rows, progress=progress, what="drawing", threads=threads)
-    return np.concatenate(strips, axis=1).clip(0.0, 1.0)
-
-
-def _strip(
-    footprints: Footprints,
-    colors: NDArray[np.float64],
-    columns: NDArray[np.int64],
-    rows: NDArray[np.int64],
-) -> NDArray[np.float64]:
-    """Return the colours of the pixels in C columns and R rows, ascending, (3, R * C).
-
-    Footprints come front to back, some at a time; pixels through which nothing more is seen are
-    left out of those that follow. Their colours are (3, n) float64.
-    """
-    pixels = len(columns) * len(rows)
-    log_left, image = np.zeros(pixels), np.zeros((3, pixels))  # logarithm of the transmittance
-
-    def unfinished(pixel: NDArray[np.int32]) -> NDArray[np.bool_]:
-        return np.asarray((log_left > LOG_OPAQUE).take(pixel))
-
-    for owner, pixel, alpha in hits(footprints, columns, rows, _PAIRS, unfinished):
-        order = np.argsort(pixel.astype(np.min_scalar_type(pixels)), kind="stable")
-        sorted_owner, sorted_pixel = owner[order], pixel[order]
-        weight = _weights(sorted_pixel, alpha[order], log_left)
-        for channel in range(3):
-            light = weight * colors[channel].take(sorted_owner)
-            image[channel] += np.bincount(sorted_pixel, light, pixels)
-    return image
-
-
-def _weights(
-    pixel: NDArray[Any], alpha: NDArray[np.float32], log_left: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the share of its pixel that each hit makes up, (h,), and darken what lies behind.
-
-    Hits come pixel by pixel, ascending, and front to back in each. `log_left`, (P,), is the
-    logarithm of the transmittance of each pixel in front of these hits; afterwards behind them.
-    """
-    if not len(pixel):
-        return np.empty(0)
-    log_passed = np.log1p(-alpha).astype(np.float64)
-    first = np.flatnonzero(np.diff(pixel, prepend=-1))
-    counts = np.diff(np.append(first, len(pixel)))
-    log_front = in_front(log_passed, counts)
-    log_front += np.repeat(log_left[pixel[first]], counts)
-    last = first + counts - 1
-    log_left[pixel[first]] = log_front[last] + log_passed[last]
-    return np.where(log_front > LOG_OPAQUE, alpha * np.exp(log_front), 0.0)
 
 
 def _rounded(picture: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -223,7 +223,7 @@ def surfaces(
     ends = np.full(len(columns) * len(rows), np.inf, np.float32)
     thickness = np.zeros(len(ends))  # optical, of what rays have met
     limit = -math.log(LIGHT_LEFT)
-    pieces = hits(footprints, columns, rows, _PAIRS, lambda rays: np.isinf(ends[rays]))
+    pieces = hits(footprints, columns, rows, _PAIRS, lambda _, rays: np.isinf(ends[rays]))
     for owners, rays, alphas in pieces:
         order = np.argsort(rays, kind="stable")  # hits of a ray stay front to back
         ray, thick = rays[order], -np.log1p(-alphas[order].astype(np.float64))

@@ -12,7 +12,7 @@ import bpy
 
 from ..core.errors import RefineError
 from . import attributes as mesh_attributes
-from . import drift, heat_map, native
+from . import drift, native
 from .edit import check_changeable, group_weights
 from .layout import KINDS, STORAGE, SplatObject, check, rest_count
 from .node_trees import add, chain, new_tree
@@ -167,7 +167,7 @@ def _copy_attributes(checked: SplatObject, data: bpy.types.ID) -> None:
 
     Raise `RefineError` if one has a name that the new form needs for another.
     """
-    moved = {column.attribute for column in _moved(checked)} | {heat_map.COLOR}  # of a preview
+    moved = {column.attribute for column in _moved(checked)}
     needed = set(data.attributes.keys())
     for attribute in list(checked.mesh.attributes):
         name = attribute.name

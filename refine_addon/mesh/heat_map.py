@@ -6,17 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..core.splats import base_color, opacity
 from . import attributes as mesh_attributes
 
 if TYPE_CHECKING:
     import bpy
     from numpy.typing import NDArray
 
-    from .layout import SplatObject
-
-HEAT, COLOR = "refine_heat", "refine_color"
-"""Colour attributes on points: the heat map, and the splat's own constant colour."""
+HEAT = "refine_heat"
+"""Colour attribute on points."""
 
 _STEPS = 256
 _KNEE = 0.0031308
@@ -58,12 +55,3 @@ def write(mesh: bpy.types.Mesh, ranks: NDArray[np.float64]) -> None:
     colors[:, :3] = ramp()
     index = np.clip(ranks * (_STEPS - 1) + 0.5, 0, _STEPS - 1).astype(np.uint8)
     mesh_attributes.write_attribute(mesh, HEAT, "BYTE_COLOR", colors[index])
-
-
-def write_base_color(checked: SplatObject) -> None:
-    """Store the constant colour of each splat, with its opacity as alpha, as `COLOR`."""
-    splats = mesh_attributes.splats_from_object(checked, sh_rest=False)
-    colors = np.empty((len(splats), 4), np.float32)
-    colors[:, :3] = base_color(splats.sh_dc)
-    colors[:, 3] = opacity(splats.opacity_logits)
-    mesh_attributes.write_attribute(checked.mesh, COLOR, "BYTE_COLOR", np.nan_to_num(colors))

@@ -1,4 +1,4 @@
-"""Building node trees: what geometry nodes and materials of ours have in common."""
+"""Building geometry node groups."""
 
 from __future__ import annotations
 
@@ -51,32 +51,3 @@ def add(tree: bpy.types.NodeTree, kind: str, **settings: Any) -> bpy.types.Node:
     for name, value in settings.items():
         setattr(node, name, value)
     return node
-
-
-def math(
-    tree: bpy.types.NodeTree, operation: str, *inputs: bpy.types.NodeSocket | float
-) -> bpy.types.NodeSocket:
-    """Add a math node with numbers or sockets as its inputs, and return its value."""
-    node = add(tree, "ShaderNodeMath", operation=operation)
-    for socket, value in zip(node.inputs, inputs, strict=False):
-        if isinstance(value, bpy.types.NodeSocket):
-            tree.links.new(value, socket)
-        else:
-            socket.default_value = value
-    return node.outputs[0]
-
-
-def vector_math(
-    tree: bpy.types.NodeTree, operation: str, *inputs: bpy.types.NodeSocket
-) -> bpy.types.NodeSocket:
-    """Add a vector math node, and return its result: a number for a dot product."""
-    node = add(tree, "ShaderNodeVectorMath", operation=operation)
-    for socket, value in zip(node.inputs, inputs, strict=False):
-        tree.links.new(value, socket)
-    return node.outputs["Value" if operation == "DOT_PRODUCT" else "Vector"]
-
-
-def logistic(tree: bpy.types.NodeTree, value: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-    """Add nodes that turn a logit into 0..1."""
-    decay = math(tree, "EXPONENT", math(tree, "MULTIPLY", value, -1.0))
-    return math(tree, "DIVIDE", 1.0, math(tree, "ADD", 1.0, decay))

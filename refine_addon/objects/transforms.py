@@ -54,7 +54,6 @@ _OF_ALL = (
     mesh_scores.SEEN,
     mesh_scores.SCORED,
     heat_map.HEAT,
-    heat_map.COLOR,
     mesh_edit.REMOVE,
     mesh_edit.FORCE,
 )

@@ -61,9 +61,10 @@ class REFINE_OT_import_cameras(AskedFirst, Needing, bpy.types.Operator, ImportHe
 
     filename_ext = ".json"
     filter_glob: StringProperty(default="*.json;*.bin;*.txt", options={"HIDDEN"})
-    files: CollectionProperty(  # without it Blender cannot ask about files that are dropped
+    files: CollectionProperty(  # without them Blender cannot ask about files that are dropped
         type=bpy.types.OperatorFileListElement, options={"HIDDEN", "SKIP_SAVE"}
     )
+    directory: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "SKIP_SAVE"})
     upright: BoolProperty(
         name="Upright",
         description=UPRIGHT_TEXT + ". Choose what you chose for the splats",

@@ -23,13 +23,12 @@ from ..mesh import scores as mesh_scores
 from ..mesh.records import parsed
 from ..objects import splat_group
 from . import plans
+from .images import put
 from .on_thread import OnThread
 from .operator_bases import Answer, OnScored
 from .operators import apply_task
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from ..core.splats import Splats
     from ..core.task import Task
     from ..core.work import Progress
@@ -40,9 +39,6 @@ NAMES = {kind: f"Compare: {kind}" for kind in KINDS}
 
 MEASURED = "refine_measured"
 """Custom property of the mesh: what was measured last, and of which plan, as JSON."""
-
-_OURS = "refine_compare"
-"""Custom property of these images: the name. An image without it is the user's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +93,7 @@ class REFINE_OT_compare(OnThread, OnScored, bpy.types.Operator):
         """Put the pictures into images, show them, and say how close they are."""
         comparison, estimated = result
         _note(context, comparison)
-        images = [_image(NAMES[kind], getattr(comparison, kind)) for kind in KINDS]
+        images = [put(NAMES[kind], getattr(comparison, kind) / np.float32(255.0)) for kind in KINDS]
         if not bpy.app.background and context.window is not None:
             _show(context, images)
         about = "" if estimated is None else f"; {in_words(estimated)} estimated in all views"
@@ -134,25 +130,6 @@ def _identity(obj: bpy.types.Object, plan: dict[str, Any]) -> list[Any]:
     """Return what tells a plan, and the scores it goes by, from others."""
     scoring = zlib.crc32(str(obj.data.get(mesh_scores.RECORD)).encode())
     return [plan["key"], plan["splats"], scoring]
-
-
-def _image(name: str, pixels: NDArray[np.uint8]) -> bpy.types.Image:
-    """Return an image of the file that holds pixels, (H, W, 3), in place of the one before."""
-    height, width = pixels.shape[:2]
-    ours = (each for each in bpy.data.images if not each.library and each.get(_OURS) == name)
-    old = next(ours, None)
-    image = bpy.data.images.new(name, width, height)
-    image[_OURS] = name
-    rgba = np.ones((height, width, 4), np.float32)
-    rgba[..., :3] = pixels[::-1] / np.float32(255.0)  # Blender's first row is the lowest
-    image.pixels.foreach_set(rgba.ravel())
-    image.pack()  # or Blender asks on leaving whether to save it
-    if old is not None:
-        old.user_remap(image)
-        name = old.name
-        bpy.data.images.remove(old)
-        image.name = name
-    return image
 
 
 def _show(context: bpy.types.Context, images: list[bpy.types.Image]) -> None:

@@ -21,8 +21,8 @@ from . import (
     camera_list,
     compare,
     plans,
-    preview,
     price,
+    render_operators,
     running,
     staleness,
     transforms,
@@ -247,9 +247,7 @@ class REFINE_PT_preview(_InSidebar, bpy.types.Panel):
         obj = context.object
         splats = mesh_layout.looks_like_splats(obj)
         _draw_modes(layout, obj if splats else None)
-        mode = preview.shown(obj) if splats else ""
-        button = layout.operator("refine.preview", icon="RENDER_STILL", depress=bool(mode))
-        button.mode = "OFF" if mode else "COLOR"
+        render_operators.draw_buttons(layout)
 
 
 class REFINE_PT_apply(_InSidebar, bpy.types.Panel):

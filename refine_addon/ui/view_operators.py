@@ -1,6 +1,6 @@
-"""Operators that show splats: drawn in the 3D views, or in renders."""
+"""The operator that draws splats in the 3D views."""
 
-# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
+# ruff: noqa: D400, N801, RUF012, TC001, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
 from typing import Any
@@ -9,8 +9,7 @@ import bpy
 from bpy.props import EnumProperty
 
 from ..viewport import draw
-from . import preview
-from .operator_bases import Answer, AtOnce, Needing, on_splats, out_of_edit_mode
+from .operator_bases import Answer
 
 MODES = (
     ("OFF", "Off", "Show the plain points of the mesh again"),
@@ -43,32 +42,4 @@ class REFINE_OT_view(bpy.types.Operator):
     def execute(self, _context: bpy.types.Context) -> Answer:
         """Draw, or stop it."""
         draw.show(self.mode)
-        return {"FINISHED"}
-
-
-class REFINE_OT_preview(AtOnce, Needing, bpy.types.Operator):
-    """Let renders show the splats as they are; sets the scene to Cycles, without light and with the view transform Standard"""  # noqa: E501 - a tooltip is one line
-
-    bl_idname = "refine.preview"
-    bl_label = "Show in Renders"
-    bl_options = {"REGISTER", "UNDO"}
-    needs = (on_splats, out_of_edit_mode)
-
-    mode: EnumProperty(
-        name="Show",
-        description="What renders show",
-        items=(
-            ("COLOR", "Colour", "The splats' own colours"),
-            ("HEAT", "Heat Map", "Rank of each splat: dark goes first, yellow last"),
-            ("OFF", "Off", "Nothing but the plain mesh"),
-        ),
-    )
-
-    def act(self, context: bpy.types.Context) -> Answer:
-        """Add, change or remove what renders show."""
-        if self.mode == "OFF":
-            preview.hide(context.object)
-        else:
-            preview.show(context.object, self.mode)
-            preview.set_up_render(context.scene)
         return {"FINISHED"}

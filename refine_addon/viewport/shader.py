@@ -39,7 +39,8 @@ struct ViewData {
 };
 """
 """size: pixels across, pixels up, near, texels of depth per pixel. choices: perspective, whether
-depth is tested, whether there are veils, 0."""
+depth is tested, whether there are veils, whether what is behind the tested depth is drawn and not
+what is in front."""
 
 _SPLAT_VERTEX = """
 #define value_at(values, row) texelFetch(values, ivec2((row) % WIDTH, (row) / WIDTH), 0)
@@ -128,7 +129,7 @@ void main()
       /* Blender 5 gives meshes a depth that X-ray shows transparent. */
       occluder = abs(occluder - veil) < SAME_DEPTH ? 1.0 : occluder;
     }
-    if (gl_FragCoord.z > occluder) {
+    if ((gl_FragCoord.z > occluder) != (view_data.choices.w > 0.5)) {
       discard;
     }
   }
@@ -218,6 +219,39 @@ def texture(values: NDArray[np.float32], channels: int, kind: str) -> gpu.types.
     size = (values.shape[1] // channels, values.shape[0])
     flat = np.ascontiguousarray(values, np.float32).reshape(-1)
     return gpu.types.GPUTexture(size, format=kind, data=gpu.types.Buffer("FLOAT", len(flat), flat))
+
+
+def blend(
+    frame: gpu.types.GPUFrameBuffer,
+    textures: dict[str, gpu.types.GPUTexture],
+    numbers: NDArray[np.float32],
+    count: int,
+) -> None:
+    """Draw splats into a cleared framebuffer.
+
+    Parameters
+    ----------
+    frame : gpu.types.GPUFrameBuffer
+    textures : dict of str to gpu.types.GPUTexture
+        What the shader of `splats` reads; held by the caller until they are drawn.
+    numbers : (24,) float32
+        ``ViewData``.
+    count : int
+        How many splats of the order.
+    """
+    block = gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", len(numbers), numbers))
+    with frame.bind():
+        frame.clear(color=(0.0, 0.0, 0.0, 0.0))
+        if count:
+            program, quad = splats()
+            gpu.state.blend_set("ALPHA_PREMULT")
+            gpu.state.depth_test_set("NONE")
+            program.bind()
+            program.uniform_block("view_data", block)
+            for name, texture in textures.items():
+                program.uniform_sampler(name, texture)
+            quad.draw_instanced(program, instance_count=count)
+            gpu.state.blend_set("NONE")
 
 
 def _program(

@@ -297,20 +297,9 @@ class View:
             "veils": layer.colors,
             "veil_depths": layer.depths,
         }  # held until they are drawn: the shader does not keep what it is given
-        block = _view_data(camera, size, solid=depths is not None, veiled=veils is not None)
+        numbers = _view_data(camera, size, solid=depths is not None, veiled=veils is not None)
         frame = gpu.types.GPUFrameBuffer(color_slots=self._picture)
-        with frame.bind():
-            frame.clear(color=(0.0, 0.0, 0.0, 0.0))
-            if self._order.count:
-                program, quad = shader.splats()
-                gpu.state.blend_set("ALPHA_PREMULT")
-                gpu.state.depth_test_set("NONE")
-                program.bind()
-                program.uniform_block("view_data", block)
-                for name, texture in textures.items():
-                    program.uniform_sampler(name, texture)
-                quad.draw_instanced(program, instance_count=self._order.count)
-                gpu.state.blend_set("NONE")
+        shader.blend(frame, textures, numbers, self._order.count)
 
 
 def _matrix_rows(shown: list[Shown]) -> NDArray[np.float32]:
@@ -323,13 +312,13 @@ def _matrix_rows(shown: list[Shown]) -> NDArray[np.float32]:
 
 def _view_data(
     camera: Camera, size: tuple[int, int], *, solid: bool, veiled: bool
-) -> gpu.types.GPUUniformBuf:
+) -> NDArray[np.float32]:
     """Return what the shader knows of a view as ``ViewData``, for a picture of this size."""
     numbers = np.zeros(24, np.float32)
     numbers[:16] = camera.projection.T.reshape(-1)
     numbers[16:20] = (*size, camera.near, camera.size[0] / size[0])
     numbers[20:23] = (camera.perspective, solid, veiled)
-    return gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", len(numbers), numbers))
+    return numbers
 
 
 def _parts(shown: Iterable[Shown], camera: Camera) -> list[_Part]:

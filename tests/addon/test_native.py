@@ -522,12 +522,6 @@ def test_a_missing_or_wrong_attribute_of_a_point_cloud_is_named(addon, core, clo
         addon.mesh.layout.check(cloud)
 
 
-def test_a_point_cloud_is_not_shown_in_renders_as_splats(addon, cloud):
-    """The nodes read the attributes of a mesh."""
-    with pytest.raises(addon.core.RefineError, match="convert it to a mesh"):
-        addon.ui.preview.show(cloud, "COLOR")
-
-
 def test_a_point_cloud_with_the_names_of_a_file_holds_splats(addon, room, tmp_path):
     """What geometry nodes make of a splat mesh: a file's values on points, byte for byte."""
     obj = point_cloud(len(room.data.vertices), "points")

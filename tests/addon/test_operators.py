@@ -179,7 +179,7 @@ def test_apply_is_one_undo_step(room, room_cameras):  # noqa: ARG001
 
 
 @pytest.mark.parametrize(
-    "name", ["score", "apply", "import_ply", "import_cameras", "levels", "preview", "convert"]
+    "name", ["score", "apply", "import_ply", "import_cameras", "levels", "convert"]
 )
 def test_operators_that_change_the_scene_can_be_undone(name):
     """Blender pushes an undo step for operators with UNDO."""
@@ -493,11 +493,11 @@ def test_edit_mode_greys_the_buttons(room, room_cameras):  # noqa: ARG001
     bpy.ops.object.mode_set(mode="EDIT")
     polls = [
         getattr(bpy.ops.refine, name).poll()
-        for name in ("score", "apply", "export_ply", "import_ply", "preview")
+        for name in ("score", "apply", "export_ply", "import_ply")
     ]
     bpy.ops.object.mode_set(mode="OBJECT")
 
-    assert polls == [False] * 5
+    assert polls == [False] * 4
 
 
 @pytest.mark.parametrize("how", ["hide_set", "hide_viewport", "exclude"])
@@ -571,7 +571,6 @@ def test_a_home_folder_of_nobody_is_refused_in_a_sentence(addon):
         ("ui.import_operators", "read_splats", "import_ply", {"filepath": "in.ply"}),
         ("ui.camera_import", "read_cameras", "import_cameras", {"filepath": "cameras.json"}),
         ("ui.export_operators", "as_written", "export_ply", {"filepath": "out.ply"}),
-        ("ui.preview", "show", "preview", {}),
     ],
 )
 @pytest.mark.usefixtures("room_cameras")

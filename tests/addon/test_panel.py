@@ -103,7 +103,7 @@ def test_an_empty_scene_says_what_to_do_first(draw):
     """All six steps are there from the start."""
     drawn = draw()
 
-    buttons = ["import_ply", "import_cameras", "score", "view", "preview", "apply", "export_ply"]
+    buttons = ["import_ply", "import_cameras", "score", "view", "render", "apply", "export_ply"]
     assert [b for b in buttons if f"refine.{b}" in drawn] == buttons
     assert "Select an object that holds splats" in drawn
 
@@ -113,8 +113,6 @@ def test_each_step_shows_what_came_of_it(draw, room, room_cameras):  # noqa: ARG
     imported = draw()
     bpy.ops.refine.score()
     scored = draw()
-    bpy.ops.refine.preview(mode="HEAT")
-    draw()
     bpy.ops.refine.apply()
     applied = draw()
 

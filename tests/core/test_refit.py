@@ -68,7 +68,7 @@ def drawn(splats, view, fixed):
     return image
 
 
-def linear_of(splats, view, count=12):
+def linear_of(splats, view, count=12, *, geometry=True):
     """Return what `linear` says of a view, of which the first splats are refitted."""
     gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)))
     footprints = projection.project(gaussians, scene, view)
@@ -77,7 +77,7 @@ def linear_of(splats, view, count=12):
     footprints = replace(footprints, index=rank[footprints.index])
     rays = cast(footprints, COLUMNS, ROWS)
     colors = colors_from(splats, gaussians.index[rays.hit], view)
-    shapes = linear.Shapes.of(splats, gaussians.take(slice(count)), scene)
+    shapes = linear.Shapes.of(splats, gaussians.take(slice(count)), scene, geometry=geometry)
     return linear.linear_view(rays, footprints, colors, shapes, view)
 
 
@@ -121,6 +121,22 @@ def test_backward_is_the_transpose_of_forward():
     assert found.diagonal()[5, 3] == pytest.approx(
         float((found.forward(unit) ** 2).sum()), rel=1e-4
     )
+
+
+def test_colours_and_opacities_alone_have_the_derivatives_that_they_have_among_all():
+    every, alone = (linear_of(few(), ring()[0], geometry=geometry) for geometry in (True, False))
+    random = np.random.default_rng(1)
+    change = np.zeros((linear.COUNT, 12), np.float32)
+    change[: linear.MEAN.start] = random.normal(size=(4, 12))
+    errors = random.normal(size=every.colors.shape).astype(np.float32)
+
+    np.testing.assert_allclose(alone.forward(change), every.forward(change), atol=1e-6)
+    for one, other in (
+        (alone.backward(errors), every.backward(errors)),
+        (alone.diagonal(), every.diagonal()),
+    ):
+        np.testing.assert_array_equal(one[: linear.MEAN.start], other[: linear.MEAN.start])
+        assert not one[linear.MEAN.start :].any()
 
 
 @pytest.mark.slow

@@ -139,6 +139,19 @@ def test_where_nothing_goes_nothing_is_refitted(small, views):
     assert "refitted" not in result.report
 
 
+def test_a_psnr_is_reached_with_fewer_splats_than_by_absorbing(small, views):
+    """To a dB by the estimate; the curve of refitting is tried, then put right by what it gave."""
+    splats = read_ply(small).splats()
+
+    absorbed, refitted = (
+        prune(splats, views, Budget(psnr=38.0), FEW, survivors=survivors)
+        for survivors in ("absorb", "refit")
+    )
+
+    assert refitted.report["estimated_psnr"] == pytest.approx(38.0, abs=1.0)
+    assert np.count_nonzero(refitted.keep) < 0.95 * np.count_nonzero(absorbed.keep)
+
+
 def test_levels_are_refitted_to_the_original(small, views):
     """The second, too, though it is made from the first: it is closer than without refitting."""
     splats = read_ply(small).splats()

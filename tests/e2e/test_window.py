@@ -195,6 +195,40 @@ def test_the_window_lives_while_splats_are_scored(binary: Binary, blend: Path, c
     assert found["imported"] == 39_755
 
 
+def test_the_first_minutes_hold_no_trap(binary: Binary, cloud: Path, cameras: Path):
+    """Dropped splats bring the 72 cameras beside them to Blender's own one, and their image size.
+
+    Dropped cameras are the last operation, which F9 adjusts: adjusting the splats would undo them.
+    After undo all 39,755 are drawn, without an event. The file is shown as it was saved, its plain
+    points hidden.
+    """
+    for path in (cloud, cameras):
+        shutil.copy(path, binary.work)
+    try:
+        found = binary.window_step(
+            "first_minutes",
+            cloud=binary.work / cloud.name,
+            cameras=binary.work / cameras.name,
+            pictures=binary.work,
+            blend=binary.work / "saved.blend",
+            asset=binary.work / "asset.spz",
+        )
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+
+    imported, dropped = found["imported"], found["dropped"]
+    assert (imported["splats"], imported["cameras"]) == (39_755, 1 + 72)
+    assert imported["size"] == [240, 160]
+    assert (dropped["cameras"], dropped["last"]) == (1 + 2 * 72, "REFINE_OT_import_cameras")
+    assert found["applied"]["splats"] == 19_878
+    assert found["drawn"] == [19_878, 39_755]
+    assert found["undone"]["splats"] == 39_755
+    assert found["reopened"] == ["HEAT", 39_755, "BOUNDS"]
+    assert found["exported"] < 39_755 * 30
+
+
 def _psnr(seen: dict, picture: Path, cloud: Path) -> float:
     """Return how close a view in a picture of the screen is to the reference renderer, dB."""
     view, window = np.array(seen["view"]), np.array(seen["window"])

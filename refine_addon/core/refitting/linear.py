@@ -69,20 +69,26 @@ class Shapes:
         Columns are the splat's axes in the scene's frame.
     scales : (M, 3) float64
         Standard deviations along these, scene sizes.
+    geometry : bool
+        Whether it is of interest how colours change with means, scales and turns.
     """
 
     gaussians: Gaussians
     scene: Scene
     axes: NDArray[np.float64]
     scales: NDArray[np.float64]
+    geometry: bool
 
     @classmethod
-    def of(cls, splats: Splats, gaussians: Gaussians, scene: Scene) -> Shapes:
+    def of(
+        cls, splats: Splats, gaussians: Gaussians, scene: Scene, *, geometry: bool = True
+    ) -> Shapes:
         """Return the shapes of the splats that some Gaussians were made of."""
         chosen = splats.take(gaussians.index)
         axes = np.einsum("ij,njk->nik", scene.axes, rotation_matrices(chosen.quaternions))
         logs = chosen.log_scales.astype(np.float64) - np.log(scene.size)
-        return cls(gaussians, scene, axes, np.exp(logs.clip(*projection.LOG_SCALE_RANGE)))
+        scales = np.exp(logs.clip(*projection.LOG_SCALE_RANGE))
+        return cls(gaussians, scene, axes, scales, geometry)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +109,8 @@ class LinearView:
         How the colour changes with alpha, ``T (c - B)``.
     alpha : (h,) float32
         0 where it is clipped, and does not change.
-    steepness : (2, h) float32
-        ``A d`` across and down, 1/px.
+    steepness : (2, h) float32, optional
+        ``A d`` across and down, 1/px; none if geometry does not change.
     slopes : Slopes
         Of the splats that are hit.
     """
@@ -116,7 +122,7 @@ class LinearView:
     weight: NDArray[np.float32]
     by_alpha: NDArray[np.float32]
     alpha: NDArray[np.float32]
-    steepness: NDArray[np.float32]
+    steepness: NDArray[np.float32] | None
     slopes: Slopes
 
     def forward(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -128,17 +134,12 @@ class LinearView:
             Of the parameters of all splats.
         """
         mine = change[:, self.rows]
-        constant, x, y, xx, xy, yy = self.slopes.polynomials(mine)
-        across, down = self.steepness
-        alpha = x.take(self.owner)
-        alpha += across * xx.take(self.owner)
-        alpha += down * xy.take(self.owner)
-        alpha *= across
-        by_down = y.take(self.owner)
-        by_down += down * yy.take(self.owner)
-        by_down *= down
-        alpha += by_down
-        alpha += constant.take(self.owner)
+        alpha = (self.slopes.opacity * mine[OPACITY][0]).take(self.owner)
+        if self.steepness is not None:
+            x, y, xx, xy, yy = (each.take(self.owner) for each in self.slopes.polynomials(mine))
+            across, down = self.steepness
+            alpha += across * (x + across * xx + down * xy)
+            alpha += down * (y + down * yy)
         alpha *= self.alpha
         result = np.empty((3, self.colors.shape[1]), np.float32)
         for channel in range(3):
@@ -155,7 +156,7 @@ class LinearView:
         ----------
         errors : (3, P) float32
         """
-        result = np.empty((COUNT, len(self.rows)))
+        result = np.zeros((COUNT, len(self.rows)))
         value = np.zeros(len(self.owner), np.float32)
         for channel in range(3):
             error = errors[channel].take(self.ray)
@@ -163,18 +164,22 @@ class LinearView:
             error *= self.weight
             result[channel] = self.slopes.light[channel] * self._sum(error)
         value *= self.alpha
-        across, down = self.steepness
-        x, y = value * across, value * down
-        moments = (value, x, y, x * across, x * down, y * down)
-        result[OPACITY.start :] = self.slopes.gradients([self._sum(each) for each in moments])
+        result[OPACITY] = self.slopes.opacity * self._sum(value)
+        if self.steepness is not None:
+            across, down = self.steepness
+            x, y = value * across, value * down
+            moments = (x, y, x * across, x * down, y * down)
+            result[MEAN.start :] = self.slopes.gradients([self._sum(each) for each in moments])
         return result
 
     def diagonal(self) -> NDArray[np.float64]:
         """Return the squared length of each column, that is of each parameter, (13, u)."""
-        result = np.empty((COUNT, len(self.rows)))
+        result = np.zeros((COUNT, len(self.rows)))
         result[COLOR] = np.square(self.slopes.light) * self._sum(np.square(self.weight))
         value = np.square(self.by_alpha).sum(axis=0) * np.square(self.alpha)
         result[OPACITY.start] = np.square(self.slopes.opacity) * self._sum(value)
+        if self.steepness is None:
+            return result
         x, y = self.steepness
         squares = (x * x, x * y, y * y)
         second = [value * each for each in squares]
@@ -210,25 +215,23 @@ class Slopes:
     quadratic: NDArray[np.float32]
 
     def polynomials(self, change: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-        """Return the coefficients of 1, x, y, x^2, x y, y^2 of changed splats, (u,) each.
+        """Return the coefficients of x, y, x^2, x y, y^2 of changed geometry, (u,) each.
 
         Parameters
         ----------
         change : (13, u) float32
         """
         return [
-            self.opacity * change[OPACITY][0],
             *np.einsum("kiu,ku->iu", self.linear, change[MEAN]),
             *np.einsum("kiu,ku->iu", self.quadratic, change[SCALE.start :]),
         ]
 
     def gradients(self, moments: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the transpose of `polynomials`: ten parameters of six sums, (10, u)."""
+        """Return the transpose of `polynomials`: nine parameters of five sums, (9, u)."""
         return np.concatenate(
             [
-                (self.opacity * moments[0])[None],
-                np.einsum("kiu,iu->ku", self.linear, np.stack(moments[1:3])),
-                np.einsum("kiu,iu->ku", self.quadratic, np.stack(moments[3:])),
+                np.einsum("kiu,iu->ku", self.linear, np.stack(moments[:2])),
+                np.einsum("kiu,iu->ku", self.quadratic, np.stack(moments[2:])),
             ]
         )
 
@@ -304,7 +307,7 @@ def linear_view(
     hit = rays.hit[:movable]
     return LinearView(
         shapes.gaussians.index[hit], seen.clip(0.0, 1.0), ray, owner, weight[kept], by_alpha, alpha,
-        _steepness(replace(rays, hit=hit), kept, footprints),
+        _steepness(replace(rays, hit=hit), kept, footprints) if shapes.geometry else None,
         _slopes(hit, unclipped[:, :movable], shapes, view),
     )  # fmt: skip
 
@@ -317,6 +320,11 @@ def _slopes(
     `unclipped`, (3, u), is where their colours are not clipped.
     """
     gaussians, scales = shapes.gaussians.take(hit), shapes.scales[hit]  # (u, 3)
+    light, opacity = unclipped * np.float32(SH_C0), np.float32(1.0) - gaussians.alphas
+    if not shapes.geometry:
+        return Slopes(
+            light, opacity, np.empty((3, 2, 0), np.float32), np.empty((6, 3, 0), np.float32)
+        )
     in_image = projection.jacobian(gaussians, shapes.scene, view)  # rows of J W, (u, 3) each
     x, y = (np.einsum("ui,uij->ju", each, shapes.axes[hit]) for each in in_image)  # (3, u) each
     longest, squared = scales.max(axis=1), np.square(scales).T  # (u,), (3, u)
@@ -332,8 +340,8 @@ def _slopes(
         axis=1,
     )
     return Slopes(
-        unclipped * np.float32(SH_C0),
-        np.float32(1.0) - gaussians.alphas,
+        light,
+        opacity,
         (longest * np.stack([x, y], axis=1)).astype(np.float32),
         np.concatenate([scaled, turns]).astype(np.float32),
     )

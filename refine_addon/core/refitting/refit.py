@@ -234,7 +234,10 @@ def refit_on(
         begin, middle, near, end = (
             0.04 + 0.96 * (number - 1 + share) / settings.rounds for share in (0.0, 0.4, 0.9, 1.0)
         )
-        linear = rays.linear(best.splats, number, part(progress, begin, middle))
+        linear = rays.linear(
+            best.splats, number,
+            geometry=settings.geometry, progress=part(progress, begin, middle),
+        )  # fmt: skip
         solver = _Solver(linear, rays.truths(number), movable, threads)
         damping = more * max(DAMPING * len(survivors) / rays.count(number), LEAST_DAMPING)
         change, told = solver.solve(damping, before, part(progress, middle, near))

@@ -245,7 +245,9 @@ class RoundRays:
         """Return how many rays a round has."""
         return sum(truth.colors.shape[1] for truth in self.truths(number))
 
-    def linear(self, splats: Splats, number: int, progress: Progress) -> list[LinearView]:
+    def linear(
+        self, splats: Splats, number: int, *, geometry: bool, progress: Progress
+    ) -> list[LinearView]:
         """Return how the colours of each view's rays change with survivors as they are now.
 
         Parameters
@@ -254,10 +256,12 @@ class RoundRays:
             The survivors.
         number : int
             Of the round, from 1.
+        geometry : bool
+            Whether it is wanted how they change with means, scales and turns.
         progress : callable
         """
         gaussians = self._gaussians(splats, part(progress, 0.0, 0.1))
-        shapes = Shapes.of(splats, gaussians, self.scene)
+        shapes = Shapes.of(splats, gaussians, self.scene, geometry=geometry)
         truths = self.truths(number)
         work = _Linearize(self.target(splats, gaussians), self.windows, truths, shapes)
         return self._each(work, truths, len(splats), part(progress, 0.1, 1.0))

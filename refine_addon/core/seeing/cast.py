@@ -99,7 +99,7 @@ def hits(
     columns: NDArray[np.int64],
     rows: NDArray[np.int64],
     limit: int,
-    unfinished: Callable[[NDArray[np.int32]], NDArray[np.bool_]] | None = None,
+    wanted: Callable[[NDArray[np.int64], NDArray[np.int32]], NDArray[np.bool_]] | None = None,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]]:
     """Yield which pixels footprints hit, some footprints at a time.
 
@@ -112,8 +112,8 @@ def hits(
     limit : int
         About how many pairs of a footprint and a pixel in its bounding box are looked at together,
         which limits temporary memory.
-    unfinished : callable, optional
-        Which of some pixels are of interest still, (p,) bool; by default all.
+    wanted : callable, optional
+        Which pairs of a footprint and a pixel are of interest, (p,) bool; by default all.
 
     Yields
     ------
@@ -135,8 +135,8 @@ def hits(
         checkpoint()
         owner, column, row = _boxed_pixels(boxed[start:end], across, down)
         pixel = row * np.int32(len(columns)) + column
-        if unfinished is not None:
-            left = np.flatnonzero(unfinished(pixel))
+        if wanted is not None:
+            left = np.flatnonzero(wanted(owner, pixel))
             owner, pixel = owner[left], pixel[left]
             column, row = column[left], row[left]
         squared = _mahalanobis(footprints, owner, columns.take(column), rows.take(row))

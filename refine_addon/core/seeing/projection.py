@@ -319,6 +319,11 @@ def in_camera(
     return _local(gaussians.means, scene, view), turned
 
 
+def depths(gaussians: Gaussians, scene: Scene, view: View) -> NDArray[np.float32]:
+    """Return how far Gaussians lie along the axis of a view, (M,), scene sizes."""
+    return np.asarray(_local(gaussians.means, scene, view)[2])
+
+
 def _computable(scene: Scene, view: View) -> bool:
     """Whether float32 can hold this view's coordinates; if not, the view counts as empty."""
     away = float(np.abs(view.center - scene.origin).max())

@@ -1,0 +1,37 @@
+"""What ``render`` does and says. Needs Blender."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import bpy
+
+from ..core import RefineError
+from ..core.work import Cancelled
+from ..render import frames
+from ..render.engine import Shared
+
+if TYPE_CHECKING:
+    from .run import Run
+
+
+def render(run: Run) -> None:
+    """Render frames of the open scene, each written where its output settings say."""
+    scene, options, shared = bpy.context.scene, run.options, Shared()
+    chosen = options.frames or range(scene.frame_current, scene.frame_current + 1)
+    if options.animation:
+        chosen = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+    try:
+        for step in frames.steps(scene, chosen, shared, write=True):
+            bpy.ops.render.render(scene=step.scene, animation=step.animation)
+    except Cancelled:
+        msg = "a render was stopped"
+        raise RefineError(msg) from None
+    except RuntimeError as error:  # what Blender reports
+        raise RefineError(str(error).strip()) from error
+    if shared.engine and shared.engine != scene.render.engine:
+        run.terminal.say(f"  all but splats by {shared.engine} in place of {scene.render.engine}")
+    for frame in dict.fromkeys(shared.frames):
+        run.terminal.say(f"frame {frame}: {scene.render.frame_path(frame=frame)}")
+    among = f" among what {shared.engine} rendered" if shared.engine else ""
+    run.terminal.say(f"  {shared.splats:,} splats{among}")

@@ -1,0 +1,102 @@
+"""Reading OpenEXR images of named channels, as Blender writes them for us: in one part, not packed.
+
+The layout is that of "OpenEXR File Layout" (Academy Software Foundation): a header of named
+attributes, a table of offsets, and then for each line its number, its size and its channels one
+after another, in the order of their names.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .errors import RefineError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+_MAGIC = 20000630
+_MULTI_PART = 0x1000  # flag of the version
+_LINE_HEAD = 8  # bytes: number and size of a line
+_TYPES = {1: "<f2", 2: "<f4"}  # of numbers in a channel
+
+
+def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
+    """Return the channels of an image by their names.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    mapping of str to (H, W) float32
+        The top row first.
+
+    Raises
+    ------
+    RefineError
+        If the file cannot be read, or is packed, has several parts, or channels of integers.
+    """
+    try:
+        data = path.read_bytes()
+        return _channels(data)
+    except OSError as error:
+        msg = f"{path}: cannot be read ({error.strerror or error})"
+        raise RefineError(msg) from error
+    except (ValueError, KeyError, IndexError, struct.error) as error:
+        msg = f"{path}: expected an OpenEXR image in one part, without compression; {error}"
+        raise RefineError(msg) from error
+
+
+def _channels(data: bytes) -> dict[str, NDArray[np.float32]]:
+    magic, version = struct.unpack_from("<II", data)
+    if magic != _MAGIC or version & _MULTI_PART:
+        msg = f"it begins with {magic}, version {version:#x}"
+        raise ValueError(msg)
+    header, start = _header(data)
+    if header["compression"] != b"\0":
+        msg = f"its compression is number {header['compression'][0]}"
+        raise ValueError(msg)
+    left, top, right, bottom = struct.unpack("<4i", header["dataWindow"])
+    width, height = right - left + 1, bottom - top + 1
+    line = np.dtype(
+        [("head", f"V{_LINE_HEAD}")]
+        + [(name, kind, (width,)) for name, kind in _names(header["channels"])]
+    )
+    lines = np.frombuffer(data, line, height, start + 8 * height)
+    names = line.names or ()
+    return {name: lines[name].astype(np.float32) for name in names if name != "head"}
+
+
+def _header(data: bytes) -> tuple[dict[str, bytes], int]:
+    """Return the attributes, and where the table of offsets begins."""
+    attributes, at = {}, 8
+    while data[at]:
+        name, at = _text(data, at)
+        _, at = _text(data, at)  # its type
+        (size,) = struct.unpack_from("<i", data, at)
+        attributes[name] = data[at + 4 : at + 4 + size]
+        at += 4 + size
+    return attributes, at + 1
+
+
+def _names(listed: bytes) -> list[tuple[str, str]]:
+    """Return names and types of channels, in the order in which lines hold them."""
+    channels, at = [], 0
+    while listed[at]:
+        name, at = _text(listed, at)
+        (kind,) = struct.unpack_from("<i", listed, at)
+        channels.append((name, _TYPES[kind]))
+        at += 16
+    return channels
+
+
+def _text(data: bytes, start: int) -> tuple[str, int]:
+    """Return the text that begins here, and where it is over."""
+    end = data.index(b"\0", start)
+    return data[start:end].decode(errors="replace"), end + 1

@@ -1,0 +1,145 @@
+"""Splats of a render drawn on the graphics card, by the shader of the 3D views.
+
+On Blender's main thread, where the 3D views draw, too; core's renderer (`core.drawing`) does the
+same where there is no card.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import bpy
+import gpu
+import numpy as np
+
+from ..viewport import shader
+from ..viewport.arrays import Eye, as_texture, colors, farthest_first, in_front, pack
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from ..core.drawing import Layer
+    from ..core.splats import Splats
+    from ..core.views import View
+
+_ALL, _IN_FRONT, _BEHIND = range(3)
+"""Which splats are drawn, by the depths of a layer; see ``choices`` in `shader`."""
+
+_FARTHEST = 1e6
+"""Far plane over the near plane, where a view has none nearer."""
+
+
+def available() -> bool:
+    """Tell whether there is a card that Blender draws on; to be asked on the main thread."""
+    return not bpy.app.background and gpu.platform.device_type_get() != "SOFTWARE"
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """What a card is given to draw splats in a view.
+
+    Attributes
+    ----------
+    textures : dict of str to (values, channels, kind)
+        See `shader.texture`.
+    count : int
+        Splats that are drawn.
+    numbers : (24,) float32
+        What the shader knows of the view, ``ViewData``.
+    size : (int, int)
+        Pixels across and down.
+    """
+
+    textures: dict[str, tuple[NDArray[np.float32], int, str]]
+    count: int
+    numbers: NDArray[np.float32]
+    size: tuple[int, int]
+
+
+def prepare(splats: Splats, view: View, layer: Layer | None) -> Sheet:
+    """Sort and pack splats for a view with perspective; on any thread.
+
+    Parameters
+    ----------
+    splats, view, layer
+        As `core.drawing.draw` takes them; the splats look the same from all directions.
+    """
+    matrix = np.empty((3, 4))  # world to camera: x right, y up, z back
+    matrix[:, :3] = np.array([1.0, -1.0, -1.0])[:, None] * view.rotation
+    matrix[:, 3] = -matrix[:, :3] @ view.center
+    projection = _projection(view)
+    packed = pack(splats)
+    eye = Eye(-matrix[2], view.center, perspective=True)
+    rows, depths = in_front(packed.means, eye, view.near)
+    rows = rows[depths < view.far]
+    order = rows[farthest_first(depths[depths < view.far], perspective=True)]
+    means = np.zeros((len(packed), 4), np.float32)
+    means[:, :3] = packed.means
+    limits = np.ones((1, 1), np.float32)
+    if layer is not None:  # in depths of the window, the lowest row first
+        limit = np.maximum(layer.depths[::-1], view.near)
+        ndc = (projection[2, 2] * -limit + projection[2, 3]) / limit
+        limits = (0.5 * ndc + 0.5).astype(np.float32)
+    numbers = np.zeros(24, np.float32)
+    numbers[:16] = projection.T.reshape(-1)
+    numbers[16:21] = (view.width, view.height, view.near, 1.0, 1.0)
+    nothing = np.ones((1, 4), np.float32)
+    textures = {
+        "order": (as_texture(order), 1, "R32F"),
+        "means": (as_texture(means), 4, "RGBA32F"),
+        "covariances": (as_texture(packed.covariances[:, :4]), 4, "RGBA32F"),
+        "more_covariances": (as_texture(packed.covariances[:, 4:]), 2, "RG32F"),
+        "colors": (as_texture(colors(packed)), 4, "RGBA16F"),
+        "selection": (as_texture(np.zeros(len(packed), np.float32)), 1, "R32F"),
+        "matrices": (matrix.astype(np.float32).reshape(1, 12), 4, "RGBA32F"),
+        "depths": (limits, 1, "R32F"),
+        "veils": (nothing, 4, "RGBA16F"),  # what the 3D view sees through
+        "veil_depths": (nothing, 4, "RGBA16F"),
+    }
+    return Sheet(textures, len(order), numbers, (view.width, view.height))
+
+
+def paint(sheet: Sheet, layer: Layer | None) -> NDArray[np.float64]:
+    """Draw splats on the card; return what `core.drawing.draw` does. On the main thread."""
+    textures = {name: shader.texture(*given) for name, given in sheet.textures.items()}
+    if layer is None:
+        return _drawn(sheet, textures, _ALL)
+    picture = _drawn(sheet, textures, _IN_FRONT)
+    left = 1.0 - layer.alphas
+    seen_through = bool((left > 0.0).any())
+    behind = _drawn(sheet, textures, _BEHIND) if seen_through else np.zeros_like(picture)
+    passed = 1.0 - picture[3]
+    picture[:3] += passed * (layer.colors + left * behind[:3])
+    if layer.background is not None:
+        picture[:3] += passed * (1.0 - behind[3]) * layer.background
+    picture[3] = 1.0 - passed * left * (1.0 - behind[3])
+    return np.asarray(picture.clip(0.0, 1.0))
+
+
+def _drawn(sheet: Sheet, textures: dict[str, Any], which: int) -> NDArray[np.float64]:
+    """Return some of the splats, (4, H, W), colours times alpha, the top row first."""
+    width, height = sheet.size
+    numbers = sheet.numbers.copy()
+    numbers[21], numbers[23] = which != _ALL, which == _BEHIND
+    picture = gpu.types.GPUTexture(sheet.size, format="RGBA32F")
+    frame = gpu.types.GPUFrameBuffer(color_slots=picture)
+    shader.blend(frame, textures, numbers, sheet.count)
+    values = gpu.types.Buffer("FLOAT", width * height * 4)
+    frame.read_color(0, 0, width, height, 4, 0, "FLOAT", data=values)
+    pixels = np.frombuffer(memoryview(values), np.float32).reshape(height, width, 4)
+    return np.moveaxis(pixels[::-1], -1, 0).astype(np.float64)
+
+
+def _projection(view: View) -> NDArray[np.float64]:
+    """Return the projection matrix of a view, (4, 4), as OpenGL has it."""
+    near = view.near
+    far = min(view.far, _FARTHEST * near)
+    p = np.zeros((4, 4))
+    p[0, 0], p[0, 2] = 2.0 * view.fx / view.width, 1.0 - 2.0 * view.cx / view.width
+    p[1, 1], p[1, 2] = 2.0 * view.fy / view.height, 2.0 * view.cy / view.height - 1.0
+    p[2, 2], p[2, 3] = -(far + near) / (far - near), -2.0 * far * near / (far - near)
+    p[3, 2] = -1.0
+    return p

@@ -1,0 +1,298 @@
+"""The render engine that draws splats among what `meshes` rendered; used by copies of scenes alone.
+
+Blender calls it in a thread of its own, on what it evaluated for this render.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import partial
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, NamedTuple, cast
+
+import bpy
+import numpy as np
+
+from .. import main_thread
+from ..cameras.objects import FLIP
+from ..core.affine import transformed
+from ..core.drawing import draw, seen_from
+from ..core.errors import RefineError
+from ..core.seeing.scene import scene_of
+from ..core.splats import Splats, drawable, joined
+from ..core.views import View, ViewSet
+from ..core.work import Cancelled, checked_by, checkpoint
+from ..mesh import attributes as mesh_attributes
+from ..mesh.layout import SplatObject, check, splat_count
+from . import card
+from .meshes import drawn_by_us
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from ..core.drawing import Layer
+
+_FAR = 1e4
+"""Scene sizes from which a camera without perspective is seen as one with it: less than .1 pixels
+apart in an image of 1000."""
+
+_KNEE = 0.04045
+
+
+@dataclass(eq=False)
+class Shared:
+    """What a render is told, and tells.
+
+    Attributes
+    ----------
+    layer : Layer or None
+        What is rendered besides splats, of the next frame.
+    transparent : bool
+        Whether what lies behind everything is left transparent.
+    card : bool
+        Whether splats are drawn on the graphics card, by the main thread (`main_thread.serve`).
+    finished : Path or None
+        Folder of pictures that are drawn already, to be shown once more.
+    splats : int
+        How many were drawn in the last frame.
+    frames : list of int
+        Those that were drawn.
+    engine : str
+        What rendered all but the splats, "" where there is nothing else.
+    picture : (4, H, W) or None
+        The last one, as `drawing.draw` returns it.
+    error : BaseException or None
+        Why drawing ended.
+    """
+
+    layer: Layer | None = None
+    transparent: bool = False
+    card: bool = False
+    finished: Path | None = None
+    splats: int = 0
+    frames: list[int] = field(default_factory=list)
+    engine: str = ""
+    picture: NDArray[np.float64] | None = None
+    error: BaseException | None = None
+
+
+_now: list[Shared] = []
+
+
+def begin(shared: Shared) -> None:
+    """Render with this from now on."""
+    _now[:] = [shared]
+
+
+def end() -> None:
+    """Forget what was rendered with."""
+    _now.clear()
+
+
+def save(folder: Path, frame: int, picture: NDArray[np.float64]) -> None:
+    """Keep a picture of a frame, in 16 bits."""
+    np.save(folder / f"{frame}.npy", np.rint(picture * 65535.0).astype(np.uint16))
+
+
+def load(folder: Path, frame: int) -> NDArray[np.float64]:
+    """Return what `save` has kept."""
+    return np.asarray(np.load(folder / f"{frame}.npy") / 65535.0)
+
+
+class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc] # noqa: N801 - of Blender
+    """Draws splats."""
+
+    bl_idname = "REFINE_SPLATS"
+    bl_label = "Splats"
+    bl_use_preview = False
+
+    def render(self, depsgraph: bpy.types.Depsgraph) -> None:
+        """Draw a frame; called by Blender."""
+        if not _now:
+            self.error_set("Use Render > Render Image with Splats: this engine is a part of it")
+            return
+        shared = _now[0]
+        try:
+            self._render(depsgraph, shared)
+        except Cancelled:
+            pass
+        except BaseException as error:  # noqa: BLE001 - raised again by `frames`
+            shared.error = error
+            self.error_set(str(error))
+
+    def _render(self, depsgraph: bpy.types.Depsgraph, shared: Shared) -> None:
+        frame = depsgraph.scene.frame_current
+        if shared.finished:
+            picture = load(shared.finished, frame)
+        else:
+            picture = self._picture(depsgraph, shared)
+        _, height, width = picture.shape
+        result = self.begin_result(0, 0, width, height)
+        result.layers[0].passes["Combined"].rect.foreach_set(_linear(picture).ravel())
+        self.end_result(result)
+        shared.picture = picture
+        shared.frames.append(frame)
+
+    def _picture(self, depsgraph: bpy.types.Depsgraph, shared: Shared) -> NDArray[np.float64]:
+        """Return what the camera sees, as `draw` does."""
+        scene, size = depsgraph.scene, (self.resolution_x, self.resolution_y)
+        place = _place(depsgraph, self.camera_override or scene.camera, size)
+        splats = _splats(depsgraph, place.view.center)
+        view, layer = _cropped(place.view, _border(scene, size)), shared.layer
+        if layer is not None and place.away:
+            depths = np.where(layer.depths > 0.0, layer.depths + place.away, 0.0)
+            layer = replace(layer, depths=depths)
+        shared.splats = len(splats)
+        if shared.card and not place.away and len(splats):
+            sheet = card.prepare(splats, view, layer)
+            with checked_by(self._check):
+                picture = main_thread.call(partial(card.paint, sheet, layer))
+        else:
+            frame = scene_of(splats.means, drawable(splats), ViewSet((place.near,)))
+            picture = draw(splats, view, layer, frame, progress=self._progress)
+        if not shared.transparent:
+            picture[3] = 1.0
+        return picture
+
+    def _check(self) -> None:
+        if self.test_break():
+            raise Cancelled
+
+    def _progress(self, fraction: float, what: str) -> bool:
+        self.update_progress(fraction)
+        self.update_stats("", f"Splats: {what}")
+        return not self.test_break()
+
+
+class _Place(NamedTuple):
+    """How a camera sees.
+
+    Attributes
+    ----------
+    view : View
+        Of the whole image. Without perspective, from far away.
+    near : View
+        The same where the camera stands.
+    away : float
+        Distance of the two.
+    """
+
+    view: View
+    near: View
+    away: float = 0.0
+
+
+def _place(
+    depsgraph: bpy.types.Depsgraph, camera: bpy.types.Object, size: tuple[int, int]
+) -> _Place:
+    """Return how a camera sees; a view is a pinhole, so one without perspective stands far away.
+
+    Raises
+    ------
+    RefineError
+        If the camera is a panorama.
+    """
+    data, render = camera.data, depsgraph.scene.render
+    if data.type not in {"PERSP", "ORTHO"}:
+        msg = (
+            f"camera '{camera.name}' is a panorama (lens type {data.type}): splats can be drawn in "
+            "perspective and orthographic cameras; change its lens type"
+        )
+        raise RefineError(msg)
+    width, height = size
+    pixel = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
+    projection = camera.calc_matrix_camera(depsgraph, x=width, y=height, **pixel)
+    p = np.array(projection, np.float64)
+    matrix = np.array(camera.matrix_world, np.float64)
+    axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
+    view = View(
+        rotation=FLIP[:, None] * axes.T,
+        center=matrix[:3, 3],
+        fx=p[0, 0] * width / 2,
+        fy=p[1, 1] * height / 2,
+        cx=(1.0 - p[0, 2] + p[0, 3]) * width / 2,
+        cy=(1.0 + p[1, 2] - p[1, 3]) * height / 2,
+        width=width,
+        height=height,
+        near=data.clip_start,
+        far=data.clip_end,
+        name=camera.name,
+    )
+    if data.type == "PERSP":
+        return _Place(view, view)
+    away = _FAR * data.ortho_scale
+    far = replace(
+        view,
+        center=view.center - away * view.rotation[2],
+        fx=view.fx * away,
+        fy=view.fy * away,
+        near=away + data.clip_start,
+        far=away + data.clip_end,
+    )
+    return _Place(far, view, away)
+
+
+def _border(scene: bpy.types.Scene, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return the columns and rows that are rendered: left, top, right, bottom."""
+    render, (width, height) = scene.render, size
+    if not render.use_border:
+        return 0, 0, width, height
+    left, right = int(render.border_min_x * width), int(render.border_max_x * width)
+    low, high = int(render.border_min_y * height), int(render.border_max_y * height)
+    return left, height - high, right, height - low
+
+
+def _cropped(view: View, border: tuple[int, int, int, int]) -> View:
+    left, top, right, bottom = border
+    return replace(
+        view, cx=view.cx - left, cy=view.cy - top, width=right - left, height=bottom - top
+    )
+
+
+def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
+    """Return all splats that a render shows, in the world, in the colours that they show to an eye.
+
+    Instances are among them. Modifiers are not looked at, as in the 3D views.
+    """
+    parts = [_NOTHING]
+    for instance in depsgraph.object_instances:
+        obj = instance.object.original
+        if not drawn_by_us(obj) or not splat_count(obj.data):
+            continue
+        checkpoint()
+        matrix = np.array(instance.matrix_world, np.float64)
+        evaluated = SimpleNamespace(data=obj.data.evaluated_get(depsgraph))
+        checked = SplatObject(cast("bpy.types.Object", evaluated), check(obj).layout)
+        splats = mesh_attributes.splats_from_object(checked)
+        local = np.linalg.inv(matrix)
+        splats = seen_from(splats, local[:3, :3] @ eye + local[:3, 3])
+        parts.append(transformed(splats, matrix, rotate_sh=False))
+    return joined(parts)
+
+
+_NOTHING = Splats(
+    means=np.empty((0, 3)),
+    log_scales=np.empty((0, 3)),
+    quaternions=np.empty((0, 4)),
+    opacity_logits=np.empty(0),
+    sh_dc=np.empty((0, 3)),
+    sh_rest=np.empty((0, 0, 3)),
+)
+
+
+def _linear(picture: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return a picture, (4, H, W) display-referred, as linear pixels, (H * W, 4), lowest row first.
+
+    By the curve of sRGB (IEC 61966-2-1), which the view transform of the copy takes back.
+    """
+    colors, alphas = picture[:3], picture[3]
+    straight = (colors / np.maximum(alphas, 1e-6)).clip(0.0, 1.0)
+    curved = ((straight + 0.055) / 1.055) ** 2.4
+    pixels = np.empty((*alphas.shape, 4), np.float32)
+    pixels[..., :3] = np.moveaxis(
+        alphas * np.where(straight > _KNEE, curved, straight / 12.92), 0, -1
+    )
+    pixels[..., 3] = alphas
+    return pixels[::-1].reshape(-1, 4)

@@ -1,0 +1,69 @@
+"""F12 does not show splats: the status bar says which button does."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import bpy
+from bpy.app.handlers import persistent
+
+from ..render import copies
+from ..render.meshes import drawn_by_us
+
+NOTICE = "Splats are not in this render: use Render > Render Image with Splats"
+"""What is said."""
+
+IN_BACKGROUND = "refine: splats are not in this render; use --command refine render"
+"""What is said where there is no window."""
+
+_LINGERS = 10.0
+"""Seconds that it stays when the render is over."""
+
+_until: list[float] = []
+
+
+def register() -> None:
+    """Say it from now on."""
+    bpy.app.handlers.render_init.append(_began)
+    bpy.app.handlers.undo_post.append(_undone)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    bpy.app.handlers.undo_post.remove(_undone)
+    bpy.app.handlers.render_init.remove(_began)
+
+
+@persistent
+def _began(scene: bpy.types.Scene, *_: object) -> None:
+    """Look whether a render leaves splats out; called on the thread that renders."""
+    if copies.MARK in scene:
+        return
+    shown = (layer.objects for layer in scene.view_layers if layer.use)
+    if not any(drawn_by_us(obj) and not obj.hide_render for group in shown for obj in group):
+        return
+    if bpy.app.background:
+        sys.stderr.write(f"{IN_BACKGROUND}\n")
+    elif not _until:
+        _until.append(time.monotonic() + _LINGERS)
+        bpy.app.timers.register(_say, first_interval=0.0)
+
+
+def _say() -> float | None:
+    """Say it until the render has been over for a while."""
+    if bpy.app.is_job_running("RENDER"):
+        _until[0] = time.monotonic() + _LINGERS
+    over = time.monotonic() > _until[0]
+    for workspace in bpy.data.workspaces:
+        workspace.status_text_set(None if over else NOTICE)
+    if over:
+        _until.clear()
+    return None if over else 0.5
+
+
+@persistent
+def _undone(*_: object) -> None:
+    """Remove what a step back has brought of a render that is over."""
+    if not bpy.app.is_job_running("RENDER"):
+        copies.remove_all()

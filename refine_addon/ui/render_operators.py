@@ -1,0 +1,198 @@
+"""*Render with Splats*: an operator that has Blender do one render after another, and waits."""
+
+# ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import numpy as np
+from bpy.props import BoolProperty
+
+from .. import main_thread
+from ..core.work import Cancelled
+from ..render import card, frames
+from ..render.engine import Shared
+from .images import put
+from .operator_bases import FAILURES, Answer, Needing, fail, idle
+from .wrapped import counted
+
+if TYPE_CHECKING:
+    from ..render.frames import Step
+
+IMAGE = "Render with Splats"
+"""Name of the image that shows the last frame."""
+
+_STEP = 0.05
+"""Seconds between two looks at whether Blender's render is over."""
+
+
+def no_render(_context: bpy.types.Context) -> str:
+    """Return that a render has to be over first, "" if none is under way."""
+    return "A render is under way" if bpy.app.is_job_running("RENDER") else ""
+
+
+class REFINE_OT_render(Needing, bpy.types.Operator):
+    """Render what the camera sees with the splats as the 3D view shows them, among meshes that the scene's engine renders; an animation is written where Output says"""  # noqa: E501 - a tooltip is one line
+
+    bl_idname = "refine.render"
+    bl_label = "Render Image with Splats"
+    bl_options = {"REGISTER"}
+    needs = (idle, no_render)
+
+    animation: BoolProperty(
+        name="Animation",
+        description="Render all frames of the scene, and write them",
+        options={"SKIP_SAVE"},
+    )
+    _steps: Any = None
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: REFINE_OT_render) -> str:
+        """Return the tooltip of a button."""
+        if properties.animation:
+            return "Render all frames with splats, and write them where the scene's Output says"
+        return str(cls.__doc__)
+
+    def execute(self, context: bpy.types.Context) -> Answer:
+        """Do all of it at once."""
+        self._begin(context)
+        try:
+            for step in self._steps or ():
+                bpy.ops.render.render(scene=step.scene, animation=step.animation)
+        except Cancelled:
+            return self._stopped(context)
+        except (*FAILURES, RuntimeError) as error:
+            return self._stopped(context, error)
+        return self._finished(context)
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
+        """Start the first render, unless there is nobody to watch."""
+        if bpy.app.background or context.window is None:
+            return self.execute(context)
+        self._begin(context)
+        manager = context.window_manager
+        self._timer = manager.event_timer_add(_STEP, window=context.window)
+        manager.modal_handler_add(self)
+        return self._go_on(context)
+
+    def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+        """Start the next render when one is over."""
+        if event.type == "ESC" and event.value == "PRESS":
+            self._escaped = True  # Blender ends its render by itself
+        elif event.type == "TIMER":
+            main_thread.serve()
+            if not bpy.app.is_job_running("RENDER"):
+                return self._go_on(context)
+        return {"PASS_THROUGH"}
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Clean up where Blender ends the operator: its window is closed, or its file."""
+        self._over(context)
+
+    def _begin(self, context: bpy.types.Context) -> None:
+        scene = context.scene
+        chosen = [scene.frame_current]
+        if self.animation:
+            chosen = [*range(scene.frame_start, scene.frame_end + 1, scene.frame_step)]
+        self._shared, self._frames = Shared(card=card.available()), chosen
+        self._steps = frames.steps(scene, chosen, self._shared, write=self.animation)
+        self._started, self._escaped, self._timer = time.monotonic(), False, None
+        self._opened = False
+
+    def _go_on(self, context: bpy.types.Context) -> Answer:
+        """Take what the last render came to, and start the next one."""
+        try:
+            if self._escaped or self._steps is None:
+                return self._stopped(context)
+            step = next(self._steps, None)
+            self._show()
+            if step is None:
+                return self._finished(context)
+            self._render(context, step)
+        except Cancelled:
+            return self._stopped(context)
+        except (*FAILURES, RuntimeError) as error:
+            return self._stopped(context, error)
+        except Exception:  # a fault of the program, which Blender prints
+            self._over(context)
+            raise
+        return {"RUNNING_MODAL"}
+
+    def _render(self, context: bpy.types.Context, step: Step) -> None:
+        """Have Blender render; only the first time it opens what shows renders, as F12 does."""
+        number, total = len(self._shared.frames) + 1, len(self._frames)
+        of_all = f" frame {number} of {total}" if total > 1 else ""
+        context.workspace.status_text_set(f"Rendering{of_all}: {step.what}; Esc cancels")
+        view = context.preferences.view
+        display = view.render_display_type
+        if self._opened:
+            view.render_display_type = "NONE"
+        try:
+            bpy.ops.render.render("INVOKE_DEFAULT", scene=step.scene, animation=step.animation)
+        finally:
+            view.render_display_type = display
+        self._opened = True
+
+    def _show(self) -> None:
+        """Show the last frame wherever a render is shown."""
+        picture, self._shared.picture = self._shared.picture, None
+        if picture is None:
+            return
+        alphas = picture[3:]
+        straight = np.concatenate([picture[:3] / np.maximum(alphas, 1e-6), alphas])
+        image = put(IMAGE, np.moveaxis(straight, 0, -1).clip(0.0, 1.0))
+        for window in bpy.context.window_manager.windows:
+            for area in window.screen.areas:
+                space = area.spaces.active
+                if area.type == "IMAGE_EDITOR" and _shows_render(space.image):
+                    space.image = image
+
+    def _finished(self, context: bpy.types.Context) -> Answer:
+        self._show()
+        self._over(context)
+        shared, seconds = self._shared, time.monotonic() - self._started
+        what = counted(len(shared.frames), "frame") if self.animation else "Rendered"
+        among = f" among what {shared.engine} rendered" if shared.engine else ""
+        self.report({"INFO"}, f"{what}: {shared.splats:,} splats{among}, {seconds:.1f} s")
+        return {"FINISHED"}
+
+    def _stopped(self, context: bpy.types.Context, error: Exception | None = None) -> Answer:
+        self._over(context)
+        if error is not None:
+            return fail(self, error)
+        self.report({"INFO"}, "Render cancelled")
+        return {"CANCELLED"}
+
+    def _over(self, context: bpy.types.Context) -> None:
+        """Remove all that was made for the render."""
+        if self._steps is not None:
+            self._steps.close()
+            self._steps = None
+        if self._timer is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._timer = None
+            for workspace in bpy.data.workspaces:
+                workspace.status_text_set(None)
+
+
+def _shows_render(image: bpy.types.Image | None) -> bool:
+    return image is not None and image.type == "RENDER_RESULT"
+
+
+def draw_buttons(layout: bpy.types.UILayout) -> None:
+    """Draw the buttons of the panel."""
+    column = layout.column(align=True)
+    column.operator("refine.render", text="Render with Splats", icon="RENDER_STILL")
+    text = "Render Animation"
+    column.operator("refine.render", text=text, icon="RENDER_ANIMATION").animation = True
+
+
+def draw_menu(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
+    """Draw the entries of Blender's menu Render."""
+    layout = menu.layout
+    layout.separator()
+    layout.operator("refine.render", icon="RENDER_STILL")
+    text = "Render Animation with Splats"
+    layout.operator("refine.render", text=text, icon="RENDER_ANIMATION").animation = True

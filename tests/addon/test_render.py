@@ -1,0 +1,300 @@
+"""*Render with Splats*: what the camera sees, among meshes, and a scene that stays as it was."""
+
+from __future__ import annotations
+
+import math
+
+import bpy
+import numpy as np
+import pytest
+from mathutils import Matrix, Vector
+
+IMAGE = "Render with Splats"
+
+
+@pytest.fixture
+def shot(quarter, room_views):  # noqa: ARG001
+    """Give a scene with splats and a camera, 60 x 40 px, on transparent film, by Cycles."""
+    scene = bpy.context.scene
+    view = room_views[20]
+    data = bpy.data.cameras.new("camera")
+    data.sensor_fit, data.clip_start = "HORIZONTAL", 0.1
+    data.lens = view.fx / view.width * data.sensor_width
+    scene.camera = bpy.data.objects.new("camera", data)
+    axes = (np.array([1.0, -1.0, -1.0])[:, None] * view.rotation).T
+    scene.camera.matrix_world = Matrix.Translation(view.center) @ Matrix(axes.tolist()).to_4x4()
+    scene.collection.objects.link(scene.camera)
+    render = scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = 120, 80, 50
+    render.engine, render.film_transparent = "CYCLES", True
+    scene.cycles.samples, scene.cycles.use_denoising = 16, False
+    bpy.context.view_layer.update()
+    return scene
+
+
+def rendered():
+    """Return the picture, (H, W, 4), the top row first."""
+    bpy.ops.refine.render()
+    image = bpy.data.images[IMAGE]
+    values = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(values)
+    return values.reshape(image.size[1], image.size[0], 4)[::-1]
+
+
+def drawn(addon, scene, obj, **changes):
+    """Return what core draws of an object in the scene's camera, alpha not multiplied."""
+    view = addon.cameras.objects.view_from_camera(
+        scene.camera, scene, bpy.context.evaluated_depsgraph_get()
+    )
+    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(obj), whole=True)
+    picture = addon.core.drawing.draw(splats, addon.render.engine.replace(view, **changes))
+    picture[:3] /= np.maximum(picture[3], 1e-6)
+    return np.moveaxis(picture, 0, -1).clip(0.0, 1.0)
+
+
+def plane(scene, depth, color, alpha, *, width=9.0):
+    """Put a plane that shines in a colour before the camera; return it."""
+    matrix = scene.camera.matrix_world @ Matrix.Translation((0.0, 0.0, -depth))
+    bpy.ops.mesh.primitive_plane_add(size=width)
+    obj = bpy.context.object
+    obj.matrix_world = matrix
+    material = bpy.data.materials.new("plane")
+    material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    light, clear, mix, end = (
+        tree.nodes.new(f"ShaderNode{kind}")
+        for kind in ("Emission", "BsdfTransparent", "MixShader", "OutputMaterial")
+    )
+    light.inputs[0].default_value = (*color, 1.0)
+    mix.inputs[0].default_value = alpha
+    for number, node in ((1, clear), (2, light)):
+        tree.links.new(node.outputs[0], mix.inputs[number])
+    tree.links.new(mix.outputs[0], end.inputs[0])
+    obj.data.materials.append(material)
+    return obj
+
+
+def settings(scene):
+    """Return what a render must leave as it was."""
+    groups = (scene, scene.render, scene.render.image_settings, scene.view_settings, scene.cycles)
+    told = [
+        (group.bl_rna.identifier, name, repr(getattr(group, name)))
+        for group in (*groups, *scene.view_layers)
+        for name, kind in group.bl_rna.properties.items()
+        if kind.type in {"BOOLEAN", "INT", "FLOAT", "STRING", "ENUM"} and not kind.is_readonly
+    ]
+    hidden = [(obj.name, obj.hide_render) for obj in bpy.data.objects]
+    names = [scene.name for scene in bpy.data.scenes] + [world.name for world in bpy.data.worlds]
+    names += [image.name for image in bpy.data.images if image.type != "RENDER_RESULT"]
+    return told, hidden, [name for name in names if name != IMAGE]
+
+
+def test_a_render_is_what_core_draws(addon, shot, quarter):
+    """To the rounding of 8 bits where there is something, whatever the view transform is."""
+    shot.view_settings.view_transform, shot.view_settings.exposure = "AgX", 2.0
+    before = settings(shot)
+
+    picture, expected = rendered(), drawn(addon, shot, quarter)
+
+    seen = expected[..., 3] > 0.1
+    assert picture.shape == (40, 60, 4)
+    assert np.abs(picture - expected)[seen].max() < 3.0 / 255.0
+    assert seen.mean() > 0.9
+    assert settings(shot) == before
+
+
+def test_without_transparent_film_the_world_is_behind(shot):
+    """A splat object that is far away shows a world of linear .5: sRGB 188 of 255, opaque."""
+    bpy.context.object.location.x += 1e4
+    shot.render.film_transparent = False
+    shot.view_settings.view_transform = "Standard"
+    shot.world = bpy.data.worlds.new("world")
+    shot.world.use_nodes = True
+    shot.world.node_tree.nodes["Background"].inputs[0].default_value = (0.5, 0.5, 0.5, 1.0)
+
+    picture = rendered()
+
+    assert np.abs(picture - [*[188 / 255] * 3, 1.0]).max() < 2.0 / 255.0
+
+
+def test_meshes_hide_splats_by_depth_and_alpha(shot):
+    """A plane of 30 % white, .2 m away, mixes: .7 of the picture without it, over black, and .3.
+
+    A black one behind all, 50 m away, changes nothing.
+    """
+    shot.view_settings.view_transform = "Standard"
+    shot.render.film_transparent = False
+    plain = rendered()
+    near = plane(shot, 0.2, (1.0, 1.0, 1.0), 1.0)
+    hidden = rendered()
+    near.data.materials[0].node_tree.nodes["Mix Shader"].inputs[0].default_value = 0.3
+    mixed = rendered()
+    near.matrix_world = shot.camera.matrix_world @ Matrix.Translation((0.0, 0.0, -50.0))
+    near.scale *= 50.0
+    near.data.materials[0].node_tree.nodes["Emission"].inputs[0].default_value = (0, 0, 0, 1)
+    behind = rendered()
+
+    apart = mixed[..., :3] - (0.7 * plain[..., :3] + 0.3)
+    assert plain[..., :3].mean() > 0.1
+    assert (hidden > 0.99).all()
+    assert np.abs(apart).mean() < 0.05  # 16 rays a pixel
+    assert abs(apart.mean()) < 0.01
+    assert np.abs(behind - plain).max() < 0.01
+
+
+def test_instances_are_drawn_and_what_renders_hide_is_not(addon, shot, quarter):
+    """An empty that stands for the collection of the hidden object shows it elsewhere."""
+    whole = drawn(addon, shot, quarter)
+    collection = bpy.data.collections.new("splats")
+    collection.objects.link(quarter)
+    shot.collection.objects.unlink(quarter)
+    empty = bpy.data.objects.new("empty", None)
+    empty.instance_type, empty.instance_collection = "COLLECTION", collection
+    shot.collection.objects.link(empty)
+    shown = rendered()
+    empty.hide_render = True
+    hidden = rendered()
+
+    seen = whole[..., 3] > 0.1
+    assert np.abs(shown - whole)[seen].max() < 3.0 / 255.0
+    assert not hidden[..., 3].any()
+
+
+def test_a_border_is_cut_out_of_the_picture(shot):
+    """The left half of the upper half: columns 0 to 30 and rows 0 to 20 of 60 x 40."""
+    whole = rendered()
+    render = shot.render
+    render.use_border = render.use_crop_to_border = True
+    render.border_min_x, render.border_max_x = 0.0, 0.5
+    render.border_min_y, render.border_max_y = 0.5, 1.0
+    plane(shot, 50.0, (0.0, 0.0, 0.0), 1.0, width=200.0)
+
+    cut = rendered()
+
+    assert cut.shape == (20, 30, 4)
+    solid = whole[:20, :30, 3] > 0.995
+    assert np.abs(cut[..., :3] - whole[:20, :30, :3])[solid].max() < 0.02
+
+
+def test_an_orthographic_camera_sees_splats_at_one_scale(shot):
+    """A round splat of deviation .1 in an image 4 m wide, 60 px: 1.5 px wherever it is.
+
+    At the middle alpha is .9; 2 px aside, with the low-pass of .3 px^2, .9 exp(-2 / 2.55).
+    """
+    shot.camera.data.type, shot.camera.data.ortho_scale = "ORTHO", 4.0
+    mesh = bpy.context.object.data
+    values = np.zeros((len(mesh.vertices), 3), np.float32)
+    back = shot.camera.matrix_world.to_3x3() @ Vector((0.0, 0.0, -1.0))
+    values[:] = np.array(shot.camera.matrix_world.translation + 3.0 * back)
+    mesh.attributes["position"].data.foreach_set("vector", values.ravel())
+    for axis in range(3):
+        column = np.full(len(values), math.log(0.1), np.float32)
+        mesh.attributes[f"scale_{axis}"].data.foreach_set("value", column)
+    column = np.full(len(values), -20.0, np.float32)
+    column[0] = math.log(9.0)
+    mesh.attributes["opacity"].data.foreach_set("value", column)
+    shot.render.resolution_x, shot.render.resolution_y = 122, 82  # 61 x 41: a pixel in the middle
+    shot.camera.data.ortho_scale = 4.0 * 61 / 60
+
+    alphas = rendered()[..., 3]
+
+    assert abs(alphas[20, 30] - 0.9) < 0.01
+    assert abs(alphas[20, 32] - 0.9 * math.exp(-2.0 / 2.55)) < 0.01
+    assert abs(alphas[18, 30] - 0.9 * math.exp(-2.0 / 2.55)) < 0.01
+
+
+def test_an_animation_is_written_where_the_output_settings_say(shot, tmp_path):
+    """Frames 2 and 4 of 2 to 5 in steps of 2; one that is there stays unless it may be replaced."""
+    shot.frame_start, shot.frame_end, shot.frame_step = 2, 5, 2
+    shot.render.filepath = str(tmp_path / "f_###")
+    shot.render.use_overwrite = False
+    (tmp_path / "f_002.png").write_bytes(b"precious")
+    before = settings(shot)
+    bpy.ops.refine.render(animation=True)
+    assert settings(shot) == before
+
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["f_002.png", "f_004.png"]
+    assert (tmp_path / "f_002.png").read_bytes() == b"precious"
+    image = bpy.data.images.load(str(tmp_path / "f_004.png"))
+    assert tuple(image.size) == (60, 40)
+
+
+@pytest.mark.slow
+def test_a_movie_is_written_as_one_file(shot, tmp_path):
+    """Two frames, drawn one after another and then written by Blender."""
+    shot.frame_start, shot.frame_end = 1, 2
+    render = shot.render
+    if hasattr(render.image_settings, "media_type"):
+        render.image_settings.media_type = "VIDEO"
+    render.image_settings.file_format = "FFMPEG"
+    render.filepath = str(tmp_path / "movie.mkv")
+    render.use_file_extension = False
+    bpy.ops.refine.render(animation=True)
+
+    (movie,) = tmp_path.iterdir()
+    assert bpy.data.movieclips.load(str(movie)).frame_duration == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda scene: setattr(scene, "camera", None), "has no camera"),
+        (lambda scene: setattr(scene.camera.data, "type", "PANO"), "is a panorama"),
+        (lambda scene: setattr(scene.render, "use_multiview", True), "not drawn in stereo"),
+        (lambda _scene: bpy.data.objects.remove(bpy.data.objects["room"]), "has no splats"),
+    ],
+    ids=["no camera", "panorama", "stereo", "no splats"],
+)
+def test_what_cannot_be_rendered_is_said_and_nothing_is_left(shot, change, message):
+    change(shot)
+    before = settings(shot)
+    with pytest.raises(RuntimeError, match=message):
+        bpy.ops.refine.render()
+
+    assert settings(shot) == before
+    assert not hasattr(bpy.types, "REFINE_engine")
+
+
+def test_a_render_that_is_stopped_leaves_nothing(addon, shot, monkeypatch):
+    """As by Esc: the engine ends without a picture."""
+    plane(shot, 1.0, (1.0, 1.0, 1.0), 1.0)
+    before = settings(shot)
+
+    def stopped(*_, **__):
+        raise addon.core.work.Cancelled
+
+    monkeypatch.setattr(addon.render.engine, "draw", stopped)
+
+    assert bpy.ops.refine.render() == {"CANCELLED"}
+    assert settings(shot) == before
+    assert IMAGE not in bpy.data.images
+
+
+def test_f12_says_that_splats_are_not_in_it(addon, shot, quarter, capfd):
+    """On stderr where there is no window; not where renders hide the splats."""
+    bpy.ops.render.render()
+    said = capfd.readouterr().err
+    quarter.hide_render = True
+    bpy.ops.render.render()
+
+    assert addon.ui.render_notice.IN_BACKGROUND in said
+    assert addon.ui.render_notice.IN_BACKGROUND not in capfd.readouterr().err
+    assert shot.name in bpy.data.scenes
+
+
+def test_the_command_writes_the_frames_it_is_told(addon, shot, tmp_path, capsys):
+    """By default the current frame; files are named by the frame, as Blender's own ``-f`` does."""
+    shot.render.filepath = str(tmp_path / "f_##")
+    shot.frame_set(7)
+
+    codes = [addon.command.main(["render"], scene=True)]
+    codes.append(addon.command.main(["render", "--frames", "3:5:2"], scene=True))
+    shot.camera = None
+    codes.append(addon.command.main(["render", "--animation"], scene=True))
+
+    assert codes == [0, 0, 1]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["f_03.png", "f_05.png", "f_07.png"]
+    told = capsys.readouterr()
+    assert f"frame 7: {tmp_path / 'f_07.png'}" in told.out
+    assert "has no camera" in told.err

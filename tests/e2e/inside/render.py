@@ -1,0 +1,134 @@
+"""*Render with Splats* in a window: a picture among meshes, an animation, Esc, F12 by itself."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import extension
+import numpy as np
+import xkey
+from mathutils import Vector
+from window import picture, until
+
+if TYPE_CHECKING:
+    from collections.abc import Generator
+
+IMAGE = "Render with Splats"
+
+
+def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
+    """Render the open scene with a cube in front of its splats; return what is there afterwards.
+
+    Parameters
+    ----------
+    pictures
+        Folder for pictures of the whole screen, and the frames of an animation.
+
+    Yields
+    ------
+    float
+        Seconds to wait.
+    """
+    extension.enable()
+    yield 1.0
+    scene = bpy.context.scene
+    prepare(scene)
+    scene.render.filepath = f"{pictures}/frame_##"
+    found: dict[str, Any] = {}
+    before = settings(scene)
+
+    invoke()
+    yield from until(lambda: IMAGE in bpy.data.images and not rendering(), "it is rendered")
+    yield from picture(pictures, "render")
+    found["size"] = list(bpy.data.images[IMAGE].size)
+    found["alike"] = [settings(scene) == before]
+    save(bpy.data.images[IMAGE], f"{pictures}/rendered.npy")
+
+    card = importlib.import_module(f"{extension.MODULE}.render.card")
+    card.available, real = (lambda: True), card.available
+    name = bpy.data.images[IMAGE].session_uid
+    invoke()
+    yield from until(
+        lambda: bpy.data.images[IMAGE].session_uid != name and not rendering(), "again"
+    )
+    save(bpy.data.images[IMAGE], f"{pictures}/by_card.npy")
+    card.available = real
+
+    scene.frame_end = 2
+    before = settings(scene)
+    invoke(animation=True)
+    yield from until(lambda: not rendering(), "the animation is over")
+    found["alike"].append(settings(scene) == before)
+
+    bpy.data.objects["Cube"].hide_render = True  # so it is the splats that are rendered
+    scene.render.resolution_percentage = 3200
+    before, shown = settings(scene), bpy.data.images[IMAGE].size[:]
+    yield 0.5
+    invoke()
+    yield 1.0
+    found["began"] = rendering()
+    xkey.tap(xkey.ESCAPE)
+    yield from until(lambda: not rendering(), "it has stopped")
+    found["alike"].append(settings(scene) == before)
+    found["stopped"] = bpy.data.images[IMAGE].size[:] == shown
+
+    scene.render.resolution_percentage = 100
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+        bpy.ops.render.render("INVOKE_DEFAULT")
+    yield 1.0
+    yield from picture(pictures, "f12")
+    notice = importlib.import_module(f"{extension.MODULE}.ui.render_notice")
+    found["notice"] = bool(notice._until)
+    return found
+
+
+def prepare(scene: bpy.types.Scene) -> None:
+    """Put a red cube without shading in front of the splats, to the left."""
+    place = scene.camera.matrix_world @ Vector((-0.15, 0.0, -0.5))
+    bpy.ops.mesh.primitive_cube_add(size=0.12, location=place)
+    material = bpy.data.materials.new("red")
+    material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    light = tree.nodes.new("ShaderNodeEmission")
+    light.inputs["Color"].default_value = (1.0, 0.0, 0.0, 1.0)
+    end = tree.nodes.new("ShaderNodeOutputMaterial")
+    tree.links.new(light.outputs[0], end.inputs["Surface"])
+    bpy.context.object.data.materials.append(material)
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples, scene.cycles.use_denoising = 8, False
+    scene.view_settings.view_transform = "Standard"
+
+
+def invoke(*, animation: bool = False) -> None:
+    """Start it as the button does."""
+    with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
+        bpy.ops.refine.render("INVOKE_DEFAULT", animation=animation)
+
+
+def rendering() -> bool:
+    """Tell whether a render is under way."""
+    return bpy.app.is_job_running("RENDER") or any("refine_render" in s for s in bpy.data.scenes)
+
+
+def settings(scene: bpy.types.Scene) -> list[str]:
+    """Return what a render must leave as it was."""
+    groups = (scene, scene.render, scene.render.image_settings, scene.view_settings)
+    groups += (*scene.view_layers, bpy.context.preferences.view)
+    told = [
+        f"{group.bl_rna.identifier}.{name} = {getattr(group, name)!r}"
+        for group in groups
+        for name, kind in group.bl_rna.properties.items()
+        if kind.type in {"BOOLEAN", "INT", "FLOAT", "STRING", "ENUM"} and not kind.is_readonly
+    ]
+    told += [f"{obj.name} {obj.hide_render} {obj.is_holdout}" for obj in bpy.data.objects]
+    return told + [scene.name for scene in bpy.data.scenes]
+
+
+def save(image: bpy.types.Image, path: str) -> None:
+    """Write the pixels of an image as they are, the top row first."""
+    values = np.empty(len(image.pixels), np.float32)
+    image.pixels.foreach_get(values)
+    np.save(path, values.reshape(image.size[1], image.size[0], 4)[::-1])

@@ -1,0 +1,81 @@
+"""*Render with Splats* of the installed zip, in windows and in the background."""
+
+from __future__ import annotations
+
+import shutil
+from typing import TYPE_CHECKING
+
+import numpy as np
+from blenders import PROJECT
+from PIL import Image
+
+from benchmarks.renderer.rasterizer import render
+from refine_addon.core.cameras.read import read_cameras
+from refine_addon.core.formats.ply import read_ply
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from blenders import Binary
+
+PICTURES = PROJECT / "build" / "e2e"
+
+
+def test_renders_show_splats_among_meshes(binary: Binary, blend: Path, cloud: Path, cameras: Path):
+    """At least 40 dB between the render and the reference renderer, off the red cube.
+
+    So it is where the shader draws the splats, as with a graphics card, and between both.
+
+    Every setting is as before, also after Esc, which ends a render of 39 million pixels. F12 says
+    that it leaves splats out.
+    """
+    try:
+        found = binary.window_step("render", blend, simulate=False, pictures=binary.work)
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+
+    assert found["size"] == [240, 160]
+    assert found["alike"] == [True] * 3
+    assert found["began"]
+    assert found["stopped"]
+    assert found["notice"]
+    assert {path.name for path in binary.work.glob("frame_*")} == {"frame_01.png", "frame_02.png"}
+    picture = np.load(binary.work / "rendered.npy")[..., :3]
+    assert _psnr(picture, cloud, cameras) > 40.0
+    by_card = np.load(binary.work / "by_card.npy")[..., :3]
+    assert _psnr(by_card, cloud, cameras) > 40.0
+    assert -10.0 * np.log10(np.mean((by_card - picture) ** 2)) > 40.0
+    frame = np.asarray(Image.open(binary.work / "frame_02.png"))[..., :3] / 255.0
+    assert _psnr(frame, cloud, cameras) > 40.0
+
+
+def _psnr(picture: np.ndarray, cloud: Path, cameras: Path) -> float:
+    """Return how close a render of camera 0 is to the reference renderer off what is red, dB."""
+    view, splats = read_cameras(cameras)[0], read_ply(cloud).splats()
+    expected = render(splats, view, near=0.1).clip(0.0, 1.0)
+    red = (picture[..., 0] > 0.7) & (picture[..., 1:] < 0.3).all(axis=-1)
+    assert 0.01 < red.mean() < 0.5
+    for _ in range(3):  # pixels at its edges are mixed
+        red[1:] |= red[:-1]
+        red[:-1] |= red[1:]
+        red[:, 1:] |= red[:, :-1]
+        red[:, :-1] |= red[:, 1:]
+    return float(-10.0 * np.log10(np.mean((picture - expected)[~red] ** 2)))
+
+
+def test_the_command_renders_without_a_window(
+    binary: Binary, blend: Path, cloud: Path, cameras: Path
+):
+    """The current frame, 1, where ``-o`` says; at least 40 dB from the reference renderer."""
+    done = binary.blender(
+        *(blend, "--render-output", binary.work / "shot_##", "--command", "refine", "render")
+    )
+
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert f"frame 1: {binary.work / 'shot_01.png'}" in done.stdout
+    picture = np.asarray(Image.open(binary.work / "shot_01.png"))[..., :3] / 255.0
+    view, splats = read_cameras(cameras)[0], read_ply(cloud).splats()
+    expected = render(splats, view, near=0.1).clip(0.0, 1.0)
+    assert -10.0 * np.log10(np.mean((picture - expected) ** 2)) > 40.0
