@@ -196,7 +196,7 @@ def _core() -> list[Method]:
     for name in get_args(get_type_hints(Settings)["method"]):
         about = CORE_ABOUT.get(name, f"method '{name}'")
         methods.append(_scoring(name, OURS, about, Settings(views=0, method=name)))
-    about = "`--absorb`: survivors absorb what goes, by what the views see of each"
+    about = "`--survivors absorb`: survivors absorb what goes, by what the views see of each"
     return [*methods, Method("occlusion+absorb", OURS, about, reduce=_absorb)]
 
 

@@ -162,9 +162,10 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         choices=CHOICES,
         help="what those that stay may become: unchanged; absorb: they take over what is removed, "
         "by what the cameras see of it, far better when much is removed (--method then only "
-        "matters with --threshold and --min-seen); refit: they are then fitted to what the "
-        "unpruned ones look like, better still, and slower; auto, the default: absorb, but "
-        "unchanged where that is as good; with --method, --threshold or --min-seen: unchanged",
+        "matters with --threshold and --min-seen); refit: they absorb and are then fitted to what "
+        "all splats look like, some dB better still, in several times the time; auto, the "
+        "default: absorb, but unchanged where that is as good, and with --method, --threshold, "
+        "--min-seen or --together",
     )
     becoming.add_argument(
         "--absorb",

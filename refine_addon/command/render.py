@@ -29,9 +29,10 @@ def render(run: Run) -> None:
         raise RefineError(msg) from None
     except RuntimeError as error:  # what Blender reports
         raise RefineError(str(error).strip()) from error
-    if shared.engine and shared.engine != scene.render.engine:
-        run.terminal.say(f"  all but splats by {shared.engine} in place of {scene.render.engine}")
     for frame in dict.fromkeys(shared.frames):
         run.terminal.say(f"frame {frame}: {scene.render.frame_path(frame=frame)}")
     among = f" among what {shared.engine} rendered" if shared.engine else ""
     run.terminal.say(f"  {shared.splats:,} splats{among}")
+    if shared.engine and shared.engine != scene.render.engine:
+        engines = f"all but splats is by {shared.engine}, not {scene.render.engine}"
+        run.terminal.notes([f"{engines}: there is no graphics card, or only the world to render"])

@@ -56,10 +56,14 @@ def by_survivors(told: Mapping[str, Any], without: str = "") -> str:
     >>> psnr = {"unchanged": 38.0, "absorb": 46.0, "refit": None}
     >>> by_survivors({"psnr": psnr, "seconds": {"unchanged": 1.2, "absorb": 2.1, "refit": 8.0}})
     'unchanged about 38 dB in 2 s, absorb about 46 dB in 3 s'
+    >>> by_survivors({"psnr": psnr}, "absorb")  # one round of scoring tells less than all
+    'unchanged about 38 dB or more'
     """
     seconds = told.get("seconds") or {}
     return ", ".join(
-        f"{way} {in_words(psnr)}" + (f" in {in_time(seconds[way])}" if seconds else "")
+        f"{way} {in_words(psnr)}"
+        + (" or more" if way == "unchanged" and without else "")
+        + (f" in {in_time(seconds[way])}" if seconds else "")
         for way, psnr in told["psnr"].items()
         if psnr is not None and way != without
     )

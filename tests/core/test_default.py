@@ -21,8 +21,10 @@ from refine_addon.core import (
     read_ply,
     score,
 )
+from refine_addon.core.absorbing.absorb import Absorbed
 from refine_addon.core.estimate.quality import AS_GOOD, expected
 from refine_addon.core.pipeline import decide, decide_task
+from refine_addon.core.pipeline.refit_splats import Made, unchanged_note
 from refine_addon.core.task import Task
 from tests.strategies import ply_of
 
@@ -85,6 +87,17 @@ def test_where_absorbing_gains_hardly_anything_rows_stay(splats, views, monkeypa
     assert told["psnr"]["absorb"] > told["psnr"]["unchanged"]
     assert told["psnr"]["unchanged"] == wanted.report["estimated_psnr"]
     assert any("hardly more" in note for note in result.report["notes"])
+
+
+@pytest.mark.parametrize(
+    ("reached", "words"), [(54.0, "about 54 dB, no more"), (59.3, "about 59 dB, hardly more")]
+)
+def test_the_note_does_not_call_less_more(splats, reached, words):
+    """Absorbing can reach less than deletion, in a shot that sees a fifth of the splats."""
+    every = np.ones(len(splats), np.bool_)
+    tried = Made(Absorbed(splats, every, every, 0, 0), reached)
+
+    assert unchanged_note(59.0, tried).endswith(words)
 
 
 @pytest.mark.slow

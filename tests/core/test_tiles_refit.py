@@ -97,7 +97,7 @@ def test_refitting_a_single_region_is_refitting_one_file(
 
 @pytest.mark.slow
 def test_refitting_regions_is_as_good_as_refitting_one_file(tmp_path, tiles, views):
-    """Within .7 dB by rays of all views: regions of 600 survivors are border for the most part.
+    """Within 1.3 dB by rays of all views: regions of 600 survivors are border for the most part.
 
     Larger ones come closer (docs/scale.md). The report tells how many rows changed; all others are
     their old bytes.
@@ -113,7 +113,7 @@ def test_refitting_regions_is_as_good_as_refitting_one_file(tmp_path, tiles, vie
     one = psnr_against(rays, read_ply(tmp_path / "pruned.ply").splats(), used)
     psnr = psnr_against(rays, made, used)
     facts = told["refitted"]
-    assert psnr > one - 0.7
+    assert psnr > one - 1.3
     assert told["estimated_psnr"] == pytest.approx(psnr, abs=0.1)
     assert facts["psnr_before"] == absorbed["estimated_psnr"]
     assert facts["psnr"] == told["estimated_psnr"] > absorbed["estimated_psnr"] + 1.0
@@ -150,7 +150,7 @@ def test_a_job_that_was_interrupted_while_refitting_goes_on_where_it_was(
         stop = next(stops, 1.0)
     prune_tiles(tiles, tmp_path / "often", few)
 
-    assert needed == 4  # two regions, twice
+    assert needed == 2  # regions
     assert needed <= len(done) <= needed + 3  # those under way
     assert read(tmp_path / "often", tiles).tobytes() == read(tmp_path / "once", tiles).tobytes()
 

@@ -33,7 +33,8 @@ def test_prune_removes_exactly_half_and_changes_no_row(
     """
     output = binary.work / "pruned.ply"
 
-    done = refine(binary, "prune", cloud, "--cameras", cameras, "-o", output, "--ratio", "0.5")
+    words = ("prune", cloud, "--cameras", cameras, "--ratio", "0.5", "--survivors", "unchanged")
+    done = refine(binary, *words, "-o", output)
 
     assert done.returncode == 0, done.stdout + done.stderr
     before, after = rows(cloud), rows(output)
@@ -51,7 +52,8 @@ def test_every_blender_writes_the_same_file(
     The `bpy` wheels have no `--command`, so the step calls the function behind it.
     """
     output = blender.work / "pruned.ply"
-    words = ["prune", cloud, "--cameras", cameras, "--ratio", "0.5", "-o", output]
+    words = ["prune", cloud, "--cameras", cameras, "--ratio", "0.5"]
+    words += ["--survivors", "unchanged", "-o", output]
 
     code = blender.step("command", arguments=words)
 
@@ -136,7 +138,7 @@ def test_pictures_are_drawn_in_the_background_without_a_display(binary: Binary, 
 
     done = binary.blender(
         *(blend, "--command", "refine", "prune", "--object", "Splats", "--ratio", "0.5"),
-        *("--dry-run", "--pictures", shown),
+        *("--survivors", "unchanged", "--dry-run", "--pictures", shown),
     )
 
     assert done.returncode == 0, done.stdout + done.stderr
@@ -158,7 +160,7 @@ def test_blends_cameras_decide_as_their_file_does(
     Measured: all rows agree; with lenses 1 % longer 99.6 %, with cameras 1 cm off 99.8 %.
     """
     by_file, by_scene = binary.work / "file.ply", binary.work / "scene.ply"
-    words = ("prune", cloud, "--ratio", "0.5", "--views", "0", "-o")
+    words = ("prune", cloud, "--ratio", "0.5", "--views", "0", "--survivors", "unchanged", "-o")
 
     from_scene = binary.blender(blend, "--command", "refine", *words, by_scene)
     from_file = without_blender(*words, by_file, "--cameras", cameras)

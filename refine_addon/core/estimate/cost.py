@@ -15,10 +15,12 @@ ROUNDS = 2.5
 SHARES = (0.1, 0.3, 0.5, 0.55, 0.7, 0.9)
 """Shares removed for which the next two hold; between them they are interpolated."""
 
-ABSORBING = (0.1, 0.5, 1.1, 1.6, 2.0, 2.6)
-"""How many times as long as measuring once absorbing takes after that: more stages, more time."""
+ABSORBING = (0.1, 0.5, 0.65, 1.4, 1.8, 2.4)
+"""How many times as long as measuring once absorbing takes after that: more stages, more time.
 
-REFITTING = (8.0, 7.0, 6.0, 6.0, 5.0, 4.0)
+These and the next are processor times of `room_small`, of one thread."""
+
+REFITTING = (23.0, 20.0, 14.0, 14.0, 10.0, 7.0)
 """The same of refitting."""
 
 
@@ -37,7 +39,7 @@ def expected_seconds(scored: float, share: float, *, once: bool) -> dict[Became,
     Examples
     --------
     >>> expected_seconds(1.0, 0.5, once=True)
-    {'unchanged': 2.5, 'absorb': 2.1, 'refit': 8.1}
+    {'unchanged': 2.5, 'absorb': 1.65, 'refit': 15.65}
     """
     measured = scored if once else scored / ROUNDS
     absorbing, refitting = (

@@ -78,7 +78,8 @@ def unchanged_note(plain: float | None, tried: Made | None) -> str:
     """
     why = "the views see too little to tell what absorbing would gain"
     if tried is not None and tried.psnr is not None:
-        why = f"absorbing reaches {in_words(tried.psnr)}, hardly more"
+        more = "no more" if plain is not None and tried.psnr <= plain else "hardly more"
+        why = f"absorbing reaches {in_words(tried.psnr)}, {more}"
     elif plain is not None:
         why = "nobody would see what absorbing gains"
     return f"survivors stay unchanged: {why}"

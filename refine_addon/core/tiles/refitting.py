@@ -1,9 +1,8 @@
-"""Refitting survivors that no memory holds at once: region by region, in two passes.
+"""Refitting survivors that no memory holds at once: region by region.
 
 Up to `absorbing.REGION` splats are refitted at once, as in memory. Of more, the survivors are
-divided into boxes of about equally many, and each box is refitted by itself, amid all others as the
-pass before left them. Where rays cross a border, the regions on both sides make up for the same
-error; the next pass, whose borders lie elsewhere, mends that.
+divided into boxes of about equally many, and each box is refitted by itself, amid all others as
+they were before.
 """
 
 from __future__ import annotations
@@ -33,9 +32,6 @@ if TYPE_CHECKING:
     from .scoring import MeasuredTiles
     from .units import Source, Unit
     from .workers import Runner
-
-PASSES = 2
-"""How often the survivors are divided; rounds are shared out among the passes."""
 
 _DENSER = 2  # a refitted survivor takes so many times the memory of one that is absorbed
 
@@ -121,14 +117,13 @@ class RefitAtOnce:
 
 
 @dataclass(frozen=True)
-class PassContext:
-    """What all steps of a pass need; the folder has of each region the ``rows`` of survivors."""
+class RegionsContext:
+    """What all regions need; the folder has of each the ``rows`` of its survivors."""
 
     folder: Folder
     before: StoredSplats  # the unpruned splats
-    after: StoredSplats  # survivors, as the pass before left them
+    after: StoredSplats  # all survivors, as they are
     settings: Refit
-    first: int  # how many rounds there were before
 
 
 @dataclass(frozen=True)
@@ -137,18 +132,16 @@ class RefitRegion:
 
     index: int
 
-    def run(self, context: PassContext, runtime: Runtime) -> int:
+    def run(self, context: RegionsContext, runtime: Runtime) -> int:
         """Save them, unless that is done; return in how many rounds they were refitted."""
         name = f"{self.index:06d}.refitted"
         return int(context.folder.once(name, lambda: self._refitted(context, runtime)))
 
-    def _refitted(self, context: PassContext, runtime: Runtime) -> NDArray[np.int64]:
+    def _refitted(self, context: RegionsContext, runtime: Runtime) -> NDArray[np.int64]:
         rows, settings = context.folder.load(self.index, ["rows"])["rows"], context.settings
         splats, changed, rounds = context.after.take(rows), np.zeros(len(rows), np.bool_), 0
-        first = context.first + 1
-        numbers = [0, *range(first, first + settings.rounds)]
         rays = RegionRays(
-            splats, rows, context.before, context.after, numbers, runtime.part(0.0, 0.3)
+            splats, rows, context.before, context.after, settings.rounds, runtime.part(0.0, 0.3)
         )
         if rays.windows:
             *_, done = refit_on(
@@ -193,30 +186,20 @@ def refit_survivors(
         return _at_once(tiles, survivors, runner)
     folder = tiles.context.folder.inner("refitting")
     if not survivors.regions:
-        regions = _saved(tiles.units, folder.inner("kept"), runner, survivors.origin)
-        survivors = replace(survivors, regions=regions)
+        kept = _saved(tiles.units, folder.inner("kept"), runner, survivors.origin)
+        survivors = replace(survivors, regions=kept)
     context, psnr_before = absorbing.estimated(tiles, survivors.regions, runner.part(0.0, 0.1))
     if psnr_before is None:
         return None
     before = StoredSplats(tiles.context, _saved(tiles.units, folder.inner("unpruned"), runner))
-    unchanged = np.zeros(len(survivors.origin), np.bool_)
-    best = Refitting(survivors, unchanged, 0, psnr_before, psnr_before)
-    first = 0
-    for number in range(PASSES):
-        rounds = (settings.rounds + number) // PASSES
-        if not rounds:
-            continue
-        of_pass = runner.part(0.1 + 0.9 * number / PASSES, 0.1 + 0.9 * (number + 1) / PASSES)
-        after = StoredSplats(context, best.survivors.regions)
-        how = PassContext(
-            folder.inner(f"pass-{number}"), before, after, replace(settings, rounds=rounds), first
-        )
-        trial = _pass(how, best, number, of_pass.part(0.0, 0.8))
-        context, psnr = absorbing.estimated(tiles, trial.survivors.regions, of_pass.part(0.8, 1.0))
-        if psnr is None or psnr <= best.psnr:
-            break
-        best, first = replace(trial, psnr=psnr), first + rounds
-    return best
+    after = StoredSplats(context, survivors.regions)
+    regions = RegionsContext(folder.inner("regions"), before, after, settings)
+    refitted = _by_regions(regions, survivors, psnr_before, runner.part(0.1, 0.9))
+    _, psnr = absorbing.estimated(tiles, refitted.survivors.regions, runner.part(0.9, 1.0))
+    if psnr is None or psnr <= psnr_before:
+        unchanged = np.zeros(len(survivors.origin), np.bool_)
+        return Refitting(survivors, unchanged, 0, psnr_before, psnr_before)
+    return replace(refitted, psnr=psnr)
 
 
 def _at_once(tiles: MeasuredTiles, survivors: Survivors, runner: Runner) -> Refitting:
@@ -234,29 +217,26 @@ def _at_once(tiles: MeasuredTiles, survivors: Survivors, runner: Runner) -> Refi
     return Refitting(made, changed, int(rounds), float(psnr_before), float(psnr))
 
 
-def _pass(context: PassContext, best: Refitting, number: int, runner: Runner) -> Refitting:
-    """Refit survivors once more, region by region; the PSNR stays to be found."""
-    survivors, scene = best.survivors, context.before.context
+def _by_regions(
+    context: RegionsContext, survivors: Survivors, psnr: float, runner: Runner
+) -> Refitting:
+    """Refit survivors region by region; the PSNR afterwards stays to be found."""
+    scene, rows = context.before.context, np.arange(len(survivors.origin))
     stage = StageContext(context.folder, scene.views, scene.scene, survivors.regions)
-    rows = np.arange(len(survivors.origin))
-    boxes = absorbing.boxes_of(stage, rows, absorbing.REGION // _DENSER, number, runner)
+    boxes = absorbing.boxes_of(stage, rows, absorbing.REGION // _DENSER, 0, runner)
     for index, box in enumerate(boxes):
         context.folder.save(index, {"rows": box})
     steps, sizes = [RefitRegion(index) for index in range(len(boxes))], [*map(len, boxes)]
     rounds = [*runner.run(context, steps, "refitting", sizes)]
-    regions = [Region(index, size, context.folder) for index, size in enumerate(sizes)]
     order = np.concatenate(boxes)
     changed = context.folder.joined(range(len(boxes)), "changed")
     made = replace(
         survivors,
-        regions=regions,
+        regions=[Region(index, size, context.folder) for index, size in enumerate(sizes)],
         origin=survivors.origin[order],
         changed=survivors.changed[order] | changed,
     )
-    return replace(
-        best, survivors=made, changed=best.changed[order] | changed,
-        rounds=best.rounds + max(rounds),
-    )  # fmt: skip
+    return Refitting(made, changed, max(rounds), psnr, psnr)
 
 
 def _saved(

@@ -120,8 +120,8 @@ class RegionRays(RoundRays):
         Which of the survivors of all regions these are.
     before, after : StoredSplats
         The unpruned splats, and the survivors of all regions.
-    rounds : sequence of int
-        Their numbers, see `CastTruth`.
+    rounds : int
+        How many rounds are refitted.
     runtime : Runtime
     """
 
@@ -131,12 +131,12 @@ class RegionRays(RoundRays):
         rows: NDArray[np.int64],
         before: StoredSplats,
         after: StoredSplats,
-        rounds: Sequence[int],
+        rounds: int,
         runtime: Runtime,
     ) -> None:
         views, scene = before.context.views.by_distance(), before.context.scene
         windows = _windows(splats, len(after), scene, views)
-        work = CastTruth(before, windows, rounds)
+        work = CastTruth(before, windows, range(rounds + 1))
         truths = cast_truths(work, len(before), runtime.progress, runtime.threads)
         super().__init__(windows, scene, truths, runtime.threads)
         self._after, self.around = after, len(after)

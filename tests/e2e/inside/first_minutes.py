@@ -80,6 +80,7 @@ def bring_in(
 
 def prune(show: Show, hand: Hand, found: dict[str, Any]) -> Generator[float, None, None]:
     """Score, apply and take that back; no event follows the last key."""
+    bpy.context.scene.refine.survivors = "unchanged"
     yield from hand.click("refine.score(")
     yield from until(lambda: not at_work() and scene()["scored"], "there are scores")
     yield from hand.scroll(down=True)

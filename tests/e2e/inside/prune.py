@@ -20,6 +20,7 @@ def main(cloud: str, cameras: str, output: str) -> dict[str, Any]:
     found = {"imported": len(splats.data.vertices), "cameras": len(bpy.data.cameras)}
     bpy.ops.refine.score()
     found["scored"] = "refine_score" in splats.data.attributes
+    bpy.context.scene.refine.survivors = "unchanged"
     bpy.ops.refine.apply()
     found["kept"] = len(splats.data.vertices)
     bpy.ops.refine.export_ply(filepath=output)

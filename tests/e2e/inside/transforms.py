@@ -60,6 +60,7 @@ def main(cloud: str, cameras: str, picture: str, blend: str) -> Generator[float,
     yield from joined(steps)
     yield from edited(steps)
     yield from reopened(steps, blend)
+    yield from foreign(steps, cloud)
     steps.told["failure"] = steps.show.draw.failure()
     return steps.told
 
@@ -187,6 +188,22 @@ def reopened(steps: Steps, blend: str) -> Generator[float, None, None]:
     yield from steps.look("ruined and reopened")
     steps.do(bpy.ops.refine.mend)
     yield from steps.look("reopened")
+
+
+def foreign(steps: Steps, cloud: str) -> Generator[float, None, None]:
+    """Apply a transform of splats that Blender's own importer brought, and undo it."""
+    bpy.data.objects.remove(splats())
+    steps.do(bpy.ops.wm.ply_import, filepath=cloud)
+    yield from until(lambda: "refine_shape" in splats().data.attributes, "they are noted")
+    splats().matrix_world = PLACE
+    steps.select(splats())
+    steps.do(bpy.ops.ed.undo_push, message="placed")
+    steps.do(bpy.ops.object.transform_apply)
+    yield 0.5
+    steps.told["foreign"] = steps.said()
+    steps.do(bpy.ops.ed.undo)
+    yield 0.5
+    steps.told["foreign undone"] = steps.said()
 
 
 def splats(but: bpy.types.Object | None = None) -> bpy.types.Object:
