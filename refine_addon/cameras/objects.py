@@ -90,7 +90,7 @@ def view_from_camera(
     size, aspect = render_size(scene)
     if source:
         size, aspect = (source["width"], source["height"]), 1.0
-    rotation, center = _pose(obj.name, matrix)
+    rotation, center = pose(obj.name, matrix)
     view = View(
         rotation=rotation,
         center=center,
@@ -222,10 +222,21 @@ def _intrinsics(data: bpy.types.Camera, size: tuple[int, int], aspect: float) ->
     }
 
 
-def _pose(
-    name: str, matrix: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the world-to-camera rotation and the centre; a camera's scale means nothing."""
+def pose(name: str, matrix: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the world-to-camera rotation and the centre; a camera's scale means nothing.
+
+    Parameters
+    ----------
+    name : str
+        Of the camera, for messages.
+    matrix : (4, 4) float64
+        From the camera, as Blender has its axes, to the world.
+
+    Raises
+    ------
+    RefineError
+        If the camera is sheared or flat.
+    """
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     axes = matrix[:3, :3] / np.where(lengths > 0.0, lengths, 1.0)
     if lengths.min() <= 0.0 or np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR:

@@ -14,8 +14,8 @@ import bpy
 import numpy as np
 
 from .. import main_thread
-from ..cameras.objects import FLIP
-from ..core.affine import transformed
+from ..cameras.objects import pose
+from ..core.affine import is_flat, transformed
 from ..core.drawing import draw, seen_from
 from ..core.errors import RefineError
 from ..core.seeing.scene import scene_of
@@ -192,7 +192,7 @@ def _place(
     Raises
     ------
     RefineError
-        If the camera is a panorama.
+        If the camera is a panorama, sheared or flat.
     """
     data, render = camera.data, depsgraph.scene.render
     if data.type not in {"PERSP", "ORTHO"}:
@@ -205,11 +205,10 @@ def _place(
     pixel = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
     projection = camera.calc_matrix_camera(depsgraph, x=width, y=height, **pixel)
     p = np.array(projection, np.float64)
-    matrix = np.array(camera.matrix_world, np.float64)
-    axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=0)
+    rotation, center = pose(camera.name, np.array(camera.matrix_world, np.float64))
     view = View(
-        rotation=FLIP[:, None] * axes.T,
-        center=matrix[:3, 3],
+        rotation=rotation,
+        center=center,
         fx=p[0, 0] * width / 2,
         fy=p[1, 1] * height / 2,
         cx=(1.0 - p[0, 2] + p[0, 3]) * width / 2,
@@ -263,6 +262,8 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
             continue
         checkpoint()
         matrix = np.array(instance.matrix_world, np.float64)
+        if not np.isfinite(matrix).all() or is_flat(matrix):  # shows nothing, as a mesh would
+            continue
         evaluated = SimpleNamespace(data=obj.data.evaluated_get(depsgraph))
         checked = SplatObject(cast("bpy.types.Object", evaluated), check(obj).layout)
         splats = mesh_attributes.splats_from_object(checked)

@@ -284,8 +284,10 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
             plans.forget(member.mesh)
         plans.refresh(context)
         psnr = result.report["estimated_psnr"]
-        if result.absorbed:
-            self.report({"INFO"}, result.absorbed.note())
+        known = scoring_notes(result.scores)  # said when they were scored
+        for note in result.report["notes"]:
+            if note not in known:
+                self.report({"INFO"}, note)
         self.report(
             {"INFO"},
             f"Kept {outcome.kept:,} splats{_of_objects(group)}, removed {outcome.removed:,}: "

@@ -48,6 +48,20 @@ def test_apply_leaves_what_core_says(addon, few, room_views, survivors):
     assert expected.changed.sum() > 100
 
 
+@BOTH
+def test_apply_says_what_became_of_the_survivors(addon, few, room_views, capfd, survivors):
+    """The sentences of the report: of refitting its own, and how many absorbed others by then."""
+    room, budget = few
+    bpy.context.scene.refine.survivors = survivors
+    report = absorbed_in_core(addon, room, room_views, budget, survivors).report
+    bpy.ops.refine.score()
+    bpy.ops.refine.apply()
+
+    told = capfd.readouterr().out
+    assert f"{report['absorbed']['changed']:,} survivors absorbed " in told
+    assert ("survivors were refitted in" in told) == (survivors == "refit")
+
+
 def test_a_moved_object_is_absorbed_in_its_own_frame(addon, few, room_views):
     """Object and cameras moved together: the data changes as if neither had been."""
     room, budget = few

@@ -161,6 +161,17 @@ def test_instances_are_drawn_and_what_renders_hide_is_not(addon, shot, quarter):
     assert not hidden[..., 3].any()
 
 
+@pytest.mark.parametrize("flat", [(0.0, 0.0, 0.0), (1.0, 1.0, 0.0), (math.nan, 1.0, 1.0)])
+def test_splats_that_are_scaled_to_nothing_do_not_show(shot, flat):
+    """As where an animation ends one object and begins another; the others are drawn."""
+    whole = rendered()
+    gone = bpy.data.objects.new("gone", bpy.data.objects["room"].data)
+    gone.matrix_world = Matrix.Diagonal((*flat, 1.0))
+    shot.collection.objects.link(gone)
+
+    np.testing.assert_array_equal(rendered(), whole)
+
+
 def test_a_border_is_cut_out_of_the_picture(shot):
     """The left half of the upper half: columns 0 to 30 and rows 0 to 20 of 60 x 40."""
     whole = rendered()
@@ -241,10 +252,11 @@ def test_a_movie_is_written_as_one_file(shot, tmp_path):
     [
         (lambda scene: setattr(scene, "camera", None), "has no camera"),
         (lambda scene: setattr(scene.camera.data, "type", "PANO"), "is a panorama"),
+        (lambda scene: setattr(scene.camera, "scale", (0.0, 0.0, 0.0)), "is sheared or flat"),
         (lambda scene: setattr(scene.render, "use_multiview", True), "not drawn in stereo"),
         (lambda _scene: bpy.data.objects.remove(bpy.data.objects["room"]), "has no splats"),
     ],
-    ids=["no camera", "panorama", "stereo", "no splats"],
+    ids=["no camera", "panorama", "flat camera", "stereo", "no splats"],
 )
 def test_what_cannot_be_rendered_is_said_and_nothing_is_left(shot, change, message):
     change(shot)
