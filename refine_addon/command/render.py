@@ -29,8 +29,15 @@ def render(run: Run) -> None:
         raise RefineError(msg) from None
     except RuntimeError as error:  # what Blender reports
         raise RefineError(str(error).strip()) from error
-    for frame in dict.fromkeys(shared.frames):
-        run.terminal.say(f"frame {frame}: {scene.render.frame_path(frame=frame)}")
+    drawn = set(shared.frames)
+    for frame in chosen:
+        path = scene.render.frame_path(frame=frame)
+        if frame in drawn:
+            run.terminal.say(f"frame {frame}: {path}")
+        else:
+            run.terminal.notes([f"{path}: exists and stays; the scene's Overwrite is off"])
+    if not drawn:
+        return
     among = f" among what {shared.engine} rendered" if shared.engine else ""
     run.terminal.say(f"  {shared.splats:,} splats{among}")
     if shared.engine and shared.engine != scene.render.engine:

@@ -310,3 +310,21 @@ def test_the_command_writes_the_frames_it_is_told(addon, shot, tmp_path, capsys)
     told = capsys.readouterr()
     assert f"frame 7: {tmp_path / 'f_07.png'}" in told.out
     assert "has no camera" in told.err
+
+
+def test_the_command_names_the_frames_that_it_leaves(addon, shot, tmp_path, capsys):
+    """With *Overwrite* off a file that is there stays, and nothing is said to be rendered."""
+    shot.render.filepath = str(tmp_path / "f_##")
+    shot.render.use_overwrite = False
+    (tmp_path / "f_03.png").touch()
+
+    codes = [
+        addon.command.main(["render", "--frames", frames], scene=True) for frames in ("3:3", "3:4")
+    ]
+
+    assert codes == [0, 0]
+    there = f"  note: {tmp_path / 'f_03.png'}: exists and stays; the scene's Overwrite is off\n"
+    said = capsys.readouterr().out
+    assert said.startswith(there)
+    assert said.count(there) == 2
+    assert said.count(" splats") == 1

@@ -79,6 +79,7 @@ def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
         bpy.ops.render.render("INVOKE_DEFAULT")
     yield 1.0
     yield from picture(pictures, "f12")
+    yield from until(lambda: not rendering(), "F12 is over")  # Blender quits badly amid a render
     notice = importlib.import_module(f"{extension.MODULE}.ui.render_notice")
     found["notice"] = bool(notice._until)
     return found
