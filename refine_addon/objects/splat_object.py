@@ -97,14 +97,18 @@ def gather(checked: SplatObject, *, whole: bool | None = False) -> Splats:
     Raises
     ------
     RefineError
-        If the object's matrix cannot be applied.
+        If the object's matrix cannot be applied; names the object.
     """
     matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
     whole = is_uniform(matrix) if whole is None else whole
     splats = mesh_attributes.splats_from_object(checked, sh_rest=whole)
     if np.array_equal(matrix, np.eye(4)):
         return splats
-    return transformed(splats, matrix, rotate_sh=whole)
+    try:
+        return transformed(splats, matrix, rotate_sh=whole)
+    except RefineError as error:
+        msg = f"object '{checked.obj.name}': {error}"
+        raise RefineError(msg) from None
 
 
 def can_become(group: Sequence[SplatObject], survivors: SurvivorChoice) -> SurvivorChoice:

@@ -38,6 +38,14 @@ def rows(addon, objects):
     return np.sort(np.concatenate(found))
 
 
+def test_the_object_that_cannot_be_scored_is_named(halves):
+    """The one that is not the active one, scaled to nothing."""
+    halves[0].scale = (0.0, 0.0, 0.0)
+
+    with pytest.raises(RuntimeError, match="object 'a': the transform is flat"):
+        bpy.ops.refine.score()
+
+
 @pytest.mark.parametrize(
     ("method", "survivors"),
     [
