@@ -18,6 +18,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import threading
 import tomllib
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -92,10 +93,16 @@ def module_of(fault: Fault, texts: dict[str, str]) -> str:
     return places[0]
 
 
+_ONE = threading.Lock()
+"""Held while it is asked whether all tests pass, which takes minutes, so that it is asked once."""
+
+
 def outcome(fault: Fault, module: str, text: str) -> str:
     """Return the first test that fails with a fault in a module, or "" if none does."""
     caught = _outcome([[fault.first]], fault, module, text)
-    if not caught and not unbroken():
+    with _ONE:
+        broken = not caught and not unbroken()
+    if broken:
         msg = "not known: other tests fail without any fault"
         raise ValueError(msg)
     return caught or _outcome(_stages(fault.test), fault, module, text)
