@@ -46,8 +46,8 @@ class Splats:
     sh_rest : (N, K, 3) floating
         The other coefficients, K = (degree + 1)^2 - 1 of each channel.
     model : {"default", "antialiased", "2dgs"}
-        How they are drawn, see `rendering.Model`. Of "2dgs" the third scale does not count: it is 0
-        (`LOG_ZERO`) where a file has none.
+        How they are drawn, see `rendering.Model`. Of "2dgs" the third scale is 0 (`LOG_ZERO`),
+        whatever a file holds: see `with_model`.
     """
 
     means: NDArray[Any]
@@ -85,6 +85,21 @@ class Splats:
             name: np.asfortranarray(getattr(self, name)) for name in ARRAYS if name != "sh_rest"
         }
         return replace(self, **columns)
+
+
+def with_model(splats: Splats, model: Model) -> Splats:
+    """Return the splats as drawn in another way; discs have no third scale.
+
+    Parameters
+    ----------
+    splats : Splats
+    model : {"default", "antialiased", "2dgs"}
+    """
+    if model != "2dgs":
+        return replace(splats, model=model)
+    flat = np.array(splats.log_scales)
+    flat[:, 2] = LOG_ZERO
+    return replace(splats, log_scales=flat, model=model)
 
 
 def joined(parts: Sequence[Splats]) -> Splats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..formats.ply_header import HEADER_LIMIT, TEXT, format_of
 from ..formats.registry import read_splats
 from ..rendering import MODELS
 from ..scoring.closed_form_block import ROWS
-from ..splats import Splats, joined
+from ..splats import Splats, joined, with_model
 from ..urls import Url
 from . import storage
 
@@ -152,7 +152,7 @@ class Unit:
                 chosen.append(Part(part.tile, begin + start, begin + stop))
         chosen = chosen or [*kinds.values()]
         splats = joined([splats_from_columns(rows_of(part)) for part in chosen])
-        return replace(splats, model=self.parts[0].tile.model)
+        return with_model(splats, self.parts[0].tile.model)
 
     def slices(self) -> list[slice]:
         """Return where in the unit each part lies."""
