@@ -103,12 +103,18 @@ def with_model(splats: Splats, model: Model) -> Splats:
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
-    """Return all splats of several sets of one model, one at least, in that order.
+    """Return all splats of several sets, one at least, in that order.
 
     The result has the highest degree among them; coefficients that a part lacks are 0.
+
+    Raises
+    ------
+    RefineError
+        If they are drawn in different ways.
     """
     if len(parts) == 1:
         return parts[0]
+    refuse_mixed([part.model for part in parts])
     most = max(part.sh_rest.shape[1] for part in parts)
     columns: dict[str, Any] = {name: [getattr(part, name) for part in parts] for name in ARRAYS}
     columns["sh_rest"] = [
@@ -117,6 +123,14 @@ def joined(parts: Sequence[Splats]) -> Splats:
     with np.errstate(invalid="ignore"):  # signalling NaN converted to float64
         columns = {name: np.concatenate(arrays) for name, arrays in columns.items()}
     return replace(parts[0], **columns)
+
+
+def refuse_mixed(models: Sequence[Model]) -> None:
+    """Raise `RefineError` if splats that are to become one scene are drawn in different ways."""
+    if len(set(models)) > 1:
+        listed = ", ".join(dict.fromkeys(models))
+        msg = f"splats of different models ({listed}), expected one: say how all are drawn"
+        raise RefineError(msg)
 
 
 def above_constant(degree: int) -> int:

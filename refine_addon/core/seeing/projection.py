@@ -313,7 +313,11 @@ def footprints_and_depths(
                 if gaussians.model == "antialiased":
                     alphas *= kept
             footprints = Footprints(index, centers, *axes, inside, alphas, discs)
-            pieces.append((footprints, local[2]))
+            depths_of_piece = local[2]
+            if gaussians.model == "antialiased":  # some are now too faint to be drawn
+                drawn = np.flatnonzero(alphas > ALPHA_CUT)
+                footprints, depths_of_piece = footprints.take(drawn), depths_of_piece.take(drawn)
+            pieces.append((footprints, depths_of_piece))
     return _joined(pieces)
 
 
