@@ -58,15 +58,15 @@ def discs(splats: Splats) -> Splats:
 
 
 def measure(
-    splats: Splats, decided: Splats, views: ViewSet, judges: Sequence[Evaluator], ratio: float
+    splats: Splats, decided: Splats, views: ViewSet, evaluators: Sequence[Evaluator], ratio: float
 ) -> list[str]:
-    """Return for each way: PSNR in the views of both judges, and the estimate, dB."""
+    """Return for each way: PSNR in the views of both evaluators, and the estimate, dB."""
     cells = []
     for way in WAYS:
         result = prune(decided, views, Budget(ratio=ratio), survivors=way)
         left = result.survivors(decided)
         drawn = left if left.model == splats.model else version(left, splats.model)
-        scoring, held = (judge.evaluate(drawn).renders.mean["psnr"] for judge in judges)
+        scoring, held = (each.evaluate(drawn).renders.mean["psnr"] for each in evaluators)
         cells.append(f"{held:.2f} ({result.report['estimated_psnr']:.2f} for {scoring:.2f})")
     return cells
 
@@ -83,13 +83,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print("|---|---|---|" + "---|" * len(WAYS))
     for model in options.models:
         splats = version(scene.splats, model)
-        judges = [
+        evaluators = [
             Evaluator(splats, views, metrics=("psnr",)) for views in (scene.train, scene.test)
         ]
         for asked in dict.fromkeys((model, MODELS[0])):
             decided = replace(splats, model=asked)
             for ratio in options.ratios:
-                cells = measure(splats, decided, scene.train, judges, ratio)
+                cells = measure(splats, decided, scene.train, evaluators, ratio)
                 print(f"| {model} | {asked} | {100 * ratio:.0f} % |", " | ".join(cells), "|")
                 sys.stdout.flush()
     return 0

@@ -33,7 +33,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..affine import quaternion
-from ..rendering import ALPHA_MAX
+from ..rendering import ALPHA_MAX, LOW_PASS
+from ..seeing.projection import disc_axes
 from ..splats import LOG_ZERO, rotation_matrices
 from .merge_field import Field, across, footprint, normalized
 
@@ -210,7 +211,7 @@ class _Signal(NamedTuple):
         Covariances in the plane, low-pass included.
     area, base : (M,) float64
         See `_area`, with the low-pass; and of what the opacity is meant for: of antialiased splats
-        without the low-pass.
+        without the low-pass, of discs with their own.
     mass : (M,) float64
         Opacity times `base`.
     """
@@ -289,10 +290,21 @@ def _signal(splats: Field, plane: tuple[Array, Array], blur: Array) -> _Signal:
 
 def _base(footprint: Footprint, blur: Array, model: Model) -> Array:
     """Return the area that opacity is meant for, (M,): see `_Signal`."""
-    if model != "antialiased":
+    if model == "default":
         return _area(footprint)
     xx, xy, yy = footprint
-    return _area((np.maximum(xx - blur, _TINY), xy, np.maximum(yy - blur, _TINY)))
+    sharp = (np.maximum(xx - blur, _TINY), xy, np.maximum(yy - blur, _TINY))
+    return _area(sharp) if model == "antialiased" else _disc_area(sharp, blur / LOW_PASS)
+
+
+def _disc_area(footprint: Footprint, pixel: Array) -> Array:
+    """Return what discs cover with their low-pass, over 2 pi, (M,); `pixel` is a pixel's area."""
+    xx, xy, yy = footprint
+    mean = 0.5 * (xx + yy)
+    first = mean + np.hypot(0.5 * (xx - yy), xy)
+    axes_of = disc_axes(np.stack([first, _determinant(footprint) / first]) / pixel)
+    covered: Array = axes_of[0] * axes_of[1] * pixel
+    return covered
 
 
 def _contrasts(ends: _Ends, one: Array, two: Array) -> tuple[Array, Array, Array]:
@@ -368,7 +380,8 @@ def flattened(merged: Field, logs: Array, quaternions: Array) -> tuple[Array, Ar
     covariances = (vectors @ np.swapaxes(vectors, 1, 2))[:, rows, columns]
     plane = across(merged.direction)
     thick, thin = (
-        _area(footprint(each, plane, merged.blur)) for each in (merged.covariances, covariances)
+        _base(footprint(each, plane, merged.blur), merged.blur, "2dgs")
+        for each in (merged.covariances, covariances)
     )
     return flat, turned, np.minimum(merged.opacity * thick / thin, ALPHA_MAX)
 

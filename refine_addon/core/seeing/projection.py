@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from ..rendering import Model
     from ..splats import Splats
     from ..views import View, ViewSet
+
+FloatT = TypeVar("FloatT", np.float32, np.float64)
 
 CUT_SIGMAS = 3.3
 """Standard deviations to which a footprint counts as reaching: alpha = 1 falls to `ALPHA_CUT` at
@@ -106,7 +108,7 @@ class Footprints:
         Column and row, pixels.
     major, minor : (2, n) float32
         Half axes: one standard deviation along each principal direction, pixels. Of discs: those of
-        an ellipse that covers as much, see `_disc_axes`.
+        an ellipse that covers as much, see `disc_axes`.
     sigmas : (2, n) float32
         Their lengths, the longer first.
     inside : (n,) bool
@@ -598,7 +600,7 @@ def _discs(
     Returns
     -------
     centers, axes
-        See `_ellipses`; the ellipse is that of `_disc_axes`.
+        See `_ellipses`; the ellipse is that of `disc_axes`.
     discs : (7, n) float32
         Two vectors p with ``d' C^-1 d = (p_1 d)^2 + (p_2 d)^2``, 1/px, g, 1/px, and the largest
         ``1 + g d`` that is drawn: the depth of the centre over that of the near plane.
@@ -619,10 +621,10 @@ def _discs(
             z / np.float32(near),
         ]
     )
-    return centers, _half_axes(_disc_axes(variances), direction), discs.astype(np.float32)
+    return centers, _half_axes(disc_axes(variances), direction), discs.astype(np.float32)
 
 
-def _disc_axes(variances: NDArray[np.float32]) -> NDArray[np.float32]:
+def disc_axes(variances: NDArray[FloatT]) -> NDArray[FloatT]:
     """Return the half axes, (2, n), of ellipses that cover as much as discs with their low-pass.
 
     The larger of two Gaussians of variance l along both axes, the low-pass, and of a and b, has the
@@ -633,21 +635,21 @@ def _disc_axes(variances: NDArray[np.float32]) -> NDArray[np.float32]:
 
     Parameters
     ----------
-    variances : (2, n) float32
+    variances : (2, n) floating
         a and b, px^2, the larger first; without the low-pass.
     """
-    low = np.float32(DISC_LOW_PASS)
+    low = variances.dtype.type(DISC_LOW_PASS)
     first = np.maximum(variances[0], low)
-    thin = np.maximum(variances[1], np.float32(_THINNEST_DISC**2))
-    second = np.clip(thin, None, low * np.float32(0.999))
-    square = (1.0 / low - 1.0 / first) / (1.0 / second - 1.0 / first)  # of sin t
+    thin = np.maximum(variances[1], variances.dtype.type(_THINNEST_DISC**2))
+    second = np.minimum(thin, variances.dtype.type(0.999 * DISC_LOW_PASS))
+    square = (1.0 / low - 1.0 / first) / (1.0 / second - 1.0 / first)  # of the sine of t
     angle = np.arcsin(np.sqrt(np.clip(square, 0.0, 1.0)))
     product = np.sqrt(first * second)
     covered = 4.0 * product * np.arctan(np.sqrt(first / second) * np.tan(angle))
     covered += low * (2.0 * np.pi - 4.0 * angle)
     whole = np.where(variances[1] >= low, np.sqrt(first * thin), covered / (2.0 * np.pi))
     major = np.sqrt(first)
-    return np.asarray(np.stack([major, np.minimum(whole / major, major)]), np.float32)
+    return np.asarray(np.stack([major, np.minimum(whole / major, major)]), variances.dtype)
 
 
 def _major_direction(
