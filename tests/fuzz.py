@@ -398,6 +398,33 @@ def use_sog(folder: Path) -> None:
     use_splats(folder)
 
 
+def ksplat_seeds() -> list[Files]:
+    """Return what files of the reference converter hold, without the zeros between."""
+    seeds = []
+    for name in ("level_0", "level_1", "level_2", "degree_1"):
+        data = (ROOT / f"tests/data/other_tools/{name}.ksplat").read_bytes()
+        count = data[4]
+        starts = [4096 + 1024 * number for number in range(count)]
+        sections = {f"{1 + n}": data[at : at + 42] for n, at in enumerate(starts)}
+        seeds.append({"0": data[:44], **sections, "9": data[4096 + 1024 * count :]})
+    return seeds
+
+
+def use_ksplat(folder: Path) -> None:
+    """Put header, sections and splats into a file and use that."""
+    header, *sections, rest = sorted(folder.iterdir())
+    data = header.read_bytes()[:4096].ljust(4096, b"\0")
+    data += b"".join(path.read_bytes()[:1024].ljust(1024, b"\0") for path in sections)
+    data += rest.read_bytes()
+    for path in (header, *sections, rest):
+        path.unlink()
+    path = folder / "in.ksplat"
+    path.write_bytes(data)
+    file = read_splats(path)
+    describe(file)
+    file.write(folder / "out.ply")
+
+
 def use_cameras(folder: Path) -> None:
     """Read cameras, and score a few splats by them, by either method."""
     files = sorted(path for path in folder.iterdir() if path.name != "dataparser_transforms.json")
@@ -426,6 +453,7 @@ TARGETS: dict[str, Target] = {
         if form.name != "SOG"
     },
     **({"SOG": (sog_seeds, use_sog)} if find_spec("PIL") else {}),
+    ".ksplat": (ksplat_seeds, use_ksplat),
     "cameras.json": (inria_seeds, use_cameras),
     "transforms.json": (transforms_seeds, use_cameras),
     "colmap text": (colmap_text_seeds, use_cameras),

@@ -18,7 +18,7 @@ from ..core import (
     Settings,
 )
 from ..core.errors import printable
-from ..core.formats.registry import SUFFIXES
+from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.levels.files import GOAL
 from ..core.urls import Url, is_url, refuse_url
 from ..core.whole_file import expanded
@@ -35,6 +35,8 @@ DEFAULT_RATIO = 0.5
 DEFAULT_LEVELS = (0.5, 0.25, 0.12, 0.06)
 
 FORMATS = ", ".join(SUFFIXES)
+
+_FILES = f"files: {', '.join(READ_SUFFIXES)}"
 
 SOURCES = ("visible", "active", "selected", "frames", "collection:NAME")
 """What --source takes: the choices of the panel, in small letters."""
@@ -127,7 +129,7 @@ def _add(commands: Any, name: str, purpose: str) -> argparse.ArgumentParser:  # 
 
 def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     prune = _add(commands, "prune", "remove the splats the cameras would miss least")
-    prune.add_argument("inputs", nargs="*", type=_tile, metavar="INPUT", help=f"files: {FORMATS}")
+    prune.add_argument("inputs", nargs="*", type=_tile, metavar="INPUT", help=_FILES)
     _add_object(prune)
     prune.add_argument(
         "--save", action="store_true", help="with --object: delete the splats there and save"
@@ -213,9 +215,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
 
 def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     cleaning = _add(commands, "clean", "remove what the cameras see to float in the air")
-    cleaning.add_argument(
-        "inputs", nargs="+", type=_given, metavar="INPUT", help=f"files: {FORMATS}"
-    )
+    cleaning.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help=_FILES)
     _add_outputs(cleaning, "; without it, only say what would go")
     _add_cameras(cleaning)
     cleaning.add_argument(

@@ -16,7 +16,7 @@ from bpy_extras.io_utils import ImportHelper
 from ..cameras.objects import SOURCE, UPRIGHT
 from ..core.cameras.read import read_cameras
 from ..core.errors import RefineError
-from ..core.formats.registry import SUFFIXES, read_splats
+from ..core.formats.registry import READ_SUFFIXES, read_splats
 from ..core.work import part, report
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 _ROWS = 1 << 16
 """Rows that are read before the next look at whether the import was cancelled."""
 
-FILE_NAMES = ";".join(f"*{suffix}" for suffix in SUFFIXES)
+FILE_NAMES = ";".join(f"*{suffix}" for suffix in READ_SUFFIXES)
 """What a file browser shows."""
 
 
@@ -194,7 +194,9 @@ class REFINE_FH_ply(bpy.types.FileHandler):
     bl_idname = "REFINE_FH_ply"
     bl_label = "Gaussian Splats (REFINE)"
     bl_import_operator = "refine.import_ply"
-    bl_file_extensions = ";".join(dict.fromkeys("." + suffix.split(".")[-1] for suffix in SUFFIXES))
+    bl_file_extensions = ";".join(
+        dict.fromkeys("." + suffix.split(".")[-1] for suffix in READ_SUFFIXES)
+    )
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:

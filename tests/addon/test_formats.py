@@ -20,7 +20,7 @@ def small(addon, tmp_path):
 
 
 def suffixes(addon):
-    """Return the endings of all formats."""
+    """Return the endings of all formats that are written."""
     return addon.core.formats.registry.SUFFIXES
 
 
@@ -80,8 +80,9 @@ def test_all_formats_can_be_dropped_and_picked(addon):
         for operator in (bpy.ops.refine.import_ply, bpy.ops.refine.export_ply)
     ]
 
-    assert set(handler) == {Path(f"a{suffix}").suffix for suffix in suffixes(addon)}
-    assert globs == [[f"*{suffix}" for suffix in suffixes(addon)]] * 2
+    read = addon.core.formats.registry.READ_SUFFIXES
+    assert set(handler) == {Path(f"a{suffix}").suffix for suffix in read}
+    assert globs == [[f"*{end}" for end in read], [f"*{end}" for end in suffixes(addon)]]
 
 
 def test_an_object_is_pruned_to_a_size_in_another_format(addon, small, tmp_path):

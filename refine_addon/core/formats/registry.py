@@ -14,7 +14,7 @@ from ..errors import RefineError, reason_of
 from ..foreign_files import refuse_pointer
 from ..splats import drawable
 from ..whole_file import expanded, whole_file
-from . import compressed_ply, dot_splat, glb, sog, spz
+from . import compressed_ply, dot_splat, glb, ksplat, sog, spz
 from .ply import SplatFile, read_ply
 from .ply_columns import REQUIRED, splats_from_columns
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..rendering import Model
     from ..splats import Splats
     from ..urls import Url
-    from .format import Format, Sizes
+    from .format import Format, Reader, Sizes
 
 FORMATS: tuple[Format, ...] = (
     compressed_ply.FORMAT,
@@ -36,14 +36,20 @@ FORMATS: tuple[Format, ...] = (
     sog.FORMAT,
     dot_splat.FORMAT,  # known by its name alone, if it is none of the others
 )
-"""Every format but plain PLY, in the order in which an input is tried."""
+"""Every format that is written, but plain PLY."""
+
+READERS: tuple[Reader, ...] = (*FORMATS, ksplat.READER)
+"""Every format that is read, but plain PLY, in the order in which an input is tried."""
 
 SUFFIXES = (".ply", *(form.suffix for form in FORMATS))
-"""Endings of the files that are read and written."""
+"""Endings of the files that are written."""
 
-_LONGEST_FIRST = sorted(SUFFIXES, key=len, reverse=True)
+READ_SUFFIXES = (".ply", *(form.suffix for form in READERS))
+"""Endings of the files that are read."""
 
-NOT_WRITTEN = (".ksplat", ".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
+_LONGEST_FIRST = sorted(READ_SUFFIXES, key=len, reverse=True)
+
+NOT_WRITTEN = (ksplat.READER.suffix, ".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
 """Endings of other splat formats and of compressed files: a PLY of such a name would mislead."""
 
 _HEAD = 1 << 16  # bytes by which a format is known; the header of a compressed PLY has fewer
@@ -78,7 +84,7 @@ def _read(path: Path) -> SplatFile:
     """Open a file of splats, see `read_splats`."""
     head = _beginning(path)
     refuse_pointer(path, head)
-    form = next((form for form in FORMATS if form.matches(path, head)), None)
+    form = next((form for form in READERS if form.matches(path, head)), None)
     if form is None:
         return read_ply(path)
     try:
