@@ -51,7 +51,7 @@ class _Section(NamedTuple):
 
     place: Place
     start: int
-    count: int
+    splats: int
     room: int  # splats that there is room for
     bucket_size: int  # splats of a full bucket
     bucket_count: int
@@ -108,10 +108,10 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     """
     header = _parsed(path, data)
     sections = list(_sections(path, data, header))
-    count = sum(section.count for section in sections)
+    count = sum(section.splats for section in sections)
     if count != header.count:
         Place(path).fail(f"{header.count} splats by byte 16, {count} by the sections")
-    degree = max((section.degree for section in sections if section.count), default=0)
+    degree = max((section.degree for section in sections if section.splats), default=0)
     origin = Origin(f"{NAME} level {header.level}", len(data))
     file, splats = new_file(path, origin, count, degree)
     splats.sh_rest[:] = 0.0
@@ -119,8 +119,8 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
     # Any bits may stand in a file: scales that are no sizes, ranges that are no numbers.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore", under="ignore"):
         for section in sections:
-            _fill(splats.take(slice(start, start + section.count)), header, section, data)
-            start += section.count
+            _fill(splats.take(slice(start, start + section.splats)), header, section, data)
+            start += section.splats
     return file
 
 
@@ -149,8 +149,8 @@ def _sections(path: Path, data: NDArray[np.uint8], header: _Header) -> Iterator[
         section = section._replace(middle=section.middle or _MIDDLE)
         if section.degree >= _DEGREES:
             place.fail(f"harmonics of degree {section.degree}, expected 0 to {_DEGREES - 1}")
-        if section.count > section.room:
-            place.fail(f"{section.count} splats, expected at most {section.room}, its room")
+        if section.splats > section.room:
+            place.fail(f"{section.splats} splats, expected at most {section.room}, its room")
         if header.level and section.bucket_bytes != 12:  # noqa: PLR2004 - three float32
             place.fail(f"{section.bucket_bytes} bytes of a bucket, expected 12")
         start += section.before_rows + header.row(section.degree).itemsize * section.room
@@ -162,10 +162,10 @@ def _fill(splats: Splats, header: _Header, section: _Section, data: NDArray[np.u
     """Set the splats of a section."""
     start = section.start + section.before_rows
     dtype = header.row(section.degree)
-    stored = data[start : start + section.count * dtype.itemsize].view(dtype)
+    stored = data[start : start + section.splats * dtype.itemsize].view(dtype)
     centers, buckets = _buckets(section, data) if header.level else (None, None)
     step = section.block / 2.0 / section.middle
-    for piece in pieces(section.count):
+    for piece in pieces(section.splats):
         rows = stored[piece]
         if centers is None or buckets is None:
             splats.means[piece] = rows["mean"]
@@ -191,12 +191,12 @@ def _buckets(
     lengths = data[section.start : middle].view("<u4").astype(np.int64)
     end = middle + section.bucket_bytes * section.bucket_count
     centers = data[middle:end].view("<f4").reshape(-1, 3)
-    rows = np.arange(section.count)
-    in_full = min(section.full * section.bucket_size, section.count)
+    rows = np.arange(section.splats)
+    in_full = min(section.full * section.bucket_size, section.splats)
     bucket = rows // max(section.bucket_size, 1)
     behind = np.searchsorted(np.cumsum(lengths), rows[in_full:] - in_full, "right")
     bucket[in_full:] = section.full + behind
-    if section.count and bucket.max() >= len(centers):
+    if section.splats and bucket.max() >= len(centers):
         row = int(np.argmax(bucket >= len(centers)))
         section.place.fail(f"splat {row} lies in bucket {bucket[row]} of {len(centers)}")
     return centers, bucket
