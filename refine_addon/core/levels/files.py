@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import RefineError
 from ..estimate.quality import PSNR_CAP
-from ..formats.registry import SUFFIXES, as_written, without_suffix
+from ..formats.registry import SUFFIXES, as_written, scene_name
 from ..operation.files import FileSource
 from ..operation.run import Request, Written, run
 from ..report import held, scoring_notes, seen_by
@@ -62,8 +62,7 @@ def level_paths(source: Path, folder: Path, count: int, suffix: str = ".ply") ->
     >>> [path.as_posix() for path in level_paths(Path("a/b.compressed.ply"), Path("out"), 2)]
     ['out/b.lod1.ply', 'out/b.lod2.ply']
     """
-    name = without_suffix(source.name)
-    name = source.stem if name == source.name else name or source.name
+    name = scene_name(source)
     return [folder / f"{name}.lod{number}{suffix}" for number in range(1, count + 1)]
 
 
