@@ -68,6 +68,7 @@ EXAMPLES = {
     ),
     "lod": (
         "refine lod in.ply --cameras cameras.json -o levels",
+        "refine lod in.ply --cameras cameras.json -o web/lod-meta.json",
         "refine lod in.ply --cameras cameras.json --psnr 45,40,35 --format .spz -o levels",
     ),
     "convert": ("refine convert in.ply out.spz",),
@@ -251,7 +252,8 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
         type=_path,
         metavar="DIR",
         required=True,
-        help="for NAME.lod1.ply and so on, and lod.json; made if it is not there",
+        help="for NAME.lod1.ply and so on; DIR/lod-meta.json makes a streamed SOG of all levels, "
+        "which viewers on the web load by chunks; DIR is made if it is not there",
     )
     amount = making.add_mutually_exclusive_group()
     amount.add_argument(
@@ -288,7 +290,6 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
         "--format",
         type=str.lower,
         choices=SUFFIXES,
-        default=SUFFIXES[0],
         metavar="SUFFIX",
         help=f"of the files: {FORMATS} (default {SUFFIXES[0]})",
     )
