@@ -20,6 +20,7 @@ from ..core import (
 from ..core.errors import printable
 from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.levels.files import GOAL
+from ..core.rendering import MODELS
 from ..core.urls import Url, is_url, refuse_url
 from ..core.whole_file import expanded
 from ..version import VERSION
@@ -210,6 +211,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         help="with --together: on the workers of this Dask scheduler, which see the same files "
         "under the same paths",
     )
+    _add_model(prune)
     prune.add_argument("--dry-run", action="store_true", help="decide and report, write no splats")
     _add_common(prune)
 
@@ -228,6 +230,7 @@ def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     )
     _add_views(cleaning)
     zones.add(cleaning)
+    _add_model(cleaning)
     _add_common(cleaning)
 
 
@@ -240,6 +243,7 @@ def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     )
     _add_scoring(scoring)
     zones.add(scoring, protects=False)
+    _add_model(scoring)
     _add_common(scoring)
 
 
@@ -303,6 +307,7 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
     )
     _add_scoring(making)
     zones.add(making)
+    _add_model(making)
     _add_common(making)
 
 
@@ -310,6 +315,7 @@ def _add_convert(commands: Any) -> None:  # noqa: ANN401 - argparse does not nam
     convert = _add(commands, "convert", "write a file of splats in another format")
     convert.add_argument("inputs", nargs=1, type=_given, metavar="IN", help="known by its content")
     convert.add_argument("output", type=_path, metavar="OUT", help=f"by its suffix: {FORMATS}")
+    _add_model(convert)
     _add_common(convert)
 
 
@@ -409,6 +415,15 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
         f"(default {Settings.tolerance})",
     )
     _add_views(parser)
+
+
+def _add_model(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--model",
+        choices=MODELS,
+        help="how the splats are drawn, where a file does not say or is wrong: default, "
+        "antialiased (Mip-Splatting, gsplat, Brush's mip) or 2dgs (discs)",
+    )
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
