@@ -17,7 +17,7 @@ from ..scoring import occlusion
 from ..selection import Budget, quality_of, select
 from ..task import DEFAULTS, Settings
 from ..work import Progress, part, silent
-from .refit_splats import Made, refit_absorbed
+from .refit_splats import Made, refit_made
 from .score_splats import score_once, with_quality
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ ABSORBED = 0.3
 
 def absorb_task(
     task: Task,
-    count: int,
+    keep: NDArray[np.bool_],
     known: tuple[Scores, Measured] | None,
     progress: Progress,
     threads: int | None,
@@ -61,8 +61,9 @@ def absorb_task(
     Parameters
     ----------
     task : Task
-    count : int
-        How many survive, unless the budget is a PSNR: then as few as keep it.
+    keep : (N,) bool
+        Which splats plain deletion keeps: as many survive, unless the budget is a PSNR: then as few
+        as keep it.
     known : tuple of Scores and Measured, optional
         See `absorb_removed`.
     progress : callable
@@ -81,36 +82,52 @@ def absorb_task(
         )  # fmt: skip
     progress = part(progress, start, 1.0)
     if goal is None:
-        return _absorb_to_count(task, count, known, progress, threads)
+        return _absorb_to_count(task, keep, known, progress, threads)
     return _absorb_to_psnr(task, goal, known, progress, threads)
 
 
 def _absorb_to_count(
     task: Task,
-    count: int,
+    keep: NDArray[np.bool_],
     known: tuple[Scores, Measured],
     progress: Progress,
     threads: int | None,
 ) -> Made:
-    """Return what so many survivors become, and the estimated PSNR of it, dB."""
+    """Return what as many survivors become as deletion keeps, and the estimated PSNR of it, dB."""
     splats, views = task.scene()
     origin, refits = task.origin, task.survivors == "refit"
+    truth = known[0].ray_sample if origin is None else origin.ray_sample
+    used = views.spread(task.settings.views)
+
+    def estimated(survivors: Splats, share: float) -> float | None:
+        if truth is None:
+            return None
+        last = part(progress, share, min(share + 0.05, 1.0))
+        return psnr_against(truth, survivors, used, progress=last, threads=threads)
+
     absorbed = absorb_removed(
-        splats, views, count, task.settings, known=known, protected=task.protected,
+        splats, views, int(np.count_nonzero(keep)), task.settings,
+        known=known, protected=task.protected,
         began=None if origin is None else len(origin.splats),
         progress=part(progress, 0.0, ABSORBED if refits else 0.95), threads=threads,
     )  # fmt: skip
-    made = Made(absorbed)
-    if refits:
-        made = refit_absorbed(task, made, part(progress, ABSORBED, 0.95), threads)
-    truth = known[0].ray_sample if origin is None else origin.ray_sample
-    if truth is None:
+    if not refits:
+        return Made(absorbed, estimated(absorbed.splats, 0.95))
+    plain = estimated(splats.take(keep), ABSORBED)
+    psnr = estimated(absorbed.splats, ABSORBED + 0.05)
+    made = Made(absorbed, psnr, before={"unchanged": plain, "absorb": psnr})
+    if plain is not None and psnr is not None and plain > psnr:
+        made = replace(made, absorbed=_deleted(splats, keep), psnr=plain, began="unchanged")
+    made = refit_made(task, made, part(progress, ABSORBED + 0.1, 0.95), threads)
+    if made.refitted is None or made.stopped is not None:
         return made
-    used = views.spread(task.settings.views)
-    progress = part(progress, 0.95, 1.0)
-    survivors = made.survivors.splats
-    psnr = psnr_against(truth, survivors, used, progress=progress, threads=threads)
-    return replace(made, psnr=psnr)
+    return replace(made, psnr=estimated(made.refitted.splats, 0.95))
+
+
+def _deleted(splats: Splats, keep: NDArray[np.bool_]) -> Absorbed:
+    """Return what plain deletion leaves, as absorbing returns it."""
+    left = absorbing.in_float64(splats.take(keep))
+    return absorbing.Absorbed(left, keep, np.zeros(len(left), np.bool_), 0, len(keep) - len(left))
 
 
 def _absorb_to_psnr(
@@ -137,7 +154,10 @@ def _absorb_to_psnr(
     for number in range(TRIES):
         count = total - math.floor(curve.share(goal - offset, way) * total)
         try_progress = part(progress, number / TRIES, (number + 1) / TRIES)
-        made = _absorb_to_count(task, count, known, try_progress, threads)
+        keep = select(known[0], Budget(keep=max(count, 1)), protected=task.protected)
+        made = _absorb_to_count(task, keep, known, try_progress, threads)
+        if made.stopped is not None:
+            return replace(best or made, stopped=made.stopped)
         if made.psnr is None:
             return made
         if best is None or abs(made.psnr - goal) < missed:
