@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from .refit_splats import Made, refit_made
 from .score_splats import score_once, with_quality
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from ..absorbing.absorb import Absorbed
@@ -139,35 +141,63 @@ def _absorb_to_psnr(
 ) -> Made:
     """Return the result with as few survivors as keep a PSNR, dB.
 
-    What a number of survivors reaches is read from the curve of the scores, and put right by what
-    the last try reached.
+    What a number of survivors reaches is read from the curve of the scores, put right by what the
+    last try reached; between a try that keeps the PSNR and one that does not, from these two.
     """
     scores, total = known[0], len(task.scene()[0])
     if scores.quality is None:
         scores = with_quality(scores, protected=task.protected, threads=threads)
     curve = quality_of(scores)
     way: Became = "refit" if task.survivors == "refit" else "absorb"
-    # By how much results are closer than the curve expects, dB.
-    offset = 0.0 if task.origin is None else goal - left_to_lose(goal, task.origin.psnr)
-    best: Made | None = None
-    missed = math.inf
+    origin = None if task.origin is None else task.origin.psnr
+    gone, tried, best = curve.share(left_to_lose(goal, origin), way), list[_Try](), None
     for number in range(TRIES):
-        count = total - math.floor(curve.share(goal - offset, way) * total)
+        count = max(total - math.floor(gone * total), 1)
+        if any(count == one.survivors for one in tried):
+            break
         try_progress = part(progress, number / TRIES, (number + 1) / TRIES)
-        keep = select(known[0], Budget(keep=max(count, 1)), protected=task.protected)
+        keep = select(known[0], Budget(keep=count), protected=task.protected)
         made = _absorb_to_count(task, keep, known, try_progress, threads)
         if made.stopped is not None:
             return replace(best or made, stopped=made.stopped)
         if made.psnr is None:
             return made
-        if best is None or abs(made.psnr - goal) < missed:
-            best, missed = made, abs(made.psnr - goal)
-        if missed <= CLOSE:
+        tried.append(_Try(count, made.psnr))
+        if best is None or min(tried, key=lambda one: one.misses(goal)) is tried[-1]:
+            best = made
+        if abs(made.psnr - goal) <= CLOSE:
             break
         gone = 1.0 - len(made.absorbed.splats) / total
-        offset = made.psnr - curve.at(gone, way)
+        gone = _between(tried, goal, total) or curve.share(
+            goal - made.psnr + curve.at(gone, way), way
+        )
     assert best is not None  # noqa: S101 - every try gives one
     return best
+
+
+class _Try(NamedTuple):
+    """How many survivors reached which PSNR, dB."""
+
+    survivors: int
+    psnr: float
+
+    def misses(self, goal: float) -> tuple[bool, float]:
+        """Return by how much it misses a PSNR, as a key: above is better than below."""
+        return self.psnr < goal - CLOSE, abs(self.psnr - goal)
+
+
+def _between(tried: Sequence[_Try], goal: float, total: int) -> float | None:
+    """Return which share of `total` has to go by the tries next to a PSNR; None without both.
+
+    The PSNR is taken as linear in the logarithm of the odds of that share, as by `Quality.at`.
+    """
+    above = min((one for one in tried if one.psnr >= goal), default=None)
+    below = max((one for one in tried if one.psnr < goal), default=None)
+    if above is None or below is None:
+        return None
+    odds = np.log([total / one.survivors - 1.0 for one in (below, above)])
+    place = np.interp(goal, [below.psnr, above.psnr], odds)
+    return float(1.0 / (1.0 + np.exp(-place)))
 
 
 def absorb_removed(  # noqa: PLR0913 - as `pipeline.prune`

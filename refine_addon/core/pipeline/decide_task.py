@@ -19,7 +19,7 @@ from ..estimate.quality import AS_GOOD, PLAIN, deletion_will_do, in_words, neede
 from ..report import MEASURES, Clock, conclude, expected_psnr, in_tenths, make_report, remark
 from ..task import DEFAULTS, Result, Settings, Task
 from ..work import Progress, part, report, silent
-from .absorb_splats import absorb_task
+from .absorb_splats import CLOSE, absorb_task
 from .refit_splats import unchanged_note
 from .score_splats import score, score_once, with_quality
 
@@ -298,9 +298,9 @@ def _as_good(task: Task, keep: NDArray[np.bool_], plain: float | None, made: Mad
     """
     if plain is None or made.psnr is None:
         return True
-    fewer = np.count_nonzero(keep) - len(made.absorbed.splats)
-    if task.budget.psnr is not None:  # both keep it
-        return bool(fewer <= 0)
+    if task.budget.psnr is not None:
+        missed = made.psnr < task.budget.psnr - CLOSE and made.psnr < plain
+        return missed or np.count_nonzero(keep) <= len(made.absorbed.splats)
     return plain > made.psnr - AS_GOOD
 
 

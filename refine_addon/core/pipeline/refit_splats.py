@@ -77,7 +77,10 @@ class Made:
 
     def notes(self) -> list[str]:
         """Return the same as sentences, for the user."""
-        notes = [] if self.refitted is None else [self.refitted.note(self.seconds)]
+        notes = []
+        if self.refitted is not None:
+            none = "refitting gains nothing on rays that nothing was fitted to"
+            notes.append(self.refitted.note(self.seconds) if self.refitted.rounds else none)
         if self.began == "unchanged":
             told = [in_words(psnr) for psnr in self.before.values() if psnr is not None]
             notes.append(f"refitting began with plain deletion: {told[0]}, absorbing {told[1]}")
