@@ -18,7 +18,7 @@ from ..core import (
     Settings,
 )
 from ..core.errors import printable
-from ..core.formats.registry import SUFFIXES
+from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.levels.files import GOAL
 from ..core.rendering import MODELS
 from ..core.urls import Url, is_url, refuse_url
@@ -36,6 +36,8 @@ DEFAULT_RATIO = 0.5
 DEFAULT_LEVELS = (0.5, 0.25, 0.12, 0.06)
 
 FORMATS = ", ".join(SUFFIXES)
+
+_FILES = f"files: {', '.join(READ_SUFFIXES)}"
 
 SOURCES = ("visible", "active", "selected", "frames", "collection:NAME")
 """What --source takes: the choices of the panel, in small letters."""
@@ -67,6 +69,7 @@ EXAMPLES = {
     ),
     "lod": (
         "refine lod in.ply --cameras cameras.json -o levels",
+        "refine lod in.ply --cameras cameras.json -o web/lod-meta.json",
         "refine lod in.ply --cameras cameras.json --psnr 45,40,35 --format .spz -o levels",
     ),
     "convert": ("refine convert in.ply out.spz",),
@@ -128,7 +131,7 @@ def _add(commands: Any, name: str, purpose: str) -> argparse.ArgumentParser:  # 
 
 def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     prune = _add(commands, "prune", "remove the splats the cameras would miss least")
-    prune.add_argument("inputs", nargs="*", type=_tile, metavar="INPUT", help=f"files: {FORMATS}")
+    prune.add_argument("inputs", nargs="*", type=_tile, metavar="INPUT", help=_FILES)
     _add_object(prune)
     prune.add_argument(
         "--save", action="store_true", help="with --object: delete the splats there and save"
@@ -215,9 +218,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
 
 def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     cleaning = _add(commands, "clean", "remove what the cameras see to float in the air")
-    cleaning.add_argument(
-        "inputs", nargs="+", type=_given, metavar="INPUT", help=f"files: {FORMATS}"
-    )
+    cleaning.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help=_FILES)
     _add_outputs(cleaning, "; without it, only say what would go")
     _add_cameras(cleaning)
     cleaning.add_argument(
@@ -255,7 +256,8 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
         type=_path,
         metavar="DIR",
         required=True,
-        help="for NAME.lod1.ply and so on, and lod.json; made if it is not there",
+        help="for NAME.lod1.ply and so on; DIR/lod-meta.json makes a streamed SOG of all levels, "
+        "which viewers on the web load by chunks; DIR is made if it is not there",
     )
     amount = making.add_mutually_exclusive_group()
     amount.add_argument(
@@ -292,7 +294,6 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
         "--format",
         type=str.lower,
         choices=SUFFIXES,
-        default=SUFFIXES[0],
         metavar="SUFFIX",
         help=f"of the files: {FORMATS} (default {SUFFIXES[0]})",
     )

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..core.formats.ply import REQUIRED, SplatFile
 from ..core.formats.ply_columns import THIRD_SCALE
+from ..core.formats.registry import scene_name
 from ..core.rendering import MODELS
 from ..core.splats import Splats, single_unit_quaternions, with_model
 from .layout import KINDS, Column, Layout, SplatObject, add_attributes, rest_count, splat_count
@@ -60,7 +61,7 @@ def import_notes(source: SplatFile) -> tuple[str, ...]:
 def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
     """Make a mesh with a vertex a splat and an attribute a property; it has no user yet."""
     rows = source.rows
-    mesh = bpy.data.meshes.new(source.path.stem)
+    mesh = bpy.data.meshes.new(scene_name(source.path))
     try:
         add_vertices(mesh, len(rows))
         columns = add_attributes(mesh, rows.dtype, source.header)

@@ -354,11 +354,11 @@ def _mixture(one: Field, two: Field, share: Array) -> Array:
 
     `share`, (M,), is that of the first.
     """
-    position: Array = share[:, None]
-    step: Array = two.means - one.means
+    position, step = share[:, None], two.means - one.means
     rows, columns = np.triu_indices(3)
-    between: Array = step[:, rows] * step[:, columns] * (position * (1.0 - position))  # (M, 6)
-    whole: Array = position * one.covariances + (1.0 - position) * two.covariances + between
+    between = step[:, rows] * step[:, columns] * (position * (1.0 - position))  # (M, 6)
+    apart = position * one.covariances + (1.0 - position) * two.covariances
+    whole = np.asarray(apart + between, np.float64)
     return flat(whole) if one.model == "2dgs" else whole
 
 
