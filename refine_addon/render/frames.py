@@ -91,10 +91,10 @@ def steps(
         for frame in frames:
             if write and not movie and _is_there(whole, frame, *kept):
                 continue
-            for step in meshes.steps():
+            for step in meshes.steps(frame):
                 _set_frames(step, [frame])
                 yield Step(step, animation=True, what="meshes")
-            shared.layer = meshes.layer(frame)
+            shared.layers = meshes.layers()
             _set_frames(whole, [frame])
             yield Step(whole, animation=write, what="splats")
             _check(shared, frame)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import sys
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import bpy
 import numpy as np
 
-from ..core.drawing import Layer
+from ..core.drawing import Layers, in_order
 from ..core.exr import read_exr
 from ..mesh import native
 from ..mesh.layout import looks_like_splats
-from . import copies
+from . import copies, see_through
+from .out_of_sight import out_of_sight
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -42,8 +45,45 @@ def drawn_by_us(obj: bpy.types.Object) -> bool:
     )
 
 
+class _Apart(NamedTuple):
+    """Objects that are rendered together.
+
+    Attributes
+    ----------
+    others : list of bpy.types.Object
+        Those that are left out.
+    blended : bool
+        Whether the engine tells no depth of them.
+    """
+
+    others: list[bpy.types.Object]
+    blended: bool = False
+
+
+class _Pass(NamedTuple):
+    """What was rendered of them: colours times alpha, alphas, depths."""
+
+    colors: NDArray[np.float32]
+    alphas: NDArray[np.float32]
+    depths: NDArray[np.float32]
+
+
+def _divided(scene: bpy.types.Scene, objects: list[bpy.types.Object]) -> list[_Apart]:
+    """Return which objects of a copy are rendered together, the opaque ones last."""
+    eevee = scene.render.engine.startswith("BLENDER_EEVEE")
+    glass = not eevee and scene.cycles.film_transparent_glass
+    opaque, apart = see_through.groups(objects, glass=glass)
+    parts = [_Apart([obj for obj in objects if obj not in group], eevee) for group in apart]
+    if opaque:
+        parts.append(_Apart([obj for obj in objects if obj not in opaque]))
+    return parts
+
+
 class Meshes:
     """What a scene shows besides splats, rendered frame by frame.
+
+    What lets light through is rendered apart, object by object, so that splats between it and what
+    stands behind it are seen.
 
     Parameters
     ----------
@@ -61,13 +101,19 @@ class Meshes:
         self._folder = folder
         self._meshes = self._world = ""  # names of copies
         self._hidden: list[bpy.types.Object] = []
+        self._apart: list[_Apart] = [_Apart([])]
+        self._found: list[_Pass] = []
+        self._behind: NDArray[np.float32] | None = None
         self.engine = ""
         layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
         objects = [obj for obj in layer.objects if obj.type in _RENDERED and not obj.hide_render]
-        if any(not drawn_by_us(obj) for obj in objects):
-            self._meshes = self._copy(scene, "REFINE meshes", transparent=True).name
+        shown = [obj for obj in objects if not drawn_by_us(obj)]
+        if shown:
+            meshes = self._copy(scene, "REFINE meshes", transparent=True)
+            self._meshes = meshes.name
             # Older Blenders show the points of point clouds as balls.
             self._hidden = [o for o in objects if drawn_by_us(o) and o.type == "POINTCLOUD"]
+            self._apart = _divided(meshes, shown)
         if not scene.render.film_transparent and scene.world is not None:
             world = self._copy(scene, "REFINE world", transparent=False)
             for linked in (world.collection.children, world.collection.objects):
@@ -80,41 +126,71 @@ class Meshes:
         if self._meshes or self._world:
             self.engine = bpy.data.scenes[self._meshes or self._world].render.engine
 
-    def steps(self) -> Iterator[str]:
-        """Give the names of the scenes to be rendered for a frame, one after another."""
-        if self._meshes:
-            for obj in self._hidden:
-                obj.hide_render = True
-            try:
+    def steps(self, frame: int) -> Iterator[str]:
+        """Give the names of the scenes to be rendered for a frame, one after another.
+
+        The next is asked for when one is rendered.
+        """
+        self._found, self._behind = [], None
+        for part in self._apart if self._meshes else ():
+            with out_of_sight([*self._hidden, *part.others]):
                 yield self._meshes
-            finally:
-                for obj in self._hidden:
-                    obj.hide_render = False
+                passes = self._passes(self._meshes, frame)
+                if part.blended:
+                    with self._solid():
+                        yield self._meshes
+                        passes["Depth"] = self._passes(self._meshes, frame)["Depth"]
+            self._found.append(self._pass(passes))
         if self._world:
             yield self._world
+            self._behind = self._passes(self._world, frame)["Combined"][:3]
 
-    def layer(self, frame: int) -> Layer | None:
-        """Return what was rendered for a frame, None if there is nothing to render."""
-        meshes, world = (
-            self._passes(name, frame) if name else None for name in (self._meshes, self._world)
-        )
-        if meshes is None:
+    def layers(self) -> Layers | None:
+        """Return what was rendered for the last frame, None if there is nothing to render."""
+        name, world = self._meshes or self._world, self._behind
+        if not self._found:
             if world is None:
                 return None
-            background = world["Combined"][:3]
-            height, width = background.shape[1:]
-            nothing = np.zeros((height, width), np.float32)
-            (shown,) = self._shown(self._world, [background])
-            return Layer(np.zeros_like(shown), nothing, nothing, shown)
-        colors, alphas = meshes["Combined"][:3], meshes["Combined"][3].clip(0.0, 1.0)
-        depths = _known(meshes["Depth"][0], alphas, bpy.data.scenes[self._meshes].camera.data)
-        opaque = colors / np.maximum(alphas, 1e-6)
+            (background,) = self._shown(name, [world])
+            nothing = np.zeros((1, *background.shape[1:]), np.float32)
+            return Layers(np.zeros_like(background)[None], nothing, nothing, background)
+        as_light = in_order(self._found)
+        over, left = as_light.over_nothing(), as_light.left()[-1]
         if world is None:
-            (shown,) = self._shown(self._meshes, [opaque])
-            return Layer(alphas * shown, alphas, depths)
-        over = colors + (1.0 - alphas) * world["Combined"][:3]  # as without splats
-        shown, whole = self._shown(self._meshes, [opaque, over])
-        return Layer(alphas * shown, alphas, depths, whole - alphas * shown)
+            over /= np.maximum(1.0 - left, 1e-6)
+        else:
+            over += left * world  # as without splats
+        opaque = [each.colors / np.maximum(each.alphas, 1e-6) for each in self._found]
+        shown = self._shown(name, [*opaque, over.astype(np.float32)])
+        whole = shown.pop()
+        pairs = zip(shown, self._found, strict=True)
+        layers = in_order([each._replace(colors=each.alphas * colors) for colors, each in pairs])
+        if world is None and len(self._found) == 1:
+            return layers
+        if world is None:
+            return replace(layers, background=whole * (1.0 - left) - layers.over_nothing())
+        return replace(layers, background=whole - layers.over_nothing())
+
+    @contextmanager
+    def _solid(self) -> Iterator[None]:
+        """Render all in one opaque material and with one sample: its depth is what counts."""
+        scene = bpy.data.scenes[self._meshes]
+        samples, material = scene.eevee.taa_render_samples, bpy.data.materials.new(scene.name)
+        material[copies.MARK] = True
+        scene.eevee.taa_render_samples = 1
+        for layer in scene.view_layers:
+            layer.material_override = material
+        try:
+            yield
+        finally:
+            bpy.data.materials.remove(material)
+            scene.eevee.taa_render_samples = samples
+
+    def _pass(self, passes: dict[str, NDArray[np.float32]]) -> _Pass:
+        """Return what was rendered in one step."""
+        colors, alphas = passes["Combined"][:3], passes["Combined"][3].clip(0.0, 1.0)
+        camera = bpy.data.scenes[self._meshes].camera.data
+        return _Pass(colors, alphas, _known(passes["Depth"][0], alphas, camera))
 
     def _copy(self, scene: bpy.types.Scene, name: str, *, transparent: bool) -> bpy.types.Scene:
         copy = copies.copied(scene, name)
