@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 MARK = "refine_render"
-"""Custom property of such a copy, and of what is made for it."""
+"""Custom property of such a copy."""
 
 
 def copied(scene: bpy.types.Scene, name: str) -> bpy.types.Scene:
@@ -31,8 +31,6 @@ def copied(scene: bpy.types.Scene, name: str) -> bpy.types.Scene:
 
 def remove_all() -> None:
     """Remove all copies."""
-    for material in [material for material in bpy.data.materials if MARK in material]:
-        bpy.data.materials.remove(material)
     found = [scene for scene in bpy.data.scenes if MARK in scene]
     if bpy.context.window is None:  # as in a command: `remove` of 4.3 crashes without a window
         bpy.data.batch_remove(found)

@@ -29,6 +29,7 @@ from . import card
 from .meshes import drawn_by_us
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -48,8 +49,8 @@ class Shared:
 
     Attributes
     ----------
-    layers : Layers or None
-        What is rendered besides splats, of the next frame.
+    layers : callable or None
+        Gives what was rendered besides splats, of the next frame, or None.
     transparent : bool
         Whether what lies behind everything is left transparent.
     card : bool
@@ -68,7 +69,7 @@ class Shared:
         Why drawing ended.
     """
 
-    layers: Layers | None = None
+    layers: Callable[[], Layers | None] | None = None
     transparent: bool = False
     card: bool = False
     finished: Path | None = None
@@ -141,7 +142,8 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc] # noqa: N801 
         scene, size = depsgraph.scene, (self.resolution_x, self.resolution_y)
         place = _place(depsgraph, self.camera_override or scene.camera, size)
         splats = _splats(depsgraph, place.view.center)
-        view, layers = _cropped(place.view, _border(scene, size)), shared.layers
+        view = _cropped(place.view, _border(scene, size))
+        layers = shared.layers() if shared.layers else None
         if layers is not None and place.away:
             depths = np.where(layers.depths > 0.0, layers.depths + place.away, 0.0)
             layers = replace(layers, depths=depths)
