@@ -238,7 +238,7 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
 
     Instances are among them. Modifiers are not looked at, as in the 3D views.
     """
-    parts = [_NOTHING]
+    parts = []
     for instance in depsgraph.object_instances:
         obj = instance.object.original
         if not drawn_by_us(obj) or not splat_count(obj.data):
@@ -253,7 +253,7 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
         local = np.linalg.inv(matrix)
         splats = seen_from(splats, local[:3, :3] @ eye + local[:3, 3])
         parts.append(transformed(splats, matrix, rotate_sh=False))
-    return joined(parts)
+    return joined(parts) if parts else _NOTHING
 
 
 _NOTHING = Splats(
