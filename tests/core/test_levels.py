@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,7 @@ from refine_addon.core.formats.ply import SplatFile
 from refine_addon.core.levels import distance
 from refine_addon.core.levels.distance import OriginalPictures
 from refine_addon.core.pipeline import absorb_splats
+from refine_addon.core.splats import ARRAYS
 
 from .test_cleaning import cameras, wall
 
@@ -50,7 +51,7 @@ def colourful():
 
 def equal(one, other):
     """Say whether two sets of splats are the same to the bit."""
-    pairs = ((getattr(one, item.name), getattr(other, item.name)) for item in fields(Splats))
+    pairs = ((getattr(one, item), getattr(other, item)) for item in ARRAYS)
     return all(np.array_equal(a, b) for a, b in pairs)
 
 
@@ -127,7 +128,7 @@ def test_each_level_is_absorbed_from_the_one_before():
 
 def joined_in_double(splats):
     """Return splats in float64, which holds float32 exactly."""
-    return Splats(**{f.name: getattr(splats, f.name).astype(np.float64) for f in fields(Splats)})
+    return Splats(**{f: getattr(splats, f).astype(np.float64) for f in ARRAYS})
 
 
 @pytest.mark.slow

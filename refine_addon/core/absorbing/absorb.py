@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..seeing.scene import scene_of, spatial_order, splat_fingerprint
-from ..splats import Splats, drawable
+from ..splats import ARRAYS, Splats, drawable
 from ..work import Progress, for_chunks, part, report, silent
 from . import merge_field, merging
 from .merge_field import ViewSums
@@ -186,11 +186,11 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
 
 def _in_float64(splats: Splats, progress: Progress) -> Splats:
     """Return splats in float64: merged ones merge again, and rounding would depend on the frame."""
-    columns = {}
-    for name, values in vars(splats).items():
+    columns: dict[str, Any] = {}
+    for name in ARRAYS:
         report(progress, 0.0, "absorbing")
-        columns[name] = np.asarray(values, np.float64)
-    return Splats(**columns)
+        columns[name] = np.asarray(getattr(splats, name), np.float64)
+    return replace(splats, **columns)
 
 
 def stages(count: int, goal: int, alone: float = ALONE) -> list[int]:

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RefineError
+from ..rendering import MODELS
 from ..seeing.scene import spatial_order
 from ..work import chunks
 from .ply import Origin, SplatFile
 from .ply_columns import empty_rows
-from .ply_header import new_header
+from .ply_header import new_header, with_model
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..rendering import Model
     from ..splats import Splats
 
 CHUNK = 1 << 15
@@ -65,6 +67,8 @@ class Format:
         ``write(stream, splats)``; all of the splats can be drawn.
     sizes : callable or None
         ``sizes(count, degree)`` returns `Sizes`; None if a file is compressed as a whole.
+    models : tuple of str
+        Which of `rendering.MODELS` its files can tell: what `write` finds in `Splats.model`.
     """
 
     name: str
@@ -75,14 +79,19 @@ class Format:
     read: Callable[[Path, NDArray[np.uint8]], SplatFile]
     write: Callable[[BinaryIO, Splats], None]
     sizes: Callable[[int, int], Sizes] | None
+    models: tuple[Model, ...] = MODELS[:1]
 
     def sizes_without_more(self, count: int, degree: int) -> Sizes | None:
         """Return `sizes` of splats of any degree: without the harmonics that it does not hold."""
         return self.sizes(count, min(degree, self.degree)) if self.sizes else None
 
 
-def new_file(path: Path, origin: Origin, count: int, degree: int) -> tuple[SplatFile, Splats]:
+def new_file(
+    path: Path, origin: Origin, count: int, degree: int, model: Model = "default"
+) -> tuple[SplatFile, Splats]:
     """Return a file of `count` splats whose values are still to be set.
+
+    The splats have a third scale, whatever their model.
 
     Returns
     -------
@@ -94,7 +103,8 @@ def new_file(path: Path, origin: Origin, count: int, degree: int) -> tuple[Splat
     rows, splats = empty_rows(count, degree)
     header = new_header(((name, "float") for name in rows.dtype.names or ()), count)
     nothing = np.empty(0, np.uint8)
-    return SplatFile(path, rows, header, nothing, nothing, origin=origin), splats
+    file = SplatFile(path, rows, with_model(header, model), nothing, nothing, origin=origin)
+    return file, splats
 
 
 def pieces(count: int) -> Iterator[slice]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import mmap
 import stat
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..rendering import Model
     from ..splats import Splats
     from ..urls import Url
     from .format import Format, Sizes
@@ -48,13 +49,15 @@ NOT_WRITTEN = (".ksplat", ".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
 _HEAD = 1 << 16  # bytes by which a format is known; the header of a compressed PLY has fewer
 
 
-def read_splats(path: Path | str) -> SplatFile:
+def read_splats(path: Path | str, model: Model | None = None) -> SplatFile:
     """Open a file of splats of any format, known by its content.
 
     Parameters
     ----------
     path : path-like
         ``~`` is the home folder.
+    model : {"default", "antialiased", "2dgs"}, optional
+        How its splats are drawn, where it does not say or is wrong.
 
     Returns
     -------
@@ -66,9 +69,13 @@ def read_splats(path: Path | str) -> SplatFile:
     ------
     RefineError
         If the file does not exist, is of no known format, or is damaged; the message names the
-        file, the place, what was found and what was expected.
+        file, the place, what was found and what was expected. See also `SplatFile.drawn_as`.
     """
-    path = expanded(path)
+    return _read(expanded(path)).drawn_as(model)
+
+
+def _read(path: Path) -> SplatFile:
+    """Open a file of splats, see `read_splats`."""
     head = _beginning(path)
     refuse_pointer(path, head)
     form = next((form for form in FORMATS if form.matches(path, head)), None)
@@ -224,6 +231,11 @@ class Packed:
                 f"{self.form.suffix} holds harmonics of degree {self.form.degree}, "
                 f"the file has degree {degree}: the others are left out"
             )
+        if self.file.model not in self.form.models:
+            notes.append(
+                f"{self.form.suffix} does not say that splats are {self.file.model}: read it with "
+                f"--model {self.file.model}"
+            )
         names = self.file.rows.dtype.names or ()
         known = ("nx", "ny", "nz", *REQUIRED)
         extra = [n for n in names if n not in known and not n.startswith("f_rest_")]
@@ -279,7 +291,7 @@ class Packed:
                     msg = f"{path}: {self.form.suffix} holds no property '{name}'; write to a .ply"
                     raise RefineError(msg)
                 rows[name] = values if keep is None else values[keep]
-        splats = splats_from_columns(rows)
+        splats = replace(splats_from_columns(rows), model=self.file.model)
         good = drawable(splats)
         if not good.any():
             msg = f"{path}: none of the {len(splats)} splats can be drawn: nothing to write"

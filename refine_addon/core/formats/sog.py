@@ -14,13 +14,14 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
 from ..errors import RefineError
 from ..foreign_files import is_sog
 from ..place import Place, described
+from ..rendering import MODELS
 from ..splats import above_constant, opacity, opacity_logits, unit_quaternions
 from .format import (
     Format,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..rendering import Model
     from ..splats import Splats
 
 NAME = "SOG"
@@ -186,7 +188,7 @@ def _splats(bundle: _Bundle, count: int) -> SplatFile:
     palette, labels = _palette(bundle, count)
     degree = math.isqrt(palette.shape[1] + 1) - 1
     origin = Origin(f"{NAME} version 2", bundle.size)
-    file, splats = new_file(bundle.place.path, origin, count, degree)
+    file, splats = new_file(bundle.place.path, origin, count, degree, _model(bundle))
     with np.errstate(over="ignore", invalid="ignore"):  # any number may stand in meta.json
         _fill_means(bundle, splats)
         _fill_rotations(bundle, splats)
@@ -194,6 +196,14 @@ def _splats(bundle: _Bundle, count: int) -> SplatFile:
         for piece in pieces(count):
             splats.sh_rest[piece] = palette[labels[piece]]
     return file
+
+
+def _model(bundle: _Bundle) -> Model:
+    """Return how the splats are drawn, as splat-transform says it: a word beside the version."""
+    word = bundle.meta.get("model", MODELS[0])
+    if word not in MODELS:
+        bundle.place.at("model").fail(f"expected one of {', '.join(MODELS)}, got {described(word)}")
+    return cast("Model", word)
 
 
 def _fill_means(bundle: _Bundle, splats: Splats) -> None:
@@ -282,6 +292,8 @@ def write(stream: BinaryIO, splats: Splats) -> None:
         "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": color_table.tolist(), "files": ["sh0.webp"]},
     }
+    if splats.model != MODELS[0]:
+        meta["model"] = splats.model
     images = {
         "means_l.webp": _image(size, lower),
         "means_u.webp": _image(size, upper),
@@ -438,4 +450,5 @@ FORMAT = Format(
     read=read,
     write=write,
     sizes=None,
+    models=MODELS,
 )

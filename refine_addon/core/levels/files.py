@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from ..formats.format import Format
     from ..operation.loaded import Loaded
     from ..operation.run import Runtime
+    from ..rendering import Model
     from ..task import Settings
     from ..views import ViewSet
     from ..volumes import Zone
@@ -93,8 +94,8 @@ class LevelsRequest(Request["Loaded", "LevelSeries"]):
         Of the files, which names their format.
     goal : float
         The PSNR that the manifest's ``distance_psnr`` is for, dB.
-    overwrite : bool
-        Whether files may be replaced.
+    overwrite, model
+        See `Request`.
     """
 
     views: ViewSet
@@ -104,6 +105,7 @@ class LevelsRequest(Request["Loaded", "LevelSeries"]):
     suffix: str = ".ply"
     goal: float = GOAL
     overwrite: bool = False
+    model: Model | None = None
 
     @contextlib.contextmanager
     def opened(self, _form: Format | None) -> Iterator[None]:
@@ -272,7 +274,7 @@ def lod_file(
         removed again then, and where one was to be replaced, no manifest is left.
     """
     sink = LevelSink(expanded(source), expanded(folder), request)
-    read = FileSource(source, request.zones)
+    read = FileSource(source, request.zones, request.model)
     return run(read, request, sink, progress=progress).report
 
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ..formats.format import Format
+    from ..rendering import Model
     from ..volumes import Zone
 
 
@@ -117,9 +118,12 @@ class Request(ABC, Generic[LoadedT_contra, DecisionT]):
         Whether files may be replaced.
     dry_run : bool
         Whether to decide as for the output, and write no splats.
+    model : {"default", "antialiased", "2dgs"}, optional
+        How the splats of a file are drawn, where it does not say or is wrong.
     """
 
     zones: Sequence[Zone] = ()
+    model: Model | None = None
     overwrite: bool = False
     dry_run: bool = False
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..refitting.refit import Gains, Refit, refit, refit_on
-from ..splats import joined
+from ..splats import ARRAYS, joined
 from . import absorbing
 from .region_rays import RegionRays, StoredSplats
 from .regions import Region, StageContext
@@ -75,7 +75,7 @@ class SaveSplats:
     def _saved(self, folder: Folder) -> NDArray[np.int64]:
         splats = self.source.splats()
         splats = splats if self.rows is None else splats.take(self.rows)
-        kind = np.result_type(*vars(splats).values())
+        kind = np.result_type(*(getattr(splats, name) for name in ARRAYS))
         folder.save(self.source.index, {"splats": packed(splats).astype(kind, copy=False)})
         return np.array(len(splats))
 
