@@ -14,7 +14,7 @@ from refine_addon.core.seeing import projection
 from refine_addon.core.seeing.cast import cast, pixels
 from refine_addon.core.seeing.ray_sample import colors_from
 from refine_addon.core.splats import SH_C0, rotation_matrices
-from refine_addon.core.work import Cancelled, silent
+from refine_addon.core.work import Cancelled
 from tests.core.test_invariance import moved, rotation
 from tests.core.test_occlusion import cloud, ring
 
@@ -268,19 +268,6 @@ def test_views_move_a_little_in_each_round_and_along_their_own_axes():
     moves = np.linalg.norm(places[0], axis=1)
     assert 0.7 * steps[0] < np.sqrt(np.mean(moves**2)) < 1.3 * steps[0]
     np.testing.assert_allclose(places[1], places[0] @ turn.T, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_views_take_turns():
-    """Of 40 views each has rays in every second round; of 12 all have, as 6 are too few."""
-    splats = cloud(60)
-    for count, of_round in ((40, 20), (12, 12)):
-        views = ViewSet(tuple(ring(count)))
-        rays = round_rays.RoundRays.of(splats, views, 30, silent, 1)
-        rays.psnr(splats, silent)
-        for number in (1, 2):
-            found = rays.linear(splats, number, geometry=True, progress=silent)
-            assert len(found) == of_round
 
 
 def test_what_is_around_a_region_is_drawn_and_does_not_change():

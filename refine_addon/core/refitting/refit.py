@@ -23,7 +23,7 @@ loses is undone, and the next is damped more. Rounds end where little is gained.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from ..splats import Splats
     from ..views import ViewSet
 
-STEPS = 8
+STEPS = 6
 """Steps of conjugate gradients in a round."""
 
 DAMPING, LEAST_DAMPING = 4.0, 0.1
@@ -59,6 +59,9 @@ LEAST_GAIN = 0.05
 
 MAX_STEP = {"color": 0.5, "opacity": 1.0, "mean": 0.5, "scale": 0.3, "turn": 0.3}
 """How far a parameter moves in a round: as `linear` has them, means by the longest scale."""
+
+
+_NOTHING = 1e-30  # rays that tell less of a parameter tell nothing; 1 over it is a float32
 
 
 @dataclass(frozen=True)
@@ -226,7 +229,7 @@ def refit_on(
     psnr = rays.psnr(survivors, part(progress, 0.0, 0.04))
     best = Refitted(survivors, np.zeros(len(survivors), np.bool_), 0, psnr, psnr)
     yield best
-    before, more = _Told(*np.zeros((2, COUNT, len(survivors)))), 1.0
+    before, more = _Told(*np.zeros((2, COUNT, len(survivors)), np.float32)), 1.0
     for number in range(1, settings.rounds + 1):
         begin, middle, near, end = (
             0.04 + 0.96 * (number - 1 + share) / settings.rounds for share in (0.0, 0.4, 0.9, 1.0)
@@ -263,14 +266,14 @@ class _Told(NamedTuple):
 
     Attributes
     ----------
-    diagonal : (13, N) float64
+    diagonal : (13, N) float32
         K; see the top of this file.
-    left : (13, N) float64
+    left : (13, N) float32
         What is left of J'r.
     """
 
-    diagonal: NDArray[np.float64]
-    left: NDArray[np.float64]
+    diagonal: NDArray[np.float32]
+    left: NDArray[np.float32]
 
 
 class _Solver:
@@ -295,7 +298,7 @@ class _Solver:
 
     def solve(
         self, damping: float, before: _Told, progress: Progress
-    ) -> tuple[NDArray[np.float64], _Told]:
+    ) -> tuple[NDArray[np.float32], _Told]:
         """Return by how much to change the parameters of survivors, (13, N), and what rays told.
 
         Parameters
@@ -308,24 +311,28 @@ class _Solver:
         """
         steps = [part(progress, k / (STEPS + 2), (k + 1) / (STEPS + 2)) for k in range(STEPS + 2)]
         residual = self._sum(lambda view: view.backward(view.errors), steps[0])
-        residual += CARRIED * before.left
+        residual += np.float32(CARRIED) * before.left
         diagonal = self._sum(lambda view: view.diagonal(), steps[1])
-        prior = damping * (diagonal + _medians(diagonal)[:, None])
+        prior = np.float32(damping) * (diagonal + _medians(diagonal)[:, None])
         damped = prior + before.diagonal
-        inverse = np.divide(1.0, diagonal + damped, out=np.zeros_like(damped), where=diagonal > 0.0)
+        inverse = np.divide(
+            1.0, diagonal + damped, out=np.zeros_like(damped), where=diagonal > _NOTHING
+        )
+        diagonal += before.diagonal
 
-        def product(direction: NDArray[np.float64], step: Progress) -> NDArray[np.float64]:
-            small = direction.astype(np.float32)
-            result = self._sum(lambda view: view.backward(view.forward(small)), step)
+        def product(direction: NDArray[np.float32], step: Progress) -> NDArray[np.float32]:
+            result = self._sum(lambda view: view.backward(view.forward(direction)), step)
             result += damped * direction
             return result
 
         change, residual = _conjugate_gradients(product, residual, inverse, steps[2:])
-        return change, _Told(before.diagonal + diagonal, residual + prior * change)
+        prior *= change
+        residual += prior
+        return change, _Told(diagonal, residual)
 
     def _sum(
         self, work: Callable[[LinearView], NDArray[np.float64]], progress: Progress
-    ) -> NDArray[np.float64]:
+    ) -> NDArray[np.float32]:
         """Return the sum over views, one after the other, of values of the splats hit, (13, N)."""
         total = np.zeros(self._movable.shape)
 
@@ -341,20 +348,21 @@ class _Solver:
             for kind in self._kinds:  # one after the other: four times as fast as all at once
                 total[kind][view.rows] += values[kind]
         total *= self._movable
-        return total
+        return total.astype(np.float32)
 
 
-def _medians(diagonal: NDArray[np.float64]) -> NDArray[np.float64]:
+def _medians(diagonal: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the median over splats of what rays tell, 1 where they tell nothing, (13,)."""
-    return np.array([np.median(row[row > 0.0]) if row.any() else 1.0 for row in diagonal])
+    medians = [np.median(row[row > 0.0]) if row.any() else 1.0 for row in diagonal]
+    return np.array(medians, np.float32)
 
 
 def _conjugate_gradients(
-    product: Callable[[NDArray[np.float64], Progress], NDArray[np.float64]],
-    residual: NDArray[np.float64],
-    inverse: NDArray[np.float64],
+    product: Callable[[NDArray[np.float32], Progress], NDArray[np.float32]],
+    residual: NDArray[np.float32],
+    inverse: NDArray[np.float32],
     steps: list[Progress],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return about the solution x of ``product(x) = residual``, by a few steps from 0.
 
     And what it leaves of the residual.
@@ -362,39 +370,45 @@ def _conjugate_gradients(
     Parameters
     ----------
     product : callable
-    residual, inverse : (13, N) float64
+    residual, inverse : (13, N) float32
         The right side, and the preconditioner: 0 where x stays 0.
     steps : list of callable
         The progress of each step.
     """
     solution = np.zeros_like(residual)
     direction = inverse * residual
-    before = float(np.vdot(residual, direction))
+    before = _dot(residual, direction)
     for step in steps:
         if before <= 0.0:
             break
         image = product(direction, step)
-        length = before / float(np.vdot(direction, image))
+        length = np.float32(before / _dot(direction, image))
         solution += length * direction
-        residual = residual - length * image
+        image *= length
+        residual = np.subtract(residual, image, out=image)
         preconditioned = inverse * residual
-        after = float(np.vdot(residual, preconditioned))
-        direction = preconditioned + after / before * direction
+        after = _dot(residual, preconditioned)
+        direction *= np.float32(after / before)
+        direction += preconditioned
         before = after
     return solution, residual
 
 
-def _moved(splats: Splats, change: NDArray[np.float64]) -> Splats:
+def _dot(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+    """Return the inner product of two arrays, (13, N), summed in float64."""
+    return float(sum(np.sum(a * b, dtype=np.float64) for a, b in zip(one, other, strict=True)))
+
+
+def _moved(splats: Splats, change: NDArray[np.floating[Any]]) -> Splats:
     """Return splats with changed parameters; those that do not change keep their bits.
 
     Parameters
     ----------
     splats : Splats
-    change : (13, N) float64
+    change : (13, N) floating
     """
-    moving = change.any(axis=0)
-    rows = np.flatnonzero(moving)
-    some, change = splats.take(rows), change[:, rows]
+    rows = np.flatnonzero(change.any(axis=0))
+    some, change = splats.take(rows), change[:, rows].astype(np.float64)
     quaternions = unit_quaternions(some.quaternions)
     logs = some.log_scales.astype(np.float64)
     longest = np.exp(logs.max(axis=1))

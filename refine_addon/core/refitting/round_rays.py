@@ -46,10 +46,6 @@ MAX_HITS = 3 << 21
 """About how many hits of a round may show in the unpruned splats (`linear.LEAST_WEIGHT`). Survivors
 have fewer; each takes 30 bytes."""
 
-PARTS, MIN_VIEWS = 2, 16
-"""Views take turns: each has rays in every second round, if a round then has so many views. Half of
-the hits are then there at a time, and half as many splats are projected."""
-
 SHIFT, MAX_SHIFT = 0.7, 0.1
 """About how far a view is moved in a round: so many times as far as the view next to it is, at most
 so many scene sizes."""
@@ -274,10 +270,8 @@ class RoundRays:
         """
         gaussians = self._gaussians(splats, part(progress, 0.0, 0.05))
         shapes = Shapes.of(splats, gaussians, self.scene, geometry=geometry)
-        parts = PARTS if len(self.windows) >= PARTS * MIN_VIEWS else 1
-        turn = slice(number % parts, None, parts)
-        windows = [window.moved(number) for window in self.windows[turn]]
-        hits = [truth.hits for truth in self._validation[turn]]
+        windows = [window.moved(number) for window in self.windows]
+        hits = [truth.hits for truth in self._validation]
         truth = CastTruth(self._original, windows, number, hits)
         work = _Linearize(truth, self.target(splats, gaussians), shapes)
         count = self._count + len(splats)
