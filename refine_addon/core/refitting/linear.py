@@ -104,12 +104,12 @@ class LinearView:
     ray : (h,) uint16
     owner : (h,) int32
         Of each hit: its ray, and the splat as a place in `rows`.
-    weight : (h,) float32
-        T a.
-    by_log_alpha : (3, h) float32
+    weight : (h,) uint16
+        T a, see `_halves`.
+    by_log_alpha : (3, h) uint16
         How the colour changes with the logarithm of alpha, ``T a (c - B)``; 0 where alpha is
         clipped, and does not change.
-    steepness : (2, h) float32, optional
+    steepness : (2, h) uint16, optional
         ``A d`` across and down, 1/px; none if geometry does not change.
     slopes : Slopes
         Of the splats that are hit.
@@ -119,9 +119,9 @@ class LinearView:
     errors: NDArray[np.float32]
     ray: NDArray[np.uint16]
     owner: NDArray[np.int32]
-    weight: NDArray[np.float32]
-    by_log_alpha: NDArray[np.float32]
-    steepness: NDArray[np.float32] | None
+    weight: NDArray[np.uint16]
+    by_log_alpha: NDArray[np.uint16]
+    steepness: NDArray[np.uint16] | None
     slopes: Slopes
 
     def forward(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -137,14 +137,14 @@ class LinearView:
         log_alpha = (self.slopes.opacity * mine[OPACITY][0]).take(owner)
         if self.steepness is not None:
             x, y, xx, xy, yy = (each.take(owner) for each in self.slopes.polynomials(mine))
-            across, down = self.steepness
+            across, down = map(_floats, self.steepness)
             log_alpha += across * (x + across * xx + down * xy)
             log_alpha += down * (y + down * yy)
-        result = np.empty_like(self.errors)
+        result, weight = np.empty_like(self.errors), _floats(self.weight)
         for channel in range(3):
             light = (self.slopes.light[channel] * mine[channel]).take(owner)
-            light *= self.weight
-            light += self.by_log_alpha[channel] * log_alpha
+            light *= weight
+            light += _floats(self.by_log_alpha[channel]) * log_alpha
             result[channel] = np.bincount(ray, light, self.errors.shape[1])
         return result
 
@@ -157,15 +157,15 @@ class LinearView:
         """
         result = np.zeros((COUNT, len(self.rows)))
         ray, owner = self.ray.astype(np.intp), self.owner.astype(np.intp)
-        value = np.zeros(len(owner), np.float32)
+        value, weight = np.zeros(len(owner), np.float32), _floats(self.weight)
         for channel in range(3):
             error = errors[channel].take(ray)
-            value += self.by_log_alpha[channel] * error
-            error *= self.weight
+            value += _floats(self.by_log_alpha[channel]) * error
+            error *= weight
             result[channel] = self.slopes.light[channel] * self._sum(error, owner)
         result[OPACITY] = self.slopes.opacity * self._sum(value, owner)
         if self.steepness is not None:
-            across, down = self.steepness
+            across, down = map(_floats, self.steepness)
             x, y = value * across, value * down
             moments = [x, y, x * across, x * down, y * down]
             sums = np.stack([self._sum(each, owner).astype(np.float32) for each in moments])
@@ -176,12 +176,14 @@ class LinearView:
         """Return the squared length of each column, that is of each parameter, (13, u)."""
         result = np.zeros((COUNT, len(self.rows)))
         owner = self.owner.astype(np.intp)
-        result[COLOR] = np.square(self.slopes.light) * self._sum(np.square(self.weight), owner)
-        value = np.square(self.by_log_alpha).sum(axis=0)
+        result[COLOR] = np.square(self.slopes.light) * self._sum(
+            np.square(_floats(self.weight)), owner
+        )
+        value = np.square(_floats(self.by_log_alpha)).sum(axis=0)
         result[OPACITY.start] = np.square(self.slopes.opacity) * self._sum(value, owner)
         if self.steepness is None:
             return result
-        x, y = self.steepness
+        x, y = map(_floats, self.steepness)
         squares = (x * x, x * y, y * y)
         second = [value * each for each in squares]
         fourth = [each * squares[0] for each in second[:2]] + [each * squares[2] for each in second]
@@ -313,10 +315,20 @@ def linear_view(
     hit = rays.hit[:movable]
     return LinearView(
         shapes.gaussians.index[hit], (truth - seen.clip(0.0, 1.0)).astype(np.float32),
-        rays.ray.take(kept).astype(np.uint16), owner, weight[kept], by_log_alpha,
-        _steepness(replace(rays, hit=hit), kept, footprints) if shapes.geometry else None,
+        rays.ray.take(kept).astype(np.uint16), owner, _halves(weight[kept]), _halves(by_log_alpha),
+        _halves(_steepness(replace(rays, hit=hit), kept, footprints)) if shapes.geometry else None,
         _slopes(hit, unclipped[:, :movable], shapes, view),
     )  # fmt: skip
+
+
+def _halves(values: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Return the upper halves of the bits of some numbers, rounded: they keep them to 1 / 512."""
+    return ((values.view(np.uint32) + np.uint32(1 << 15)) >> np.uint32(16)).astype(np.uint16)
+
+
+def _floats(halves: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """Return the numbers of `_halves`."""
+    return (halves.astype(np.uint32) << np.uint32(16)).view(np.float32)
 
 
 def _slopes(

@@ -54,6 +54,10 @@ CARRIED = 0.5
 MORE_DAMPING = 8.0
 """Factor of k after a round that lost; see the top of this file."""
 
+MAX_ROUNDS, ENOUGH_RAYS = 4, (5, 400_000)
+"""By default there are so many rounds, and fewer where these have had so many rays for each
+survivor and so many in all: of large scenes each round takes as long as absorbing."""
+
 LEAST_GAIN = 0.05
 """Rounds end where the PSNR of the validation rays rises by less, dB."""
 
@@ -70,13 +74,13 @@ class Refit:
 
     Attributes
     ----------
-    rounds : int
-        At most so many.
+    rounds : int, optional
+        At most so many; by default see `MAX_ROUNDS`.
     geometry : bool
         Whether means, scales and rotations are refitted too, or colours and opacities alone.
     """
 
-    rounds: int = 4
+    rounds: int | None = None
     geometry: bool = True
 
     def __post_init__(self) -> None:
@@ -87,7 +91,7 @@ class Refit:
         RefineError
             If a value is out of range.
         """
-        if self.rounds < 1:
+        if self.rounds is not None and self.rounds < 1:
             msg = f"rounds is {self.rounds}, expected 1 or more"
             raise RefineError(msg)
 
@@ -180,7 +184,7 @@ def refit(  # noqa: PLR0913 - all but three are optional
 
     Notes
     -----
-    Memory: about 700 bytes a survivor, and 30 bytes for each hit of a round, see
+    Memory: about 700 bytes a survivor, and 18 bytes for each hit of a round, see
     `round_rays.MAX_HITS`.
     """
     *_, last = refit_rounds(
@@ -229,10 +233,12 @@ def refit_on(
     psnr = rays.psnr(survivors, part(progress, 0.0, 0.04))
     best = Refitted(survivors, np.zeros(len(survivors), np.bool_), 0, psnr, psnr)
     yield best
+    rounds, cast = settings.rounds or MAX_ROUNDS, 0
+    enough = np.inf if settings.rounds else max(ENOUGH_RAYS[0] * len(survivors), ENOUGH_RAYS[1])
     before, more = _Told(*np.zeros((2, COUNT, len(survivors)), np.float32)), 1.0
-    for number in range(1, settings.rounds + 1):
+    for number in range(1, rounds + 1):
         begin, middle, near, end = (
-            0.04 + 0.96 * (number - 1 + share) / settings.rounds for share in (0.0, 0.4, 0.9, 1.0)
+            0.04 + 0.96 * (number - 1 + share) / rounds for share in (0.0, 0.4, 0.9, 1.0)
         )
         linear = rays.linear(
             best.splats, number,
@@ -240,6 +246,7 @@ def refit_on(
         )  # fmt: skip
         solver = _Solver(linear, movable, threads)
         count = sum(view.errors.shape[1] for view in linear)
+        cast += count
         damping = more * max(DAMPING * len(survivors) / count, LEAST_DAMPING)
         change, told = solver.solve(damping, before, part(progress, middle, near))
         del linear, solver  # the hits, before those of the next round
@@ -253,7 +260,7 @@ def refit_on(
             changed = ~_same(survivors, trial)
             best = Refitted(trial, changed, best.rounds + 1, best.psnr_before, psnr)
             yield best
-            if gain < LEAST_GAIN:
+            if gain < LEAST_GAIN or cast >= enough:
                 return
         elif more > 1.0:
             return

@@ -42,9 +42,9 @@ RAYS_OF_SPLAT = 4.0
 MIN_RAYS = 1 << 17
 """Rays of a round where that would be fewer."""
 
-MAX_HITS = 3 << 21
-"""About how many hits of a round may show in the unpruned splats (`linear.LEAST_WEIGHT`). Survivors
-have fewer; each takes 30 bytes."""
+HITS_OF_SPLAT, MIN_HITS = 64, 3 << 21
+"""About how many hits of a round may show in the unpruned splats (`linear.LEAST_WEIGHT`), for each
+survivor, and where that would be fewer. Each takes 18 bytes."""
 
 SHIFT, MAX_SHIFT = 0.7, 0.1
 """About how far a view is moved in a round: so many times as far as the view next to it is, at most
@@ -245,10 +245,10 @@ class RoundRays:
             original, views, progress=progress, threads=threads
         )
         chosen = views.by_distance()
-        rays = max(RAYS_OF_SPLAT * count, MIN_RAYS) / len(chosen)
+        rays, hits = (each / len(chosen) for each in limits(count))
         steps = steps_of([view for view, _ in chosen], scene)
         windows = [
-            Window(view, number, weight, rays, MAX_HITS / len(chosen), step=steps[number])
+            Window(view, number, weight, rays, hits, step=steps[number])
             for number, (view, weight) in enumerate(chosen)
         ]
         return cls(windows, scene, InMemory(original, gaussians, scene), len(original), threads)
@@ -319,6 +319,11 @@ class RoundRays:
                 progress=progress, what="refitting", threads=self._threads,
             )
         ]  # fmt: skip
+
+
+def limits(count: int) -> tuple[float, float]:
+    """Return about how many rays and hits a round of `count` survivors may have."""
+    return max(RAYS_OF_SPLAT * count, MIN_RAYS), max(HITS_OF_SPLAT * count, MIN_HITS)
 
 
 def steps_of(views: Sequence[View], scene: Scene) -> list[float]:

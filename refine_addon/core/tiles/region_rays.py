@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..refitting.round_rays import (
-    MAX_HITS,
-    MIN_RAYS,
-    RAYS_OF_SPLAT,
     InMemory,
     RoundRays,
     Window,
+    limits,
     steps_of,
 )
 from ..seeing import projection
@@ -161,14 +159,14 @@ def _windows(
         if centers.shape[1]:
             boxes[number] = centers.shape[1], _box(centers, view)
     shown = sum(count for count, _ in boxes.values())
-    rays = max(RAYS_OF_SPLAT * total, MIN_RAYS) / len(views)
+    rays, hits = limits(total)[0] / len(views), limits(len(splats))[1]
     steps, windows = steps_of([view for view, _ in views], scene), []
     for number, (count, box) in boxes.items():
         (view, weight), share = views[number], count / shown
         part_of_image = box[2] * box[3] / (view.width * view.height)
         windows.append(
             Window(
-                view, number, weight * share, rays * part_of_image, MAX_HITS * share, *box,
+                view, number, weight * share, rays * part_of_image, hits * share, *box,
                 steps[number],
             )
         )  # fmt: skip
