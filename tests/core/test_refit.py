@@ -295,7 +295,7 @@ def test_rays_see_the_same_without_their_hidden_hits():
 
 
 def test_numbers_are_kept_to_one_in_256():
-    """Half of the last of 8 bits, the first of which is not stored: 2^-8; infinity and 0 are exact."""
+    """Half of the last of 8 bits, the first of which is not stored; infinity and 0 are exact."""
     values = np.random.default_rng(3).normal(size=1000).astype(np.float32) * np.float32(1e-20)
 
     kept = linear._floats(linear._halves(values))
