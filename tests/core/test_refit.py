@@ -156,6 +156,19 @@ def test_refitted_survivors_are_nearer_to_what_the_views_see():
     assert every.splats.sh_rest is survivors.sh_rest
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["antialiased", "2dgs"])
+def test_splats_of_other_models_gain_and_discs_keep_their_shapes(model):
+    """Half of a cloud gains a dB at least, as Gaussians do; discs by colours and opacities."""
+    splats = replace(cloud(300), model=model)
+    survivors = splats.take(np.arange(0, 300, 2))
+
+    found = refit.refit(survivors, splats, ring(), refit.Refit(rounds=2))
+
+    assert found.psnr > found.psnr_before + 1.0
+    assert np.array_equal(found.splats.means, survivors.means) == (model == "2dgs")
+
+
 def test_a_round_that_loses_is_undone_and_the_next_damped_more(monkeypatch):
     """What the validation rays say is given: a gain, a loss, a gain, and a gain too small to go on.
 
