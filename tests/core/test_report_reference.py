@@ -77,7 +77,7 @@ def test_every_key_of_a_report_is_in_the_reference(files, monkeypatch, command):
     monkeypatch.chdir(files)
     keys = [key for key, of in documented("An entry") if command in of.split(", ")]
     if command == "lod":
-        keys += [key for key, _ in documented("The manifest")]
+        keys += [key for key, _ in documented("Levels of detail")]
 
     found = set()
     for report in reports(command):
@@ -85,19 +85,6 @@ def test_every_key_of_a_report_is_in_the_reference(files, monkeypatch, command):
         found |= set(written(report["results"][0]))
     found.discard("quality")
     keys = [key for key in keys if key not in ("levels", "quality")]
-
-    assert missing(found, keys) == set()
-    assert [key for key in keys if len(missing(found, [key])) == len(found)] == []
-
-
-def test_the_manifest_is_in_the_reference(files, monkeypatch):  # noqa: F811
-    """Key by key."""
-    monkeypatch.chdir(files)
-    list(reports("lod"))
-
-    found, keys = set(), [key for key, _ in documented("The manifest") if key != "levels"]
-    for folder in ("levels", "refitted"):
-        found |= set(written(json.loads(Path(f"{folder}/lod.json").read_text())))
 
     assert missing(found, keys) == set()
     assert [key for key in keys if len(missing(found, [key])) == len(found)] == []

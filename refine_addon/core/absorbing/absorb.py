@@ -387,11 +387,14 @@ def _put_shapes(
     def fill(piece: slice) -> None:
         logs[piece], quaternions[piece] = merging.axes(merged.covariances[piece])
 
+    opacity = merged.opacity
     with np.errstate(under="ignore"):
         for_chunks(fill, len(target), _CHUNK, progress=progress, what="absorbing", threads=threads)
+        if left.model == "2dgs":
+            logs, quaternions, opacity = merging.flattened(merged, logs, quaternions)
         left.means[target], left.log_scales[target] = merged.means, logs
         left.quaternions[target] = quaternions
-        left.opacity_logits[target] = np.log(merged.opacity) - np.log1p(-merged.opacity)
+        left.opacity_logits[target] = np.log(opacity) - np.log1p(-opacity)
 
 
 class _Blend:

@@ -6,7 +6,7 @@ A request says what is to be done, a source where the splats are, a sink where t
 |---|---|---|---|---|
 | `prune_file` | `FileSource` | `PruneRequest` | `FileSink` | `core/operation/files.py` |
 | `file_to_file` | `FileSource` | any of `requests.py` | `FileSink` | `core/operation/files.py` |
-| `lod_file` | `FileSource` | `LevelsRequest` | `LevelSink` | `core/levels/files.py` |
+| `lod_file` | `FileSource` | `LevelsRequest` | a `LevelSink` | `core/levels/files.py` |
 | `prune_object` | `ObjectSource` | `PruneRequest` | `ObjectSink` | `objects/operation.py` |
 | `score_object` | `ObjectSource` | `ScoreRequest` | `FileSink` | `objects/operation.py` |
 | `prune_tiles` | `TileScene` | `TilesRequest` | `TileSink` | `core/tiles/prune.py` |
