@@ -757,3 +757,23 @@ def test_a_link_to_another_disk_is_refused_before_the_work(tmp_path, tiles, view
 
     with pytest.raises(RefineError, match="is a link to another disk"):
         prune_tiles(tiles, out, PruneRequest(views, Budget(ratio=0.5), CLOSED))
+
+
+@pytest.mark.slow
+def test_over_tiles_survivors_stay_unchanged_by_default_and_a_note_says_so(tiles, views):
+    """As by name, where a file would absorb; where it would not, nobody is told."""
+    settings = Settings(views=4)
+    default, named = (
+        prune_tiles(tiles, None, PruneRequest(views, Budget(ratio=0.5), settings, survivors=way))
+        for way in ("auto", "unchanged")
+    )
+    scored = prune_tiles(tiles, None, PruneRequest(views, Budget(ratio=0.5), CLOSED))
+
+    words = "survivors stay unchanged: over tiles"
+    assert [note for note in default["notes"] if note not in named["notes"]] == [
+        note for note in default["notes"] if words in note
+    ]
+    assert any(words in note for note in default["notes"])
+    assert default["survivors"]["asked"] == scored["survivors"]["asked"] == "auto"
+    assert default["survivors"]["psnr"] == named["survivors"]["psnr"]
+    assert not any(words in note for note in scored["notes"])
