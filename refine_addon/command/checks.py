@@ -181,6 +181,8 @@ def _check_source(parser: argparse.ArgumentParser, options: argparse.Namespace) 
     """Refuse an object beside files or out of Blender, and a choice of cameras beside another."""
     if bool(options.inputs) == bool(options.object):
         parser.error("expected INPUT files or --object NAME, and not both")
+    if options.object and options.model:
+        parser.error("--model goes with INPUT files; an object has it in the panel, under Splats")
     if options.object and not options.scene:
         command = f"blender -b scene.blend --command refine {options.command} ..."
         parser.error(f"--object needs Blender: {command}")

@@ -24,7 +24,7 @@ def convert(run: Run) -> None:
 
 def _convert(run: Run, sources: Sequence[Path], source: str) -> dict[str, Any]:
     output = run.options.output
-    request = ConvertRequest(run.options.overwrite)
+    request = ConvertRequest(run.options.overwrite, run.options.model)
     done = convert_files(sources, output, request, arrangement(run.options)).report
     splats, files = done["splats"], done["files"]
     size = sizes(files["input_bytes"], files["output_bytes"])

@@ -35,6 +35,7 @@ def _make_levels(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
         suffix=options.format or SUFFIXES[0],
         goal=options.distance_psnr,
         overwrite=options.overwrite,
+        model=options.model,
     )
     done = lod_file(source, options.output_dir, request, progress=run.progress(source.name))
     terminal.clear()

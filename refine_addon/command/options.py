@@ -23,6 +23,7 @@ from ..core import (
 from ..core.errors import printable
 from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.levels.files import GOAL
+from ..core.rendering import MODELS
 from ..core.urls import Url, is_url, refuse_url
 from ..core.whole_file import expanded
 from ..version import VERSION
@@ -217,6 +218,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         help="with --together: on the workers of this Dask scheduler, which see the same files "
         "under the same paths",
     )
+    _add_model(prune)
     prune.add_argument("--dry-run", action="store_true", help="decide and report, write no splats")
     _add_common(prune)
 
@@ -235,6 +237,7 @@ def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     )
     _add_views(cleaning)
     zones.add(cleaning)
+    _add_model(cleaning)
     _add_common(cleaning)
 
 
@@ -247,6 +250,7 @@ def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     )
     _add_scoring(scoring)
     zones.add(scoring, protects=False)
+    _add_model(scoring)
     _add_common(scoring)
 
 
@@ -310,6 +314,7 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
     )
     _add_scoring(making)
     zones.add(making)
+    _add_model(making)
     _add_common(making)
 
 
@@ -351,6 +356,7 @@ def _add_convert(commands: Any) -> None:  # noqa: ANN401 - argparse does not nam
         metavar="L",
         help="of a streamed SOG (lod-meta.json): 0, the default, is the finest",
     )
+    _add_model(convert)
     _add_common(convert)
 
 
@@ -450,6 +456,15 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
         f"(default {Settings.tolerance})",
     )
     _add_views(parser)
+
+
+def _add_model(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--model",
+        choices=MODELS,
+        help="how the splats are drawn, where a file does not say or is wrong: default, "
+        "antialiased (Mip-Splatting, gsplat, Brush's mip) or 2dgs (discs)",
+    )
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:

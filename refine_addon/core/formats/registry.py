@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import mmap
 import stat
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import RefineError, reason_of
 from ..foreign_files import refuse_pointer
-from ..splats import drawable
+from ..splats import drawable, with_model
 from ..whole_file import expanded, whole_file
 from . import compressed_ply, dot_splat, glb, ksplat, sog, spz, streamed_sog
 from .ply import SplatFile, read_ply
@@ -332,7 +332,7 @@ class Packed:
                     msg = f"{path}: {self.form.suffix} holds no property '{name}'; write to a .ply"
                     raise RefineError(msg)
                 rows[name] = values if keep is None else values[keep]
-        splats = replace(splats_from_columns(rows), model=self.file.model)
+        splats = with_model(splats_from_columns(rows), self.file.model)
         good = drawable(splats)
         if not good.any():
             msg = f"{path}: none of the {len(splats)} splats can be drawn: nothing to write"

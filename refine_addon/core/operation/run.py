@@ -196,15 +196,23 @@ def run(
     ------
     RefineError, Cancelled
         See the steps. Nothing is written then; but where comparing fails or is cancelled, after
-        writing, the file that was written stays.
+        writing, the file that was written stays; and where refitting is cancelled, what it had
+        reached is written.
     """
     runtime = Runtime(progress=progress, threads=threads)
     with request.opened(sink.form), sink.opened():
         loaded = source.read(sink.form)
         runtime.clock.lap("read_s")
         decision = request.decide(loaded, runtime)
+        stopped = getattr(decision, "stopped", None)
+        if stopped is not None:  # what was reached is written
+            runtime = replace(runtime, progress=silent)
         written = sink.write(loaded, decision, runtime)
         runtime.clock.lap(sink.timing)
+        if stopped is not None:
+            if written.path is not None:
+                stopped.add_note(f"{written.path} is written with what that had reached")
+            raise stopped
         try:
             compared = request.compare(loaded, decision, written.path, runtime)
         except (Cancelled, KeyboardInterrupt) as stop:
