@@ -168,6 +168,8 @@ def format_named(path: Path | Url) -> Format | None:
     form = next((form for form in FORMATS if name.endswith(form.suffix)), None)
     if form is None and name.endswith(NOT_WRITTEN):
         msg = f"{path}: {path.suffix} is not written, expected one of {', '.join(SUFFIXES)}"
+        if name.endswith(streamed_sog.INDEX):
+            msg = f"{path}: holds levels, which lod makes; expected one of {', '.join(SUFFIXES)}"
         raise RefineError(msg)
     return form
 
