@@ -166,6 +166,21 @@ def test_levels_are_exported_as_a_streamed_sog(addon, few, tmp_path):
     np.testing.assert_allclose(np.sort(means, axis=0), np.sort(wanted, axis=0), atol=6e-4)
 
 
+def test_the_button_stands_where_there_are_levels(addon, few):
+    """On the object and on each level; on another there is none."""
+    has = addon.objects.level_objects.has_levels
+    assert not has(few)
+    assert not has(None)
+
+    bpy.ops.refine.levels()
+
+    assert has(few)
+    assert has(bpy.data.objects["room_lod2"])
+    for name in ("room_lod1", "room_lod2"):
+        bpy.data.objects.remove(bpy.data.objects[name])
+    assert not has(few)
+
+
 def test_an_object_without_levels_is_not_exported_as_some(few, tmp_path):
     """It says what to do."""
     with pytest.raises(RuntimeError, match="'room': has no levels; make them first"):
