@@ -15,6 +15,7 @@ from .formats.ply import SplatFile, read_ply
 from .formats.registry import as_written, read_splats
 from .levels.files import LevelsRequest, lod_file
 from .levels.lod import Level, Levels, lod
+from .operation.arranged import Arrangement, Move, convert_files
 from .operation.files import file_to_file, prune_file
 from .operation.requests import CleanRequest, ConvertRequest, PruneRequest, ScoreRequest
 from .pipeline import prune, score
@@ -38,6 +39,7 @@ __all__ = [
     "METHODS",
     "REASONS",
     "SURVIVORS",
+    "Arrangement",
     "Box",
     "Budget",
     "Cancelled",
@@ -49,6 +51,7 @@ __all__ = [
     "Level",
     "Levels",
     "LevelsRequest",
+    "Move",
     "MovedVolume",
     "Occlusion",
     "PruneRequest",
@@ -68,6 +71,7 @@ __all__ = [
     "Zone",
     "as_written",
     "clean",
+    "convert_files",
     "file_to_file",
     "forced",
     "lod",

@@ -15,7 +15,7 @@ from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
-from ..objects import demands, splat_group
+from ..objects import demands, level_objects, splat_group
 from ..viewport import draw as viewport_draw
 from . import (
     camera_list,
@@ -295,7 +295,11 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
         column.prop(settings, "levels")
         column.prop(settings, "level_survivors")
         column.operator("refine.levels", icon="MOD_DECIM")
-        _draw_progress(layout, context, "refine.export_ply", "refine.levels")
+        if level_objects.has_levels(obj):
+            column.operator("refine.export_levels", icon="EXPORT")
+        _draw_progress(
+            layout, context, "refine.export_ply", "refine.levels", "refine.export_levels"
+        )
 
 
 def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *names: str) -> None:
