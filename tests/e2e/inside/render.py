@@ -69,14 +69,13 @@ def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
         copy = bpy.data.objects["Splats"].copy()
         copy.location.z += 0.01 * number
         scene.collection.objects.link(copy)
-    scene.render.resolution_percentage = 400
-    shown = bpy.data.images[IMAGE].size[:]
     found["busy"] = []
-    for animation in (True, False):
-        # Where meshes are rendered, then where it is the splats.
-        bpy.data.objects["Cube"].hide_render = not animation
+    for animation in (True, False):  # which end by themselves in minutes alone
+        bpy.data.objects["Cube"].hide_render = not animation  # else it is the splats that are drawn
+        scene.render.resolution_percentage = 400 if animation else 3200
+        scene.frame_end, scene.render.filepath = 99, f"{pictures}/stopped_##"
         yield 0.5
-        before = settings(scene)
+        before, shown = settings(scene), bpy.data.images[IMAGE].size[:]
         yield from escape(found, animation=animation)
         found["alike"].append(settings(scene) == before)
     found["stopped"] = bpy.data.images[IMAGE].size[:] == shown
