@@ -29,6 +29,10 @@ MODELS: tuple[Model, ...] = get_args(Model)
 LOW_PASS = 0.3
 """Variance added to a footprint along both axes so that it is not thinner than a pixel, px^2."""
 
+DISC_LOW_PASS = 0.5
+"""Variance of the Gaussian that a disc is at least drawn as, px^2: the larger of the two alphas
+counts (Huang et al. 2024, Eq. 11, with sigma = sqrt(2) / 2)."""
+
 ALPHA_MAX = 0.99
 """Largest alpha of one splat at a pixel, 0..1: no splat hides everything behind it."""
 

@@ -46,8 +46,8 @@ class Splats:
     sh_rest : (N, K, 3) floating
         The other coefficients, K = (degree + 1)^2 - 1 of each channel.
     model : {"default", "antialiased", "2dgs"}
-        How they are drawn, see `rendering.Model`. Of "2dgs" the third scale does not count: it is 0
-        (`LOG_ZERO`) where a file has none.
+        How they are drawn, see `rendering.Model`. Of "2dgs" the third scale is 0 (`LOG_ZERO`),
+        whatever a file holds: see `with_model`.
     """
 
     means: NDArray[Any]
@@ -87,13 +87,34 @@ class Splats:
         return replace(self, **columns)
 
 
+def with_model(splats: Splats, model: Model) -> Splats:
+    """Return the splats as drawn in another way; discs have no third scale.
+
+    Parameters
+    ----------
+    splats : Splats
+    model : {"default", "antialiased", "2dgs"}
+    """
+    if model != "2dgs":
+        return replace(splats, model=model)
+    flat = np.array(splats.log_scales)
+    flat[:, 2] = LOG_ZERO
+    return replace(splats, log_scales=flat, model=model)
+
+
 def joined(parts: Sequence[Splats]) -> Splats:
-    """Return all splats of several sets of one model, one at least, in that order.
+    """Return all splats of several sets, one at least, in that order.
 
     The result has the highest degree among them; coefficients that a part lacks are 0.
+
+    Raises
+    ------
+    RefineError
+        If they are drawn in different ways.
     """
     if len(parts) == 1:
         return parts[0]
+    refuse_mixed([part.model for part in parts])
     most = max(part.sh_rest.shape[1] for part in parts)
     columns: dict[str, Any] = {name: [getattr(part, name) for part in parts] for name in ARRAYS}
     columns["sh_rest"] = [
@@ -102,6 +123,14 @@ def joined(parts: Sequence[Splats]) -> Splats:
     with np.errstate(invalid="ignore"):  # signalling NaN converted to float64
         columns = {name: np.concatenate(arrays) for name, arrays in columns.items()}
     return replace(parts[0], **columns)
+
+
+def refuse_mixed(models: Sequence[Model]) -> None:
+    """Raise `RefineError` if splats that are to become one scene are drawn in different ways."""
+    if len(set(models)) > 1:
+        listed = ", ".join(dict.fromkeys(models))
+        msg = f"splats of different models ({listed}), expected one: say how all are drawn"
+        raise RefineError(msg)
 
 
 def above_constant(degree: int) -> int:

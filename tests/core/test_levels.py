@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -290,20 +289,17 @@ def test_where_the_views_see_too_little_no_distance_is_said():
     assert reach.within(10.0) is None
 
 
-def test_files_of_levels_and_a_manifest_are_written(tmp_path):
-    """The bytes of kept rows are the source's; the manifest says what the report says."""
+def test_files_of_levels_are_written(tmp_path):
+    """The bytes of kept rows are the source's."""
     source = file_of(colourful(), tmp_path / "a.ply")
     out = tmp_path / "out"
 
     done = lod_file(source, out, LevelsRequest(cameras(2), DELETED, QUICK))
 
-    assert sorted(path.name for path in out.iterdir()) == ["a.lod1.ply", "a.lod2.ply", "lod.json"]
-    told = json.loads((out / "lod.json").read_text())
-    assert {name: done[name] for name in told} == told
-    assert next(iter(told)) == "lod"
-    assert told["nested"] is True
-    assert [entry["splats"] for entry in told["levels"]] == [288, 144]
-    for entry in told["levels"]:
+    assert sorted(path.name for path in out.iterdir()) == ["a.lod1.ply", "a.lod2.ply"]
+    assert done["nested"] is True
+    assert [entry["splats"] for entry in done["levels"]] == [288, 144]
+    for entry in done["levels"]:
         assert (out / entry["file"]).stat().st_size == entry["bytes"]
     rows = read_ply(source).rows
     wanted = prune(colourful(), cameras(2), Budget(ratio=0.75), QUICK).keep
@@ -338,7 +334,7 @@ def test_levels_are_written_in_any_format(tmp_path, suffix):
     assert any(suffix in note for note in done["notes"])
 
 
-@pytest.mark.parametrize("name", ["a.lod2.ply", "lod.json"])
+@pytest.mark.parametrize("name", ["a.lod1.ply", "a.lod2.ply"])
 def test_no_file_is_replaced_unless_told(tmp_path, name):
     """Said before any work, and nothing else is written."""
     source = file_of(colourful(), tmp_path / "a.ply")
@@ -375,20 +371,6 @@ def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, monkeypat
         lod_file(source, tmp_path / "out", LevelsRequest(cameras(2), DELETED, QUICK))
 
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
-
-
-@pytest.mark.slow
-def test_no_manifest_lists_levels_of_two_runs(tmp_path, monkeypatch):
-    """Where replacing fails at the second level, the first is replaced and the manifest is gone."""
-    source = file_of(colourful(), tmp_path / "a.ply")
-    lod_file(source, tmp_path, LevelsRequest(cameras(2), DELETED, QUICK))
-    failing_second(monkeypatch, RefineError("no space"))
-
-    with pytest.raises(RefineError):
-        lod_file(source, tmp_path, LevelsRequest(cameras(2), DELETED, QUICK, overwrite=True))
-
-    names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == ["a.lod1.ply", "a.lod2.ply", "a.ply"]
 
 
 @pytest.mark.parametrize("goal", [0.0, 100.0, math.nan])

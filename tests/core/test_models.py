@@ -7,14 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from refine_addon.core import RefineError, Splats, read_splats
+from refine_addon.core import RefineError, Splats, View, ViewSet, read_splats
+from refine_addon.core.absorbing.absorb import absorb
+from refine_addon.core.absorbing.merge_field import ViewSums
 from refine_addon.core.formats import ply_header
 from refine_addon.core.formats.ply_columns import columns_from_splats
 from refine_addon.core.formats.registry import FORMATS
 from refine_addon.core.operation.files import file_to_file
 from refine_addon.core.operation.requests import ConvertRequest
-from refine_addon.core.rendering import MODELS
-from refine_addon.core.splats import LOG_ZERO
+from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS, MODELS
+from refine_addon.core.seeing import projection
+from refine_addon.core.seeing.cast import hits
+from refine_addon.core.splats import LOG_ZERO, joined, opacity, rotation_matrices, with_model
 
 
 def cloud(count, seed=0):
@@ -117,3 +121,110 @@ def test_a_model_that_cannot_be_is_refused(tmp_path, model, expected):
         read_splats(path, model)
 
     assert expected in str(caught.value)
+
+
+VIEW = View(np.eye(3), np.zeros(3), 100.0, 110.0, 60.3, 41.7, 120, 80, near=0.2)
+
+
+def footprints_of(splats):
+    """Return the footprints in `VIEW`, and the Gaussians."""
+    gaussians, scene, _ = projection.prepare(splats, ViewSet((VIEW,)))
+    return projection.project(gaussians, scene, VIEW), gaussians
+
+
+def before_the_camera(count, size, model):
+    """Return opaque splats of all shapes before `VIEW`."""
+    random = np.random.default_rng(3)
+    splats = replace(
+        cloud(count),
+        means=random.uniform([-1.5, -1.0, 2.0], [1.5, 1.0, 4.0], (count, 3)),
+        log_scales=random.normal(size, 0.5, (count, 3)),
+        opacity_logits=np.full(count, 3.0),
+    )
+    return with_model(splats, model)
+
+
+@pytest.mark.parametrize("size", [-4.0, -3.0, -2.0])
+def test_an_antialiased_footprint_keeps_the_integral_of_its_alpha(size):
+    """``o' 2 pi sqrt(det(C + .3 I))`` is ``o 2 pi sqrt(det C)``: by the sigmas of both."""
+    plain, _ = footprints_of(before_the_camera(50, size, "default"))
+    faint, gaussians = footprints_of(before_the_camera(50, size, "antialiased"))
+    rows = np.searchsorted(np.sort(plain.index), faint.index)
+    plain = plain.take(np.argsort(plain.index)[rows])
+
+    np.testing.assert_array_equal(faint.sigmas, plain.sigmas)
+    sharp = np.sqrt(np.prod(plain.sigmas.astype(np.float64) ** 2 - LOW_PASS, axis=0))
+    kept = faint.alphas * np.prod(faint.sigmas, axis=0)
+    np.testing.assert_allclose(kept, gaussians.alphas[faint.index] * sharp, rtol=2e-3, atol=1e-5)
+
+
+def test_a_ray_hits_a_disc_where_it_meets_its_plane():
+    """Alpha is ``o exp(-q / 2)``, q where line and plane meet, or twice px^2 if less."""
+    splats = before_the_camera(60, -2.0, "2dgs")
+    footprints, gaussians = footprints_of(splats)
+    columns, rows = np.arange(VIEW.width), np.arange(VIEW.height)
+    turns, sizes = rotation_matrices(splats.quaternions), np.exp(splats.log_scales)
+    found = 0
+
+    for owner, pixel, alpha in hits(footprints, columns, rows, 1 << 16):
+        for place, at, got in zip(owner[::97], pixel[::97], alpha[::97], strict=True):
+            index = gaussians.index[footprints.index[place]]
+            mean, turn = splats.means[index], turns[index]
+            x, y = at % VIEW.width + 0.5, at // VIEW.width + 0.5
+            ray = np.array([(x - VIEW.cx) / VIEW.fx, (y - VIEW.cy) / VIEW.fy, 1.0])
+            hit = ray * (turn[:, 2] @ mean) / (turn[:, 2] @ ray)
+            on_plane = np.sum((turn[:, :2].T @ (hit - mean) / sizes[index, :2]) ** 2)
+            center = mean[:2] / mean[2] * [VIEW.fx, VIEW.fy] + [VIEW.cx, VIEW.cy]
+            square = min(on_plane, 2.0 * np.sum((center - [x, y]) ** 2))
+            expected = min(opacity(splats.opacity_logits[index]) * np.exp(-0.5 * square), 0.99)
+            assert got == pytest.approx(expected, rel=2e-3)
+            found += 1
+    assert found > 50
+
+
+@pytest.mark.parametrize(
+    ("a", "b"), [(4.0, 2.0), (9.0, 0.01), (0.3, 0.1), (0.6, 0.4), (30.0, 1e-6)]
+)
+def test_the_ellipse_of_a_disc_covers_what_the_disc_covers(a, b):
+    """Half axes s and t stand for ``2 pi s t``: the integral of the larger of both Gaussians."""
+    axes = projection.disc_axes(np.array([[a], [b]], np.float32))[:, 0]
+
+    angle = (np.arange(200_000) + 0.5) * 2.0 * np.pi / 200_000
+    falls = np.cos(angle) ** 2 / a + np.sin(angle) ** 2 / b
+    expected = np.mean(1.0 / np.minimum(falls, 1.0 / DISC_LOW_PASS))
+    assert np.prod(axes) == pytest.approx(expected, rel=2e-3)
+    assert axes[0] >= axes[1]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_two_small_splats_merge_into_one_of_their_mass(model):
+    """Seen by the camera that measured them, what they cover together stays, but for overlap."""
+    count = 2
+    splats = replace(
+        cloud(count),
+        means=np.array([[-0.02, 0.0, 2.0], [0.02, 0.0, 2.0]]),
+        log_scales=np.full((count, 3), np.log(0.01)),
+        quaternions=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        opacity_logits=np.full(count, -1.0),
+        sh_dc=np.ones((count, 3)),
+    )
+    splats = with_model(splats, model)
+    views = ViewSet((VIEW,))
+
+    merged = absorb(splats, views, seen_whole, 1).splats
+
+    assert merged.model == model
+    before, after = (
+        np.prod(f.sigmas, axis=0) @ f.alphas for f, _ in map(footprints_of, (splats, merged))
+    )
+    assert after == pytest.approx(before, rel=0.12)
+
+
+def seen_whole(left, _sums, _progress):
+    """Return what absorbing asks of views: all splats contribute alike."""
+    return ViewSums(np.full(len(left), 10.0), np.full(len(left), 1.0))
+
+
+def test_splats_of_different_models_are_no_scene():
+    with pytest.raises(RefineError, match="different models"):
+        joined([cloud(2), with_model(cloud(2), "2dgs")])

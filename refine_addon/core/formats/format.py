@@ -45,24 +45,40 @@ class Sizes:
     fixed: int
 
 
-@dataclass(frozen=True)
-class Format:
-    """A format of splat files.
+@dataclass(frozen=True, kw_only=True)
+class Reader:
+    """A format of splat files that is read.
 
     Attributes
     ----------
     name : str
         For messages.
     suffix : str
-        Ending of its files, lower case, by which an output is known.
-    degree : int
-        Highest degree of harmonics that it holds.
-    loss : str
-        What it does to splats, as a sentence without its subject.
+        Ending of its files, lower case.
     matches : callable
         ``matches(path, head)``: whether a file with these first bytes is of this format.
     read : callable
         ``read(path, data)`` returns a `SplatFile`; `data` is the file, (M,) uint8.
+    """
+
+    name: str
+    suffix: str
+    matches: Callable[[Path, bytes], bool]
+    read: Callable[[Path, NDArray[np.uint8]], SplatFile]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format(Reader):
+    """A format of splat files that is read and written; an output is known by its suffix.
+
+    Attributes
+    ----------
+    name, suffix, matches, read
+        See `Reader`.
+    degree : int
+        Highest degree of harmonics that it holds.
+    loss : str
+        What it does to splats, as a sentence without its subject.
     write : callable
         ``write(stream, splats)``; all of the splats can be drawn.
     sizes : callable or None
@@ -71,12 +87,8 @@ class Format:
         Which of `rendering.MODELS` its files can tell: what `write` finds in `Splats.model`.
     """
 
-    name: str
-    suffix: str
     degree: int
     loss: str
-    matches: Callable[[Path, bytes], bool]
-    read: Callable[[Path, NDArray[np.uint8]], SplatFile]
     write: Callable[[BinaryIO, Splats], None]
     sizes: Callable[[int, int], Sizes] | None
     models: tuple[Model, ...] = MODELS[:1]

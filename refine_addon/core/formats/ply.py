@@ -16,6 +16,7 @@ import plyfile
 
 from ..errors import RefineError, reason_of
 from ..rendering import MODELS, Model
+from ..splats import with_model as drawn_as
 from ..whole_file import expanded, refuse_mapped, whole_file
 from .ply_body import check_counts, read_text, vertex_range
 from .ply_columns import (
@@ -202,7 +203,7 @@ class SplatFile:
 
     def splats(self) -> Splats:
         """Return the rows as splats; the arrays are views of the file if its layout permits."""
-        return replace(splats_from_columns(self.rows), model=self.model)
+        return drawn_as(splats_from_columns(self.rows), self.model)
 
     def write(
         self,

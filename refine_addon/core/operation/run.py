@@ -6,7 +6,7 @@ A request says what is to be done, a source where the splats are, a sink where t
 |---|---|---|---|---|
 | `prune_file` | `FileSource` | `PruneRequest` | `FileSink` | `core/operation/files.py` |
 | `file_to_file` | `FileSource` | any of `requests.py` | `FileSink` | `core/operation/files.py` |
-| `lod_file` | `FileSource` | `LevelsRequest` | `LevelSink` | `core/levels/files.py` |
+| `lod_file` | `FileSource` | `LevelsRequest` | a `LevelSink` | `core/levels/files.py` |
 | `prune_object` | `ObjectSource` | `PruneRequest` | `ObjectSink` | `objects/operation.py` |
 | `score_object` | `ObjectSource` | `ScoreRequest` | `FileSink` | `objects/operation.py` |
 | `prune_tiles` | `TileScene` | `TilesRequest` | `TileSink` | `core/tiles/prune.py` |
@@ -195,15 +195,23 @@ def run(
     ------
     RefineError, Cancelled
         See the steps. Nothing is written then; but where comparing fails or is cancelled, after
-        writing, the file that was written stays.
+        writing, the file that was written stays; and where refitting is cancelled, what it had
+        reached is written.
     """
     runtime = Runtime(progress=progress, threads=threads)
     with request.opened(sink.form), sink.opened():
         loaded = source.read(sink.form)
         runtime.clock.lap("read_s")
         decision = request.decide(loaded, runtime)
+        stopped = getattr(decision, "stopped", None)
+        if stopped is not None:  # what was reached is written
+            runtime = replace(runtime, progress=silent)
         written = sink.write(loaded, decision, runtime)
         runtime.clock.lap(sink.timing)
+        if stopped is not None:
+            if written.path is not None:
+                stopped.add_note(f"{written.path} is written with what that had reached")
+            raise stopped
         try:
             compared = request.compare(loaded, decision, written.path, runtime)
         except (Cancelled, KeyboardInterrupt) as stop:

@@ -108,7 +108,7 @@ def prune_tiles(
     if request.survivors == "auto":  # over tiles absorbing takes far longer, and room on the disk
         request = replace(request, survivors="unchanged")
     asked = TilesRequest(request)
-    tiles = tiles_at(sources)
+    tiles = tiles_at(sources, request.model)
     output = None if folder is None or request.dry_run else located(folder)
     with contextlib.ExitStack() as held:
         if output is None:

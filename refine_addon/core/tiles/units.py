@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
@@ -12,12 +12,12 @@ import numpy as np
 from ..errors import RefineError
 from ..formats.ply import splat_header, stated_model
 from ..formats.ply_body import check_counts, has_lists, vertex_range
-from ..formats.ply_columns import splats_from_columns
+from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
 from ..formats.ply_header import HEADER_LIMIT, TEXT, format_of
 from ..formats.registry import read_splats
 from ..rendering import MODELS
 from ..scoring.closed_form_block import ROWS
-from ..splats import Splats, joined
+from ..splats import Splats, joined, with_model
 from ..urls import Url
 from . import storage
 
@@ -64,6 +64,11 @@ class Tile(NamedTuple):
     begin: int  # bytes before the first row
     size: int  # bytes of the file
     changed: int | str  # see `storage.state`
+
+    @property
+    def model_can_change(self) -> bool:
+        """Whether its splats may be drawn otherwise: those without a third scale are discs."""
+        return THIRD_SCALE in (self.dtype.names or ())
 
     @property
     def place(self) -> Path | Url:
@@ -152,7 +157,7 @@ class Unit:
                 chosen.append(Part(part.tile, begin + start, begin + stop))
         chosen = chosen or [*kinds.values()]
         splats = joined([splats_from_columns(rows_of(part)) for part in chosen])
-        return replace(splats, model=self.parts[0].tile.model)
+        return with_model(splats, self.parts[0].tile.model)
 
     def slices(self) -> list[slice]:
         """Return where in the unit each part lies."""
@@ -174,8 +179,14 @@ class Piece(NamedTuple):
     part: Part
 
 
-def tiles_at(paths: Sequence[Path | str]) -> list[Tile]:
+def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Tile]:
     """Look at the files of a scene.
+
+    Parameters
+    ----------
+    paths : sequence of path-like
+    model : {"default", "antialiased", "2dgs"}, optional
+        How their splats are drawn, where they do not say or are wrong.
 
     Raises
     ------
@@ -185,7 +196,7 @@ def tiles_at(paths: Sequence[Path | str]) -> list[Tile]:
     """
     tiles: list[Tile] = []
     given: dict[Hashable, Tile] = {}
-    for tile in map(tile_at, paths):
+    for tile in (_drawn_as(tile_at(path), model) for path in paths):
         first = given.setdefault(storage.file_key(tile.place), tile)
         if first is not tile:
             msg = f"{tile.path}: is given twice"
@@ -201,6 +212,16 @@ def tiles_at(paths: Sequence[Path | str]) -> list[Tile]:
         msg = f"none of {len(tiles)} tiles has a splat: there is nothing to prune"
         raise RefineError(msg)
     return tiles
+
+
+def _drawn_as(tile: Tile, model: Model | None) -> Tile:
+    """Return a tile with splats of another model; None leaves it as it is."""
+    if model is None or model == tile.model:
+        return tile
+    if not tile.model_can_change:
+        msg = f"{tile.path}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}"
+        raise RefineError(msg)
+    return tile._replace(model=model)
 
 
 def tile_at(path: Path | str) -> Tile:
