@@ -240,6 +240,11 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
     """Return all splats that a render shows, in the world, in the colours that they show to an eye.
 
     Instances are among them. Modifiers are not looked at, as in the 3D views.
+
+    Raises
+    ------
+    RefineError
+        If they are drawn in different ways: see `splats.refuse_mixed`.
     """
     parts = []
     for instance in depsgraph.object_instances:
