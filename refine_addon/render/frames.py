@@ -61,6 +61,30 @@ def refuse(scene: bpy.types.Scene) -> None:
         raise RefineError(msg)
 
 
+def left_out(scene: bpy.types.Scene) -> list[str]:
+    """Return what the scene asks for and a render with splats does without, in sentences."""
+    render, told = scene.render, []
+    blurred = [
+        name
+        for name, asked in (
+            ("depth of field", scene.camera.data.dof.use_dof),
+            ("motion blur", render.use_motion_blur),
+        )
+        if asked
+    ]
+    if blurred:
+        told.append(f"Splats are drawn without {' and '.join(blurred)}")
+    if hasattr(scene, "compositing_node_group"):  # since 5.0
+        nodes = scene.compositing_node_group
+    else:
+        nodes = scene.use_nodes and scene.node_tree
+    if render.use_compositing and nodes:
+        told.append("Compositing nodes are left out")
+    if sum(layer.use for layer in scene.view_layers) > 1:
+        told.append("Of several view layers the first is rendered")
+    return told
+
+
 def steps(
     scene: bpy.types.Scene, frames: Sequence[int], shared: Shared, *, write: bool
 ) -> Generator[Step | None, None, None]:

@@ -233,6 +233,17 @@ def test_a_border_is_cut_out_of_the_picture(shot):
     assert np.abs(cut[..., :3] - whole[:20, :30, :3])[solid].max() < 0.02
 
 
+@pytest.mark.parametrize("share", [0.7, 0.55, 0.9, 0.3])
+def test_a_border_ends_at_the_column_that_blender_ends_it_at(shot, share):
+    """.7 is a little less in 32 bits, and .7 times 60 columns 42 again, rounded to these."""
+    render = shot.render
+    render.use_border = render.use_crop_to_border = True
+    render.border_max_x = render.border_max_y = share
+    plane(shot, 50.0, (0.0, 0.0, 0.0), 1.0, width=200.0)
+
+    assert rendered().shape == (round(40 * share), round(60 * share), 4)
+
+
 def test_an_orthographic_camera_sees_splats_at_one_scale(shot):
     """A round splat of deviation .1 in an image 4 m wide, 60 px: 1.5 px wherever it is.
 
@@ -355,6 +366,23 @@ def test_the_command_writes_the_frames_it_is_told(addon, shot, tmp_path, capsys)
     told = capsys.readouterr()
     assert f"frame 7: {tmp_path / 'f_07.png'}" in told.out
     assert "has no camera" in told.err
+
+
+def test_what_splats_are_rendered_without_is_said(addon, shot, tmp_path, capsys):
+    """A camera with depth of field, a scene with motion blur and compositing nodes."""
+    shot.render.filepath = str(tmp_path / "f_##")
+    quiet = addon.render.frames.left_out(shot)
+    shot.camera.data.dof.use_dof = shot.render.use_motion_blur = True
+    if not hasattr(shot, "compositing_node_group"):
+        shot.use_nodes = True
+    else:
+        shot.compositing_node_group = bpy.data.node_groups.new("nodes", "CompositorNodeTree")
+
+    assert quiet == []
+    assert addon.command.main(["render"], scene=True) == 0
+    said = capsys.readouterr().out
+    assert "note: Splats are drawn without depth of field and motion blur" in said
+    assert "note: Compositing nodes are left out" in said
 
 
 def test_the_command_names_the_frames_that_it_leaves(addon, shot, tmp_path, capsys):
