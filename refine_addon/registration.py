@@ -49,6 +49,7 @@ from .ui.preferences import RefinePreferences
 from .ui.properties import RefineSettings
 from .ui.protect import REFINE_OT_protect
 from .ui.remedies import (
+    REFINE_OT_add_between,
     REFINE_OT_add_ring,
     REFINE_OT_keep_unseen,
     REFINE_OT_leave_out,
@@ -109,6 +110,7 @@ CLASSES = (
     REFINE_OT_export_ply,
     REFINE_OT_levels,
     REFINE_OT_turn_cameras,
+    REFINE_OT_add_between,
     REFINE_OT_add_ring,
     REFINE_OT_leave_out,
     REFINE_OT_keep_unseen,

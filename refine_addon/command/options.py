@@ -437,6 +437,14 @@ def _add_views(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"use at most N views, spread out evenly; 0 uses all (default {Settings.views})",
     )
+    parser.add_argument(
+        "--views-between",
+        type=int,
+        default=0,
+        metavar="N",
+        help="besides, use N more views, halfway between neighbouring ones: for pictures from "
+        "where no camera stood (default 0)",
+    )
 
 
 def _add_scoring(parser: argparse.ArgumentParser) -> None:
@@ -571,7 +579,18 @@ def _path(text: str) -> Path:
 def settings(options: argparse.Namespace) -> Settings:
     """Return how to score, or raise `RefineError` where a value cannot be."""
     method = options.method or Settings.method
-    return Settings(method, options.views, tolerance=options.tolerance)
+    return Settings(method, most_views(options), tolerance=options.tolerance)
+
+
+def most_views(options: argparse.Namespace) -> int:
+    """Return how many views may be used, with those in between; 0 for all.
+
+    Raise `RefineError` where their number cannot be.
+    """
+    if options.views_between < 0:
+        msg = f"--views-between is {options.views_between}, expected 0 or more"
+        raise RefineError(msg)
+    return options.views + options.views_between if options.views > 0 else options.views
 
 
 def survivors(options: argparse.Namespace) -> SurvivorChoice:
@@ -582,7 +601,7 @@ def survivors(options: argparse.Namespace) -> SurvivorChoice:
 
 def cleaning(options: argparse.Namespace) -> Cleaning:
     """Return what to clean away, or raise `RefineError` where a value cannot be."""
-    return Cleaning(getattr(options, "reasons", Cleaning.reasons), options.views)
+    return Cleaning(getattr(options, "reasons", Cleaning.reasons), most_views(options))
 
 
 def levels(options: argparse.Namespace) -> Levels:

@@ -31,6 +31,7 @@ from .survivors import survivor_columns
 from .task import METHODS, Result, Settings
 from .tiles.prune import prune_tiles
 from .views import View, ViewSet
+from .views_between import with_views_between
 from .volumes import Box, MovedVolume, Sphere, Zone, forced
 from .work import Cancelled
 
@@ -88,4 +89,5 @@ __all__ = [
     "score",
     "select",
     "survivor_columns",
+    "with_views_between",
 ]
