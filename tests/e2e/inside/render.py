@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import extension
 import numpy as np
-import xkey
+import xserver
 from mathutils import Vector
 from window import picture, until
 
@@ -69,7 +69,7 @@ def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
     invoke()
     yield 1.0
     found["began"] = rendering()
-    xkey.tap(xkey.ESCAPE)
+    xserver.tap(xserver.ESCAPE)
     yield from until(lambda: not rendering(), "it has stopped")
     found["alike"].append(settings(scene) == before)
     found["stopped"] = bpy.data.images[IMAGE].size[:] == shown
