@@ -86,6 +86,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         if several:
             wrapped.label(layout, context, "Scored and pruned as one scene", icon="INFO")
             return
+        _named_column(layout).prop(context.scene.refine, "model")
         _draw_progress(layout, context, "refine.import_ply")
 
 

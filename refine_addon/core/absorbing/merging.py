@@ -16,7 +16,8 @@ to the direction that the pair is viewed along (derived in docs/method.md, secti
     |s_i|^2 = E_i / (tau_i <f_i, f_i>),   2 s_i.s_j = |s_i|^2 + |s_j|^2 - |c_i - c_j|^2
 
 The merged splat has the mean and covariance of the mixture of the two, weighted by mass, and their
-mean colour, weighted by contribution. Its mass is ``A_m = A_i + A_j - <f_i, f_j>``, since the area
+mean colour, weighted by contribution. Its mass, which of antialiased splats is the integral without
+the low-pass, since they keep that, is ``A_m = A_i + A_j - <f_i, f_j>``, since the area
 that both cover is covered only once; its opacity follows from that mass. Where the opacity would
 exceed `ALPHA_MAX`, the covariance grows instead.
 
@@ -32,10 +33,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..affine import quaternion
-from ..rendering import ALPHA_MAX
+from ..rendering import ALPHA_MAX, LOW_PASS
+from ..seeing.projection import disc_axes
+from ..splats import LOG_ZERO, rotation_matrices
 from .merge_field import Field, across, footprint, normalized
 
 if TYPE_CHECKING:
+    from ..rendering import Model
     from .merge_field import Array, Footprint, Index
 
 FLATTEST = 1e-14
@@ -177,7 +181,7 @@ def _price(ends: _Ends, tilt: float) -> Pairs:
     mixed = color * color * s_i + 2.0 * color * rest * both + rest * rest * s_j
     tau = (ends.one.contribution + ends.two.contribution) / (one.mass + two.mass)
     return Pairs(
-        tau * np.maximum(cost, 0.0), plane.position, color, merged.mass / merged.area, plane.growth,
+        tau * np.maximum(cost, 0.0), plane.position, color, merged.mass / merged.base, plane.growth,
         tau * np.maximum(mixed, 0.0) * mm,
     )  # fmt: skip
 
@@ -205,12 +209,16 @@ class _Signal(NamedTuple):
     ----------
     footprint : Footprint
         Covariances in the plane, low-pass included.
-    area, mass : (M,) float64
-        See `_area`; opacity times area.
+    area, base : (M,) float64
+        See `_area`, with the low-pass; and of what the opacity is meant for: of antialiased splats
+        without the low-pass, of discs with their own.
+    mass : (M,) float64
+        Opacity times `base`.
     """
 
     footprint: Footprint
     area: Array
+    base: Array
     mass: Array
 
     def squared(self) -> Array:
@@ -255,7 +263,8 @@ def _in_plane(ends: _Ends, tilt: float) -> _Plane:
     normal = normalized(ends.direction + tilt * ends.deviation) if tilt else ends.direction
     plane = across(normal)
     x, y = (np.einsum("ji,ji->i", (ends.two.means - ends.one.means).T, axis) for axis in plane)
-    one, two = (_signal(splats, plane, ends.blur) for splats in (ends.one, ends.two))
+    blur = ends.blur
+    one, two = (_signal(splats, plane, blur) for splats in (ends.one, ends.two))
     position, other = _shares(one.mass, two.mass)
     overlap = one.times(two, x, y)
     between = position * other
@@ -264,17 +273,38 @@ def _in_plane(ends: _Ends, tilt: float) -> _Plane:
     )
     # The estimated overlap of nearly opaque splats can exceed the smaller mass; the true one never.
     mass = one.mass + two.mass - np.minimum(overlap, np.minimum(one.mass, two.mass))
-    growth = np.maximum(mass / (_area(mixed) * ALPHA_MAX), 1.0)
+    base = _base(mixed, blur, ends.one.model)
+    growth = np.maximum(mass / (base * ALPHA_MAX), 1.0)
     mixed = (mixed[0] * growth, mixed[1] * growth, mixed[2] * growth)
-    merged = _Signal(mixed, _area(mixed), mass)
+    area = _area(mixed)
+    merged = _Signal(mixed, area, _base(mixed, blur * growth, ends.one.model), mass)
     return _Plane(one, two, merged, x, y, position, other, growth, overlap)
 
 
 def _signal(splats: Field, plane: tuple[Array, Array], blur: Array) -> _Signal:
     """Return splats in a plane, spanned by unit vectors, with a low-pass of variance `blur`."""
     ellipse = footprint(splats.covariances, plane, blur)
-    area = _area(ellipse)
-    return _Signal(ellipse, area, splats.opacity * area)
+    base = _base(ellipse, blur, splats.model)
+    return _Signal(ellipse, _area(ellipse), base, splats.opacity * base)
+
+
+def _base(footprint: Footprint, blur: Array, model: Model) -> Array:
+    """Return the area that opacity is meant for, (M,): see `_Signal`."""
+    if model == "default":
+        return _area(footprint)
+    xx, xy, yy = footprint
+    sharp = (np.maximum(xx - blur, _TINY), xy, np.maximum(yy - blur, _TINY))
+    return _area(sharp) if model == "antialiased" else _disc_area(sharp, blur / LOW_PASS)
+
+
+def _disc_area(footprint: Footprint, pixel: Array) -> Array:
+    """Return what discs cover with their low-pass, over 2 pi, (M,); `pixel` is a pixel's area."""
+    xx, xy, yy = footprint
+    mean = 0.5 * (xx + yy)
+    first = mean + np.hypot(0.5 * (xx - yy), xy)
+    axes_of = disc_axes(np.stack([first, _determinant(footprint) / first]) / pixel)
+    covered: Array = axes_of[0] * axes_of[1] * pixel
+    return covered
 
 
 def _contrasts(ends: _Ends, one: Array, two: Array) -> tuple[Array, Array, Array]:
@@ -313,6 +343,7 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
         _mean_deviation(one.deviation, two.deviation, pairs.color),
         color * one.color + (1.0 - color) * two.color,
         pairs.color * one.blur + (1.0 - pairs.color) * two.blur,
+        one.model,
     )
 
 
@@ -324,6 +355,35 @@ def axes(covariances: Array) -> tuple[Array, Array]:
     logs = 0.5 * (np.log(np.maximum(values, FLATTEST)) + np.log(total)[:, None])
     vectors[np.linalg.det(vectors) < 0.0] *= -1.0
     return logs, quaternion(vectors)
+
+
+def flattened(merged: Field, logs: Array, quaternions: Array) -> tuple[Array, Array, Array]:
+    """Return merged splats as discs of their two longest axes, with the mass that they had.
+
+    Parameters
+    ----------
+    merged : Field
+    logs, quaternions : (M, 3), (M, 4) float64
+        See `axes`: the shortest axis comes first.
+
+    Returns
+    -------
+    logs, quaternions, opacity : (M, 3), (M, 4), (M,) float64
+        The shortest axis comes last, and is 0.
+    """
+    flat = np.stack([logs[:, 1], logs[:, 2], np.full(len(logs), LOG_ZERO)], axis=1)
+    x, y, z, w = quaternions[:, 1], quaternions[:, 2], quaternions[:, 3], quaternions[:, 0]
+    # A third of a turn about (1, 1, 1) takes the first axis to the second, and so on.
+    turned = 0.5 * np.stack([w - x - y - z, w + x + y - z, w + y + z - x, w + z + x - y], axis=1)
+    vectors = rotation_matrices(turned)[:, :, :2] * np.exp(flat[:, None, :2])
+    rows, columns = np.triu_indices(3)
+    covariances = (vectors @ np.swapaxes(vectors, 1, 2))[:, rows, columns]
+    plane = across(merged.direction)
+    thick, thin = (
+        _base(footprint(each, plane, merged.blur), merged.blur, "2dgs")
+        for each in (merged.covariances, covariances)
+    )
+    return flat, turned, np.minimum(merged.opacity * thick / thin, ALPHA_MAX)
 
 
 def _shares(one: Array, two: Array) -> tuple[Array, Array]:

@@ -329,6 +329,8 @@ def _absorbing(
     for number, budget in enumerate(budgets):
         of_level = part(progress, number / len(budgets), (number + 1) / len(budgets))
         result = decide(replace(task, budget=budget), progress=of_level, threads=threads)
+        if result.stopped is not None:
+            raise result.stopped
         assert result.absorbed is not None  # noqa: S101 - the task says so
         whole = result.absorbed if whole is None else _both(whole, result.absorbed)
         yield _Made(whole.keep, whole.splats, result, whole)

@@ -108,7 +108,7 @@ def prune_tiles(
     if request.survivors == "auto":  # over tiles absorbing takes far longer, and room on the disk
         request = replace(request, survivors="unchanged")
     asked = TilesRequest(request)
-    tiles = tiles_at(sources)
+    tiles = tiles_at(sources, request.model)
     output = None if folder is None or request.dry_run else located(folder)
     with contextlib.ExitStack() as held:
         if output is None:
@@ -265,7 +265,7 @@ class TilesRequest(Request[TileScene, TileDecision]):
                 share = removed / scene.total
                 facts["survivors"] |= expected_psnr(scores.quality, share, told)
                 facts["survivors"]["became"] = "refit"
-                facts["refitted"] = made.refitted.facts(made.seconds)
+                facts["refitted"] = {"began": "absorb", **made.refitted.facts(made.seconds)}
                 facts["notes"].append(made.refitted.note(made.seconds))
             if asked.settings.method == "closed-form":
                 facts["notes"].append(MEASURES)
