@@ -124,7 +124,7 @@ def test_an_artist_walks_from_the_zip_to_an_asset(
     cropped = walk["14-cropped"]["splats"]
     assert 1_000 < cropped < 9_000
     assert walk["16-applied"]["splats"] == walk["18-redone"]["splats"] == cropped - cropped // 2
-    assert psnr(shown["16-applied"], shown["14-cropped"]) > 30.0
+    assert psnr(shown["16-applied"], shown["14-cropped"]) > 25.0
     assert psnr(shown["17-undone"], shown["14-cropped"]) > 45.0
     assert psnr(shown["18-redone"], shown["16-applied"]) > 45.0
 
