@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import bpy
 import extension
 import numpy as np
-import xkey
+import xserver
 from mathutils import Vector
 from window import picture, until
 
@@ -97,7 +97,7 @@ def escape(found: dict[str, Any], *, animation: bool) -> Generator[float, None, 
     yield 1.0
     found["began"] = rendering()
     busy = processor()
-    xkey.tap(xkey.ESCAPE)
+    xserver.tap(xserver.ESCAPE)
     yield from until(lambda: not rendering(), "it has stopped")
     found["busy"].append(processor() - busy)
 
