@@ -53,7 +53,9 @@ def refuse(scene: bpy.types.Scene) -> None:
     if scene.camera is None:
         msg = f"{label}: has no camera; add one, or make one the active camera"
         raise RefineError(msg)
-    if not any(drawn_by_us(obj) for obj in bpy.data.objects):
+    instanced = {obj.instance_collection for obj in bpy.data.objects} - {None}
+    members = [member for collection in instanced for member in collection.all_objects]
+    if not any(drawn_by_us(obj) for obj in (*scene.objects, *members)):
         msg = f"{label}: has no splats to draw; import some, or use Render Image"
         raise RefineError(msg)
     if scene.render.use_multiview:

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from mathutils import Matrix, Vector
 
+from benchmarks.renderer.rasterizer import render
+
 IMAGE = "Render with Splats"
 
 
@@ -172,6 +174,55 @@ def test_splats_between_glass_and_a_wall_are_seen(addon, shot, quarter):
     assert abs(apart.mean()) < 0.01
     assert np.abs(clear - plain).max() < 2.0 / 255.0
     assert settings(shot) == before
+
+
+@pytest.mark.slow
+def test_splats_among_glass_and_walls_are_those_of_the_reference_renderer(addon, shot, quarter):
+    """At least 40 dB: green glass, a red wall amid the splats, a blue one behind most of them.
+
+    By hand, front to back: the splats before each, seen through what is in front, then its colour.
+    Where splats let all through, it is what the three make as light.
+    """
+    shot.render.resolution_percentage, shot.cycles.samples = 100, 64
+    shot.view_settings.view_transform = "Standard"
+    view = addon.cameras.objects.view_from_camera(
+        shot.camera, shot, bpy.context.evaluated_depsgraph_get()
+    )
+    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(quarter), whole=True)
+    depths = (splats.means - view.center) @ view.rotation[2]
+    expected, light = np.zeros((2, 80, 120, 3))
+    left, passed, near = np.ones((80, 120, 1)), np.ones((80, 120, 1)), 0.0
+    compared = np.ones((80, 120), np.bool_)
+    for share, alpha, color, (columns, rows) in (
+        (0.1, 0.4, (0.0, 1.0, 0.0), ((0, 60), (0, 80))),
+        (0.3, 1.0, (1.0, 0.0, 0.0), ((40, 100), (30, 50))),
+        (0.8, 1.0, (0.0, 0.0, 1.0), ((-60, 180), (-40, 120))),
+    ):
+        far = float(np.quantile(depths[depths > 0.2], share))
+        obj = plane(shot, far, color, alpha, width=1.0)
+        edges = np.array([columns, rows]) - [[view.cx], [view.cy]]
+        (x, y), (wide, high) = edges.mean(axis=1) / view.fx, np.ptp(edges, axis=1) / view.fx
+        obj.matrix_world @= Matrix.Translation((x * far, -y * far, 0.0))
+        obj.matrix_world @= Matrix.Diagonal((wide * far, high * far, 1.0, 1.0))
+        mask = np.zeros((80, 120, 1))
+        mask[max(rows[0], 0) : rows[1], max(columns[0], 0) : columns[1]] = alpha
+        for column, row in zip(columns, rows, strict=True):
+            compared[:, max(column - 3, 0) : max(column + 3, 0)] = False
+            compared[max(row - 3, 0) : max(row + 3, 0)] = False
+        some = splats.take((depths >= near) & (depths < far))
+        black, white = (render(some, view, near=0.1, background=(b,) * 3) for b in (0.0, 1.0))
+        expected += left * passed * black
+        passed = passed * np.where(left > 0.0, (white - black).mean(axis=2, keepdims=True), 1.0)
+        expected += left * passed * mask * color
+        light += left * mask * color
+        left, near = left * (1.0 - mask), far
+    shown = np.where(light > 0.0, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055, 0.0)
+    expected += passed * (shown - light)
+
+    apart = (rendered()[..., :3] - expected.clip(0.0, 1.0))[compared]
+
+    assert compared.mean() > 0.5
+    assert -10.0 * np.log10(np.mean(apart**2)) > 40.0
 
 
 def test_what_an_undo_brings_back_of_a_render_is_put_right(addon, shot):
@@ -349,6 +400,29 @@ def test_f12_says_that_splats_are_not_in_it(addon, shot, quarter, capfd):
     assert addon.ui.render_notice.IN_BACKGROUND in said
     assert addon.ui.render_notice.IN_BACKGROUND not in capfd.readouterr().err
     assert shot.name in bpy.data.scenes
+
+
+def test_splats_that_blender_draws_are_left_to_it(
+    addon, shot, quarter, monkeypatch, capfd, tmp_path
+):
+    """In 5.3 point clouds of a type of their own; where there is none, all others stand in.
+
+    F12 shows them and says nothing, and among others they are rendered with the meshes.
+    """
+    other = bpy.data.objects.new("other", quarter.data.copy())
+    cloud, _ = addon.mesh.convert.converted(addon.mesh.layout.check(quarter))
+    monkeypatch.setattr(addon.mesh.native, "TYPE", getattr(cloud.data, "type", ""))
+    bpy.ops.render.render()
+    said = capfd.readouterr().err
+    with pytest.raises(RuntimeError, match="has no splats to draw; import some, or use Render Im"):
+        bpy.ops.refine.render()
+    shot.collection.objects.link(other)
+    meshes = addon.render.meshes.Meshes(shot, tmp_path)
+    addon.render.copies.remove_all()
+
+    assert addon.ui.render_notice.IN_BACKGROUND not in said
+    assert meshes.engine == "CYCLES"
+    assert cloud not in meshes._hidden
 
 
 def test_the_command_writes_the_frames_it_is_told(addon, shot, tmp_path, capsys):
