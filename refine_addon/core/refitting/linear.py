@@ -14,7 +14,8 @@ along the splat's axis j, whose scale is s_j and the longest of which is s::
     da / d log s_j       = a (s_j h_j)^2
     da / d turn_1        = a (s_2^2 - s_3^2) h_2 h_3    a small turn about axis 1; others in turn
 
-That J changes with the mean, and the colour with the direction of view, is left out. Parameters are
+That J changes with the mean, the colour with the direction of view, and what antialiasing keeps of
+the opacity with the scales, is left out. Of discs, d is scaled to their plane first. Parameters are
 those of the splat's own axes, so results turn and grow with the scene.
 
 With ``e = A d``, h_j is ``r_j e``, r_j the splat's axis in the image, in pixels. So the ten
@@ -29,8 +30,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..rendering import ALPHA_CUT, ALPHA_MAX
+from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..seeing import projection
+from ..seeing.cast import BEHIND
 from ..seeing.ray_sums import in_front
 from ..seeing.rays import LEAST_LEFT, LOG_OPAQUE
 from ..splats import SH_C0, rotation_matrices
@@ -366,6 +368,29 @@ def _slopes(
     )
 
 
+def _steepness_on_discs(
+    discs: NDArray[np.float32], step: list[NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """Return `_steepness` of hits on discs, (7, h), at a step from their centres, (h,) each.
+
+    With d scaled to the plane of the disc, ``d / (1 + g d)``, C of the disc is that of a Gaussian;
+    where its low-pass is what is drawn, only the mean matters.
+    """
+    across, down = step
+    depth = 1.0 + discs[4] * across + discs[5] * down
+    ahead = depth > BEHIND
+    first, second = (
+        (discs[k] * across + discs[k + 1] * down) / np.where(ahead, depth, 1.0) for k in (0, 2)
+    )
+    low_pass = np.float32(1.0 / DISC_LOW_PASS)
+    blob = (across * across + down * down) * low_pass
+    plane = ahead & (first * first + second * second <= blob)
+    result = np.empty((2, len(across)), np.float32)
+    for k, of_blob in enumerate((across, down)):
+        result[k] = np.where(plane, discs[k] * first + discs[2 + k] * second, low_pass * of_blob)
+    return result
+
+
 def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> NDArray[np.float32]:
     """Return ``A d`` of some hits, across and down, (2, h), 1/px."""
     place = np.empty(int(footprints.index.max(initial=-1)) + 1, np.intp)
@@ -378,6 +403,8 @@ def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> N
         for at, center in zip(pixel, mine.centers, strict=True)
     ]
     result = np.zeros((2, len(owner)), np.float32)
+    if mine.discs is not None:
+        return _steepness_on_discs(mine.discs.take(owner, axis=1), step)
     for axes, sigma in zip((mine.major, mine.minor), mine.sigmas, strict=True):
         inverse = (1.0 / np.square(np.square(sigma.astype(np.float64)))).astype(np.float32)
         along = step[0] * axes[0].take(owner) + step[1] * axes[1].take(owner)
