@@ -42,8 +42,7 @@ struct ViewData {
 };
 """
 """size: pixels across, pixels up, near, texels of depth per pixel. choices: perspective, whether
-depth is tested, whether there are veils, whether what is behind the tested depth is drawn and not
-what is in front."""
+depth is tested, whether there are veils, whether what is before the depths of veils is left out."""
 
 _SPLAT_VERTEX = """
 #define value_at(values, row) texelFetch(values, ivec2((row) % WIDTH, (row) / WIDTH), 0)
@@ -204,7 +203,13 @@ void main()
       /* Blender 5 gives meshes a depth that X-ray shows transparent. */
       occluder = abs(occluder - veil) < SAME_DEPTH ? 1.0 : occluder;
     }
-    if ((gl_FragCoord.z > occluder) != (view_data.choices.w > 0.5)) {
+    if (gl_FragCoord.z > occluder) {
+      discard;
+    }
+  }
+  if (view_data.choices.w > 0.5) {
+    ivec2 texel = ivec2(gl_FragCoord.xy * view_data.size.w);
+    if (gl_FragCoord.z <= texelFetch(veil_depths, texel, 0).r) {
       discard;
     }
   }

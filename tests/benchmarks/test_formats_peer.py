@@ -14,7 +14,9 @@ from scipy.spatial import cKDTree
 from benchmarks.baselines import splat_transform
 from refine_addon.core import Splats, as_written, read_splats
 from refine_addon.core.formats import streamed_sog_write
+from refine_addon.core.formats.registry import format_named
 from refine_addon.core.formats.streamed_sog_write import StreamedSog, folder_for
+from refine_addon.core.rendering import MODELS
 from refine_addon.core.splats import base_color, opacity, rotation_matrices
 from tests.fuzz import version_1_of
 from tests.strategies import ply_of, splat_names
@@ -277,3 +279,43 @@ def test_the_validator_of_khronos_finds_no_fault_in_our_glb(tmp_path):
     names = "/meshes/0/primitives/0/attributes/KHR_gaussian_splatting:"
     assert {issue["code"] for issue in faults} == {"MESH_PRIMITIVE_INVALID_ATTRIBUTE"}
     assert all(issue["pointer"].startswith(names) for issue in faults)
+
+
+@pytest.mark.parametrize("suffix", [".ply", *BOUNDS])
+@pytest.mark.parametrize("model", MODELS)
+def test_what_is_said_of_how_splats_are_drawn_survives_both(tmp_path, suffix, model):
+    """PLY, a format by us, PLY by splat-transform; and a format by it, PLY by us.
+
+    Where the format holds the tag; else the splats count as ordinary ones.
+    """
+    source = read_splats(room(tmp_path, 0), model)
+    form = format_named(tmp_path / f"x{suffix}")
+    held = form is None or model in form.models
+    ours, theirs = tmp_path / f"ours{suffix}", tmp_path / f"theirs{suffix}"
+    source.write(tmp_path / "tagged.ply")
+    as_written(source, ours).write(ours)
+
+    transformed(ours, tmp_path / "back.ply")
+    transformed(tmp_path / "tagged.ply", theirs)
+
+    expected = model if held else "default"
+    assert read_splats(tmp_path / "back.ply").model == expected
+    assert read_splats(theirs).model == expected
+
+
+def test_discs_without_a_third_scale_pass_through_splat_transform(tmp_path):
+    """They come back without it, and with the two that they have."""
+    columns = {name: values for name, values in columns_of(room(tmp_path, 0)) if name != "scale_2"}
+    (tmp_path / "discs.ply").write_bytes(ply_of(columns))
+
+    transformed(tmp_path / "discs.ply", tmp_path / "back.ply")
+
+    back = read_splats(tmp_path / "back.ply")
+    assert "scale_2" not in (back.rows.dtype.names or ())
+    np.testing.assert_allclose(back.rows["scale_1"], columns["scale_1"], rtol=1e-5)
+
+
+def columns_of(path: Path) -> list[tuple[str, np.ndarray]]:
+    """Return the properties of a file by their names."""
+    rows = read_splats(path).rows
+    return [(name, rows[name]) for name in rows.dtype.names or ()]

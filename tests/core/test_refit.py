@@ -78,7 +78,8 @@ def linear_of(splats, view, count=12, *, geometry=True):
     rays = cast(footprints, COLUMNS, ROWS)
     colors = colors_from(splats, gaussians.index[rays.hit], view)
     shapes = linear.Shapes.of(splats, gaussians.take(slice(count)), scene, geometry=geometry)
-    return linear.linear_view(rays, footprints, colors, shapes, view)
+    black = np.zeros((3, rays.count), np.float32)
+    return linear.linear_view(rays, footprints, black, colors, shapes, view)
 
 
 @pytest.mark.parametrize("parameter", range(linear.COUNT))
@@ -110,7 +111,7 @@ def test_backward_is_the_transpose_of_forward():
     found = linear_of(few(), ring()[0])
     random = np.random.default_rng(1)
     change = random.normal(size=(linear.COUNT, 12)).astype(np.float32)
-    errors = random.normal(size=found.colors.shape).astype(np.float32)
+    errors = random.normal(size=found.errors.shape).astype(np.float32)
 
     one = float(np.vdot(found.forward(change), errors))
     other = float(np.vdot(found.backward(errors), change[:, found.rows]))
@@ -128,7 +129,7 @@ def test_colours_and_opacities_alone_have_the_derivatives_that_they_have_among_a
     random = np.random.default_rng(1)
     change = np.zeros((linear.COUNT, 12), np.float32)
     change[: linear.MEAN.start] = random.normal(size=(4, 12))
-    errors = random.normal(size=every.colors.shape).astype(np.float32)
+    errors = random.normal(size=every.errors.shape).astype(np.float32)
 
     np.testing.assert_allclose(alone.forward(change), every.forward(change), atol=1e-6)
     for one, other in (
@@ -244,6 +245,31 @@ def test_rays_of_one_round_are_not_next_to_those_of_another():
         assert distance.min() > 25
 
 
+def test_views_move_a_little_in_each_round_and_along_their_own_axes():
+    """By at most a few times `SHIFT` of the distance to the next view, or of a share of the scene.
+
+    Of 12 views on a circle of radius r the next is 2 r sin(15 degrees) away. Views that stand in
+    one place with others, or alone, stay. Turned cameras move as the world turns.
+    """
+    views = list(ring())
+    scene = projection.prepare(cloud(50), ring())[1]
+    apart = np.linalg.norm(views[0].center - views[1].center)
+
+    steps = round_rays.steps_of(views, scene)
+
+    assert steps == pytest.approx([min(0.7 * apart, 0.1 * scene.size)] * len(views))
+    assert round_rays.steps_of(views[:1], scene) == [0.0]
+    assert round_rays.steps_of([views[0]] * 3, scene) == [0.0] * 3
+    turn = rotation([3, -1, 2], 111.0)
+    places = []
+    for view in (views[0], views[0].turned(turn)):
+        window = round_rays.Window(view, 3, 1.0, 100.0, 1e9, step=steps[0])
+        places.append([window.moved(number).view.center - view.center for number in range(1, 200)])
+    moves = np.linalg.norm(places[0], axis=1)
+    assert 0.7 * steps[0] < np.sqrt(np.mean(moves**2)) < 1.3 * steps[0]
+    np.testing.assert_allclose(places[1], places[0] @ turn.T, atol=1e-9)
+
+
 def test_what_is_around_a_region_is_drawn_and_does_not_change():
     """Of the last six splats of 12, colours and derivatives of the first six are the same."""
     splats, view = few(), ring()[0]
@@ -251,7 +277,7 @@ def test_what_is_around_a_region_is_drawn_and_does_not_change():
 
     found = linear_of(splats, view, 6)
 
-    np.testing.assert_array_equal(found.colors, every.colors)
+    np.testing.assert_array_equal(found.errors, every.errors)
     assert found.rows.max() < 6
     change = np.random.default_rng(2).normal(size=(linear.COUNT, 12)).astype(np.float32)
     change[:, 6:] = 0.0

@@ -24,12 +24,15 @@ if TYPE_CHECKING:
 MIN_RAYS_OF_VIEW = 16
 """A view has at least this many rays, if it has as many pixels."""
 
+BEHIND = 1e-4
+"""Of a disc: a plane that a ray hits behind the camera, or at 1 / this times the centre's depth, is
+not hit."""
+
 _PAIRS = 1 << 17  # pairs of footprint and pixel at a time, which limits temporary memory
 _MAX_TABLE = 1 << 14  # pixels; images up to this size are looked up in a table, see `_before`
 
 _CROSSING = 1e-3  # a disc of which this much is left of a plane through the camera crosses it
 _NO_END = 1e9  # px; beyond any image
-_BEHIND = 1e-4  # a hit this many times as far away as the centre is none
 
 _STEPS = (0.7548776662466927, 0.5698402909980532)
 """1 / p and 1 / p^2 of the plastic number p: their multiples modulo 1 spread evenly over the unit
@@ -299,7 +302,7 @@ def _on_discs(
     """Return what `_squared_distances` does of discs, (7, p), at a step from their centres."""
     depth = 1.0 + discs[4] * across + discs[5] * down  # of the centre over that of the hit
     first, second = (discs[k] * across + discs[k + 1] * down for k in (0, 2))
-    ahead = depth > _BEHIND
+    ahead = depth > BEHIND
     squared = (first * first + second * second) / np.square(np.where(ahead, depth, 1.0))
     low_pass = (across * across + down * down) * np.float32(1.0 / DISC_LOW_PASS)
     on_plane = ahead & (squared <= low_pass)

@@ -277,7 +277,7 @@ class TilesRequest(Request[TileScene, TileDecision]):
                 share = removed / scene.total
                 facts["survivors"] |= expected_psnr(scores, share, told)
                 facts["survivors"]["became"] = "refit"
-                facts["refitted"] = made.refitted.facts(made.seconds)
+                facts["refitted"] = {"began": "absorb", **made.refitted.facts(made.seconds)}
                 facts["notes"].append(made.refitted.note(made.seconds))
             if asked.settings.method == "closed-form":
                 facts["notes"].append(MEASURES)

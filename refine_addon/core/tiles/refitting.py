@@ -140,13 +140,11 @@ class RefitRegion:
     def _refitted(self, context: RegionsContext, runtime: Runtime) -> NDArray[np.int64]:
         rows, settings = context.folder.load(self.index, ["rows"])["rows"], context.settings
         splats, changed, rounds = context.after.take(rows), np.zeros(len(rows), np.bool_), 0
-        rays = RegionRays(
-            splats, rows, context.before, context.after, settings.rounds, runtime.part(0.0, 0.3)
-        )
+        rays = RegionRays(splats, rows, context.before, context.after, runtime.threads)
         if rays.windows:
             *_, done = refit_on(
                 rays, splats, settings,
-                progress=runtime.part(0.3, 1.0).progress, threads=runtime.threads,
+                progress=runtime.progress, threads=runtime.threads,
             )  # fmt: skip
             splats, changed, rounds = done.splats, done.changed, done.rounds
         context.folder.save(self.index, {"splats": packed(splats), "changed": changed})
