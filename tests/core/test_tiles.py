@@ -347,6 +347,20 @@ def counted_calls(folder, views, count):
     return calls[0]
 
 
+def test_tiles_of_different_models_are_refused(tiles):
+    """The message names both files and what each holds."""
+    tagged = tiles[1]
+    rest = tagged.read_bytes().removeprefix(b"ply\n")
+    tagged.write_bytes(b"ply\ncomment SplatRenderMode: mip\n" + rest)
+
+    with pytest.raises(RefineError) as caught:
+        units.tiles_at(tiles)
+
+    first = f"{tagged}: its splats are antialiased, those of {tiles[0]} default"
+    assert str(caught.value) == f"{first}; expected one model in all tiles"
+    assert {tile.model for tile in units.tiles_at(tiles[:1], "2dgs")} == {"2dgs"}
+
+
 def test_a_slice_of_a_unit_is_that_of_its_tiles(tmp_path):
     """Any slice of a unit, across its parts, in the types and the degree of all of them.
 
