@@ -370,17 +370,11 @@ def test_the_summary_says_how_close_the_pictures_stay(capsys):
     for options, pattern in (
         (
             ["--method", "occlusion"],
-            (
-                r"  quality: about \d+ dB in these views, about \d+ between them; "
-                "what absorbing and refitting reach is not "
-            ),
+            r"  quality: about \d+ dB in these views, about \d+ between them; what absorbing ",
         ),
         (
             ["--absorb"],
-            (
-                r"  quality: about \d+ dB in these views, about \d+ between them "
-                r"\(--survivors unchanged about \d+ dB or more "
-            ),
+            r"quality: about \d+ dB in these views, about \d+ between them \(--survivors unch",
         ),
         (
             ["--method", "occlusion", "--ratio", "0"],
