@@ -7,7 +7,7 @@ from bpy.props import PointerProperty
 
 from . import command
 from .core.formats import images
-from .core.formats.registry import SUFFIXES
+from .core.formats.registry import READ_SUFFIXES
 from .ui import (
     camera_list,
     demand_changes,
@@ -127,7 +127,7 @@ CLASSES = (
     REFINE_PT_export,
 )
 
-_SPLATS = f"Gaussian Splats ({', '.join(SUFFIXES)})"
+_SPLATS = f"Gaussian Splats ({', '.join(READ_SUFFIXES)})"
 
 _commands: list[object] = []
 """Handle of the command, which Blender wants back."""

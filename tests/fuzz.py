@@ -398,6 +398,82 @@ def use_sog(folder: Path) -> None:
     use_splats(folder)
 
 
+def version_1_of(files: Files) -> Files:
+    """Return the files of a SOG with what version 1 says in place of version 2."""
+    held = json.loads(files["meta.json"])
+    meta = {name: {"files": held[name]["files"]} for name in ("means", "scales", "quats", "sh0")}
+    meta["means"] |= {"shape": [held["count"], 3], "mins": [-1, -1, -1], "maxs": [1, 1, 1]}
+    meta["scales"] |= {"mins": [-9, -9, -9], "maxs": [-1, -1, -1]}
+    meta["sh0"] |= {"mins": [-2, -2, -2, -5], "maxs": [2, 2, 2, 5]}
+    if "shN" in held:
+        meta["shN"] = {"files": held["shN"]["files"], "mins": -1, "maxs": 1}
+    return {**files, "meta.json": json.dumps(meta).encode()}
+
+
+def streamed_seeds() -> list[Files]:
+    """Return a streamed SOG of two levels: an index, and SOG whose files have names of their own.
+
+    All lie in one folder, as files of other seeds do.
+    """
+    units = [*sog_seeds(), version_1_of(sog_seeds()[1])]
+    files: Files = {}
+    for number, unit in enumerate(units):
+        text = unit.pop("meta.json").decode()
+        for name in unit:
+            text = text.replace(name, f"{number}_{name}")
+        files |= {f"{number}_{name}": data for name, data in unit.items()}
+        files[f"{number}_meta.json"] = text.encode()
+    lods = {str(n): {"file": n, "offset": 0, "count": 5} for n in (0, 1)}
+    index = {
+        "version": 1, "lodLevels": 2, "counts": [5, 5], "environment": "2_meta.json",
+        "filenames": ["0_meta.json", "1_meta.json"],
+        "tree": {"children": [{"bound": {}, "lods": lods}]},
+    }  # fmt: skip
+    return [{**files, "lod-meta.json": json.dumps(index).encode()}]
+
+
+def use_streamed(folder: Path) -> None:
+    """Read both levels of a streamed SOG."""
+    for level in (0, 1):
+        file = read_splats(folder / "lod-meta.json", level=level)
+        describe(file)
+        file.write(folder / f"{level}.ply")
+
+
+def use_unbundled(folder: Path) -> None:
+    """Read a SOG in a folder."""
+    file = read_splats(folder / "meta.json")
+    describe(file)
+    file.write(folder / "out.ply")
+
+
+def ksplat_seeds() -> list[Files]:
+    """Return what files of the reference converter hold, without the zeros between."""
+    seeds = []
+    for name in ("level_0", "level_1", "level_2", "degree_1"):
+        data = (ROOT / f"tests/data/other_tools/{name}.ksplat").read_bytes()
+        count = data[4]
+        starts = [4096 + 1024 * number for number in range(count)]
+        sections = {f"{1 + n}": data[at : at + 42] for n, at in enumerate(starts)}
+        seeds.append({"0": data[:44], **sections, "9": data[4096 + 1024 * count :]})
+    return seeds
+
+
+def use_ksplat(folder: Path) -> None:
+    """Put header, sections and splats into a file and use that."""
+    header, *sections, rest = sorted(folder.iterdir())
+    data = header.read_bytes()[:4096].ljust(4096, b"\0")
+    data += b"".join(path.read_bytes()[:1024].ljust(1024, b"\0") for path in sections)
+    data += rest.read_bytes()
+    for path in (header, *sections, rest):
+        path.unlink()
+    path = folder / "in.ksplat"
+    path.write_bytes(data)
+    file = read_splats(path)
+    describe(file)
+    file.write(folder / "out.ply")
+
+
 def use_cameras(folder: Path) -> None:
     """Read cameras, and score a few splats by them, by either method."""
     files = sorted(path for path in folder.iterdir() if path.name != "dataparser_transforms.json")
@@ -425,7 +501,16 @@ TARGETS: dict[str, Target] = {
         for form in FORMATS
         if form.name != "SOG"
     },
-    **({"SOG": (sog_seeds, use_sog)} if find_spec("PIL") else {}),
+    **(
+        {
+            "SOG": (sog_seeds, use_sog),
+            "SOG 1": (lambda: [version_1_of(seed) for seed in sog_seeds()], use_unbundled),
+            "streamed SOG": (streamed_seeds, use_streamed),
+        }
+        if find_spec("PIL")
+        else {}
+    ),
+    ".ksplat": (ksplat_seeds, use_ksplat),
     "cameras.json": (inria_seeds, use_cameras),
     "transforms.json": (transforms_seeds, use_cameras),
     "colmap text": (colmap_text_seeds, use_cameras),

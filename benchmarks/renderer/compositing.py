@@ -11,7 +11,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numba
 import numpy as np
 
-from .footprints import ALPHA_CUT, DETERMINANT, LIMIT, OPACITY, RED, A, B, C, Footprints, U, V
+from .footprints import (
+    ALPHA_CUT,
+    COLUMNS,
+    DETERMINANT,
+    LIMIT,
+    OPACITY,
+    RED,
+    A,
+    B,
+    C,
+    Footprints,
+    U,
+    V,
+    disc_distance,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -185,6 +199,8 @@ def _splat_hits(
     On a row of pixels at height d from the centre, ``a e^2 + 2 b e d + c d^2 <= limit`` holds for
     e within ``sqrt(a limit - d^2 / det) / a`` of ``-b d / a``, because ``a c - b^2 = 1 / det``.
     """
+    if len(row) > COLUMNS:
+        return _disc_hits(row, box, region, progress, hits)
     (left, top), (width, height) = region
     through, stop = progress
     places, alphas, count = hits
@@ -204,6 +220,31 @@ def _splat_hits(
                 continue
             dx = left + i + 0.5 - row[U]
             square = row[A] * dx * dx + 2.0 * row[B] * dx * dy + row[C] * dy * dy
+            alpha = min(ALPHA_MAX, row[OPACITY] * math.exp(-0.5 * square))
+            if alpha >= ALPHA_CUT:
+                places[count], alphas[count] = place, alpha
+                count += 1
+    return count
+
+
+@numba.njit(cache=True)
+def _disc_hits(
+    row: NDArray[np.float64],
+    box: NDArray[np.int32],
+    region: tuple[tuple[int, int], tuple[int, int]],
+    progress: tuple[NDArray[np.float64], float],
+    hits: tuple[NDArray[np.int32], NDArray[np.float64], int],
+) -> int:
+    """Do the same for a disc: every pixel of its box is asked."""
+    (left, top), (width, height) = region
+    through, stop = progress
+    places, alphas, count = hits
+    for j in range(max(box[2] - top, 0), min(box[3] - top, height - 1) + 1):
+        for i in range(max(box[0] - left, 0), min(box[1] - left, width - 1) + 1):
+            place = j * width + i
+            if through[place] < stop:
+                continue
+            square = disc_distance(row, left + i + 0.5, top + j + 0.5)
             alpha = min(ALPHA_MAX, row[OPACITY] * math.exp(-0.5 * square))
             if alpha >= ALPHA_CUT:
                 places[count], alphas[count] = place, alpha

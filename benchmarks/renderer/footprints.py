@@ -24,8 +24,12 @@ LOW_PASS = 0.3
 ALPHA_CUT = 1.0 / 255.0
 FIELD_OF_VIEW_CLAMP = 1.3
 
-# Columns of Footprints.table.
+DISC_FILTER = 2.0
+"""Of discs (2DGS): the squared distance in pixels from the centre counts times this, at least."""
+
+# Columns of Footprints.table; of discs, there follow the 9 of their homography and the near plane.
 U, V, A, B, C, DETERMINANT, LIMIT, OPACITY, RED, COLUMNS = 0, 1, 2, 3, 4, 5, 6, 7, 8, 11
+NEAR = COLUMNS + 9
 
 
 class Gaussians(NamedTuple):
@@ -41,12 +45,19 @@ class Gaussians(NamedTuple):
         0 to 1; 0 is never drawn, whatever the other values.
     harmonics : (N, (degree + 1)^2, 3) float32
         Spherical-harmonics coefficients of red, green, blue.
+    antialiased : bool
+        Whether opacities fall where the low-pass widens footprints.
+    tangents : (N, 3, 2) float64
+        Of discs (2DGS): their two axes as columns, as long as a standard deviation, world units; of
+        others (0, 3, 2).
     """
 
     means: NDArray[np.float64]
     covariances: NDArray[np.float64]
     opacities: NDArray[np.float64]
     harmonics: NDArray[np.float32]
+    antialiased: bool
+    tangents: NDArray[np.float64]
 
 
 class Camera(NamedTuple):
@@ -71,7 +82,8 @@ class Footprints(NamedTuple):
         Which splat it is.
     table : (M, 11) float64
         u, v: centre, pixels; a, b, c: inverse covariance, 1 / px^2; determinant of the covariance,
-        px^4; largest squared Mahalanobis distance drawn; opacity; red, green, blue.
+        px^4; largest squared Mahalanobis distance drawn; opacity; red, green, blue. Of discs
+        (M, 21): see `_project_disc`.
     boxes : (M, 4) int32
         First and last pixel column, first and last pixel row, clipped to the image.
     """
@@ -87,6 +99,8 @@ def gaussians(
     quaternions: ArrayLike,
     opacities: ArrayLike,
     harmonics: ArrayLike,
+    *,
+    model: str = "default",
 ) -> Gaussians:
     """Prepare plain arrays for rendering; once for any number of views.
 
@@ -102,6 +116,7 @@ def gaussians(
         0 to 1.
     harmonics : (N, K, 3) floating
         K = (degree + 1)^2 coefficients of each channel, degree 0 to 4.
+    model : {"default", "antialiased", "2dgs"}
 
     Raises
     ------
@@ -123,7 +138,9 @@ def gaussians(
     axes = rotation_matrices(np.asarray(quaternions)) * scales[:, None, :]
     matrices = axes @ np.swapaxes(axes, 1, 2)
     rows, columns = np.triu_indices(3)
-    return Gaussians(means, np.ascontiguousarray(matrices[:, rows, columns]), opacities, harmonics)
+    upper = np.ascontiguousarray(matrices[:, rows, columns])
+    tangents = np.ascontiguousarray(axes[: count if model == "2dgs" else 0, :, :2])
+    return Gaussians(means, upper, opacities, harmonics, model == "antialiased", tangents)
 
 
 def gaussians_of(splats: Splats) -> Gaussians:
@@ -134,7 +151,9 @@ def gaussians_of(splats: Splats) -> Gaussians:
     opacities = np.where(good, opacity(splats.opacity_logits), 0.0)
     harmonics = np.concatenate([splats.sh_dc[:, None, :], splats.sh_rest], axis=1)
     harmonics[~good] = 0.0
-    return gaussians(splats.means, scales, splats.quaternions, opacities, harmonics)
+    return gaussians(
+        splats.means, scales, splats.quaternions, opacities, harmonics, model=splats.model
+    )
 
 
 def camera_of(view: View) -> Camera:
@@ -168,12 +187,20 @@ def _project(
     """Return depth (infinite where not drawn), uncoloured `table` and `boxes` of every splat."""
     count = len(scene.means)
     depths = np.full(count, np.inf)
-    table = np.empty((count, COLUMNS))
+    discs = len(scene.tangents) > 0
+    table = np.empty((count, NEAR + 1 if discs else COLUMNS))
     boxes = np.empty((count, 4), np.int32)
     for i in numba.prange(count):
         if scene.opacities[i] >= ALPHA_CUT:
             x, y, z = to_camera(camera, scene.means[i])
-            if z > near and _project_one(scene, i, camera, (x, y, z), (table[i], boxes[i])):
+            out = table[i], boxes[i]
+            if z <= near:
+                continue
+            if discs:
+                drawn = _project_disc(scene, i, camera, near, out)
+            else:
+                drawn = _project_one(scene, i, camera, (x, y, z), out)
+            if drawn:
                 depths[i] = z
     return depths, table, boxes
 
@@ -207,16 +234,95 @@ def _project_one(
     determinant = xx * yy - xy * xy
     if not (determinant > 0.0 and np.isfinite(determinant) and np.isfinite(u + v)):
         return False
+    opacity = scene.opacities[i]
+    if scene.antialiased:
+        sharp = (xx - LOW_PASS) * (yy - LOW_PASS) - xy * xy
+        opacity *= math.sqrt(max(sharp, 0.0) / determinant)
+        if opacity < ALPHA_CUT:
+            return False
     # opacity exp(-q / 2) = 1 / 255; the margin only keeps rounding from losing an edge pixel.
-    limit = 2.0 * math.log(scene.opacities[i] / ALPHA_CUT) + 1e-9
+    limit = 2.0 * math.log(opacity / ALPHA_CUT) + 1e-9
     reach_x, reach_y = math.sqrt(limit * xx), math.sqrt(limit * yy)
     box[0], box[1] = _pixels_within(u - reach_x, u + reach_x, camera.width)
     box[2], box[3] = _pixels_within(v - reach_y, v + reach_y, camera.height)
     row[U], row[V] = u, v
     row[A], row[B], row[C] = yy / determinant, -xy / determinant, xx / determinant
     row[DETERMINANT], row[LIMIT] = determinant, limit
-    row[OPACITY] = scene.opacities[i]
+    row[OPACITY] = opacity
     return box[0] <= box[1] and box[2] <= box[3]
+
+
+@numba.njit(cache=True)
+def _project_disc(
+    scene: Gaussians,
+    i: int,
+    camera: Camera,
+    near: float,
+    out: tuple[NDArray[np.float64], NDArray[np.int32]],
+) -> bool:
+    """Fill the row of `table` and `boxes` of disc `i`; return whether it may touch the image.
+
+    The point (u, v) of a disc, in standard deviations along its axes, is seen at the pixel
+    ``M (u, v, 1)``, up to a factor: M is the camera's matrix times the columns t_u, t_v and p in
+    camera coordinates (Huang et al. 2024, Eq. 6 and 7). The row keeps M, row by row, and `near`.
+    """
+    row, box = out
+    matrix = np.empty((3, 3))
+    for column in range(3):
+        mean = column == 2  # noqa: PLR2004 - the third column
+        point = scene.means[i] if mean else scene.tangents[i, :, column] + camera.center
+        x, y, z = to_camera(camera, point)
+        matrix[0, column] = camera.fx * x + camera.cx * z
+        matrix[1, column] = camera.fy * y + camera.cy * z
+        matrix[2, column] = z
+    row[COLUMNS:NEAR] = matrix.ravel()
+    row[NEAR] = near
+    row[U], row[V] = matrix[0, 2] / matrix[2, 2], matrix[1, 2] / matrix[2, 2]
+    row[OPACITY] = scene.opacities[i]
+    row[LIMIT] = 2.0 * math.log(scene.opacities[i] / ALPHA_CUT) + 1e-9
+    # A square around the disc, seen whole, has it in the box of its corners.
+    reach = math.sqrt(row[LIMIT])
+    blob = math.sqrt(row[LIMIT] / DISC_FILTER)
+    low_x, high_x, low_y, high_y = row[U] - blob, row[U] + blob, row[V] - blob, row[V] + blob
+    for corner in range(4):
+        u = reach if corner % 2 else -reach
+        v = reach if corner // 2 else -reach
+        seen = matrix[:, 0] * u + matrix[:, 1] * v + matrix[:, 2]
+        if seen[2] < 1e-3 * matrix[2, 2]:
+            low_x, low_y, high_x, high_y = 0.0, 0.0, 1.0 * camera.width, 1.0 * camera.height
+            break
+        low_x, high_x = min(low_x, seen[0] / seen[2]), max(high_x, seen[0] / seen[2])
+        low_y, high_y = min(low_y, seen[1] / seen[2]), max(high_y, seen[1] / seen[2])
+    if not np.isfinite(low_x + high_x + low_y + high_y):
+        return False
+    box[0], box[1] = _pixels_within(low_x, high_x, camera.width)
+    box[2], box[3] = _pixels_within(low_y, high_y, camera.height)
+    return box[0] <= box[1] and box[2] <= box[3]
+
+
+@numba.njit(cache=True)
+def disc_distance(row: NDArray[np.float64], x: float, y: float) -> float:
+    """Return the squared distance of a ray to the centre of a disc, in standard deviations.
+
+    The pixel (x, y) is where two planes meet, ``x M_3 - M_1`` and ``y M_3 - M_2`` on the disc, M_k
+    the rows of M; they cross where their cross product points (Huang et al. 2024, Eq. 9 and 10).
+    It is at most `DISC_FILTER` times the squared distance in pixels (Eq. 11). Where the ray hits
+    nearer than the near plane, nothing is drawn: infinite.
+    """
+    m = row[COLUMNS:NEAR]
+    a, b, c = x * m[6] - m[0], x * m[7] - m[1], x * m[8] - m[2]
+    d, e, f = y * m[6] - m[3], y * m[7] - m[4], y * m[8] - m[5]
+    p, q, r = b * f - c * e, c * d - a * f, a * e - b * d
+    blob = DISC_FILTER * ((x - row[U]) ** 2 + (y - row[V]) ** 2)
+    if r == 0.0:
+        return blob
+    u, v = p / r, q / r
+    square = u * u + v * v
+    if square > blob:
+        return blob
+    if m[6] * u + m[7] * v + m[8] < row[NEAR]:
+        return np.inf
+    return square
 
 
 @numba.njit(cache=True)

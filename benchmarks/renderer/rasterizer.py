@@ -14,6 +14,12 @@ statistics from it. It computes in float64 and follows the reference implementat
   that would take its transmittance below 1e-4, and that splat is not drawn.
 - Colour is ``max(0, SH(direction) + 0.5)``, direction from the camera's centre to the mean.
 
+Splats of another model (`Splats.model`) are drawn as its papers say. Antialiased ones have the
+opacity ``o sqrt(det C / det(C + 0.3 I))``, C the covariance without the low-pass (Yu et al. 2024,
+"Mip-Splatting"; gsplat). Discs are hit where the ray meets their plane, ``q = u^2 + v^2`` there,
+and at most twice the squared distance in pixels from the centre (Huang et al. 2024, "2D Gaussian
+Splatting"); see `footprints.disc_distance`.
+
 One rule differs: the reference implementation draws a splat in the 16-pixel tiles that a square of
 three standard deviations touches, so the cut depends on where the tiles lie. Here the footprint
 ends where alpha reaches 1/255, and tiles only make it fast: no pixel depends on them. Nor does

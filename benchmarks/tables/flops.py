@@ -19,7 +19,7 @@ import numpy as np
 
 from refine_addon.core.scoring import closed_form, occlusion
 from refine_addon.core.scoring.closed_form_settings import ClosedForm
-from refine_addon.core.splats import Splats
+from refine_addon.core.splats import ARRAYS, Splats
 from refine_addon.core.task import Settings
 
 from ..renderer import rasterizer
@@ -162,7 +162,7 @@ def measure(splats: Splats, views: ViewSet) -> Counts:
 
 def count(splats: Splats, views: ViewSet, settings: Settings) -> int:
     """Return how many operations the method takes, without what is said of the views besides."""
-    arrays = {name: np.asarray(value).view(Counting) for name, value in vars(splats).items()}
+    arrays = {name: np.asarray(getattr(splats, name)).view(Counting) for name in ARRAYS}
     with _counted():
         Counting.total = 0
         with np.errstate(under="ignore"):

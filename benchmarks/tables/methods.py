@@ -7,7 +7,7 @@ offers is asked of its `Settings`, so that a method that is added there is measu
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
@@ -19,7 +19,7 @@ from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.scores import Scores
 from refine_addon.core.scoring.closed_form_settings import ClosedForm
 from refine_addon.core.selection import Budget
-from refine_addon.core.splats import Splats
+from refine_addon.core.splats import ARRAYS, Splats
 
 from ..baselines import merging, rap, splat_transform
 from ..baselines.rendered import BASELINES, RENDERED, ROUNDS, removed_in_rounds
@@ -227,9 +227,9 @@ def in_memory(splats: Splats) -> Splats:
     """Return a copy that no longer lies in a file."""
     return Splats(
         **{
-            field.name: np.array(getattr(splats, field.name), order="C").astype(
-                getattr(splats, field.name).dtype.newbyteorder("=")
+            name: np.array(getattr(splats, name), order="C").astype(
+                getattr(splats, name).dtype.newbyteorder("=")
             )
-            for field in fields(Splats)
+            for name in ARRAYS
         }
     )

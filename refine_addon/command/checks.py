@@ -7,8 +7,8 @@ import stat
 from typing import TYPE_CHECKING
 
 from ..core import RefineError
-from ..core.formats.registry import format_named, without_suffix
-from ..core.levels.files import MANIFEST, check_goal, is_manifest, level_paths
+from ..core.formats.registry import SUFFIXES, format_named, without_suffix
+from ..core.levels.files import check_goal, is_streamed, level_paths
 from ..core.urls import Url, refuse_url
 from . import zones
 from .options import DEFAULT_LEVELS, budget, cleaning, levels, settings, survivors
@@ -49,8 +49,8 @@ def _check_splats(parser: argparse.ArgumentParser, options: argparse.Namespace) 
     _check_report(parser, options)
     for path in _outputs(options):
         _check_output(parser, path)
-    if options.command == "lod":
-        _check_manifest(parser, options)
+    if options.command == "lod" and options.format and is_streamed(options.output_dir):
+        parser.error(f"--format goes with a folder, not with {options.output_dir.name}")
     if options.command in ("info", "convert"):
         return
     try:
@@ -107,7 +107,11 @@ def _outputs(options: argparse.Namespace) -> Sequence[Path | Url]:
     """Return the splat files to be made."""
     if options.command == "lod":
         count = len(options.psnr or options.levels or DEFAULT_LEVELS)
-        return level_paths(options.inputs[0], options.output_dir, count, options.format)
+        if is_streamed(options.output_dir):
+            return []
+        return level_paths(
+            options.inputs[0], options.output_dir, count, options.format or SUFFIXES[0]
+        )
     if getattr(options, "output_dir", None):
         return [options.output_dir / path.name for path in options.inputs]
     return [options.output] if getattr(options, "output", None) else []
@@ -119,7 +123,7 @@ def _check_report(parser: argparse.ArgumentParser, options: argparse.Namespace) 
         return
     others = [*options.inputs, *_outputs(options), getattr(options, "cameras", None)]
     if options.command == "lod":
-        others.append(options.output_dir / MANIFEST)
+        others.append(options.output_dir)
     if options.scene:
         others.append(open_blend())
     path = os.path.realpath(options.report)
@@ -149,14 +153,6 @@ def _check_output(parser: argparse.ArgumentParser, path: Path | Url) -> None:
         parser.error(f"{path} exists and is no PLY: write to another name")
 
 
-def _check_manifest(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Refuse a folder in which another file has the name of the manifest."""
-    path = options.output_dir / MANIFEST
-    beginning = _beginning(path) if options.overwrite else None
-    if beginning is not None and not is_manifest(beginning):
-        parser.error(f"{path} exists and lists no levels: write to another folder")
-
-
 def _beginning(path: Path) -> bytes | None:
     """Return the first bytes of a file; None where there is none."""
     try:
@@ -175,6 +171,8 @@ def _check_source(parser: argparse.ArgumentParser, options: argparse.Namespace) 
     """Refuse an object beside files or out of Blender, and a choice of cameras beside another."""
     if bool(options.inputs) == bool(options.object):
         parser.error("expected INPUT files or --object NAME, and not both")
+    if options.object and options.model:
+        parser.error("--model goes with INPUT files; an object has it in the panel, under Splats")
     if options.object and not options.scene:
         command = f"blender -b scene.blend --command refine {options.command} ..."
         parser.error(f"--object needs Blender: {command}")

@@ -23,7 +23,9 @@ def clean(run: Run) -> None:
 
 def _clean(run: Run, source: Path, output: Path | None, views: ViewSet) -> dict[str, Any]:
     options = run.options
-    request = CleanRequest(views, cleaning(options), zones.of_files(options), options.overwrite)
+    request = CleanRequest(
+        views, cleaning(options), zones.of_files(options), options.overwrite, options.model
+    )
     done = file_to_file(source, output, request, progress=run.progress(source.name)).report
     run.terminal.clear()
     splats, to = done["splats"], f" -> {output}" if output else "; nothing is written without -o"

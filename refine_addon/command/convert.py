@@ -21,7 +21,8 @@ def convert(run: Run) -> None:
 
 def _convert(run: Run, source: Path) -> dict[str, Any]:
     output = run.options.output
-    done = file_to_file(source, output, ConvertRequest(run.options.overwrite)).report
+    request = ConvertRequest(run.options.overwrite, run.options.model)
+    done = file_to_file(source, output, request).report
     splats, files = done["splats"], done["files"]
     size = sizes(files["input_bytes"], files["output_bytes"])
     run.terminal.say(f"{source}: {splats['before']:,} splats{written(splats)}, {size} -> {output}")

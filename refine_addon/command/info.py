@@ -61,6 +61,7 @@ def describe(file: SplatFile) -> dict[str, Any]:
         "bytes": file.stored_bytes,
         "bytes_per_splat": average,
         "format": file.format,
+        "model": file.model,
         "extent_low": low.tolist() if np.isfinite(low).all() else None,
         "extent_high": high.tolist() if np.isfinite(high).all() else None,
         "non_finite_rows": broken,

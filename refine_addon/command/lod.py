@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from ..core.estimate.quality import in_words
+from ..core.formats.registry import SUFFIXES
 from ..core.levels.files import LevelsRequest, lod_file
 from ..core.report import size_in_words
 from .options import levels, settings
@@ -31,9 +32,10 @@ def _make_levels(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
         levels(options),
         settings(options),
         zones=of_files(options),
-        suffix=options.format,
+        suffix=options.format or SUFFIXES[0],
         goal=options.distance_psnr,
         overwrite=options.overwrite,
+        model=options.model,
     )
     done = lod_file(source, options.output_dir, request, progress=run.progress(source.name))
     terminal.clear()

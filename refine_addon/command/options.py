@@ -18,8 +18,9 @@ from ..core import (
     Settings,
 )
 from ..core.errors import printable
-from ..core.formats.registry import SUFFIXES
+from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.levels.files import GOAL
+from ..core.rendering import MODELS
 from ..core.urls import Url, is_url, refuse_url
 from ..core.whole_file import expanded
 from ..version import VERSION
@@ -35,6 +36,8 @@ DEFAULT_RATIO = 0.5
 DEFAULT_LEVELS = (0.5, 0.25, 0.12, 0.06)
 
 FORMATS = ", ".join(SUFFIXES)
+
+_FILES = f"files: {', '.join(READ_SUFFIXES)}"
 
 SOURCES = ("visible", "active", "selected", "frames", "collection:NAME")
 """What --source takes: the choices of the panel, in small letters."""
@@ -66,6 +69,7 @@ EXAMPLES = {
     ),
     "lod": (
         "refine lod in.ply --cameras cameras.json -o levels",
+        "refine lod in.ply --cameras cameras.json -o web/lod-meta.json",
         "refine lod in.ply --cameras cameras.json --psnr 45,40,35 --format .spz -o levels",
     ),
     "convert": ("refine convert in.ply out.spz",),
@@ -127,7 +131,7 @@ def _add(commands: Any, name: str, purpose: str) -> argparse.ArgumentParser:  # 
 
 def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     prune = _add(commands, "prune", "remove the splats the cameras would miss least")
-    prune.add_argument("inputs", nargs="*", type=_tile, metavar="INPUT", help=f"files: {FORMATS}")
+    prune.add_argument("inputs", nargs="*", type=_tile, metavar="INPUT", help=_FILES)
     _add_object(prune)
     prune.add_argument(
         "--save", action="store_true", help="with --object: delete the splats there and save"
@@ -164,8 +168,8 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "by what the cameras see of it, far better when much is removed (--method then only "
         "matters with --threshold and --min-seen); refit: they absorb and are then fitted to what "
         "all splats look like, some dB better still, in several times the time; auto, the "
-        "default: absorb, but unchanged where that is as good, and with --method, --threshold, "
-        "--min-seen or --together",
+        "default (no way to score, as --method auto is): absorb, but unchanged where that is as "
+        "good, and with --method, --threshold, --min-seen or --together",
     )
     becoming.add_argument(
         "--absorb",
@@ -207,15 +211,14 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         help="with --together: on the workers of this Dask scheduler, which see the same files "
         "under the same paths",
     )
+    _add_model(prune)
     prune.add_argument("--dry-run", action="store_true", help="decide and report, write no splats")
     _add_common(prune)
 
 
 def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
     cleaning = _add(commands, "clean", "remove what the cameras see to float in the air")
-    cleaning.add_argument(
-        "inputs", nargs="+", type=_given, metavar="INPUT", help=f"files: {FORMATS}"
-    )
+    cleaning.add_argument("inputs", nargs="+", type=_given, metavar="INPUT", help=_FILES)
     _add_outputs(cleaning, "; without it, only say what would go")
     _add_cameras(cleaning)
     cleaning.add_argument(
@@ -227,6 +230,7 @@ def _add_clean(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     )
     _add_views(cleaning)
     zones.add(cleaning)
+    _add_model(cleaning)
     _add_common(cleaning)
 
 
@@ -239,6 +243,7 @@ def _add_score(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
     )
     _add_scoring(scoring)
     zones.add(scoring, protects=False)
+    _add_model(scoring)
     _add_common(scoring)
 
 
@@ -251,7 +256,8 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
         type=_path,
         metavar="DIR",
         required=True,
-        help="for NAME.lod1.ply and so on, and lod.json; made if it is not there",
+        help="for NAME.lod1.ply and so on; DIR/lod-meta.json makes a streamed SOG of all levels, "
+        "which viewers on the web load by chunks; DIR is made if it is not there",
     )
     amount = making.add_mutually_exclusive_group()
     amount.add_argument(
@@ -274,8 +280,9 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
         "--survivors",
         choices=SURVIVORS,
         default=Levels.survivors,
-        help="what those that stay may become, see prune (default absorb); --method only matters "
-        "where they stay unchanged",
+        help="what those that stay may become, see prune (default absorb; no auto: either each "
+        "level is made from the one before, or all are parts of one another); --method only "
+        "matters where they stay unchanged",
     )
     becoming.add_argument(
         "--nested",
@@ -288,7 +295,6 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
         "--format",
         type=str.lower,
         choices=SUFFIXES,
-        default=SUFFIXES[0],
         metavar="SUFFIX",
         help=f"of the files: {FORMATS} (default {SUFFIXES[0]})",
     )
@@ -302,6 +308,7 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
     )
     _add_scoring(making)
     zones.add(making)
+    _add_model(making)
     _add_common(making)
 
 
@@ -309,6 +316,7 @@ def _add_convert(commands: Any) -> None:  # noqa: ANN401 - argparse does not nam
     convert = _add(commands, "convert", "write a file of splats in another format")
     convert.add_argument("inputs", nargs=1, type=_given, metavar="IN", help="known by its content")
     convert.add_argument("output", type=_path, metavar="OUT", help=f"by its suffix: {FORMATS}")
+    _add_model(convert)
     _add_common(convert)
 
 
@@ -395,9 +403,9 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         choices=METHODS,
-        help="how splats are scored; default: auto, which knows what hides what, by no more views "
-        "than --tolerance asks for; occlusion uses all of them; closed-form takes nothing as "
-        "hidden: far faster, worse",
+        help="how splats are scored; default: auto (another than that of --survivors), which knows "
+        "what hides what, by no more views than --tolerance asks for; occlusion uses all of them; "
+        "closed-form takes nothing as hidden: far faster, worse",
     )
     parser.add_argument(
         "--tolerance",
@@ -408,6 +416,15 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
         f"(default {Settings.tolerance})",
     )
     _add_views(parser)
+
+
+def _add_model(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--model",
+        choices=MODELS,
+        help="how the splats are drawn, where a file does not say or is wrong: default, "
+        "antialiased (Mip-Splatting, gsplat, Brush's mip) or 2dgs (discs)",
+    )
 
 
 def _add_common(parser: argparse.ArgumentParser) -> None:

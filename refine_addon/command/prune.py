@@ -50,6 +50,7 @@ def _request(options: argparse.Namespace, views: ViewSet, name: str) -> PruneReq
         pictures=pictures,
         overwrite=options.overwrite,
         dry_run=options.dry_run,
+        model=options.model,
     )
 
 

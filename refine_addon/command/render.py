@@ -22,7 +22,7 @@ def render(run: Run) -> None:
     if options.animation:
         chosen = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
     try:
-        for step in frames.steps(scene, chosen, shared, write=True):
+        for step in filter(None, frames.steps(scene, chosen, shared, write=True)):
             bpy.ops.render.render(scene=step.scene, animation=step.animation)
     except Cancelled:
         msg = "a render was stopped"

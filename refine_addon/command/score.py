@@ -28,7 +28,9 @@ def score(run: Run) -> None:
 
 def _score_file(run: Run, source: Path, views: ViewSet) -> dict[str, Any]:
     options = run.options
-    request = ScoreRequest(views, settings(options), zones.of_files(options), options.overwrite)
+    request = ScoreRequest(
+        views, settings(options), zones.of_files(options), options.overwrite, options.model
+    )
     progress = run.progress(source.name)
     done = file_to_file(source, options.output, request, progress=progress).report
     return _said(run, str(source), done)

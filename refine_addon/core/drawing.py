@@ -23,6 +23,7 @@ from .views import ViewSet
 from .work import Progress, for_chunks, part, silent
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from typing import Any
 
     from numpy.typing import NDArray
@@ -37,21 +38,22 @@ _PAIRS = 1 << 18  # pairs of footprint and pixel at a time
 
 
 @dataclass(frozen=True, eq=False)
-class Layer:
-    """A picture of other things with a depth a pixel, such as meshes that splats stand among.
+class Layers:
+    """Pictures of other things with a depth a pixel, such as meshes that splats stand among.
 
-    A splat is in front of a pixel of it where its centre is nearer, else behind.
+    In each pixel K layers lie one behind another. A splat is in front of a layer where its centre
+    is nearer, else behind it.
 
     Attributes
     ----------
-    colors : (3, H, W) floating
+    colors : (K, 3, H, W) floating
         Display-referred, 0..1, times alpha.
-    alphas : (H, W) floating
-        How much it hides of what is behind, 0..1.
-    depths : (H, W) floating
-        Along the view's axis, world units.
+    alphas : (K, H, W) floating
+        How much each hides of what is behind it, 0..1.
+    depths : (K, H, W) floating
+        Along the view's axis, world units; ascending in each pixel.
     background : (3, H, W) floating, optional
-        What it lets through of what is infinitely far away, display-referred.
+        What is seen through all of them of what is infinitely far away, display-referred.
     """
 
     colors: NDArray[Any]
@@ -59,24 +61,50 @@ class Layer:
     depths: NDArray[Any]
     background: NDArray[Any] | None = None
 
+    def left(self) -> NDArray[np.float64]:
+        """Return how much is seen of what is behind the first 0 to K of them, (K + 1, H, W)."""
+        left = np.ones((len(self.alphas) + 1, *self.alphas.shape[1:]))
+        np.cumprod(1.0 - self.alphas, axis=0, out=left[1:])
+        return left
+
+    def over_nothing(self) -> NDArray[np.float64]:
+        """Return their colours, blended, without the background, (3, H, W)."""
+        return np.asarray(np.einsum("kchw,khw->chw", self.colors, self.left()[:-1]))
+
+
+def in_order(layers: Sequence[tuple[NDArray[Any], NDArray[Any], NDArray[Any]]]) -> Layers:
+    """Return layers, each in an order of its own, in the order of their depths in each pixel.
+
+    Parameters
+    ----------
+    layers : sequence of ((3, H, W), (H, W), (H, W)) floating
+        Colours, alphas and depths, as in `Layers`. Of equal depths the first is in front.
+    """
+    colors, alphas, depths = (np.stack(arrays) for arrays in zip(*layers, strict=True))
+    if len(layers) > 1:
+        order = np.argsort(depths, axis=0, kind="stable")
+        alphas, depths = (np.take_along_axis(of_each, order, 0) for of_each in (alphas, depths))
+        colors = np.take_along_axis(colors, order[:, None], 0)
+    return Layers(colors, alphas, depths)
+
 
 def draw(
     splats: Splats,
     view: View,
-    layer: Layer | None = None,
+    layers: Layers | None = None,
     scene: Scene | None = None,
     *,
     progress: Progress = silent,
     threads: int | None = None,
 ) -> NDArray[np.float64]:
-    """Return what a view sees of splats, and of a layer among them.
+    """Return what a view sees of splats, and of layers among them.
 
     Parameters
     ----------
     splats : Splats
         In the frame of the view.
     view : View
-    layer : Layer, optional
+    layers : Layers, optional
         In the size of the view.
     scene : Scene, optional
         The frame to compute in; by default that of the splats and the view.
@@ -88,7 +116,7 @@ def draw(
     -------
     (4, H, W) float64
         Display-referred red, green and blue, times alpha, and alpha, 0..1; the top row first. What
-        shows of the background of the layer adds to the colours and not to alpha.
+        shows of the background of the layers adds to the colours and not to alpha.
 
     Raises
     ------
@@ -102,7 +130,7 @@ def draw(
         footprints = projection.project(gaussians, scene, view)
         colors = colors_from(splats, gaussians.index[footprints.index], view)
         depths = scene.size * projection.depths(gaussians, scene, view)[footprints.index]
-    among = None if layer is None else (layer, depths)
+    among = None if layers is None else (layers, depths)
     rest = part(progress, 0.1, 1.0)
     return picture(footprints, colors, view, among, progress=rest, threads=threads)
 
@@ -130,7 +158,7 @@ def picture(
     footprints: Footprints,
     colors: NDArray[np.float64],
     view: View,
-    among: tuple[Layer, NDArray[Any]] | None = None,
+    among: tuple[Layers, NDArray[Any]] | None = None,
     *,
     progress: Progress,
     threads: int | None,
@@ -143,8 +171,8 @@ def picture(
     colors : (3, n) float64
         Of the footprints.
     view : View
-    among : (Layer, (n,) floating), optional
-        A layer, and the depths of the footprints in world units.
+    among : (Layers, (n,) floating), optional
+        Layers, and the depths of the footprints in world units.
     progress, threads
         See `draw`.
     """
@@ -162,40 +190,56 @@ def picture(
 
 
 class _Cut:
-    """A layer between the splats of a strip of R rows, in P pixels."""
+    """Layers between the splats of a strip of R rows, in P pixels."""
 
-    def __init__(self, layer: Layer, depths: NDArray[Any], rows: slice) -> None:
+    def __init__(self, layers: Layers, depths: NDArray[Any], rows: slice) -> None:
+        count = len(layers.depths)
         self._depths = depths  # (n,), of the footprints
-        self._limits = layer.depths[rows].reshape(-1)  # (P,)
-        self._left = 1.0 - layer.alphas[rows].reshape(-1).astype(np.float64)
-        self._colors = layer.colors[:, rows].reshape(3, -1)
-        back = layer.background
+        self._limits = layers.depths[:, rows].reshape(count, -1)  # (K, P)
+        self._left = layers.left()[:, rows].reshape(count + 1, -1)  # (K + 1, P)
+        self._colors = layers.colors[:, :, rows].reshape(count, 3, -1)
+        back = layers.background
         self._background = None if back is None else back[:, rows].reshape(3, -1)
-        self._log_front = np.zeros(len(self._left))  # transmittance of the splats in front of it
+        self._log_front = np.zeros(self._limits.shape)  # transmittance of splats in front of each
 
     def shows(self, footprint: NDArray[np.int64], pixel: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return which splats it does not hide, (p,)."""
-        return (self._left.take(pixel) > 0.0) | self._in_front(footprint, pixel)
+        """Return which splats they do not hide, (p,)."""
+        return np.asarray(self._left_of(self._layers_before(footprint, pixel), pixel) > 0.0)
 
     def shares(
         self, footprint: NDArray[np.int64], pixel: NDArray[Any], alpha: NDArray[np.float32]
     ) -> NDArray[np.float64]:
-        """Return how much of each hit it lets through, (h,), and note what is in front of it."""
-        front = self._in_front(footprint, pixel)
-        log_passed = np.where(front, np.log1p(-alpha), 0.0)
-        self._log_front += np.bincount(pixel, log_passed, len(self._left))
-        return np.where(front, 1.0, self._left.take(pixel))
+        """Return how much of each hit they let through, (h,), and note what is before them."""
+        before = self._layers_before(footprint, pixel)
+        log_passed = np.log1p(-alpha)
+        for layer in range(len(self._log_front)):
+            of_front = np.bincount(pixel, log_passed * (before <= layer), self._left.shape[1])
+            self._log_front[layer] += of_front
+        return self._left_of(before, pixel)
 
     def insert(self, image: NDArray[np.float64], log_left: NDArray[np.float64]) -> None:
-        """Add it to the picture of the splats, (4, P), whose transmittance is (P,)."""
+        """Add them to the picture of the splats, (4, P), whose transmittance is (P,)."""
         passed = np.exp(log_left)
-        image[:3] += np.exp(self._log_front) * self._colors
+        for layer, log_front in enumerate(self._log_front):
+            image[:3] += self._left[layer] * np.exp(log_front) * self._colors[layer]
         if self._background is not None:
             image[:3] += passed * self._background
-        image[3] = 1.0 - passed * self._left
+        image[3] = 1.0 - passed * self._left[-1]
 
-    def _in_front(self, footprint: NDArray[np.int64], pixel: NDArray[Any]) -> NDArray[np.bool_]:
-        return np.asarray(self._depths.take(footprint) < self._limits.take(pixel))
+    def _layers_before(
+        self, footprint: NDArray[np.int64], pixel: NDArray[Any]
+    ) -> NDArray[np.uint8]:
+        """Return how many layers are in front of each splat in its pixel, (p,)."""
+        depths = self._depths.take(footprint)
+        before = np.zeros(len(depths), np.uint8)
+        for limits in self._limits:
+            before += depths >= limits.take(pixel)
+        return before
+
+    def _left_of(self, before: NDArray[np.uint8], pixel: NDArray[Any]) -> NDArray[np.float64]:
+        """Return how much is seen behind so many layers, (p,)."""
+        place = before.astype(np.int64) * self._left.shape[1] + pixel
+        return np.asarray(self._left.reshape(-1).take(place))
 
 
 def _strip(

@@ -22,11 +22,10 @@ SPZ = b"NGSP"
 """The first bytes of what an SPZ file holds."""
 
 _ZIP = b"PK\x03\x04"
-_CONVERT = "convert it to a plain 3DGS PLY first (SuperSplat and splat-transform do)"
 _READ = "'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
 
-_UNSIGNED = {".splat": _READ, ".ksplat": _CONVERT}
-"""Formats that only the file's name tells, since the files have no signature, and what to do."""
+_UNSIGNED = (".splat", ".ksplat")
+"""Formats that only the file's name tells, since the files have no signature."""
 
 
 def refuse_pointer(path: Path | Url, head: bytes) -> None:
@@ -79,7 +78,7 @@ def foreign_kind(path: Path | Url, head: bytes) -> str:
     """
     suffix = path.suffix.lower()
     if suffix in _UNSIGNED:
-        return f"a {suffix} file: {_UNSIGNED[suffix]}"
+        return f"a {suffix} file: {_READ}"
     if is_spz(head):
         return f"an SPZ file: {_READ}"
     if is_sog(path, head):

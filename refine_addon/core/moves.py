@@ -88,10 +88,10 @@ def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
     left = np.flatnonzero(finite & ~same)
     random = np.random.default_rng(0)
     while len(left) >= LEAST and len(moves) <= _MOST:
-        matrix = _best(before[left], after[left], random)
+        some = slice(None) if len(left) == len(before) else left
+        matrix, fits = _best(before[some], after[some], random)
         if matrix is None:
             break
-        fits = _fits(matrix, before[left], after[left])
         moves.append(Move(left[fits], matrix))
         left = left[~fits]
     return moves
@@ -99,11 +99,11 @@ def affine_moves(before: NDArray[Any], after: NDArray[Any]) -> list[Move]:
 
 def _best(
     before: NDArray[np.float64], after: NDArray[np.float64], random: np.random.Generator
-) -> NDArray[np.float64] | None:
-    """Return the map that most points agree with, (4, 4); None where hardly any agree."""
+) -> tuple[NDArray[np.float64] | None, NDArray[np.bool_]]:
+    """Return the map that most points agree with, (4, 4), None where hardly any, and which do."""
     whole = _refined(before, after, np.arange(len(before)))
-    if whole is not None and _fits(whole, before, after).all():
-        return whole
+    if whole is not None and (fits := _fits(whole, before, after)).all():
+        return whole, fits
     some = _spread(np.arange(len(before)), _SAMPLE)
     best, most = None, LEAST - 1
     for drawn in _draws(len(before), random):
@@ -120,9 +120,11 @@ def _best(
             best, most = matrix, agreeing
         if most > len(some) // 2:
             break
+    if best is not None:
+        best = _refined(before, after, np.flatnonzero(_fits(best, before, after)))
     if best is None:
-        return None
-    return _refined(before, after, np.flatnonzero(_fits(best, before, after)))
+        return None, np.zeros(len(before), np.bool_)
+    return best, _fits(best, before, after)
 
 
 def _draws(count: int, random: np.random.Generator) -> Iterator[NDArray[np.int64]]:

@@ -261,19 +261,46 @@ def pinhole(
     axes = matrix[:3, :3] / np.linalg.norm(matrix[:3, :3], axis=1, keepdims=True)  # float32
     rotation = flip @ axes
     center = -rotation.T @ flip @ matrix[:3, 3]
-    p, (width, height) = projection_matrix, size
-    fx, fy = p[0, 0] * width / 2.0, p[1, 1] * height / 2.0
-    if p[3, 3] == 0.0:
-        cx, cy = (1.0 - p[0, 2]) * width / 2.0, (1.0 + p[1, 2]) * height / 2.0
-        near = max(float(p[2, 3] / (p[2, 2] - 1.0)), 0.0)
-        return View(rotation, center, fx, fy, cx, cy, width, height, near)
+    if projection_matrix[3, 3] == 0.0:
+        return view_through(projection_matrix, (rotation, center), size)
     finite = means[np.isfinite(means).all(axis=1)]
     middle = np.median(finite, axis=0) if len(finite) else center
-    extent = max([*np.ptp(finite, axis=0), 2.0 / p[0, 0]]) if len(finite) else 1.0
-    away = FAR * float(extent)  # from the middle of the splats
+    width = 2.0 / projection_matrix[0, 0]
+    extent = float(max([*np.ptp(finite, axis=0), width])) if len(finite) else 1.0
     depth = float((rotation @ (middle - center))[2])
+    return view_through(projection_matrix, (rotation, center), size, (depth, FAR * extent))
+
+
+def view_through(
+    projection_matrix: NDArray[np.float64],
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]],
+    size: tuple[int, int],
+    parallel: tuple[float, float] = (0.0, 1.0),
+) -> View:
+    """Return the view of a camera with one of OpenGL's projection matrices.
+
+    Parameters
+    ----------
+    projection_matrix : (4, 4) float64
+    pose : ((3, 3) float64, (3,) float64)
+        Rotation and centre of the view.
+    size : (int, int)
+        Pixels across and up.
+    parallel : (float, float)
+        Of a camera without perspective: the depth at which pixels have their exact size, along its
+        axis, and how far from there the view stands instead.
+    """
+    p, (width, height), (rotation, center) = projection_matrix, size, pose
+    fx, fy = p[0, 0] * width / 2.0, p[1, 1] * height / 2.0
+    # What shifts the image stands in the third column of a matrix with perspective, else in the
+    # fourth.
+    cx = (1.0 - p[0, 2] + p[0, 3]) * width / 2.0
+    cy = (1.0 + p[1, 2] - p[1, 3]) * height / 2.0
+    if p[3, 3] == 0.0:
+        near = max(float(p[2, 3] / (p[2, 2] - 1.0)), 0.0)
+        return View(rotation, center, fx, fy, cx, cy, width, height, near)
+    depth, away = parallel
     center = center + rotation[2] * (depth - away)
     near = float((p[2, 3] + 1.0) / p[2, 2])  # along the axis, from the camera; may be behind it
     near = max(near - depth + away, 0.0)
-    cx, cy = (1.0 + p[0, 3]) * width / 2.0, (1.0 - p[1, 3]) * height / 2.0
     return View(rotation, center, fx * away, fy * away, cx, cy, width, height, near)

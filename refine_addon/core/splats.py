@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,8 +15,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from .rendering import Model
+
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
+"""Attributes of `Splats` that have a row for each splat."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +45,9 @@ class Splats:
         Constant spherical-harmonics coefficient of red, green, blue.
     sh_rest : (N, K, 3) floating
         The other coefficients, K = (degree + 1)^2 - 1 of each channel.
+    model : {"default", "antialiased", "2dgs"}
+        How they are drawn, see `rendering.Model`. Of "2dgs" the third scale is 0 (`LOG_ZERO`),
+        whatever a file holds: see `with_model`.
     """
 
     means: NDArray[Any]
@@ -48,6 +56,7 @@ class Splats:
     opacity_logits: NDArray[Any]
     sh_dc: NDArray[Any]
     sh_rest: NDArray[Any]
+    model: Model = "default"
 
     def __len__(self) -> int:
         """Return the number of splats."""
@@ -64,7 +73,7 @@ class Splats:
 
     def take(self, index: NDArray[Any] | slice) -> Splats:
         """Return the splats at `index` (a mask, integers or a slice), in that order."""
-        return Splats(**{field.name: getattr(self, field.name)[index] for field in fields(self)})
+        return replace(self, **{name: getattr(self, name)[index] for name in ARRAYS})
 
     def by_columns(self) -> Splats:
         """Return copies of which each column is contiguous, and `sh_rest` as it is.
@@ -72,32 +81,56 @@ class Splats:
         Rows of a file have the values of a splat side by side; numbers of many splats are computed
         several times as fast where they stand side by side.
         """
-        return replace(
-            self,
-            **{
-                field.name: np.asfortranarray(getattr(self, field.name))
-                for field in fields(self)
-                if field.name != "sh_rest"
-            },
-        )
+        columns: dict[str, Any] = {
+            name: np.asfortranarray(getattr(self, name)) for name in ARRAYS if name != "sh_rest"
+        }
+        return replace(self, **columns)
+
+
+def with_model(splats: Splats, model: Model) -> Splats:
+    """Return the splats as drawn in another way; discs have no third scale.
+
+    Parameters
+    ----------
+    splats : Splats
+    model : {"default", "antialiased", "2dgs"}
+    """
+    if model != "2dgs":
+        return replace(splats, model=model)
+    flat = np.array(splats.log_scales)
+    flat[:, 2] = LOG_ZERO
+    return replace(splats, log_scales=flat, model=model)
 
 
 def joined(parts: Sequence[Splats]) -> Splats:
     """Return all splats of several sets, one at least, in that order.
 
     The result has the highest degree among them; coefficients that a part lacks are 0.
+
+    Raises
+    ------
+    RefineError
+        If they are drawn in different ways.
     """
     if len(parts) == 1:
         return parts[0]
+    refuse_mixed([part.model for part in parts])
     most = max(part.sh_rest.shape[1] for part in parts)
-    columns = {
-        field.name: [getattr(part, field.name) for part in parts] for field in fields(Splats)
-    }
+    columns: dict[str, Any] = {name: [getattr(part, name) for part in parts] for name in ARRAYS}
     columns["sh_rest"] = [
         np.pad(rest, ((0, 0), (0, most - rest.shape[1]), (0, 0))) for rest in columns["sh_rest"]
     ]
     with np.errstate(invalid="ignore"):  # signalling NaN converted to float64
-        return Splats(**{name: np.concatenate(arrays) for name, arrays in columns.items()})
+        columns = {name: np.concatenate(arrays) for name, arrays in columns.items()}
+    return replace(parts[0], **columns)
+
+
+def refuse_mixed(models: Sequence[Model]) -> None:
+    """Raise `RefineError` if splats that are to become one scene are drawn in different ways."""
+    if len(set(models)) > 1:
+        listed = ", ".join(dict.fromkeys(models))
+        msg = f"splats of different models ({listed}), expected one: say how all are drawn"
+        raise RefineError(msg)
 
 
 def above_constant(degree: int) -> int:

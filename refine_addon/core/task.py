@@ -13,6 +13,7 @@ from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
 from .splats import among_all
 from .survivor_choice import refuse_unknown
+from .views import refuse_other
 from .volumes import refuse_all
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from .splats import Splats
     from .survivor_choice import SurvivorChoice
     from .views import ViewSet
+    from .work import Cancelled
 
 METHODS = ("auto", "occlusion", "closed-form")
 """The first is the default."""
@@ -173,14 +175,16 @@ class Task:
     reusable: bool = False
 
     def __post_init__(self) -> None:
-        """Check what survivors may become.
+        """Check what survivors may become, and that the views are such.
 
         Raises
         ------
         RefineError
-            If there is no such choice.
+            If there is no such choice, or the views are none.
         """
         refuse_unknown(self.survivors)
+        if self.views is not None:
+            refuse_other(self.views)
 
     @property
     def absorb(self) -> bool:
@@ -230,7 +234,7 @@ class Task:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """The result of a prune.
 
@@ -246,12 +250,23 @@ class Result:
         The survivors as they became; None if all are what they were.
     report : dict
         Counts, settings, facts about the scores, timings and versions, ready for JSON.
+    stopped : Cancelled or KeyboardInterrupt or None
+        What ended refitting before it was done: the result is what it had reached by then. `decide`
+        returns such a result, for its caller to offer; `prune` raises this.
     """
 
     keep: NDArray[np.bool_]
     scores: Scores
     report: dict[str, Any]
     absorbed: Absorbed | None = None
+    stopped: Cancelled | KeyboardInterrupt | None = None
+
+    def __repr__(self) -> str:
+        """Return how many splats stay, what they became, and how close the pictures stay."""
+        kept, became = int(np.count_nonzero(self.keep)), self.report["survivors"]["became"]
+        psnr = self.report["estimated_psnr"]
+        close = "" if psnr is None else f", {psnr:.1f} dB"
+        return f"<Result: {kept:,} of {len(self.keep):,} splats kept, {became}{close}>"
 
     def survivors(self, splats: Splats) -> Splats:
         """Return the splats that stay, as they became; in the frame of the views.

@@ -16,7 +16,10 @@ import bpy
 import numpy as np
 
 from ..core.formats.ply import REQUIRED, SplatFile
-from ..core.splats import Splats, single_unit_quaternions
+from ..core.formats.ply_columns import THIRD_SCALE
+from ..core.formats.registry import scene_name
+from ..core.rendering import MODELS
+from ..core.splats import Splats, single_unit_quaternions, with_model
 from .layout import KINDS, Column, Layout, SplatObject, add_attributes, rest_count, splat_count
 
 if TYPE_CHECKING:
@@ -58,7 +61,7 @@ def import_notes(source: SplatFile) -> tuple[str, ...]:
 def mesh_from_file(source: SplatFile) -> bpy.types.Mesh:
     """Make a mesh with a vertex a splat and an attribute a property; it has no user yet."""
     rows = source.rows
-    mesh = bpy.data.meshes.new(source.path.stem)
+    mesh = bpy.data.meshes.new(scene_name(source.path))
     try:
         add_vertices(mesh, len(rows))
         columns = add_attributes(mesh, rows.dtype, source.header)
@@ -100,14 +103,17 @@ def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
             finite &= values if values.ndim == 1 else values.all(axis=1)
         coefficients = np.where(finite, 0.0, np.nan).astype(np.float32)[:, None, None]
         coefficients = np.broadcast_to(coefficients, (count, 1, 3))
-    return Splats(
+    flat = THIRD_SCALE not in read.columns
+    scales = read.planes(["scale_0", "scale_1", "scale_1" if flat else THIRD_SCALE])
+    splats = Splats(
         means=read_attribute(checked.mesh, "position"),
-        log_scales=read.planes(["scale_0", "scale_1", "scale_2"]).T,
+        log_scales=scales.T,
         quaternions=read.planes(["rot_0", "rot_1", "rot_2", "rot_3"]).T,
         opacity_logits=read.planes(["opacity"])[0],
         sh_dc=read.planes(["f_dc_0", "f_dc_1", "f_dc_2"]).T,
         sh_rest=coefficients,
     )
+    return with_model(splats, checked.layout.model)
 
 
 def file_from_object(
@@ -245,12 +251,16 @@ def write_attribute(mesh: bpy.types.Mesh, name: str, data_type: str, values: NDA
 
 
 def digest(checked: SplatObject) -> int:
-    """Return a checksum of what makes an object's splats, but for view-dependent colour."""
+    """Return a checksum of what makes an object's splats, but for view-dependent colour.
+
+    How they are drawn counts, too.
+    """
     columns = (column for column in checked.layout.columns if column.name in REQUIRED)
     checksum = 0
     for name in dict.fromkeys(column.attribute for column in columns):
         checksum = zlib.crc32(read_attribute(checked.mesh, name).data, checksum)
-    return checksum
+    model = checked.layout.model
+    return checksum if model == MODELS[0] else zlib.crc32(model.encode(), checksum)
 
 
 def remove_attribute(mesh: bpy.types.Mesh, name: str) -> None:

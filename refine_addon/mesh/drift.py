@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..core.formats.ply_columns import THIRD_SCALE
 from ..core.moves import Move, affine_moves
 from . import attributes as mesh_attributes
 from . import native
@@ -258,6 +259,8 @@ def _followed(rows: NDArray[np.int64], moves: list[Move]) -> list[Move]:
 def _checksums(mesh: bpy.types.Mesh | bpy.types.PointCloud, step: int = 1) -> NDArray[np.uint32]:
     """Return a checksum of 16 bits of the scales and the rotation of one splat of `step`."""
     names = [*(f"scale_{axis}" for axis in range(3)), *(f"rot_{index}" for index in range(4))]
+    if THIRD_SCALE not in mesh.attributes:  # discs
+        names.remove(THIRD_SCALE)
     if native.is_native(mesh):
         names = [native.SCALE, native.ROTATION]
     total = np.zeros(len(range(0, splat_count(mesh), step)), np.uint32)

@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..core.errors import RefineError
-from ..core.formats.ply import REQUIRED, REST_COUNTS
-from ..core.formats.ply_header import new_header
+from ..core.formats.ply import REQUIRED, REST_COUNTS, stated_model
+from ..core.formats.ply_columns import THIRD_SCALE
+from ..core.formats.ply_header import new_header, with_model
 from ..core.formats.ply_write import PLY_TYPES
+from ..core.rendering import MODELS
 from . import native
 from .native import Place
 
@@ -25,8 +27,14 @@ if TYPE_CHECKING:
 
     import bpy
 
+    from ..core.rendering import Model
+
 LAYOUT = "refine_layout"
 """Custom property of the mesh: how the file it came from was laid out, as JSON."""
+
+MODEL = "refine_model"
+"""Custom property of the mesh: how its splats are drawn, where the file it came from did not say;
+one of `rendering.MODELS`."""
 
 
 class Kind(NamedTuple):
@@ -138,6 +146,11 @@ class Layout:
         """Type of one row of the file."""
         return np.dtype([(column.name, column.dtype) for column in self.columns])
 
+    @property
+    def model(self) -> Model:
+        """How the splats are drawn."""
+        return stated_model(self.header, self.row_dtype) or MODELS[0]
+
 
 @dataclass(frozen=True)
 class SplatObject:
@@ -218,9 +231,24 @@ def check(obj: bpy.types.Object) -> SplatObject:
         msg = f"{label}: has no {points}, expected one a splat"
         raise RefineError(msg)
     native.refuse_lost_base(obj)
-    layout = _remembered(obj.data) or _standard(obj)
+    layout = layout_of(obj)
     _check_attributes(obj, layout)
     return SplatObject(obj, layout)
+
+
+def layout_of(obj: bpy.types.Object) -> Layout:
+    """Return the layout of an object with splats, without a look at its attributes' types.
+
+    Raises
+    ------
+    RefineError
+        If its harmonics are those of no degree.
+    """
+    layout = _remembered(obj.data) or _standard(obj)
+    model = obj.data.get(MODEL)
+    if model in MODELS and THIRD_SCALE in (column.name for column in layout.columns):
+        return replace(layout, header=with_model(layout.header, model))
+    return layout
 
 
 def sh_degree(mesh: bpy.types.Mesh) -> int:
@@ -231,7 +259,7 @@ def sh_degree(mesh: bpy.types.Mesh) -> int:
 def export_bytes(obj: bpy.types.Object) -> int | None:
     """Return how large the exported file is, None if there can be none; cheap enough to draw."""
     try:
-        layout = _remembered(obj.data) or _standard(obj)
+        layout = layout_of(obj)
     except RefineError:
         return None
     return len(layout.header) + layout.row_dtype.itemsize * splat_count(obj.data)
@@ -391,6 +419,8 @@ def _standard(obj: bpy.types.Object) -> Layout:
         normals = tuple(NORMAL_PLACES)
         places.update(NORMAL_PLACES)
     names = [*PLACES, *normals, *REQUIRED[3:6], *rest, *REQUIRED[6:]]
+    if THIRD_SCALE not in attributes and THIRD_SCALE not in places and "scale_1" in attributes:
+        names.remove(THIRD_SCALE)
     columns = [Column(name, "<f4", places.get(name) or _plain("<f4", name)) for name in names]
     columns += _further_columns(obj.data, {*names, *(column.attribute for column in columns)})
     header = _new_header(columns, splat_count(obj.data))
@@ -425,6 +455,8 @@ def _check_attributes(obj: bpy.types.Object, layout: Layout) -> None:
     attributes = obj.data.attributes
     properties = {column.name for column in layout.columns}
     absent = [name for name in REQUIRED if name not in properties]
+    if absent == [THIRD_SCALE]:  # discs
+        absent = []
     absent += [column.attribute for column in layout.columns if column.attribute not in attributes]
     if absent:
         present = [a.name for a in attributes if a.domain == "POINT" and a.name[0] != "."]

@@ -225,6 +225,8 @@ class ObjectSink:
             See `FileSink.write`; also if the .blend cannot be saved. The file stays then, and the
             object is as it was.
         """
+        if self.save and result.stopped is not None:  # nothing is saved over what was not finished
+            raise result.stopped
         written = self.file.write(loaded, result, runtime)
         if self.save:
             columns = loaded.columns(result.absorbed)

@@ -352,8 +352,9 @@ def moved_columns(checked: SplatObject, moves: Sequence[Move]) -> dict[str, NDAr
         See `refine_addon.core.affine.baked`.
     """
     splats = mesh_attributes.splats_from_object(checked)
-    columns = {name: np.array(column) for name, column in values_by_name(splats).items()}
-    del columns["opacity"]
+    stored = {name: row for name, row in values_by_name(splats).items() if name != "opacity"}
+    copied = np.empty_like if any(len(move.rows) == len(splats) for move in moves) else np.array
+    columns = {name: copied(column) for name, column in stored.items()}
     for move in moves:
         _move_rows(splats, columns, move)
     if {"nx", "ny", "nz"} <= {column.name for column in checked.layout.columns}:
@@ -377,10 +378,10 @@ def _move_rows(splats: Splats, columns: dict[str, NDArray[Any]], move: Move) -> 
     for_chunks(move_some, len(move.rows), _ROWS)
 
 
-def _turned_normals(
-    normals: NDArray[np.float32], matrix: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _turned_normals(normals: NDArray[np.float32], matrix: NDArray[np.float64]) -> NDArray[Any]:
     """Return normals, (M, 3), of surfaces that a matrix moved; zeros, as most files have, stay."""
+    if not normals.any():
+        return normals
     turned = normals @ np.linalg.inv(matrix[:3, :3])
     lengths = np.linalg.norm(turned, axis=1, keepdims=True)
     return np.asarray(turned / np.where(lengths > 0.0, lengths, 1.0))

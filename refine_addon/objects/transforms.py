@@ -16,7 +16,7 @@ from ..core.affine import is_flat
 from ..core.errors import RefineError
 from ..core.formats.ply import REST_COUNTS
 from ..core.moves import Move
-from ..core.splats import above_constant
+from ..core.splats import above_constant, refuse_mixed
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
@@ -301,6 +301,7 @@ def _made_alike(parts: Sequence[SplatObject], group: Sequence[SplatObject]) -> l
     """Have objects hold the same columns in the same attributes; tell what some lack, in notes."""
     notes = []
     most = max(mesh_layout.rest_count(part.mesh) for part in parts)
+    refuse_mixed([member.layout.model for member in group])
     layout = mesh_layout.merged([part.layout for part in parts])
     for part, member in zip(parts, group, strict=True):
         own = {column.name: column for column in part.layout.columns}

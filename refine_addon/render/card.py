@@ -21,12 +21,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..core.drawing import Layer
+    from ..core.drawing import Layers
     from ..core.splats import Splats
     from ..core.views import View
-
-_ALL, _IN_FRONT, _BEHIND = range(3)
-"""Which splats are drawn, by the depths of a layer; see ``choices`` in `shader`."""
 
 _FARTHEST = 1e6
 """Far plane over the near plane, where a view has none nearer."""
@@ -45,6 +42,8 @@ class Sheet:
     ----------
     textures : dict of str to (values, channels, kind)
         See `shader.texture`.
+    limits : list of (H, W) float32
+        Depths in the window that part the splats: of each layer, the lowest row first.
     count : int
         Splats that are drawn.
     numbers : (24,) float32
@@ -54,17 +53,18 @@ class Sheet:
     """
 
     textures: dict[str, tuple[NDArray[np.float32], int, str]]
+    limits: list[NDArray[np.float32]]
     count: int
     numbers: NDArray[np.float32]
     size: tuple[int, int]
 
 
-def prepare(splats: Splats, view: View, layer: Layer | None) -> Sheet:
+def prepare(splats: Splats, view: View, layers: Layers | None) -> Sheet:
     """Sort and pack splats for a view with perspective; on any thread.
 
     Parameters
     ----------
-    splats, view, layer
+    splats, view, layers
         As `core.drawing.draw` takes them; the splats look the same from all directions.
     """
     matrix = np.empty((3, 4))  # world to camera: x right, y up, z back
@@ -78,11 +78,11 @@ def prepare(splats: Splats, view: View, layer: Layer | None) -> Sheet:
     order = rows[farthest_first(depths[depths < view.far], perspective=True)]
     means = np.zeros((len(packed), 4), np.float32)
     means[:, :3] = packed.means
-    limits = np.ones((1, 1), np.float32)
-    if layer is not None:  # in depths of the window, the lowest row first
-        limit = np.maximum(layer.depths[::-1], view.near)
-        ndc = (projection[2, 2] * -limit + projection[2, 3]) / limit
-        limits = (0.5 * ndc + 0.5).astype(np.float32)
+    limits = []
+    for depth in () if layers is None else layers.depths:
+        away = np.maximum(depth[::-1], view.near)
+        ndc = (projection[2, 2] * -away + projection[2, 3]) / away
+        limits.append((0.5 * ndc + 0.5).astype(np.float32))
     numbers = np.zeros(24, np.float32)
     numbers[:16] = projection.T.reshape(-1)
     numbers[16:21] = (view.width, view.height, view.near, 1.0, 1.0)
@@ -95,38 +95,48 @@ def prepare(splats: Splats, view: View, layer: Layer | None) -> Sheet:
         "colors": (as_texture(colors(packed)), 4, "RGBA16F"),
         "selection": (as_texture(np.zeros(len(packed), np.float32)), 1, "R32F"),
         "matrices": (matrix.astype(np.float32).reshape(1, 12), 4, "RGBA32F"),
-        "depths": (limits, 1, "R32F"),
+        "depths": (np.ones((1, 1), np.float32), 1, "R32F"),
         "veils": (nothing, 4, "RGBA16F"),  # what the 3D view sees through
         "veil_depths": (nothing, 4, "RGBA16F"),
     }
-    return Sheet(textures, len(order), numbers, (view.width, view.height))
+    return Sheet(textures, limits, len(order), numbers, (view.width, view.height))
 
 
-def paint(sheet: Sheet, layer: Layer | None) -> NDArray[np.float64]:
+def paint(sheet: Sheet, layers: Layers | None) -> NDArray[np.float64]:
     """Draw splats on the card; return what `core.drawing.draw` does. On the main thread."""
     textures = {name: shader.texture(*given) for name, given in sheet.textures.items()}
-    if layer is None:
-        return _drawn(sheet, textures, _ALL)
-    picture = _drawn(sheet, textures, _IN_FRONT)
-    left = 1.0 - layer.alphas
-    seen_through = bool((left > 0.0).any())
-    behind = _drawn(sheet, textures, _BEHIND) if seen_through else np.zeros_like(picture)
-    passed = 1.0 - picture[3]
-    picture[:3] += passed * (layer.colors + left * behind[:3])
-    if layer.background is not None:
-        picture[:3] += passed * (1.0 - behind[3]) * layer.background
-    picture[3] = 1.0 - passed * left * (1.0 - behind[3])
-    return np.asarray(picture.clip(0.0, 1.0))
+    if layers is None:
+        return _drawn(sheet, textures)
+    limits = [shader.texture(limit, 1, "R32F") for limit in sheet.limits]
+    left, passed = layers.left(), np.ones(sheet.size[::-1])
+    image = np.zeros((4, *passed.shape))
+    for number, share in enumerate(left):  # the splats before each layer, and behind the last
+        if (share > 0.0).any():
+            between = {"veil_depths": limits[number - 1]} if number else {}
+            if limits[number:]:
+                between["depths"] = limits[number]
+            drawn = _drawn(sheet, textures, between)
+            image[:3] += share * passed * drawn[:3]
+            passed *= np.where(share > 0.0, 1.0 - drawn[3], 1.0)
+        if limits[number:]:
+            image[:3] += share * passed * layers.colors[number]
+    if layers.background is not None:
+        image[:3] += passed * layers.background
+    image[3] = 1.0 - passed * left[-1]
+    return image.clip(0.0, 1.0)
 
 
-def _drawn(sheet: Sheet, textures: dict[str, Any], which: int) -> NDArray[np.float64]:
-    """Return some of the splats, (4, H, W), colours times alpha, the top row first."""
+def _drawn(
+    sheet: Sheet, textures: dict[str, Any], between: dict[str, Any] | None = None
+) -> NDArray[np.float64]:
+    """Return splats between some depths, (4, H, W), colours times alpha, the top row first."""
     width, height = sheet.size
+    between = between or {}
     numbers = sheet.numbers.copy()
-    numbers[21], numbers[23] = which != _ALL, which == _BEHIND
+    numbers[21], numbers[23] = "depths" in between, "veil_depths" in between
     picture = gpu.types.GPUTexture(sheet.size, format="RGBA32F")
     frame = gpu.types.GPUFrameBuffer(color_slots=picture)
-    shader.blend(frame, textures, numbers, sheet.count)
+    shader.blend(frame, {**textures, **between}, numbers, sheet.count)
     values = gpu.types.Buffer("FLOAT", width * height * 4)
     frame.read_color(0, 0, width, height, 4, 0, "FLOAT", data=values)
     pixels = np.frombuffer(memoryview(values), np.float32).reshape(height, width, 4)

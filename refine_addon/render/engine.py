@@ -19,6 +19,7 @@ from ..core.affine import is_flat, transformed
 from ..core.drawing import draw, seen_from
 from ..core.errors import RefineError
 from ..core.seeing.scene import scene_of
+from ..core.sight import view_through
 from ..core.splats import Splats, drawable, joined
 from ..core.views import View, ViewSet
 from ..core.work import Cancelled, checked_by, checkpoint
@@ -28,11 +29,12 @@ from . import card
 from .meshes import drawn_by_us
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from numpy.typing import NDArray
 
-    from ..core.drawing import Layer
+    from ..core.drawing import Layers
 
 _FAR = 1e4
 """Scene sizes from which a camera without perspective is seen as one with it: less than .1 pixels
@@ -47,8 +49,8 @@ class Shared:
 
     Attributes
     ----------
-    layer : Layer or None
-        What is rendered besides splats, of the next frame.
+    layers : callable or None
+        Gives what was rendered besides splats, of the next frame, or None.
     transparent : bool
         Whether what lies behind everything is left transparent.
     card : bool
@@ -67,7 +69,7 @@ class Shared:
         Why drawing ended.
     """
 
-    layer: Layer | None = None
+    layers: Callable[[], Layers | None] | None = None
     transparent: bool = False
     card: bool = False
     finished: Path | None = None
@@ -140,18 +142,19 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc] # noqa: N801 
         scene, size = depsgraph.scene, (self.resolution_x, self.resolution_y)
         place = _place(depsgraph, self.camera_override or scene.camera, size)
         splats = _splats(depsgraph, place.view.center)
-        view, layer = _cropped(place.view, _border(scene, size)), shared.layer
-        if layer is not None and place.away:
-            depths = np.where(layer.depths > 0.0, layer.depths + place.away, 0.0)
-            layer = replace(layer, depths=depths)
+        view = _cropped(place.view, _border(scene, size))
+        layers = shared.layers() if shared.layers else None
+        if layers is not None and place.away:
+            depths = np.where(layers.depths > 0.0, layers.depths + place.away, 0.0)
+            layers = replace(layers, depths=depths)
         shared.splats = len(splats)
         if shared.card and not place.away and len(splats):
-            sheet = card.prepare(splats, view, layer)
+            sheet = card.prepare(splats, view, layers)
             with checked_by(self._check):
-                picture = main_thread.call(partial(card.paint, sheet, layer))
+                picture = main_thread.call(partial(card.paint, sheet, layers))
         else:
             frame = scene_of(splats.means, drawable(splats), ViewSet((place.near,)))
-            picture = draw(splats, view, layer, frame, progress=self._progress)
+            picture = draw(splats, view, layers, frame, progress=self._progress)
         if not shared.transparent:
             picture[3] = 1.0
         return picture
@@ -204,33 +207,13 @@ def _place(
     width, height = size
     pixel = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
     projection = camera.calc_matrix_camera(depsgraph, x=width, y=height, **pixel)
-    p = np.array(projection, np.float64)
-    rotation, center = pose(camera.name, np.array(camera.matrix_world, np.float64))
-    view = View(
-        rotation=rotation,
-        center=center,
-        fx=p[0, 0] * width / 2,
-        fy=p[1, 1] * height / 2,
-        cx=(1.0 - p[0, 2] + p[0, 3]) * width / 2,
-        cy=(1.0 + p[1, 2] - p[1, 3]) * height / 2,
-        width=width,
-        height=height,
-        near=data.clip_start,
-        far=data.clip_end,
-        name=camera.name,
-    )
-    if data.type == "PERSP":
-        return _Place(view, view)
-    away = _FAR * data.ortho_scale
-    far = replace(
-        view,
-        center=view.center - away * view.rotation[2],
-        fx=view.fx * away,
-        fy=view.fy * away,
-        near=away + data.clip_start,
-        far=away + data.clip_end,
-    )
-    return _Place(far, view, away)
+    looking = pose(camera.name, np.array(camera.matrix_world, np.float64))
+    parallel = data.type == "ORTHO"
+    away = _FAR * data.ortho_scale if parallel else 0.0
+    view = view_through(np.array(projection, np.float64), looking, size, (0.0, away))
+    near, far = away + data.clip_start, away + data.clip_end
+    view = replace(view, near=near, far=far, name=camera.name)
+    return _Place(view, replace(view, center=looking[1]), away)
 
 
 def _border(scene: bpy.types.Scene, size: tuple[int, int]) -> tuple[int, int, int, int]:
@@ -255,7 +238,7 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
 
     Instances are among them. Modifiers are not looked at, as in the 3D views.
     """
-    parts = [_NOTHING]
+    parts = []
     for instance in depsgraph.object_instances:
         obj = instance.object.original
         if not drawn_by_us(obj) or not splat_count(obj.data):
@@ -270,7 +253,7 @@ def _splats(depsgraph: bpy.types.Depsgraph, eye: NDArray[np.float64]) -> Splats:
         local = np.linalg.inv(matrix)
         splats = seen_from(splats, local[:3, :3] @ eye + local[:3, 3])
         parts.append(transformed(splats, matrix, rotate_sh=False))
-    return joined(parts)
+    return joined(parts) if parts else _NOTHING
 
 
 _NOTHING = Splats(

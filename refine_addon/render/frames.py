@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import bpy
 
@@ -16,9 +18,15 @@ from . import copies, engine
 from .meshes import Meshes, drawn_by_us
 
 if TYPE_CHECKING:
-    from collections.abc import Generator, Iterator, Sequence
+    from collections.abc import Callable, Generator, Iterator, Sequence
 
     from .engine import Shared
+    from .passes import Rendered
+
+Answer = TypeVar("Answer")
+
+_MOMENT = 0.01
+"""Seconds that Blender may stand still."""
 
 
 class Step(NamedTuple):
@@ -55,10 +63,11 @@ def refuse(scene: bpy.types.Scene) -> None:
 
 def steps(
     scene: bpy.types.Scene, frames: Sequence[int], shared: Shared, *, write: bool
-) -> Generator[Step, None, None]:
+) -> Generator[Step | None, None, None]:
     """Yield what Blender has to render for some frames, one after another.
 
-    Whoever renders them asks for the next when one is over. All that is made for them is removed
+    Whoever renders them asks for the next when one is over. Where None is yielded there is nothing
+    to render, and Blender may do something else meanwhile. All that is made for them is removed
     when the last is over, or the generator is closed.
 
     Parameters
@@ -91,10 +100,10 @@ def steps(
         for frame in frames:
             if write and not movie and _is_there(whole, frame, *kept):
                 continue
-            for step in meshes.steps():
-                _set_frames(step, [frame])
-                yield Step(step, animation=True, what="meshes")
-            shared.layer = meshes.layer(frame)
+            rendered = yield from _one_by_one(meshes, frame)
+            light = yield from _on_thread(rendered.read)
+            shown = yield from meshes.shown(light.pictures)
+            shared.layers = partial(light.layers, shown)
             _set_frames(whole, [frame])
             yield Step(whole, animation=write, what="splats")
             _check(shared, frame)
@@ -105,6 +114,30 @@ def steps(
             _set_frames(written, frames)
             yield Step(written, animation=True, what="movie")
             _check(shared, frames[-1])
+
+
+def _one_by_one(meshes: Meshes, frame: int) -> Generator[Step, None, Rendered]:
+    """Yield what has to be rendered besides splats; return what was."""
+    names = meshes.steps(frame)
+    try:
+        while True:
+            name = next(names)
+            _set_frames(name, [frame])
+            yield Step(name, animation=True, what="meshes")
+    except StopIteration as end:
+        rendered: Rendered = end.value
+        return rendered
+    finally:
+        names.close()
+
+
+def _on_thread(work: Callable[[], Answer]) -> Generator[None, None, Answer]:
+    """Return what work returns that touches nothing of Blender's; yield until it is done."""
+    with ThreadPoolExecutor(1, "refine-render") as pool:
+        future = pool.submit(work)
+        while not wait([future], _MOMENT).done:
+            yield
+        return future.result()
 
 
 def _whole(scene: bpy.types.Scene, name: str) -> str:

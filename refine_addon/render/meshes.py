@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import bpy
 import numpy as np
 
-from ..core.drawing import Layer
-from ..core.exr import read_exr
+from ..core.work import Cancelled
 from ..mesh import native
 from ..mesh.layout import looks_like_splats
-from . import copies
+from . import copies, see_through
+from .out_of_sight import out_of_sight
+from .passes import Rendered
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Generator, Sequence
 
     from numpy.typing import NDArray
 
@@ -31,8 +32,11 @@ _WORLD_SAMPLES = 16
 _FARTHEST = 0.999
 """Share of the camera's range beyond which a depth is that of nothing: EEVEE of 4.3 says so."""
 
-_ROUNDS = 2
-"""Pixels by which known depths are spread to pixels at edges without one."""
+_INFINITE = 1e9
+"""Depth beyond which there is nothing: Cycles says 1e10."""
+
+_PIXELS = 1 << 18
+"""Pixels that the view transform is applied to at a time."""
 
 
 def drawn_by_us(obj: bpy.types.Object) -> bool:
@@ -42,8 +46,37 @@ def drawn_by_us(obj: bpy.types.Object) -> bool:
     )
 
 
+class _Apart(NamedTuple):
+    """Objects that are rendered together.
+
+    Attributes
+    ----------
+    others : list of bpy.types.Object
+        Those that are left out.
+    blended : bool
+        Whether the engine tells no depth of them, as EEVEE of what it blends; Cycles does.
+    """
+
+    others: list[bpy.types.Object]
+    blended: bool = False
+
+
+def _divided(scene: bpy.types.Scene, objects: list[bpy.types.Object]) -> list[_Apart]:
+    """Return which objects of a copy are rendered together, the opaque ones last."""
+    eevee = scene.render.engine.startswith("BLENDER_EEVEE")
+    glass = scene.render.engine == "CYCLES" and scene.cycles.film_transparent_glass
+    opaque, apart = see_through.groups(objects, glass=glass)
+    parts = [_Apart([obj for obj in objects if obj not in group], eevee) for group in apart]
+    if opaque:
+        parts.append(_Apart([obj for obj in objects if obj not in opaque]))
+    return parts
+
+
 class Meshes:
     """What a scene shows besides splats, rendered frame by frame.
+
+    What lets light through is rendered apart, object by object, so that splats between it and what
+    stands behind it are seen.
 
     Parameters
     ----------
@@ -59,15 +92,24 @@ class Meshes:
 
     def __init__(self, scene: bpy.types.Scene, folder: Path) -> None:
         self._folder = folder
-        self._meshes = self._world = ""  # names of copies
+        self._meshes = self._depths = self._world = ""  # names of copies
         self._hidden: list[bpy.types.Object] = []
+        self._apart: list[_Apart] = [_Apart([])]
         self.engine = ""
         layer = next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
         objects = [obj for obj in layer.objects if obj.type in _RENDERED and not obj.hide_render]
-        if any(not drawn_by_us(obj) for obj in objects):
-            self._meshes = self._copy(scene, "REFINE meshes", transparent=True).name
+        shown = [obj for obj in objects if not drawn_by_us(obj)]
+        if shown:
+            meshes = self._copy(scene, "REFINE meshes", transparent=True)
+            self._meshes = meshes.name
             # Older Blenders show the points of point clouds as balls.
             self._hidden = [o for o in objects if drawn_by_us(o) and o.type == "POINTCLOUD"]
+            self._apart = _divided(meshes, shown)
+            if any(part.blended for part in self._apart) and hasattr(meshes, "cycles"):
+                depths = self._copy(scene, "REFINE depths", transparent=True)
+                depths.render.engine = "CYCLES"
+                depths.cycles.samples, depths.cycles.use_denoising = 1, False
+                self._depths = depths.name
         if not scene.render.film_transparent and scene.world is not None:
             world = self._copy(scene, "REFINE world", transparent=False)
             for linked in (world.collection.children, world.collection.objects):
@@ -80,50 +122,45 @@ class Meshes:
         if self._meshes or self._world:
             self.engine = bpy.data.scenes[self._meshes or self._world].render.engine
 
-    def steps(self) -> Iterator[str]:
-        """Give the names of the scenes to be rendered for a frame, one after another."""
-        if self._meshes:
-            for obj in self._hidden:
-                obj.hide_render = True
-            try:
+    def steps(self, frame: int) -> Generator[str, None, Rendered]:
+        """Give the names of the scenes to be rendered for a frame, one after another.
+
+        The next is asked for when one is rendered; afterwards it returns what was.
+        """
+        camera = bpy.data.scenes[self._meshes or self._world].camera.data if self.engine else None
+        far = min(_FARTHEST * camera.clip_end, _INFINITE) if camera else _INFINITE
+        rendered = Rendered(far)
+        for number, part in enumerate(self._apart if self._meshes else ()):
+            with out_of_sight([*self._hidden, *part.others]):
                 yield self._meshes
-            finally:
-                for obj in self._hidden:
-                    obj.hide_render = False
+                colors = depths = self._kept(self._meshes, frame, f"colors_{number}")
+                if part.blended and self._depths:
+                    yield self._depths
+                    depths = self._kept(self._depths, frame, f"depths_{number}")
+            rendered.parts.append((colors, depths))
         if self._world:
             yield self._world
+            rendered.world = self._kept(self._world, frame, "world")
+        return rendered
 
-    def layer(self, frame: int) -> Layer | None:
-        """Return what was rendered for a frame, None if there is nothing to render."""
-        meshes, world = (
-            self._passes(name, frame) if name else None for name in (self._meshes, self._world)
-        )
-        if meshes is None:
-            if world is None:
-                return None
-            background = world["Combined"][:3]
-            height, width = background.shape[1:]
-            nothing = np.zeros((height, width), np.float32)
-            (shown,) = self._shown(self._world, [background])
-            return Layer(np.zeros_like(shown), nothing, nothing, shown)
-        colors, alphas = meshes["Combined"][:3], meshes["Combined"][3].clip(0.0, 1.0)
-        depths = _known(meshes["Depth"][0], alphas, bpy.data.scenes[self._meshes].camera.data)
-        opaque = colors / np.maximum(alphas, 1e-6)
-        if world is None:
-            (shown,) = self._shown(self._meshes, [opaque])
-            return Layer(alphas * shown, alphas, depths)
-        over = colors + (1.0 - alphas) * world["Combined"][:3]  # as without splats
-        shown, whole = self._shown(self._meshes, [opaque, over])
-        return Layer(alphas * shown, alphas, depths, whole - alphas * shown)
+    def _kept(self, name: str, frame: int, label: str) -> Path:
+        """Return the file that was just written, under another name.
+
+        Blender takes Esc for itself, and writes nothing of what it has not finished.
+        """
+        try:
+            written = Path(bpy.data.scenes[name].render.frame_path(frame=frame))
+            return written.replace(self._folder / f"{label}.exr")
+        except FileNotFoundError:
+            raise Cancelled from None
 
     def _copy(self, scene: bpy.types.Scene, name: str, *, transparent: bool) -> bpy.types.Scene:
         copy = copies.copied(scene, name)
         copy.render.film_transparent = transparent
         for layer in copy.view_layers:
             layer.use_pass_combined = layer.use_pass_z = True
-            layer.pass_alpha_threshold = (
-                0.0  # Cycles: the depth of what is nearest, seen through or not
-            )
+            # Cycles: the depth of what is nearest, seen through or not.
+            layer.pass_alpha_threshold = 0.0
         if copy.render.engine.startswith("BLENDER_EEVEE") and not _has_card():
             copy.render.engine = "CYCLES"
             copy.cycles.samples = copy.eevee.taa_render_samples
@@ -131,32 +168,31 @@ class Meshes:
         copies.write_exr(copy, self._folder / f"{name.rsplit(maxsplit=1)[-1]}_######")
         return copy
 
-    def _passes(self, name: str, frame: int) -> dict[str, NDArray[np.float32]]:
-        """Return the passes that were written, (channels, H, W) each, and remove the file."""
-        path = Path(bpy.data.scenes[name].render.frame_path(frame=frame))
-        channels = read_exr(path)
-        path.unlink()
-        found: dict[str, NDArray[np.float32]] = {}
-        for kind, letters in (("Combined", "RGBA"), ("Depth", "ZV")):
-            rows = [
-                values
-                for letter in letters
-                for channel, values in channels.items()
-                if channel.endswith(f".{kind}.{letter}")
-            ]
-            found[kind] = np.stack(rows) if rows else np.empty((0, 0, 0), np.float32)
-        return found
+    def shown(
+        self, pictures: Sequence[NDArray[np.float32]]
+    ) -> Generator[None, None, list[NDArray[np.float32]]]:
+        """Return linear colours, (3, H, W) each, as the view transform of the scene shows them.
 
-    def _shown(self, name: str, pictures: list[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
-        """Return linear colours, (3, H, W) each, as the view transform of a scene shows them.
-
-        Only Blender knows the transform, and applies it where it saves an image.
+        Only Blender knows the transform, and applies it where it saves an image. So much is done
+        between two yields that Blender stands still for a tenth of a second.
         """
-        scene, path = bpy.data.scenes[name], self._folder / "shown.png"
+        if not pictures:
+            return []
         tall = np.concatenate(pictures, axis=1)
-        height, width = tall.shape[1:]
+        rows = max(_PIXELS // tall.shape[2], 1)
+        bands = []
+        for start in range(0, tall.shape[1], rows):
+            yield
+            bands.append(self._band_shown(tall[:, start : start + rows]))
+        return np.split(np.concatenate(bands, axis=1), len(pictures), axis=1)
+
+    def _band_shown(self, band: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return some rows of linear colours, (3, R, W), as they are shown."""
+        scene = bpy.data.scenes[self._meshes or self._world]
+        path = self._folder / "shown.png"
+        height, width = band.shape[1:]
         pixels = np.ones((height, width, 4), np.float32)
-        pixels[..., :3] = np.moveaxis(tall, 0, -1)
+        pixels[..., :3] = np.moveaxis(band, 0, -1)
         linear = bpy.data.images.new("REFINE", width, height, float_buffer=True)
         try:
             linear.pixels.foreach_set(pixels.ravel())
@@ -173,26 +209,7 @@ class Meshes:
         finally:
             bpy.data.images.remove(shown)
             path.unlink()
-        return np.split(np.moveaxis(pixels[..., :3], -1, 0), len(pictures), axis=1)
-
-
-def _known(
-    depths: NDArray[np.float32], alphas: NDArray[np.float32], camera: bpy.types.Camera
-) -> NDArray[np.float32]:
-    """Return the depth of what is seen in each pixel, (H, W), 0 where it has none.
-
-    Engines write that of one ray a pixel, which may miss what others hit: at an edge the nearest
-    depth beside it is taken. What is seen and has no depth anywhere near, as what EEVEE blends, is
-    taken to be in front.
-    """
-    nothing = depths >= min(_FARTHEST * camera.clip_end, 1e9)
-    known = np.where(nothing, np.float32(np.inf), depths)
-    for _ in range(_ROUNDS):
-        padded = np.pad(known, 1, constant_values=np.inf)
-        height, width = known.shape
-        around = [padded[y : y + height, x : x + width] for y in range(3) for x in range(3)]
-        known = np.where(np.isinf(known), np.minimum.reduce(around), known)
-    return np.where(np.isinf(known) | (alphas <= 0.0), np.float32(0.0), known)
+        return np.moveaxis(pixels[..., :3], -1, 0)
 
 
 def _limit_samples(scene: bpy.types.Scene) -> None:

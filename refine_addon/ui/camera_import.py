@@ -17,6 +17,7 @@ from ..cameras.sets import create_cameras, known_turn
 from ..core.cameras.read import cameras_in, read_cameras
 from ..core.errors import RefineError
 from ..core.estimate.alignment import Alignment
+from ..core.formats.registry import INDEX_NAMES
 from ..mesh import layout as mesh_layout
 from . import preferences
 from .on_thread import AskedFirst
@@ -75,7 +76,13 @@ class REFINE_OT_import_cameras(AskedFirst, Needing, bpy.types.Operator, ImportHe
     reads_object = False
 
     def ask(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
-        """Ask for the file; upright by default where the splats are."""
+        """Ask for the file; upright by default where the splats are.
+
+        A JSON file that was dropped may hold splats: then it is theirs to ask.
+        """
+        path = self.properties.filepath
+        if path.lower().endswith(INDEX_NAMES):
+            return bpy.ops.refine.import_ply("INVOKE_DEFAULT", filepath=path)
         obj = _imported_splats(context)
         if obj is None:
             preferences.suggest(self, context, "upright")

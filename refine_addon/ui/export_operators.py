@@ -13,12 +13,11 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
-from ..core.formats.registry import FORMATS, Packed, as_written, without_suffix
+from ..core.formats.registry import FORMATS, SUFFIXES, Packed, as_written, without_suffix
 from ..core.whole_file import expanded, refuse_existing
 from ..core.work import report
 from ..mesh import scores as mesh_scores
 from ..objects import splat_object
-from .import_operators import FILE_NAMES
 from .on_thread import AskedFirst
 from .operator_bases import Answer, OnSplats
 
@@ -53,7 +52,7 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
     doing = "Writing splats"
 
     filename_ext = ".ply"
-    filter_glob: StringProperty(default=FILE_NAMES, options={"HIDDEN"})
+    filter_glob: StringProperty(default=";".join(f"*{end}" for end in SUFFIXES), options={"HIDDEN"})
     suffix: EnumProperty(
         name="Format",
         description="Of the file that is picked here; a suffix that is typed chooses it",

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 
 import bpy
 import mathutils
-from bpy.props import BoolProperty, CollectionProperty, StringProperty
+from bpy.props import BoolProperty, CollectionProperty, IntProperty, StringProperty
 from bpy_extras.io_utils import ImportHelper
 
 from ..cameras.objects import SOURCE, UPRIGHT
 from ..core.cameras.read import read_cameras
 from ..core.errors import RefineError
-from ..core.formats.registry import SUFFIXES, read_splats
+from ..core.formats.registry import INDEX_NAMES, READ_SUFFIXES, read_splats
+from ..core.formats.streamed_sog import INDEX
 from ..core.work import part, report
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 _ROWS = 1 << 16
 """Rows that are read before the next look at whether the import was cancelled."""
 
-FILE_NAMES = ";".join(f"*{suffix}" for suffix in SUFFIXES)
+FILE_NAMES = ";".join(f"*{suffix}" for suffix in READ_SUFFIXES)
 """What a file browser shows."""
 
 
@@ -54,6 +55,7 @@ class _Files:
 
     splats: list[Path]
     cameras: Path | None
+    level: int
 
 
 @dataclass
@@ -86,6 +88,12 @@ class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper
         options={"SKIP_SAVE"},
     )
     set_resolution: BoolProperty(**SET_RESOLUTION)
+    level: IntProperty(
+        name="Level",
+        description="Of a streamed SOG (lod-meta.json): 0 is the finest level",
+        min=0,
+        options={"SKIP_SAVE"},
+    )
 
     doing = "Reading splats"
     reads_object = False
@@ -102,7 +110,10 @@ class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper
         """Draw the options, and name the cameras that would be taken before they are."""
         layout, browser = self.layout, context.space_data
         layout.prop(self, "upright")
-        folder = self._paths()[0].parent
+        path = self._paths()[0]
+        folder = path.parent
+        if path.name.lower().endswith(INDEX):
+            layout.prop(self, "level")
         if browser is not None and browser.type == "FILE_BROWSER":  # what is looked at now
             folder = Path(os.fsdecode(browser.params.directory))
         found = cameras_beside(folder)
@@ -118,7 +129,8 @@ class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper
     def prepare(self, _context: bpy.types.Context, _checked: None) -> _Files:
         """Note which files to read."""
         paths = self._paths()
-        return _Files(paths, cameras_beside(paths[0].parent) if self.cameras else None)
+        cameras = cameras_beside(paths[0].parent) if self.cameras else None
+        return _Files(paths, cameras, self.level)
 
     @staticmethod
     def work(files: _Files, progress: Progress) -> _Read:
@@ -127,7 +139,7 @@ class REFINE_OT_import_ply(AskedFirst, Needing, bpy.types.Operator, ImportHelper
         for index, path in enumerate(paths):
             progress_of_file = part(progress, index / len(paths), (index + 1) / len(paths))
             try:
-                read.files.append(_read(path, progress_of_file))
+                read.files.append(_read(path, files.level, progress_of_file))
             except FAILURES as error:
                 read.errors.append(error)
         if files.cameras is not None and read.files:
@@ -194,7 +206,10 @@ class REFINE_FH_ply(bpy.types.FileHandler):
     bl_idname = "REFINE_FH_ply"
     bl_label = "Gaussian Splats (REFINE)"
     bl_import_operator = "refine.import_ply"
-    bl_file_extensions = ";".join(dict.fromkeys("." + suffix.split(".")[-1] for suffix in SUFFIXES))
+    # Without .json, whose handler is that of cameras: Blender would ask which is meant.
+    bl_file_extensions = ";".join(
+        dict.fromkeys("." + end.split(".")[-1] for end in READ_SUFFIXES if end not in INDEX_NAMES)
+    )
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:
@@ -202,10 +217,10 @@ class REFINE_FH_ply(bpy.types.FileHandler):
         return context.area is not None and context.area.type == "VIEW_3D"
 
 
-def _read(path: Path, progress: Progress) -> SplatFile:
+def _read(path: Path, level: int, progress: Progress) -> SplatFile:
     """Return what a file holds, with all its bytes in memory."""
     report(progress, 0.0, "")
-    file = read_splats(path)
+    file = read_splats(path, level=level)
     if not len(file):
         msg = f"{path}: holds no splats"
         raise RefineError(msg)

@@ -39,6 +39,9 @@ class OnThread:
     """
 
     doing = ""
+    offers = ""
+    """What progress calls the part of the work that offers what it has reached when it is cancelled
+    (`Result.stopped`)."""
     reads_object = True
     """Whether it needs the active object."""
     _running: Running | None = None
@@ -87,6 +90,7 @@ class OnThread:
             timer=manager.event_timer_add(_STEP, window=context.window),
             sketch=sketch,
             stage="sketch" if sketch else "work",
+            offers=self.offers,
         )
         manager.modal_handler_add(self)
         at_work.begin(self._running)
@@ -129,8 +133,10 @@ class OnThread:
             running.waits = next(filter(None, waits), "")
             if running.stage == "sketch":
                 return self._sketched(context, running)
-            if running.worker.cancelled or not running.waits:
+            if not running.waits:
                 return self._done(context, running)
+            if running.worker.cancelled:
+                return self._stopped(context, running)
         running.tell(context)
         return {"PASS_THROUGH"}
 

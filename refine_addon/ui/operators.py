@@ -18,6 +18,7 @@ from ..cameras.sets import CameraChoice
 from ..core import pipeline
 from ..core.estimate.quality import in_words
 from ..core.levels.lod import Level, Levels, lod
+from ..core.pipeline.refit_splats import DOING
 from ..core.report import scoring_notes, sizes_in_words
 from ..core.seeing import frustum
 from ..core.task import may_absorb
@@ -231,7 +232,8 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
     bl_idname = "refine.apply"
     bl_label = "Apply"
     bl_options = {"REGISTER", "UNDO"}
-    doing = "Absorbing splats"
+    doing = "Pruning splats"
+    offers = DOING
 
     needs = (*OnSplats.needs, _scored_or_applied)
 

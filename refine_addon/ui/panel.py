@@ -86,6 +86,7 @@ class REFINE_PT_splats(_InSidebar, bpy.types.Panel):
         if several:
             wrapped.label(layout, context, "Scored and pruned as one scene", icon="INFO")
             return
+        _named_column(layout).prop(context.scene.refine, "model")
         _draw_progress(layout, context, "refine.import_ply")
 
 
@@ -199,13 +200,14 @@ class REFINE_PT_volumes(_InSidebar, bpy.types.Panel):
 def _draw_volume(
     layout: bpy.types.UILayout, index: int, item: RefineVolume, counts: dict[str, int]
 ) -> None:
-    """Draw a line of the list, with how many splats lie in the volume if that is known."""
-    row = layout.row(align=True)
+    """Draw a volume of the list, and below its name how many splats lie in it, if known."""
+    column = layout.column(align=True)
+    row = column.row(align=True)
     row.prop(item, "role", text="", icon_only=True)
     row.prop(item, "object", text="")
     count = counts.get(f"object '{item.object.name}'") if item.object else None
-    if count is not None:
-        row.label(text=f"{count:,}")
+    row = column.row()
+    row.label(text="" if count is None else f"{count:,} inside")
     row.operator("refine.drop_volume", text="", icon="X").index = index
 
 
@@ -235,7 +237,7 @@ class REFINE_PT_score(_InSidebar, bpy.types.Panel):
                 text = f"Score again: {', '.join(changed)}"
                 wrapped.label(layout, context, text, icon="ERROR")
         elif mesh_layout.looks_like_splats(obj) and mesh_scores.RANK in obj.data.attributes:
-            wrapped.label(layout, context, "Applied: score again for more", icon="INFO")
+            wrapped.label(layout, context, "Splats were deleted: score again", icon="INFO")
         _draw_progress(layout, context, "refine.score")
 
 

@@ -23,6 +23,7 @@ from ..core.cleaning.clean import DEFAULT_REASONS
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED
 from ..core.levels.lod import Levels
+from ..core.rendering import MODELS
 from ..core.selection import Budget
 from ..core.task import Settings
 from ..mesh import floaters
@@ -60,7 +61,7 @@ SURVIVORS = (
     (
         "auto",
         "Auto",
-        "Absorb, but unchanged where that is as good, or another method than Auto scores",
+        "Absorb, but unchanged where that is as good, or where Method, how to score, is not Auto",
     ),
     ("unchanged", "Unchanged", "They stay what they are, to the bit"),
     (
@@ -147,6 +148,17 @@ AMOUNTS: dict[str, dict[str, Any]] = {
 }
 """How much is removed, and how: properties of the panel and of *Apply*."""
 
+DRAWN = (
+    ("default", "Default", "As ordinary 3D Gaussian splats"),
+    (
+        "antialiased",
+        "Antialiased",
+        "Trained with antialiasing (Mip-Splatting, gsplat, Brush, Postshot)",
+    ),
+    ("2dgs", "2DGS", "Flat discs without a third scale"),
+)
+"""How splats are drawn, by the names of `rendering.MODELS` and in their order."""
+
 FLOATERS = (
     ("front", "In Front", "Stands in front of a surface, and cameras see past it"),
     ("isolated", "Isolated", "Is in a small cluster that touches nothing else"),
@@ -177,6 +189,23 @@ def _percent(settings: RefineSettings) -> float:
 
 def _set_percent(settings: RefineSettings, value: float) -> None:
     settings.ratio = decimal(value) / 100.0
+
+
+def _model(_settings: RefineSettings) -> int:
+    obj = getattr(bpy.context, "object", None)
+    if not mesh_layout.looks_like_splats(obj):
+        return 0
+    try:
+        return MODELS.index(mesh_layout.layout_of(obj).model)
+    except RefineError:
+        return 0
+
+
+def _set_model(_settings: RefineSettings, value: int) -> None:
+    obj = getattr(bpy.context, "object", None)
+    if mesh_layout.looks_like_splats(obj):
+        obj.data[mesh_layout.MODEL] = MODELS[value]
+        obj.data.update_tag()
 
 
 def _mark_floaters(settings: RefineSettings, context: bpy.types.Context) -> None:
@@ -250,6 +279,14 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     """Settings of the panel, at ``scene.refine``."""
 
     method: EnumProperty(name="Method", description="How splats are scored", items=METHODS)
+    model: EnumProperty(
+        name="Drawn As",
+        description="How the splats of the active object are drawn, in all of the panel and in the "
+        "exported file; by default as the imported file says",
+        items=DRAWN,
+        get=_model,
+        set=_set_model,
+    )
     views: IntProperty(**VIEWS)
     tolerance: FloatProperty(
         name="Tolerance (dB)",

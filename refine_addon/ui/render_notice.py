@@ -8,7 +8,7 @@ import time
 import bpy
 from bpy.app.handlers import persistent
 
-from ..render import copies
+from ..render import copies, out_of_sight
 from ..render.meshes import drawn_by_us
 
 NOTICE = "Splats are not in this render: use Render > Render Image with Splats"
@@ -26,12 +26,14 @@ _until: list[float] = []
 def register() -> None:
     """Say it from now on."""
     bpy.app.handlers.render_init.append(_began)
-    bpy.app.handlers.undo_post.append(_undone)
+    for listening in (bpy.app.handlers.undo_post, bpy.app.handlers.load_post):
+        listening.append(_returned)
 
 
 def unregister() -> None:
     """Undo `register`."""
-    bpy.app.handlers.undo_post.remove(_undone)
+    for listening in (bpy.app.handlers.load_post, bpy.app.handlers.undo_post):
+        listening.remove(_returned)
     bpy.app.handlers.render_init.remove(_began)
 
 
@@ -63,7 +65,8 @@ def _say() -> float | None:
 
 
 @persistent
-def _undone(*_: object) -> None:
-    """Remove what a step back has brought of a render that is over."""
+def _returned(*_: object) -> None:
+    """Remove what a step back, or a file, has brought of a render that is over."""
     if not bpy.app.is_job_running("RENDER"):
         copies.remove_all()
+        out_of_sight.restore()

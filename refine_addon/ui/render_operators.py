@@ -59,7 +59,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         """Do all of it at once."""
         self._begin(context)
         try:
-            for step in self._steps or ():
+            for step in filter(None, self._steps or ()):
                 bpy.ops.render.render(scene=step.scene, animation=step.animation)
         except Cancelled:
             return self._stopped(context)
@@ -106,11 +106,12 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         try:
             if self._escaped or self._steps is None:
                 return self._stopped(context)
-            step = next(self._steps, None)
+            step = next(self._steps)
             self._show()
-            if step is None:
-                return self._finished(context)
-            self._render(context, step)
+            if step is not None:  # else Blender may do something else for a moment
+                self._render(context, step)
+        except StopIteration:
+            return self._finished(context)
         except Cancelled:
             return self._stopped(context)
         except (*FAILURES, RuntimeError) as error:

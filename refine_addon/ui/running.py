@@ -73,7 +73,7 @@ class Running:
     doing : str
         What it does.
     escape : str
-        What Esc does.
+        What Esc does, but for the part of the work that offers something; see `at_escape`.
     job
         What was gathered from the scene.
     targets : list of Target
@@ -86,6 +86,8 @@ class Running:
         What is being done; "shown" is the main work with the sketch's result written.
     waits : str
         What has to happen before the result can be written, "" if nothing.
+    offers : str
+        See `OnThread.offers`.
     """
 
     operator: str
@@ -98,6 +100,7 @@ class Running:
     sketch: Sketch | None = None
     stage: Literal["sketch", "work", "shown"] = "work"
     waits: str = ""
+    offers: str = ""
     _said: tuple[str, float] = ("", 0.0)
     _pace: Pace = field(default_factory=_begun)
     _told: str = ""
@@ -122,6 +125,13 @@ class Running:
             self.stage, self.doing, self.escape = "shown", self.sketch.doing, self.sketch.escape
 
     @property
+    def at_escape(self) -> str:
+        """What Esc does at this moment."""
+        if self.offers and self.worker.what == self.offers and not self.waits:
+            return "keeps what that has reached"
+        return self.escape
+
+    @property
     def factor(self) -> float:
         """How much is done, 0 to 1."""
         return self.worker.fraction
@@ -138,9 +148,9 @@ class Running:
     def sentence(self) -> str:
         """What is being done, and what Esc does."""
         if self.waits:
-            return f"{self.doing}: {self.waits} (Esc {self.escape})"
+            return f"{self.doing}: {self.waits} (Esc {self.at_escape})"
         what = f" ({self.worker.what})" if self.worker.what else ""
-        return f"{self.doing}{what}; Esc {self.escape}"
+        return f"{self.doing}{what}; Esc {self.at_escape}"
 
     def say(self, text: str) -> None:
         """Say something in the status bar for `_LONG`."""
@@ -184,7 +194,7 @@ def refusal() -> str:
     running = now()
     if running is None:
         return ""
-    return f"{running.doing}: wait until it is over, or press Esc, which {running.escape}"
+    return f"{running.doing}: wait until it is over, or press Esc, which {running.at_escape}"
 
 
 def refused(event: bpy.types.Event) -> str:

@@ -150,7 +150,10 @@ def quantity(checked: SplatObject, name: str) -> Quantity:
     if name == "OPACITY":
         return Quantity(opacity(columns["opacity"]), Axis(0.0, 1.0))
     if name == "SIZE":
-        logs = np.max([columns[f"scale_{axis}"] for axis in range(3)], axis=0)
+        axes = [
+            column.name for column in checked.layout.columns if column.name.startswith("scale_")
+        ]
+        logs = np.max([columns[name] for name in axes], axis=0)
         sizes = np.exp(np.clip(logs.astype(np.float64), -80.0, 80.0))
         return Quantity(sizes, Axis.of(sizes, logarithmic=True))
     record = mesh_scores.record(checked.mesh)

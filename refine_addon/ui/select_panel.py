@@ -11,12 +11,11 @@ from bpy.props import BoolProperty, EnumProperty, FloatProperty
 
 from ..core.errors import RefineError
 from ..mesh import layout as mesh_layout
-from ..mesh import selection
 from . import price, wrapped
 from .chart import BINS, Chart, Histogram
-from .panel_cache import cached, cached_soon
+from .panel_cache import cached_soon
 from .select_operators import ACTIONS, QUANTITIES, SETS, in_range, quantity
-from .select_tools import MODES, SHAPES
+from .select_tools import MODES, SHAPES, selected_count
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -87,9 +86,9 @@ class REFINE_PT_select(bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the count, the tools, what else takes splats, and what is done with them."""
         layout, settings, obj = self.layout, context.scene.refine, context.object
-        count = cached("selected", context, lambda: selection.count(obj))
         total = mesh_layout.splat_count(obj.data)
-        layout.label(text=f"{count:,} of {total:,} selected", icon="RESTRICT_SELECT_OFF")
+        text = f"{selected_count(context):,} of {total:,} selected"
+        layout.label(text=text, icon="RESTRICT_SELECT_OFF")
         grid = layout.grid_flow(columns=3, even_columns=True, align=True)
         for shape, text, _ in SHAPES:
             grid.operator("wm.tool_set_by_id", text=text).name = f"refine.select_{shape.lower()}"

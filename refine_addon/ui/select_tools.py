@@ -12,8 +12,10 @@ import numpy as np
 from bpy.props import EnumProperty
 from gpu_extras.batch import batch_for_shader
 
+from ..mesh import selection
 from . import selecting
 from .operator_bases import FAILURES, Answer, Needing, fail, idle, on_splats
+from .panel_cache import cached
 from .selecting import How, Stroke
 
 if TYPE_CHECKING:
@@ -237,6 +239,13 @@ def _draw_settings(
     if tool.idname.endswith("color"):
         layout.prop(settings, "select_tolerance")
     layout.prop(settings, "select_hidden")
+    if not on_splats(context):
+        layout.label(text=f"{selected_count(context):,} selected")
+
+
+def selected_count(context: bpy.types.Context) -> int:
+    """Return how many splats of the active object are selected."""
+    return cached("selected", context, lambda: selection.count(context.object))
 
 
 def _draw_brush(

@@ -59,7 +59,7 @@ class Worker(Generic[Result]):
         return self._cancelled is not None
 
     def cancel(self) -> None:
-        """Ask it to stop; `result` raises `Cancelled` then."""
+        """Ask it to stop; `result` raises `Cancelled` then, unless the work offers one."""
         if self._cancelled is None:
             self._cancelled = time.monotonic()
 
@@ -92,7 +92,8 @@ class Worker(Generic[Result]):
         try:
             with checked_by(self._check):
                 result = work(self._progress)
-            self._check()  # nobody may be left to ask for the result
+            if getattr(result, "stopped", None) is None:  # see `Result.stopped`
+                self._check()  # nobody may be left to ask for the result
             self._outcome.append(result)
         except BaseException as error:  # noqa: BLE001 - handed to the other thread by `result`
             # Whoever cancels asks for no reason, and a traceback would keep what was worked on.

@@ -19,6 +19,7 @@ from ..core.splats import SH_C0, drawable, opacity, rotation_matrices, scales
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ..core.rendering import Model
     from ..core.splats import Splats
 
 WIDTH = 4096
@@ -62,6 +63,8 @@ class Packed:
     opacities : (M,) float32
     harmonics : (M, K, 3) float16
         All coefficients of red, green, blue, the constant one first.
+    model : {"default", "antialiased", "2dgs"}
+        How they are drawn.
     """
 
     vertices: NDArray[np.int32]
@@ -69,6 +72,7 @@ class Packed:
     covariances: NDArray[np.float32]
     opacities: NDArray[np.float32]
     harmonics: NDArray[np.float16]
+    model: Model = "default"
 
     def __len__(self) -> int:
         """Return how many there are."""
@@ -109,7 +113,7 @@ def pack(splats: Splats) -> Packed:
             covariances[chunk] = matrices[:, rows, columns]
         harmonics[chunk, 0], harmonics[chunk, 1:] = _half(part.sh_dc), _half(part.sh_rest)
     means = np.ascontiguousarray(splats.means[vertices], np.float32)
-    return Packed(vertices, means, covariances, opacities[vertices], harmonics)
+    return Packed(vertices, means, covariances, opacities[vertices], harmonics, splats.model)
 
 
 def most_important_first(packed: Packed, ranks: NDArray[Any] | None = None) -> NDArray[np.int32]:

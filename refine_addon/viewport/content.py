@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..core.errors import RefineError
+from ..core.rendering import MODELS
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import scores as mesh_scores
@@ -100,7 +101,8 @@ class Atlas:
     slots : mapping of (int, int) to Slot
         By the keys of `Placing`.
     means, covariances, more_covariances : GPUTexture
-        A texel a splat: place and number of the slot; xx, xy, xz, yy; yz, zz.
+        A texel a splat: place and number of the slot; xx, xy, xz, yy; yz, zz, number of the model
+        and 0.
     """
 
     slots: dict[tuple[int, int], Slot]
@@ -296,17 +298,18 @@ def _atlas(keys: list[tuple[int, int]], held: dict[int, MeshSplats]) -> Atlas:
     slots = _slots(keys, held)
     total = sum(slot.count for slot in slots.values())
     means = np.empty((total, 4), np.float32)
-    covariances = np.empty((total, 6), np.float32)
+    covariances = np.zeros((total, 8), np.float32)
     for slot in slots.values():
         rows = slice(slot.start, slot.start + slot.count)
         means[rows, :3] = slot.packed.means[: slot.count]
         means[rows, 3] = slot.number
-        covariances[rows] = slot.packed.covariances[: slot.count]
+        covariances[rows, :6] = slot.packed.covariances[: slot.count]
+        covariances[rows, 6] = MODELS.index(slot.packed.model)
     return Atlas(
         slots,
         shader.texture(as_texture(means), 4, "RGBA32F"),
         shader.texture(as_texture(covariances[:, :4]), 4, "RGBA32F"),
-        shader.texture(as_texture(covariances[:, 4:]), 2, "RG32F"),
+        shader.texture(as_texture(covariances[:, 4:]), 4, "RGBA32F"),
     )
 
 

@@ -14,7 +14,7 @@ import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 
-from ..core.rendering import ALPHA_CUT, ALPHA_MAX, LOW_PASS
+from ..core.rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS, LOW_PASS
 from .arrays import SELECTED, SELECTED_SHARE, WIDTH
 
 if TYPE_CHECKING:
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 _CONSTANTS = f"""
 #define WIDTH {WIDTH}
 #define LOW_PASS {LOW_PASS}
+#define DISC_LOW_PASS {DISC_LOW_PASS}
+#define CROSSING 1e-3
+#define THINNEST 1e-6
 #define ALPHA_MAX {ALPHA_MAX}
 #define ALPHA_CUT {ALPHA_CUT}
 #define BEYOND 0.3
@@ -39,16 +42,32 @@ struct ViewData {
 };
 """
 """size: pixels across, pixels up, near, texels of depth per pixel. choices: perspective, whether
-depth is tested, whether there are veils, whether what is behind the tested depth is drawn and not
-what is in front."""
+depth is tested, whether there are veils, whether what is before the depths of veils is left out."""
 
 _SPLAT_VERTEX = """
 #define value_at(values, row) texelFetch(values, ivec2((row) % WIDTH, (row) / WIDTH), 0)
+
+/* How the inverse of depths on the plane of a disc changes per pixel, in that of its centre. The
+ * normal is what the covariance maps to 0: any column of its adjugate. */
+vec2 tilt_of(mat3 covariance, vec3 seen, float depth, vec2 focal, vec3 x, vec3 y, vec3 z)
+{
+  mat3 unit = covariance / max(covariance[0][0] + covariance[1][1] + covariance[2][2], 1e-30);
+  vec3 first = cross(unit[1], unit[2]);
+  vec3 second = cross(unit[2], unit[0]);
+  vec3 third = cross(unit[0], unit[1]);
+  vec3 normal = dot(first, first) > dot(second, second) ? first : second;
+  normal = dot(third, third) > dot(normal, normal) ? third : normal;
+  vec3 turned = vec3(dot(cross(y, z), normal), dot(cross(z, x), normal), dot(cross(x, y), normal));
+  float facing = dot(turned.xy, seen.xy / depth) - turned.z;
+  return abs(facing) > 1e-6 * length(turned) ? turned.xy / (facing * focal) : vec2(0.0);
+}
 
 void main()
 {
   gl_Position = vec4(2.0, 2.0, 2.0, 1.0); /* Not drawn. */
   place = vec2(0.0);
+  axes = vec4(0.0);
+  plane = vec4(0.0);
   paint = vec4(0.0);
   int row = int(value_at(order, gl_InstanceID).r + 0.5);
   vec4 mean = value_at(means, row);
@@ -68,10 +87,10 @@ void main()
   paint = value_at(colors, row);
   float chosen = SELECTED_SHARE * step(0.5, value_at(selection, row).r);
   paint.rgb = mix(paint.rgb, SELECTED, chosen);
-  float reach = 2.0 * log(paint.a / ALPHA_CUT);
-  if (!(reach > 0.0)) {
+  if (paint.a <= ALPHA_CUT) {
     return;
   }
+  bool disc = lower.z > 1.5;
   vec4 clip = view_data.projection * vec4(seen, 1.0);
   vec3 ndc = clip.xyz / clip.w;
 
@@ -84,6 +103,7 @@ void main()
     vec2 middle = vec2(view_data.projection[2][0], view_data.projection[2][1]);
     vec2 most = vec2(1.0 + BEYOND);
     vec2 slope = clamp(seen.xy / depth, (middle - most) / focal, (middle + most) / focal);
+    slope = disc ? seen.xy / depth : slope;
     to_column = focal.x * scale.x / depth * (row_x.xyz + slope.x * row_z.xyz);
     to_row = focal.y * scale.y / depth * (row_y.xyz + slope.y * row_z.xyz);
   }
@@ -91,15 +111,31 @@ void main()
                     upper.y, upper.w, lower.x,
                     upper.z, lower.x, lower.y);
   vec3 along_column = shape * to_column;
-  float xx = dot(to_column, along_column) + LOW_PASS;
+  float xx = dot(to_column, along_column);
   float xy = dot(to_row, along_column);
-  float yy = dot(to_row, shape * to_row) + LOW_PASS;
+  float yy = dot(to_row, shape * to_row);
+  float sharp = max(xx * yy - xy * xy, 0.0);
+  if (!disc) {
+    xx += LOW_PASS;
+    yy += LOW_PASS;
+  }
+  if (lower.z > 0.5 && !disc) {
+    paint.a *= sqrt(sharp / (xx * yy - xy * xy));
+  }
+  float reach = 2.0 * log(paint.a / ALPHA_CUT);
+  if (!(reach > 0.0)) {
+    return;
+  }
 
   /* Its axes: eigenvectors times standard deviations. */
   float mean_square = 0.5 * (xx + yy);
   float radius = length(vec2(0.5 * (xx - yy), xy));
   float longest = mean_square + radius;
-  float shortest = (xx * yy - xy * xy) / longest;
+  float shortest = disc ? sharp / max(longest, 1e-30) : (xx * yy - xy * xy) / longest;
+  if (disc) {
+    longest = max(longest, THINNEST);
+    shortest = max(shortest, THINNEST);
+  }
   if (!(shortest > 0.0) || longest > 1e12) {
     return;
   }
@@ -107,9 +143,36 @@ void main()
   if (radius > 1e-6 * mean_square) {
     direction = xx > yy ? normalize(vec2(longest - yy, xy)) : normalize(vec2(xy, longest - xx));
   }
-  place = corner * sqrt(reach);
-  vec2 offset = place.x * sqrt(longest) * direction +
-                place.y * sqrt(shortest) * vec2(-direction.y, direction.x);
+  vec2 along = sqrt(longest) * direction;
+  vec2 beside = sqrt(shortest) * vec2(-direction.y, direction.x);
+  vec2 offset;
+  if (disc) {
+    /* The ray meets the plane of the disc: see core/seeing/projection.py, _discs. */
+    axes = vec4(along / longest, beside / shortest);
+    plane = vec4(0.0, 0.0, 1e9, 1.0);
+    if (perspective) {
+      plane.xy = tilt_of(shape, seen, depth, focal * scale, row_x.xyz, row_y.xyz, row_z.xyz);
+      plane.z = depth / view_data.size.z;
+    }
+    /* The box of its edge: see core/seeing/cast.py, _disc_extent. */
+    vec2 tilted = vec2(dot(along, plane.xy), dot(beside, plane.xy));
+    float left = 1.0 - reach * dot(tilted, tilted);
+    vec2 low = -view_data.size.xy;
+    vec2 high = view_data.size.xy;
+    if (left > CROSSING) {
+      float share = reach / left;
+      vec2 shift = tilted.x * along + tilted.y * beside;
+      vec2 edge = sqrt(share * (along * along + beside * beside + share * shift * shift));
+      vec2 least = vec2(sqrt(reach * DISC_LOW_PASS));
+      low = min(share * shift - edge, -least);
+      high = max(share * shift + edge, least);
+    }
+    offset = mix(low, high, 0.5 * corner + 0.5);
+    place = offset;
+  } else {
+    place = corner * sqrt(reach);
+    offset = place.x * along + place.y * beside;
+  }
   gl_Position = vec4(ndc.xy + offset / scale, ndc.z, 1.0);
 }
 """
@@ -117,7 +180,18 @@ void main()
 _SPLAT_FRAGMENT = """
 void main()
 {
-  float alpha = min(ALPHA_MAX, paint.a * exp(-0.5 * dot(place, place)));
+  float square = dot(place, place);
+  if (plane.w > 0.5) {
+    float nearer = 1.0 + dot(plane.xy, place);
+    vec2 hit = vec2(dot(axes.xy, place), dot(axes.zw, place)) / max(nearer, 1e-4);
+    float blob = square / DISC_LOW_PASS;
+    bool on_plane = nearer > 1e-4 && dot(hit, hit) <= blob;
+    if (on_plane && nearer > plane.z) {
+      discard;
+    }
+    square = on_plane ? dot(hit, hit) : blob;
+  }
+  float alpha = min(ALPHA_MAX, paint.a * exp(-0.5 * square));
   if (alpha < ALPHA_CUT) {
     discard;
   }
@@ -129,7 +203,13 @@ void main()
       /* Blender 5 gives meshes a depth that X-ray shows transparent. */
       occluder = abs(occluder - veil) < SAME_DEPTH ? 1.0 : occluder;
     }
-    if ((gl_FragCoord.z > occluder) != (view_data.choices.w > 0.5)) {
+    if (gl_FragCoord.z > occluder) {
+      discard;
+    }
+  }
+  if (view_data.choices.w > 0.5) {
+    ivec2 texel = ivec2(gl_FragCoord.xy * view_data.size.w);
+    if (gl_FragCoord.z <= texelFetch(veil_depths, texel, 0).r) {
       discard;
     }
   }
@@ -187,6 +267,8 @@ def splats() -> tuple[gpu.types.GPUShader, gpu.types.GPUBatch]:
     between = gpu.types.GPUStageInterfaceInfo("refine_splat")
     between.smooth("VEC2", "place")
     between.flat("VEC4", "paint")
+    between.flat("VEC4", "axes")
+    between.flat("VEC4", "plane")
     return _program(info, between, _SPLAT_VERTEX, _SPLAT_FRAGMENT)
 
 

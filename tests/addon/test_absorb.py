@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import time
+
 import bpy
 import numpy as np
 import pytest
 from mathutils import Euler, Matrix
+
+from tests.windows import event, started_in_a_window, until, until_over
 
 
 @pytest.fixture
@@ -178,3 +182,56 @@ def test_by_default_survivors_absorb_unless_the_scale_is_uneven(
     room.scale = (1.0, 1.0, 1.0)
     assert told["became"] == becomes
     assert len(room.data.vertices) == before - before * 6 // 10
+
+
+@pytest.mark.parametrize("rounds", [0, 1])
+def test_esc_while_refitting_keeps_what_that_has_reached(addon, few, monkeypatch, rounds):
+    """Absorbed, or refitted in a round: as many splats as asked for, and the sentence says which.
+
+    The bar says so beforehand; what ends the work is told by core, at once.
+    """
+    room, _ = few
+    bpy.context.scene.refine.survivors = "refit"
+    bpy.ops.refine.score()
+    done, measured = [], addon.core.refitting.round_rays.RoundRays.psnr
+    count = len(room.data.vertices)
+
+    def count_rounds(rays, *arguments):
+        psnr = measured(rays, *arguments)
+        done.append(psnr)
+        while len(done) > rounds and not addon.ui.running.now().worker.cancelled:
+            time.sleep(0.01)
+        return psnr
+
+    monkeypatch.setattr(addon.core.refitting.round_rays.RoundRays, "psnr", count_rounds)
+    operator, context, said = started_in_a_window(addon, addon.ui.operators.REFINE_OT_apply)
+    first = addon.ui.running.now().at_escape
+    until(operator, context, lambda: len(done) > rounds)
+    sentence = addon.ui.running.now().sentence
+    operator.modal(context, event("ESC"))
+    answer = until_over(operator, context)
+
+    assert first == "cancels"
+    assert sentence == "Pruning splats (refitting); Esc keeps what that has reached"
+    assert answer == {"FINISHED"}
+    assert len(room.data.vertices) == count - int(0.6 * count)
+    words = "after round 1" if rounds else "before its first round was done"
+    assert f"refitting was stopped {words}" in said
+    assert any("were refitted in" in text for text in said) == (rounds > 0)
+
+
+def test_esc_while_the_result_of_refitting_waits_changes_nothing(addon, few):
+    """In edit mode nothing can be written; whoever does not want to leave it gets nothing."""
+    room, _ = few
+    bpy.ops.refine.score()
+    count = len(room.data.vertices)
+    operator, context, said = started_in_a_window(addon, addon.ui.operators.REFINE_OT_apply)
+    bpy.ops.object.mode_set(mode="EDIT")
+    until(operator, context, lambda: addon.ui.running.now().waits)
+    operator.modal(context, event("ESC"))
+    answer = until_over(operator, context)
+    bpy.ops.object.mode_set(mode="OBJECT")
+
+    assert answer == {"CANCELLED"}
+    assert said == ["Pruning splats cancelled; nothing was changed"]
+    assert len(room.data.vertices) == count

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -20,7 +21,7 @@ def small(addon, tmp_path):
 
 
 def suffixes(addon):
-    """Return the endings of all formats."""
+    """Return the endings of all formats that are written."""
     return addon.core.formats.registry.SUFFIXES
 
 
@@ -80,8 +81,38 @@ def test_all_formats_can_be_dropped_and_picked(addon):
         for operator in (bpy.ops.refine.import_ply, bpy.ops.refine.export_ply)
     ]
 
-    assert set(handler) == {Path(f"a{suffix}").suffix for suffix in suffixes(addon)}
-    assert globs == [[f"*{suffix}" for suffix in suffixes(addon)]] * 2
+    read = addon.core.formats.registry.READ_SUFFIXES
+    assert set(handler) == {Path(f"a{suffix}").suffix for suffix in read} - {".json"}
+    assert globs == [[f"*{end}" for end in read], [f"*{end}" for end in suffixes(addon)]]
+
+
+@pytest.mark.usefixtures("addon")
+def test_a_level_of_a_streamed_sog_is_imported():
+    """76 of 151 splats and 15 of the environment, in an object of its folder's name."""
+    path = ROOM.parent / "other_tools/streamed/lod-meta.json"
+
+    bpy.ops.refine.import_ply(filepath=str(path), level=1)
+
+    assert len(bpy.context.object.data.vertices) == 76 + 15
+    assert bpy.context.object.name == "streamed"
+
+
+@pytest.mark.parametrize("name", ["a/lod-meta.json", "META.JSON", "a/transforms.json"])
+def test_a_json_file_that_is_dropped_is_one_of_splats_by_its_name(addon, monkeypatch, name):
+    """The handler of .json is that of cameras, which hands over an index of splats."""
+    cls, called = addon.ui.camera_import.REFINE_OT_import_cameras, []
+    operators = SimpleNamespace(import_ply=lambda *given, **named: called.append((given, named)))
+    monkeypatch.setattr(addon.ui.camera_import.bpy.ops, "refine", operators, raising=False)
+    properties = SimpleNamespace(filepath=name, is_property_set=lambda _: True)
+    operator = SimpleNamespace(
+        properties=properties, invoke_popup=lambda _: {"ASKED"}, upright=False
+    )
+
+    answer = cls.ask(operator, bpy.context, None)
+
+    expected = [(("INVOKE_DEFAULT",), {"filepath": name})] if "transf" not in name else []
+    assert called == expected
+    assert (answer == {"ASKED"}) == (not expected)
 
 
 def test_an_object_is_pruned_to_a_size_in_another_format(addon, small, tmp_path):

@@ -6,6 +6,7 @@ import json
 from types import SimpleNamespace
 
 import bpy
+import numpy as np
 import pytest
 
 
@@ -123,6 +124,39 @@ def test_each_step_shows_what_came_of_it(draw, room, room_cameras):  # noqa: ARG
     assert "chart" in scored
     assert "room: 19,878 splats, SH degree 3" in " ".join(applied)
     assert not [text for text in applied if text.startswith(("Keeps", "chart", "Scored"))]
+
+
+def test_after_deletion_by_hand_the_panel_asks_for_scores_and_says_why(
+    addon,
+    room,
+    room_cameras,  # noqa: ARG001
+):
+    """Nothing was applied, and the panel does not say so."""
+    bpy.ops.refine.score()
+    rows = np.arange(len(room.data.vertices))
+    addon.mesh.selection.select(room, rows < 100)
+    bpy.ops.refine.delete_selected()
+
+    drawn = []
+    panel = addon.ui.panel.REFINE_PT_score
+    panel.draw(SimpleNamespace(layout=Layout(drawn)), bpy.context)
+
+    assert "Splats were deleted: score again" in " ".join(drawn)
+    assert "Applied" not in " ".join(drawn)
+
+
+def test_a_tool_says_in_the_header_how_many_splats_it_has_selected(addon, room):
+    """The box *Select* may be closed, as it is at first; without splats nothing is counted."""
+    drawn = []
+    tools = addon.ui.select_tools
+    addon.mesh.selection.select(room, np.arange(len(room.data.vertices)) < 1234)
+    tool = SimpleNamespace(idname="refine.select_box")
+
+    tools._draw_settings(bpy.context, Layout(drawn), tool)
+    bpy.context.view_layer.objects.active = None
+    tools._draw_settings(bpy.context, Layout(drawn), tool)
+
+    assert drawn == ["select_hidden", "1,234 selected", "select_hidden"]
 
 
 def test_a_point_cloud_is_drawn_as_a_mesh_is(draw, room, room_cameras):  # noqa: ARG001

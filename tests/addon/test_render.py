@@ -84,7 +84,9 @@ def settings(scene):
         for name, kind in group.bl_rna.properties.items()
         if kind.type in {"BOOLEAN", "INT", "FLOAT", "STRING", "ENUM"} and not kind.is_readonly
     ]
-    hidden = [(obj.name, obj.hide_render) for obj in bpy.data.objects]
+    hidden = [(obj.name, obj.hide_render, obj.visible_camera) for obj in bpy.data.objects]
+    hidden += [[*obj.keys()] for obj in bpy.data.objects]
+    hidden.append([*bpy.data.materials.keys()])
     names = [scene.name for scene in bpy.data.scenes] + [world.name for world in bpy.data.worlds]
     names += [image.name for image in bpy.data.images if image.type != "RENDER_RESULT"]
     return told, hidden, [name for name in names if name != IMAGE]
@@ -141,6 +143,49 @@ def test_meshes_hide_splats_by_depth_and_alpha(shot):
     assert np.abs(apart).mean() < 0.05  # 16 rays a pixel
     assert abs(apart.mean()) < 0.01
     assert np.abs(behind - plain).max() < 0.01
+
+
+def test_splats_between_glass_and_a_wall_are_seen(addon, shot, quarter):
+    """A black pane of 30 % at .2 m, and a black wall before half of the splats.
+
+    It leaves .7 of the picture without the pane, and all of it where its alpha is 0.
+    """
+    shot.view_settings.view_transform = "Standard"
+    shot.cycles.samples = 64
+    depths = addon.objects.splat_object.gather(addon.mesh.layout.check(quarter), whole=True).means
+    view = addon.cameras.objects.view_from_camera(
+        shot.camera, shot, bpy.context.evaluated_depsgraph_get()
+    )
+    depths = (depths - view.center) @ view.rotation[2]
+    far = float(np.median(depths[depths > 0.2]))
+    plane(shot, far, (0.0, 0.0, 0.0), 1.0, width=90.0).name = "wall"
+    plain = rendered()
+    pane = plane(shot, 0.2, (0.0, 0.0, 0.0), 0.3)
+    before = settings(shot)
+    mixed = rendered()
+    pane.data.materials[0].node_tree.nodes["Mix Shader"].inputs[0].default_value = 0.0
+    clear = rendered()
+
+    apart = mixed[..., :3] - 0.7 * plain[..., :3]
+    assert plain[..., :3].mean() > 0.05
+    assert np.abs(apart).mean() < 0.03
+    assert abs(apart.mean()) < 0.01
+    assert np.abs(clear - plain).max() < 2.0 / 255.0
+    assert settings(shot) == before
+
+
+def test_what_an_undo_brings_back_of_a_render_is_put_right(addon, shot):
+    """A step that was noted while a mesh was left out, or a file saved then."""
+    shown, gone = (plane(shot, 1.0, (1.0, 1.0, 1.0), 1.0) for _ in range(2))
+    gone.visible_camera = False
+    before = settings(shot)
+    hide = addon.render.out_of_sight.out_of_sight([shown, gone])
+    hide.__enter__()
+    meanwhile = shown.visible_camera
+    addon.ui.render_notice._returned()
+
+    assert not meanwhile
+    assert settings(shot) == before
 
 
 def test_instances_are_drawn_and_what_renders_hide_is_not(addon, shot, quarter):

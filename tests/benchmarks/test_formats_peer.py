@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import subprocess
-from typing import TYPE_CHECKING
+import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +13,13 @@ from scipy.spatial import cKDTree
 
 from benchmarks.baselines import splat_transform
 from refine_addon.core import Splats, as_written, read_splats
+from refine_addon.core.formats import streamed_sog_write
+from refine_addon.core.formats.registry import format_named
+from refine_addon.core.formats.streamed_sog_write import StreamedSog, folder_for
+from refine_addon.core.rendering import MODELS
 from refine_addon.core.splats import base_color, opacity, rotation_matrices
+from tests.fuzz import version_1_of
 from tests.strategies import ply_of, splat_names
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = [
     pytest.mark.skipif(splat_transform.find() is None, reason=splat_transform.MISSING),
@@ -24,6 +27,7 @@ pytestmark = [
 ]
 
 COUNT = 700
+OTHER_TOOLS = Path(__file__).parents[1] / "data/other_tools"
 
 BOUNDS = {
     # suffix: (mean, log scale, opacity, colour, entry of the rotation matrix, harmonics)
@@ -42,9 +46,10 @@ EXACT[".splat"] = (*EXACT[".spz"][:4], 0.05, 1e-5)
 """Suffix -> largest differences between what the two read of one file: see `BOUNDS`."""
 
 
-def transformed(source: Path, target: Path, *options: str) -> None:
+def transformed(source: Path, target: Path, *options: str, before: tuple[str, ...] = ()) -> None:
     """Have splat-transform write `source` as `target`."""
-    order = [*splat_transform.find(), "-g", "cpu", "-q", "-w", str(source), *options, str(target)]
+    start = [*splat_transform.find(), "-g", "cpu", "-q", "-w", *before]
+    order = [*start, str(source), *options, str(target)]
     subprocess.run(order, check=True, timeout=300, capture_output=True)
 
 
@@ -70,7 +75,7 @@ def room(folder: Path, degree: int) -> Path:
     return folder / "in.ply"
 
 
-def compare(one: Splats, other: Splats, bounds: tuple[float, ...]) -> None:
+def compare(one: Splats, other: Splats, bounds: tuple[float, ...], count: int = COUNT) -> None:
     """Compare splats, each with the nearest."""
     apart, nearest = cKDTree(other.means).query(one.means)
     other = other.take(nearest)
@@ -83,7 +88,7 @@ def compare(one: Splats, other: Splats, bounds: tuple[float, ...]) -> None:
         one.sh_rest - other.sh_rest,
     )
 
-    assert len(np.unique(nearest)) == len(one) == COUNT
+    assert len(np.unique(nearest)) == len(one) == count
     for difference, bound in zip(differences, bounds, strict=True):
         assert np.abs(difference).max(initial=0.0) <= bound
 
@@ -135,6 +140,73 @@ def test_we_read_both_versions_of_spz_that_it_writes(tmp_path, version):
 
     assert file.format == f"SPZ version {version}"
     compare(file.splats(), read_splats(source).splats(), BOUNDS[".spz"])
+
+
+@pytest.mark.parametrize("name", ["level_0", "level_1", "level_2", "degree_1"])
+def test_of_a_ksplat_both_read_the_same(tmp_path, name):
+    """Files of the reference converter; it leaves rotations of float16 as long as they are."""
+    made, back = OTHER_TOOLS / f"{name}.ksplat", tmp_path / "back.ply"
+    transformed(made, back)
+
+    compare(read_splats(made).splats(), read_splats(back).splats(), (1e-6,) * 6, 151)
+
+
+def test_of_a_sog_in_a_folder_both_read_the_same(tmp_path):
+    """What splat-transform writes as `meta.json` and images beside it."""
+    made, back = tmp_path / "sog/meta.json", tmp_path / "back.ply"
+    transformed(room(tmp_path, 3), made)
+    transformed(made, back)
+
+    compare(read_splats(made).splats(), read_splats(back).splats(), EXACT[".sog"])
+
+
+def test_of_a_sog_of_version_1_both_read_the_same(tmp_path):
+    """Made of one of version 2 by putting ends in place of tables: no tool at hand writes it."""
+    source = room(tmp_path, 1)
+    as_written(read_splats(source), tmp_path / "a.sog").write(tmp_path / "a.sog")
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        files = version_1_of({name: archive.read(name) for name in archive.namelist()})
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    transformed(tmp_path / "meta.json", tmp_path / "back.ply")
+
+    ours = read_splats(tmp_path / "meta.json")
+
+    assert ours.format == "SOG version 1"
+    compare(ours.splats(), read_splats(tmp_path / "back.ply").splats(), EXACT[".sog"])
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_of_a_streamed_sog_of_ours_it_reads_every_level(tmp_path, level, monkeypatch):
+    """Its splats are the source's and those that we read, in chunks of 100 or less."""
+    monkeypatch.setattr(streamed_sog_write, "UNIT", 100)
+    splats = read_splats(room(tmp_path, 3)).splats()
+    levels = [splats, splats.take(slice(0, None, 2)), splats.take(slice(0, None, 9))]
+    path, back = tmp_path / "lod-meta.json", tmp_path / "back.ply"
+    with folder_for(path, overwrite=False) as made:
+        scene = StreamedSog(splats.means, 2.0, made)
+        for each in levels:
+            scene.add(each)
+        scene.publish(path, overwrite=False)
+    transformed(path, back, before=("-L", str(level)))
+
+    theirs, count = read_splats(back).splats(), len(levels[level])
+
+    compare(theirs, levels[level], BOUNDS[".sog"], count)
+    compare(theirs, read_splats(path, level=level).splats(), EXACT[".sog"], count)
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_of_a_streamed_sog_of_its_own_both_read_the_same(tmp_path, level):
+    """But for the environment, which it leaves out of a single level."""
+    path, back = OTHER_TOOLS / "streamed/lod-meta.json", tmp_path / "back.ply"
+    transformed(path, back, before=("-L", str(level)))
+
+    theirs, count = read_splats(back).splats(), (151, 76)[level]
+
+    ours = read_splats(path, level=level).splats()
+    assert len(ours) == count + 15
+    compare(theirs, ours.take(slice(count)), EXACT[".sog"], count)
 
 
 def test_we_read_the_glb_that_it_writes(tmp_path):
@@ -207,3 +279,43 @@ def test_the_validator_of_khronos_finds_no_fault_in_our_glb(tmp_path):
     names = "/meshes/0/primitives/0/attributes/KHR_gaussian_splatting:"
     assert {issue["code"] for issue in faults} == {"MESH_PRIMITIVE_INVALID_ATTRIBUTE"}
     assert all(issue["pointer"].startswith(names) for issue in faults)
+
+
+@pytest.mark.parametrize("suffix", [".ply", *BOUNDS])
+@pytest.mark.parametrize("model", MODELS)
+def test_what_is_said_of_how_splats_are_drawn_survives_both(tmp_path, suffix, model):
+    """PLY, a format by us, PLY by splat-transform; and a format by it, PLY by us.
+
+    Where the format holds the tag; else the splats count as ordinary ones.
+    """
+    source = read_splats(room(tmp_path, 0), model)
+    form = format_named(tmp_path / f"x{suffix}")
+    held = form is None or model in form.models
+    ours, theirs = tmp_path / f"ours{suffix}", tmp_path / f"theirs{suffix}"
+    source.write(tmp_path / "tagged.ply")
+    as_written(source, ours).write(ours)
+
+    transformed(ours, tmp_path / "back.ply")
+    transformed(tmp_path / "tagged.ply", theirs)
+
+    expected = model if held else "default"
+    assert read_splats(tmp_path / "back.ply").model == expected
+    assert read_splats(theirs).model == expected
+
+
+def test_discs_without_a_third_scale_pass_through_splat_transform(tmp_path):
+    """They come back without it, and with the two that they have."""
+    columns = {name: values for name, values in columns_of(room(tmp_path, 0)) if name != "scale_2"}
+    (tmp_path / "discs.ply").write_bytes(ply_of(columns))
+
+    transformed(tmp_path / "discs.ply", tmp_path / "back.ply")
+
+    back = read_splats(tmp_path / "back.ply")
+    assert "scale_2" not in (back.rows.dtype.names or ())
+    np.testing.assert_allclose(back.rows["scale_1"], columns["scale_1"], rtol=1e-5)
+
+
+def columns_of(path: Path) -> list[tuple[str, np.ndarray]]:
+    """Return the properties of a file by their names."""
+    rows = read_splats(path).rows
+    return [(name, rows[name]) for name in rows.dtype.names or ()]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from refine_addon.core import Cleaning, RefineError, Splats, View, ViewSet, clea
 from refine_addon.core.cleaning.clusters import connected
 from refine_addon.core.cleaning.search import agreed
 from refine_addon.core.cleaning.support import Evidence
+from refine_addon.core.splats import ARRAYS
 
 SIDE = 24
 """Splats along each side of the wall."""
@@ -32,7 +33,7 @@ def made(means, scale, opacity, color):
 
 def joined(*parts):
     """Return all splats of some sets."""
-    names = [item.name for item in fields(Splats)]
+    names = ARRAYS
     return Splats(**{name: np.concatenate([getattr(s, name) for s in parts]) for name in names})
 
 

@@ -182,6 +182,7 @@ def test_info_says_what_is_in_a_file(folder, capsys):
         "bytes": len(header) + 192,
         "bytes_per_splat": 96,
         "format": "binary_little_endian 1.0",
+        "model": "default",
         "extent_low": [-1.0, 0.0, 0.0],
         "extent_high": [2.0, 0.0, 0.0],
         "non_finite_rows": 1,

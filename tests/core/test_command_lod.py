@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
-import os
-from pathlib import Path
 
+import numpy as np
 import pytest
 
 from refine_addon.command import main
@@ -35,15 +33,15 @@ def test_lod_writes_levels_and_says_what_each_costs(files, capsys):  # noqa: F81
     assert "scene.lod1.splat: 289 splats" in said
     assert len(read_splats(out / "scene.lod2.splat")) == 58
     result = json.loads(told.read_text())["results"][0]
-    assert result["levels"] == json.loads((out / "lod.json").read_text())["levels"]
+    assert [entry["splats"] for entry in result["levels"]] == [289, 58]
 
 
 @pytest.mark.slow
 def test_by_default_survivors_absorb_and_four_levels_are_made(files):  # noqa: F811
     """Halves of halves, about: 289, 145, 70 and 35 of 577, rounded up."""
     assert call(files, "lod", "-o", str(files / "out"), "--views", "2", "--quiet") == 0
-    told = json.loads((files / "out/lod.json").read_text())
-    assert [entry["splats"] for entry in told["levels"]] == [289, 145, 70, 35]
+    made = [len(read_splats(files / f"out/scene.lod{number}.ply")) for number in range(1, 5)]
+    assert made == [289, 145, 70, 35]
     source = {row.tobytes() for row in read_splats(files / "scene.ply").rows}
     rows = read_splats(files / "out/scene.lod4.ply").rows
     assert any(row.tobytes() not in source for row in rows)
@@ -74,31 +72,14 @@ def test_a_folder_for_the_files_is_required(files, capsys):  # noqa: F811
     assert "--output-dir" in capsys.readouterr().err
 
 
-def test_what_is_no_manifest_is_not_replaced(files, capsys):  # noqa: F811
-    """Not even with --overwrite."""
-    (files / "lod.json").write_text('{"my": "notes"}')
-
-    assert call(files, "lod", "-o", str(files), "--overwrite", *QUICK) == 2
-    assert "lod.json exists and lists no levels" in capsys.readouterr().err
-    assert (files / "lod.json").read_text() == '{"my": "notes"}'
-
-
 def test_files_that_exist_are_replaced_when_told_alone(files, capsys):  # noqa: F811
-    """The second run fails on the first level, the third replaces both and the manifest."""
+    """The second run fails on the first level, the third replaces both."""
     run = ["lod", "--levels", ".5,.1", "-o", str(files / "out"), *QUICK]
     assert call(files, *run) == 0
 
     assert call(files, *run) == 1
     assert "scene.lod1.ply: exists already" in capsys.readouterr().err
     assert call(files, *run, "--overwrite") == 0
-
-
-def test_a_report_cannot_take_the_place_of_the_manifest(files, capsys):  # noqa: F811
-    """It would replace what the run writes."""
-    told = str(files / "out/lod.json")
-
-    assert call(files, "lod", "-o", str(files / "out"), "--report", told, *QUICK) == 2
-    assert "a file of its own" in capsys.readouterr().err
 
 
 def test_ctrl_c_leaves_nothing(files, monkeypatch, capsys):  # noqa: F811
@@ -139,12 +120,11 @@ def test_levels_that_would_be_equal_are_made_once(files, capsys):  # noqa: F811
     assert "2 levels of 577" in said
     assert "note: no level for 0.999: it would be a copy of the input" in said
     assert "note: no level for 0.0019: it would be a copy of level 2" in said
-    told = json.loads((files / "out/lod.json").read_text())["levels"]
-    assert [(entry["level"], entry["asked"], entry["splats"]) for entry in told] == [
-        (1, 0.5, 289),
-        (2, 0.002, 2),
+    made = sorted((files / "out").iterdir())
+    assert [(path.name, len(read_splats(path))) for path in made] == [
+        ("scene.lod1.ply", 289),
+        ("scene.lod2.ply", 2),
     ]
-    assert len(list((files / "out").iterdir())) == 3
 
 
 def test_a_psnr_that_lets_nothing_go_makes_no_level(files, capsys):  # noqa: F811
@@ -160,28 +140,6 @@ def test_a_psnr_that_lets_nothing_go_makes_no_level(files, capsys):  # noqa: F81
     assert "note: level 1: the estimate ends at 95% removed" in said
 
 
-def test_files_that_the_new_manifest_does_not_name_go(files, capsys):  # noqa: F811
-    """Those of the run before alone; neither the source nor what is no level."""
-    out = files / "out"
-    run = ["lod", "-o", str(out), "--overwrite", *QUICK]
-    assert call(files, *run, "--levels", ".5,.3,.1") == 0
-    (out / "scene.lod9.ply").write_text("mine")
-    (files / "outside.lod3.ply").write_text("mine")
-    (out / "notes.txt").write_text("mine")
-    told = json.loads((out / "lod.json").read_text())
-    names = ["scene.lod3.ply", "../outside.lod3.ply", "notes.txt", "gone.lod1.ply"]
-    told["levels"] = [{"file": name} for name in names]
-    (out / "lod.json").write_text(json.dumps(told))
-    capsys.readouterr()
-
-    assert call(files, *run, "--levels", ".5,.3") == 0
-
-    assert "note: scene.lod3.ply of the run before is removed" in capsys.readouterr().out
-    left = ["lod.json", "notes.txt", "scene.lod1.ply", "scene.lod2.ply", "scene.lod9.ply"]
-    assert sorted(path.name for path in out.iterdir()) == left
-    assert (files / "outside.lod3.ply").exists()
-
-
 def test_levels_with_names_that_are_too_long_leave_no_empty_folder(files, capsys):  # noqa: F811
     """The source's 251 bytes and .lod1 are 256; neither the folder nor the one above it is left."""
     long = files / f"{'x' * 247}.ply"
@@ -194,20 +152,8 @@ def test_levels_with_names_that_are_too_long_leave_no_empty_folder(files, capsys
     assert not (files / "a").exists()
 
 
-@pytest.mark.parametrize("told", ["[" * 100_000, "}", '{"file": 1}', "[{}]"])
-def test_a_manifest_that_cannot_be_read_names_no_files(files, told):  # noqa: F811
-    """It is replaced; brackets within brackets are more than the parser of JSON follows."""
-    out = files / "out"
-    out.mkdir()
-    (out / "lod.json").write_text('{"lod": 1, "levels": ' + told)
-
-    assert call(files, "lod", "-o", str(out), "--overwrite", *QUICK) == 0
-
-    assert json.loads((out / "lod.json").read_text())["lod"] == 1
-
-
 def test_a_level_can_be_the_source_of_a_new_run(files):  # noqa: F811
-    """It is in the folder, and the manifest before names it: it stays."""
+    """It is in the folder: it stays."""
     out = files / "out"
     assert call(files, "lod", "-o", str(out), "--levels", ".5", *QUICK) == 0
     source, cameras = str(out / "scene.lod1.ply"), ["--cameras", str(files)]
@@ -233,29 +179,6 @@ def test_a_run_that_stops_before_its_first_level_leaves_the_run_before(files, mo
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
 
 
-@pytest.mark.parametrize("stop", ["scene.lod1.ply", "scene.lod2.ply", "lod.json"])
-def test_no_manifest_names_a_file_that_is_not_there(files, monkeypatch, stop):  # noqa: F811
-    """Killed at any file: what the manifest names, if there is one, is there."""
-    out = files / "out"
-    assert call(files, "lod", "-o", str(out), "--levels", ".5,.3,.1", *QUICK) == 0
-    replace = Path.replace
-
-    def killed(self, target):
-        if Path(target).name == stop:
-            os._exit(9)  # without any clean-up
-        return replace(self, target)
-
-    monkeypatch.setattr(Path, "replace", killed)
-    process = multiprocessing.get_context("fork").Process(
-        target=call, args=(files, "lod", "-o", str(out), "--overwrite", "--levels", ".5,.3", *QUICK)
-    )
-    process.start()
-    process.join()
-
-    assert process.exitcode == 9
-    assert not (out / "lod.json").exists()
-
-
 def test_levels_that_are_one_file_by_a_link_are_refused(files, capsys):  # noqa: F811
     out = files / "out"
     out.mkdir()
@@ -265,17 +188,110 @@ def test_levels_that_are_one_file_by_a_link_are_refused(files, capsys):  # noqa:
     assert "by a link" in capsys.readouterr().err
 
 
-def test_a_killed_run_leaves_no_level_that_no_list_names(files, monkeypatch):  # noqa: F811
-    """Five levels before, two now: the other three go with the list, before a level is written."""
-    out = files / "out"
-    assert call(files, "lod", "-o", str(out), "--levels", ".5,.4,.3,.2,.1", *QUICK) == 0
+def test_more_levels_of_a_run_before_are_named(files, capsys):  # noqa: F811
+    """No list says whose they are, so they stay."""
+    run = ["lod", "-o", str(files / "out"), "--overwrite", *QUICK]
+    assert call(files, *run, "--levels", ".5,.3,.1") == 0
 
-    def killed(*_, **__):
-        raise ZeroDivisionError
+    assert call(files, *run, "--levels", ".5,.3") == 0
 
-    monkeypatch.setattr(levels_files, "_write", killed)
+    assert "note: scene.lod3.ply is of another run" in capsys.readouterr().out
+    assert len(list((files / "out").iterdir())) == 3
 
-    with pytest.raises(ZeroDivisionError):
-        call(files, "lod", "-o", str(out), "--levels", ".5,.1", "--overwrite", *QUICK)
 
-    assert sorted(path.name for path in out.iterdir()) == ["scene.lod1.ply", "scene.lod2.ply"]
+@pytest.fixture
+def streamed(files):  # noqa: F811
+    """Return the index of a streamed SOG to be made, and the command that makes it."""
+    pytest.importorskip("PIL", reason="needs Pillow, which SOG does outside of Blender")
+    path = files / "web/lod-meta.json"
+    return path, ["lod", "--levels", ".5,.1", "-o", str(path), *QUICK]
+
+
+def test_a_streamed_sog_has_all_levels_and_the_source(files, streamed, capsys):  # noqa: F811
+    """577 splats as level 0, 289 and 58; positions to 16 bits, of the levels that files have."""
+    path, run = streamed
+    assert call(files, "lod", "--levels", ".5,.1", "-o", str(files / "out"), *QUICK) == 0
+
+    assert call(files, *run) == 0
+
+    sources = [files / "scene.ply", *sorted((files / "out").iterdir())]
+    for level, source in enumerate(sources):
+        splats, wanted = read_splats(path, level=level).splats(), read_splats(source).splats()
+        assert len(splats) == len(wanted) == (577, 289, 58)[level]
+        near = np.linalg.norm(splats.means[:, None] - wanted.means, axis=2)
+        assert max(near.min(axis=0).max(), near.min(axis=1).max()) < 1e-3
+    said = capsys.readouterr().out
+    assert "2 levels of 577 splats, by 2 of 6 views, " in said
+    assert "  1_*/meta.json: 289 splats, " in said
+    assert "note: .sog holds positions in 16 bits" in said
+
+
+def test_a_streamed_sog_is_replaced_when_told_alone(files, streamed, capsys):  # noqa: F811
+    """As a file is; nothing is left of what the run before had more."""
+    path, run = streamed
+    assert call(files, *run) == 0
+    assert call(files, *run) == 1
+    assert "lod-meta.json: exists already" in capsys.readouterr().err
+
+    assert call(files, *run, "--overwrite", "--levels", ".3") == 0
+
+    names = sorted(entry.name for entry in path.parent.iterdir())
+    assert names == ["0_0", "1_0", "lod-meta.json"]
+    assert len(read_splats(path, level=1)) == 174
+
+
+def test_what_must_go_is_in_no_level_of_a_streamed_sog(files, streamed):  # noqa: F811
+    """Nor in level 0: a viewer shows that, too."""
+    path, run = streamed
+    box = "box:-1,-1,0,1,1,99"
+    everything = read_splats(files / "scene.ply").splats().means
+    inside = (np.abs(everything[:, :2]) < 1).all(axis=1)
+
+    assert call(files, *run, "--remove-inside", box) == 0
+
+    assert len(read_splats(path)) == 577 - inside.sum() < 577
+
+
+def test_a_streamed_sog_that_is_stopped_leaves_nothing(files, streamed, monkeypatch):  # noqa: F811
+    """Neither of a new one, nor of one to be replaced, which stays as it was."""
+    path, run = streamed
+    made, stops = levels_files.each_level, [True]
+
+    def interrupted(*given, **named):
+        for level in made(*given, **named):
+            if level.number == 2 and stops:
+                raise KeyboardInterrupt
+            yield level
+
+    monkeypatch.setattr(levels_files, "each_level", interrupted)
+    assert call(files, *run) == 130
+    assert not path.parent.exists()
+    stops.clear()
+    assert call(files, *run) == 0
+    before = {entry: entry.read_bytes() for entry in path.parent.rglob("*") if entry.is_file()}
+    stops.append(True)
+
+    assert call(files, *run, "--overwrite") == 130
+
+    after = {entry: entry.read_bytes() for entry in path.parent.rglob("*") if entry.is_file()}
+    assert after == before
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--format", ".spz"], "--format goes with a folder, not with lod-meta.json"),
+        (["--report", "web/lod-meta.json"], "expected a file of its own"),
+    ],
+)
+def test_wrong_usage_of_a_streamed_sog_ends_before_any_work(
+    streamed, capsys, monkeypatch, options, word
+):
+    """Code 2, and no folder."""
+    path, run = streamed
+    monkeypatch.chdir(path.parents[1])
+
+    assert call(path.parents[1], *run, *options) == 2
+
+    assert word in capsys.readouterr().err
+    assert not path.parent.exists()

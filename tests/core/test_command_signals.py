@@ -105,6 +105,34 @@ def test_ctrl_c_at_any_moment_is_code_130_and_one_line(folder, moment):
     assert outputs(folder) == []
 
 
+def test_ctrl_c_while_refitting_writes_what_that_has_reached(folder):
+    """As many splats as asked for, in a whole file; the command ends all the same.
+
+    The signal comes in the first round: survivors have absorbed by then.
+    """
+    words = [*PRUNE[:6], "--survivors", "refit", "--views", "8", "--keep", "100"]
+
+    with start("-c", CALLED, "solve", *words) as process:
+        said = process.communicate(timeout=SECONDS)
+
+    told = b"refine: error: cancelled; refitting was stopped before its first round was done; "
+    told += b"out.ply is written with what that had reached; nothing was left half-written\n"
+    assert (process.returncode, *said) == (130, b"", told)
+    assert outputs(folder) == ["out.ply"]
+    assert len(read_ply(folder / "out.ply")) == 100
+
+
+def test_ctrl_c_while_refitting_writes_nothing_in_a_dry_run(folder):
+    words = [*PRUNE[:4], "--survivors", "refit", "--views", "8", "--dry-run"]
+
+    with start("-c", CALLED, "solve", *words) as process:
+        said = process.communicate(timeout=SECONDS)
+
+    assert process.returncode == 130
+    assert b"written with" not in said[1]
+    assert outputs(folder) == []
+
+
 COUNTED = """
 import os, runpy, signal, sys
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import RefineError
-from refine_addon.core.drawing import Layer, draw, seen_from
+from refine_addon.core.drawing import draw, in_order, seen_from
 from refine_addon.core.exr import read_exr
 
 from .test_pictures import crowd, splats_of, view_of
@@ -20,7 +20,7 @@ RED, GREEN, BLUE = np.eye(3)
 def layer_of(color, alpha, depth, size=9):
     """Return a layer that is the same in all pixels."""
     plane = np.ones((size, size))
-    return Layer(alpha * color[:, None, None] * plane, alpha * plane, depth * plane)
+    return in_order([(alpha * color[:, None, None] * plane, alpha * plane, depth * plane)])
 
 
 def two_splats():
@@ -49,6 +49,38 @@ def test_a_layer_hides_what_is_behind_it_by_its_alpha(alpha, depth, expected):
     assert np.abs(picture[:, 4, 4] - expected).max() < 2e-3  # a splat is not quite flat
 
 
+@pytest.mark.parametrize("first", [0, 1])
+def test_splats_between_two_layers_are_seen_through_the_nearer_one(first):
+    """Front to back: blue glass of .4, a red splat of .8, a white wall that hides the green one.
+
+    .4 blue; .6 of the red splat's .8; .6 * .2 of the wall. Which layer is given first is all one.
+    """
+    plane = np.ones((9, 9))
+    glass = 0.4 * BLUE[:, None, None] * plane, 0.4 * plane, plane
+    wall = np.ones((3, 9, 9)), plane, 3.0 * plane
+    layers = in_order([(glass, wall)[first], (glass, wall)[1 - first]])
+
+    picture = draw(two_splats(), view_of(9, 9), layers)
+
+    assert np.abs(picture[:, 4, 4] - [0.6, 0.12, 0.52, 1.0]).max() < 2e-3
+    over = np.asarray([0.6, 0.6, 1.0])
+    assert np.abs(layers.over_nothing()[:, 4, 4] - over).max() < 1e-12
+
+
+def test_splats_between_two_panes_are_mixed_with_the_nearer_one_alone():
+    """Panes of .5 at depths 1 and 3, a splat of .8 at 2, one of .5 at 4: .5 * .8 red, and green.
+
+    Green: .5 * .2 of what is behind the red splat, * .5 * .5 behind the second pane.
+    """
+    plane = np.ones((9, 9))
+    panes = [(np.zeros((3, 9, 9)), 0.5 * plane, depth * plane) for depth in (1.0, 3.0)]
+
+    picture = draw(two_splats(), view_of(9, 9), in_order(panes))
+
+    left = 0.5 * 0.2 * 0.5 * 0.5
+    assert np.abs(picture[:, 4, 4] - [0.4, 0.5 * 0.2 * 0.5 * 0.5, 0.0, 1.0 - left]).max() < 2e-3
+
+
 def test_the_background_shows_through_splats_and_counts_for_no_alpha():
     """Of .6 that a layer of alpha .4 lets through, splats leave .1, wherever the layer stands."""
     for depth in (1.0, 3.0, 5.0):
@@ -64,11 +96,12 @@ def test_a_layer_behind_all_splats_is_the_picture_over_it():
     view = view_of(60, 40, near=0.5)
     plain = draw(crowd(), view)
     rng = np.random.default_rng(3)
-    behind = Layer(rng.random((3, 40, 60)), np.ones((40, 60)), np.full((40, 60), 1e4))
+    colors, opaque = rng.random((3, 40, 60)), np.ones((40, 60))
+    behind = in_order([(colors, opaque, 1e4 * opaque)])
 
     picture = draw(crowd(), view, behind)
 
-    expected = plain[:3] + (1.0 - plain[3]) * behind.colors
+    expected = plain[:3] + (1.0 - plain[3]) * colors
     assert np.abs(picture[:3] - expected).max() < 1e-9
     assert (picture[3] == 1.0).all()
 
@@ -77,7 +110,8 @@ def test_a_picture_cut_in_depth_is_that_of_the_splats_on_each_side():
     """An opaque layer at depth 3 over black: as if only nearer splats were there."""
     splats, view = crowd(), view_of(60, 40, near=0.5)
     near = splats.take(splats.means[:, 2] < 3.0)
-    layer = Layer(np.zeros((3, 40, 60)), np.ones((40, 60)), np.full((40, 60), 3.0))
+    opaque = np.ones((40, 60))
+    layer = in_order([(np.zeros((3, 40, 60)), opaque, 3.0 * opaque)])
 
     assert np.abs(draw(splats, view, layer)[:3] - draw(near, view)[:3]).max() < 1e-5
 

@@ -18,7 +18,6 @@ POINTER = (
 )
 SPZ = struct.pack("<4sIIBBBB", b"NGSP", 3, 1, 0, 12, 0, 0) + bytes(20)
 READ = "'refine convert IN OUT.ply' makes a plain 3DGS PLY of it"
-CONVERT = "convert it to a plain 3DGS PLY first (SuperSplat and splat-transform do)"
 
 
 def zipped(*names: str) -> bytes:
@@ -36,7 +35,7 @@ FOREIGN = {
     "splat": ("in.splat", bytes(64), f"a .splat file: {READ}"),
     "splat in capitals": ("IN.SPLAT", bytes(64), f"a .splat file: {READ}"),
     "splat that starts like gzip": ("in.splat", b"\x1f\x8b" + bytes(62), "a .splat file"),
-    "ksplat": ("in.ksplat", bytes(4096), f"a .ksplat file: {CONVERT}"),
+    "ksplat": ("in.ksplat", bytes(4096), f"a .ksplat file: {READ}"),
     "spz": ("in.spz", gzip.compress(SPZ), f"an SPZ file: {READ}"),
     "spz, whatever its name": ("in.ply", gzip.compress(SPZ), f"an SPZ file: {READ}"),
     "spz without compression around it": ("in.spz", SPZ, f"an SPZ file: {READ}"),

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +33,7 @@ from refine_addon.core.formats.ply import SplatFile
 from refine_addon.core.levels import distance
 from refine_addon.core.levels.distance import OriginalPictures
 from refine_addon.core.pipeline import absorb_splats
+from refine_addon.core.splats import ARRAYS
 
 from .test_cleaning import cameras, wall
 
@@ -50,7 +50,7 @@ def colourful():
 
 def equal(one, other):
     """Say whether two sets of splats are the same to the bit."""
-    pairs = ((getattr(one, item.name), getattr(other, item.name)) for item in fields(Splats))
+    pairs = ((getattr(one, item), getattr(other, item)) for item in ARRAYS)
     return all(np.array_equal(a, b) for a, b in pairs)
 
 
@@ -127,7 +127,7 @@ def test_each_level_is_absorbed_from_the_one_before():
 
 def joined_in_double(splats):
     """Return splats in float64, which holds float32 exactly."""
-    return Splats(**{f.name: getattr(splats, f.name).astype(np.float64) for f in fields(Splats)})
+    return Splats(**{f: getattr(splats, f).astype(np.float64) for f in ARRAYS})
 
 
 @pytest.mark.slow
@@ -289,20 +289,17 @@ def test_where_the_views_see_too_little_no_distance_is_said():
     assert reach.within(10.0) is None
 
 
-def test_files_of_levels_and_a_manifest_are_written(tmp_path):
-    """The bytes of kept rows are the source's; the manifest says what the report says."""
+def test_files_of_levels_are_written(tmp_path):
+    """The bytes of kept rows are the source's."""
     source = file_of(colourful(), tmp_path / "a.ply")
     out = tmp_path / "out"
 
     done = lod_file(source, out, LevelsRequest(cameras(2), DELETED, QUICK))
 
-    assert sorted(path.name for path in out.iterdir()) == ["a.lod1.ply", "a.lod2.ply", "lod.json"]
-    told = json.loads((out / "lod.json").read_text())
-    assert {name: done[name] for name in told} == told
-    assert next(iter(told)) == "lod"
-    assert told["nested"] is True
-    assert [entry["splats"] for entry in told["levels"]] == [288, 144]
-    for entry in told["levels"]:
+    assert sorted(path.name for path in out.iterdir()) == ["a.lod1.ply", "a.lod2.ply"]
+    assert done["nested"] is True
+    assert [entry["splats"] for entry in done["levels"]] == [288, 144]
+    for entry in done["levels"]:
         assert (out / entry["file"]).stat().st_size == entry["bytes"]
     rows = read_ply(source).rows
     wanted = prune(colourful(), cameras(2), Budget(ratio=0.75), QUICK).keep
@@ -337,7 +334,7 @@ def test_levels_are_written_in_any_format(tmp_path, suffix):
     assert any(suffix in note for note in done["notes"])
 
 
-@pytest.mark.parametrize("name", ["a.lod2.ply", "lod.json"])
+@pytest.mark.parametrize("name", ["a.lod1.ply", "a.lod2.ply"])
 def test_no_file_is_replaced_unless_told(tmp_path, name):
     """Said before any work, and nothing else is written."""
     source = file_of(colourful(), tmp_path / "a.ply")
@@ -374,20 +371,6 @@ def test_levels_that_were_written_go_where_a_later_one_fails(tmp_path, monkeypat
         lod_file(source, tmp_path / "out", LevelsRequest(cameras(2), DELETED, QUICK))
 
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
-
-
-@pytest.mark.slow
-def test_no_manifest_lists_levels_of_two_runs(tmp_path, monkeypatch):
-    """Where replacing fails at the second level, the first is replaced and the manifest is gone."""
-    source = file_of(colourful(), tmp_path / "a.ply")
-    lod_file(source, tmp_path, LevelsRequest(cameras(2), DELETED, QUICK))
-    failing_second(monkeypatch, RefineError("no space"))
-
-    with pytest.raises(RefineError):
-        lod_file(source, tmp_path, LevelsRequest(cameras(2), DELETED, QUICK, overwrite=True))
-
-    names = sorted(path.name for path in tmp_path.iterdir())
-    assert names == ["a.lod1.ply", "a.lod2.ply", "a.ply"]
 
 
 @pytest.mark.parametrize("goal", [0.0, 100.0, math.nan])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import mpmath
 import numpy as np
@@ -29,7 +29,7 @@ from refine_addon.core.absorbing import merge_field, merge_graph
 from refine_addon.core.pipeline import absorb_removed
 from refine_addon.core.scoring.adaptive import Statistics, lambdas
 from refine_addon.core.seeing import points, projection
-from refine_addon.core.splats import drawable, opacity
+from refine_addon.core.splats import ARRAYS, drawable, opacity
 
 FINITE = [
     *(0.0, -0.0, 1.0, -1.0, 1e-45, 1e-38, -1e-30, 1e-3, 88.0, -88.0, 100.0, -100.0),
@@ -123,7 +123,7 @@ def with_first(name: str, value: object, kind: type = np.float32) -> Splats:
 
 @pytest.mark.slow
 @by_method_and_reading
-@pytest.mark.parametrize("name", [item.name for item in fields(Splats)])
+@pytest.mark.parametrize("name", ARRAYS)
 def test_one_extreme_splat_spoils_neither_itself_nor_the_others(name, settings):
     """Any attribute, any value, floats and doubles."""
     for value, kind in [(v, np.float32) for v in EXTREME] + [(v, np.float64) for v in DOUBLES]:
@@ -140,11 +140,11 @@ def test_one_extreme_splat_spoils_neither_itself_nor_the_others(name, settings):
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_a_property_that_is_not_finite_makes_its_splat_the_lowest(value, settings):
     """Every property in turn; opacity 1 (logit +inf) and a flat splat (log scale -inf) are fine."""
-    for item in fields(Splats):
-        for column in np.ndindex(getattr(cloud(), item.name).shape[1:]):
+    for item in ARRAYS:
+        for column in np.ndindex(getattr(cloud(), item).shape[1:]):
             splats = cloud()
-            getattr(splats, item.name)[(0, *column)] = value
-            fine = (item.name, value) in (("opacity_logits", math.inf), ("log_scales", -math.inf))
+            getattr(splats, item)[(0, *column)] = value
+            fine = (item, value) in (("opacity_logits", math.inf), ("log_scales", -math.inf))
 
             scores = scored(splats, settings=settings)
 
@@ -433,7 +433,7 @@ def test_the_weight_of_geometry_has_no_jump_where_its_logarithm_crosses_zero(ste
 def drawn(data, count: int = 4) -> Splats:
     """Return splats of which every number is drawn from the extremes."""
     value = st.sampled_from(EXTREME + DOUBLES) | st.floats(width=32)
-    sizes = {item.name: getattr(cloud(count), item.name).shape for item in fields(Splats)}
+    sizes = {item: getattr(cloud(count), item).shape for item in ARRAYS}
     arrays = {}
     for name, shape in sizes.items():
         size = math.prod(shape)
@@ -485,10 +485,10 @@ def check_absorbed(splats, result, count):
     assert ((alphas > 0) & (alphas < 1)).all()
     logs = result.splats.log_scales[result.changed]
     assert np.isfinite(logs).all()  # every axis of a covariance is positive
-    for item in fields(Splats):
+    for item in ARRAYS:
         np.testing.assert_array_equal(
-            getattr(result.splats, item.name)[~result.changed],
-            getattr(splats, item.name)[result.keep][~result.changed],
+            getattr(result.splats, item)[~result.changed],
+            getattr(splats, item)[result.keep][~result.changed],
         )
 
 
@@ -499,10 +499,7 @@ def test_any_values_at_once_absorb_each_other_and_stay_splats(data, count):
     """Extreme splats among good ones; survivors are as many as asked for."""
     some, good = drawn(data, 4), cloud(12, data.draw(st.integers(0, 99)))
     splats = Splats(
-        **{
-            item.name: np.concatenate([getattr(some, item.name), getattr(good, item.name)])
-            for item in fields(Splats)
-        }
+        **{item: np.concatenate([getattr(some, item), getattr(good, item)]) for item in ARRAYS}
     )
 
     try:
@@ -515,7 +512,7 @@ def test_any_values_at_once_absorb_each_other_and_stay_splats(data, count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [item.name for item in fields(Splats)])
+@pytest.mark.parametrize("name", ARRAYS)
 def test_one_extreme_splat_among_good_ones_absorbs_and_is_absorbed(name):
     """Any attribute, any value; half of the splats go."""
     views = ViewSet((view(), view([0.1, 0, 0])))
@@ -594,9 +591,9 @@ def test_the_size_of_the_pieces_of_work_changes_nothing_with_occlusion(monkeypat
         np.testing.assert_allclose(scores.values, expected.values, atol=1.5 / 300)
         np.testing.assert_array_equal(scores.seen, expected.seen)
         np.testing.assert_array_equal(again.keep, survivors.keep)
-        for item in fields(Splats):
+        for item in ARRAYS:
             np.testing.assert_allclose(
-                getattr(again.splats, item.name), getattr(survivors.splats, item.name), rtol=1e-5
+                getattr(again.splats, item), getattr(survivors.splats, item), rtol=1e-5
             )
 
 

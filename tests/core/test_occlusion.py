@@ -15,7 +15,7 @@ from refine_addon.core.scoring.occlusion import Occlusion
 from refine_addon.core.seeing import froxels, lattices, measuring, projection
 from refine_addon.core.seeing import points as points_module
 from refine_addon.core.seeing.measuring import Measured, Measuring
-from refine_addon.core.splats import SH_C0, rotation_matrices
+from refine_addon.core.splats import ARRAYS, SH_C0, rotation_matrices
 
 ONCE = Occlusion(rounds=1)
 CUT = 1.0 / 255.0
@@ -262,8 +262,10 @@ def test_a_veil_lets_through_what_it_leaves_uncovered():
     behind = measured(
         Splats(
             **{
-                name: np.concatenate([getattr(veils([0.6, 0.9], 0.0, [1, 2]), name), values])
-                for name, values in vars(small).items()
+                name: np.concatenate(
+                    [getattr(veils([0.6, 0.9], 0.0, [1, 2]), name), getattr(small, name)]
+                )
+                for name in ARRAYS
             }
         ),
         square(),

@@ -6,7 +6,7 @@ import itertools
 import json
 import subprocess
 import sys
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +38,7 @@ from refine_addon.core.seeing import froxels, lattices, points, projection, ray_
 from refine_addon.core.seeing.measuring import Measured
 from refine_addon.core.seeing.scene import principal_axes
 from refine_addon.core.selection import rank
+from refine_addon.core.splats import ARRAYS
 from refine_addon.core.task import Task
 from tests.strategies import plain_header, ply_of, splat_names
 
@@ -195,9 +196,7 @@ TENTHS = [tenth / 10 for tenth in range(1, 10)]
 
 def wide(splats: Splats) -> Splats:
     """Return the same numbers as doubles, in every attribute."""
-    return Splats(
-        **{item.name: getattr(splats, item.name).astype(np.float64) for item in fields(Splats)}
-    )
+    return Splats(**{item: getattr(splats, item).astype(np.float64) for item in ARRAYS})
 
 
 def agreement(one: Scores, other: Scores) -> list[float]:
@@ -365,9 +364,9 @@ def test_survivors_of_doubles_are_doubles(small, views, tmp_path):
 
     written, changed = read_ply(tmp_path / "out.ply").splats(), result.absorbed.changed
     assert len(np.unique(written.means[changed, 0])) == np.count_nonzero(changed) > 100
-    for item in fields(Splats):
-        wanted = getattr(result.absorbed.splats, item.name)
-        np.testing.assert_array_equal(getattr(written, item.name), wanted)
+    for item in ARRAYS:
+        wanted = getattr(result.absorbed.splats, item)
+        np.testing.assert_array_equal(getattr(written, item), wanted)
         assert wanted.dtype == np.float64
 
 
@@ -393,9 +392,9 @@ def test_absorbing_text_changes_the_words_of_what_changed_and_no_other(text, vie
     kept, changed = np.flatnonzero(result.keep), result.absorbed.changed
     own = [line == before.lines[index] for line, index in zip(after.lines, kept, strict=True)]
     np.testing.assert_array_equal(own, ~changed)
-    for item in fields(Splats):
-        wanted = getattr(result.absorbed.splats, item.name).astype(np.float32)
-        np.testing.assert_array_equal(getattr(after.splats(), item.name), wanted)
+    for item in ARRAYS:
+        wanted = getattr(result.absorbed.splats, item).astype(np.float32)
+        np.testing.assert_array_equal(getattr(after.splats(), item), wanted)
     for index in np.flatnonzero(changed):
         words = zip(after.lines[index].split(), after.rows[index], strict=True)
         assert all(len(word) <= len(str(value)) for word, value in words)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,19 +13,23 @@ from refine_addon.core import (
     SURVIVORS,
     Budget,
     Levels,
+    LevelsRequest,
     PruneRequest,
     RefineError,
     Settings,
-    Splats,
     ViewSet,
     lod,
+    lod_file,
     prune,
     prune_file,
     read_cameras,
     read_ply,
 )
 from refine_addon.core.estimate.psnr import psnr_against
+from refine_addon.core.pipeline import decide
+from refine_addon.core.refitting.round_rays import RoundRays
 from refine_addon.core.seeing.ray_sample import validation_rays
+from refine_addon.core.splats import ARRAYS
 from refine_addon.core.task import Task
 from refine_addon.core.work import Cancelled
 from tests.strategies import ply_of
@@ -88,9 +92,9 @@ def test_the_file_holds_what_was_refitted_and_the_rest_bit_for_bit(small, refitt
     changed, kept = result.absorbed.changed, before.rows[result.keep]
 
     assert after.rows[~changed].tobytes() == kept[~changed].tobytes()
-    for item in fields(Splats):
-        wanted = getattr(result.absorbed.splats, item.name).astype(np.float32)
-        np.testing.assert_array_equal(getattr(after.splats(), item.name), wanted)
+    for item in ARRAYS:
+        wanted = getattr(result.absorbed.splats, item).astype(np.float32)
+        np.testing.assert_array_equal(getattr(after.splats(), item), wanted)
 
 
 def test_doubles_stay_doubles_and_what_is_not_of_a_splat_stays(small, views, tmp_path):
@@ -124,9 +128,9 @@ def test_protected_splats_keep_their_bits(small, views):
     assert result.keep[protected].all()
     assert not result.absorbed.changed[spared].any()
     assert result.absorbed.changed[~spared].any()
-    for item in fields(Splats):
-        found = getattr(result.absorbed.splats, item.name)[spared]
-        np.testing.assert_array_equal(found, getattr(splats, item.name)[protected])
+    for item in ARRAYS:
+        found = getattr(result.absorbed.splats, item)[spared]
+        np.testing.assert_array_equal(found, getattr(splats, item)[protected])
 
 
 def test_where_nothing_goes_nothing_is_refitted(small, views):
@@ -181,6 +185,105 @@ def test_progress_rises_and_can_end_while_refitting(small, views):
     assert shares == sorted(shares)
     assert told[-1][1] == "refitting"
     assert 0.2 < told[-1][0] < 0.95
+
+
+class Round:
+    """Progress that cancels once a round of refitting was done, and counts what is told after."""
+
+    def __init__(self, monkeypatch, rounds):
+        self.done, self.told_after, self.rounds = -1, 0, rounds
+        cast_errors = RoundRays.psnr
+
+        def count(rays, *arguments):
+            psnr = cast_errors(rays, *arguments)
+            self.done += 1
+            return psnr
+
+        monkeypatch.setattr(RoundRays, "psnr", count)
+
+    def __call__(self, _share, what):
+        """Cancel once the rounds are done."""
+        over = what == "refitting" and self.done >= self.rounds
+        self.told_after += over
+        return not over
+
+
+@pytest.mark.parametrize(("rounds", "became"), [(1, "refit"), (-1, "absorb")])
+def test_what_was_reached_is_the_result_where_refitting_is_cancelled(
+    small, views, monkeypatch, rounds, became
+):
+    """After a round what that reached, before it what absorbing left, each with its own PSNR."""
+    splats = read_ply(small).splats()
+    listen = Round(monkeypatch, rounds)
+    task = Task(HALF, FEW, splats, views, survivors="refit")
+
+    result = decide(task, progress=listen)
+
+    whole = prune(splats, views, HALF, FEW, survivors="refit")
+    told = result.report
+    assert isinstance(result.stopped, Cancelled)
+    assert listen.told_after == 1
+    np.testing.assert_array_equal(result.keep, whole.keep)
+    assert told["survivors"]["became"] == became
+    assert told["survivors"]["psnr"]["absorb"] == whole.report["survivors"]["psnr"]["absorb"]
+    assert (told.get("refitted", {}).get("rounds", 0) == 1) == (rounds == 1)
+    assert told["estimated_psnr"] <= whole.report["estimated_psnr"] + 0.3
+    assert any("refitting was stopped" in note for note in told["notes"])
+
+
+def test_a_file_of_what_was_reached_is_written_where_refitting_is_cancelled(
+    small, views, monkeypatch, tmp_path
+):
+    """As large as asked for, and named in what is raised; without an output nothing is."""
+    listen = Round(monkeypatch, 1)
+    request = PruneRequest(views, HALF, FEW, survivors="refit")
+
+    with pytest.raises(Cancelled) as stop:
+        prune_file(small, tmp_path / "out.ply", request, progress=listen)
+    with pytest.raises(Cancelled) as bare:
+        prune_file(small, None, request, progress=listen)
+
+    notes = stop.value.__notes__
+    assert len(read_ply(tmp_path / "out.ply")) == 994
+    assert notes[0] == "refitting was stopped after round 1"
+    assert notes[1] == f"{tmp_path / 'out.ply'} is written with what that had reached"
+    assert not any("written" in note for note in bare.value.__notes__)
+
+
+def test_a_psnr_that_is_cancelled_has_the_last_try_that_was_done(small, views, monkeypatch):
+    """The first try comes close enough, or is the only one; a later one that is cut off is not."""
+    splats, listen = read_ply(small).splats(), Round(monkeypatch, 1)
+
+    result = decide(Task(Budget(psnr=38.0), FEW, splats, views, survivors="refit"), progress=listen)
+
+    assert isinstance(result.stopped, Cancelled)
+    assert 0 < np.count_nonzero(result.keep) < len(splats)
+
+
+def test_levels_that_are_cancelled_while_refitting_are_none(small, views, tmp_path, monkeypatch):
+    """All of them or none, whatever the first had reached."""
+    request = LevelsRequest(views, Levels((0.5, 0.25), survivors="refit"), FEW)
+
+    with pytest.raises(Cancelled):
+        lod_file(small, tmp_path / "out", request, progress=Round(monkeypatch, 1))
+
+    assert not (tmp_path / "out").exists()
+
+
+def test_refitting_begins_with_deletion_where_that_is_better(small, views):
+    """Two views see a third of the splats: half can be deleted with hardly a trace."""
+    splats, two = read_ply(small).splats(), ViewSet(tuple(views)[:2])
+
+    absorbed, result = (
+        prune(splats, two, HALF, FEW, survivors=survivors) for survivors in ("absorb", "refit")
+    )
+
+    told = result.report["survivors"]["psnr"]
+    assert result.report["refitted"]["began"] == "unchanged"
+    assert result.report["absorbed"] == {"changed": 0, "merged": 0, "deleted": 994}
+    assert told["refit"] > told["unchanged"] > told["absorb"] + 10.0
+    assert any("began with plain deletion" in note for note in result.report["notes"])
+    assert any("plain deletion reaches more" in note for note in absorbed.report["notes"])
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import pytest
 
 from refine_addon.core import RefineError, as_written, read_splats
 from refine_addon.core.formats import images
-from refine_addon.core.formats.sog import _grouped
+from refine_addon.core.formats.sog_write import _grouped
 from tests.strategies import plain_ply
 
 pytest.importorskip("PIL", reason="needs Pillow, which a .sog does outside of Blender")
@@ -85,6 +85,62 @@ def test_values_by_hand(sog):
     np.testing.assert_allclose(splats.opacity_logits, [-np.log(4.0)], rtol=1e-6)
 
 
+VERSION_1 = {
+    "means": {"shape": [1, 3], "mins": [0] * 3, "maxs": [2, 2, -2], "files": ["l", "u"]},
+    "scales": {"shape": [1, 3], "mins": [-9, 0, 0], "maxs": [-4, 0, 51], "files": ["s"]},
+    "quats": {"shape": [1, 4], "files": ["q"]},
+    "sh0": {"mins": [0, 0, 0, -5.1], "maxs": [51, 51, 0, 5.1], "files": ["c"]},
+    "shN": {"mins": -1.5, "maxs": 1.05, "files": ["p", "n"]},
+}
+"""What tools wrote first: no version, ends instead of tables, opacity as a logit."""
+
+
+def test_version_1_by_hand(tmp_path):
+    """Of -9 to -4, place 51 of 255 is -8; of 0 to 51, places 10 and 2 are 2 and .4.
+
+    Of logits from -5.1 to 5.1, 51 is -3.06. A palette of 192 pixels is one of degree 1; from -1.5
+    in steps of .01, 150 is 0 and 255 is 1.05.
+    """
+    palette = np.full((1, 192, 4), 150, np.uint8)
+    palette[0, 3:6] = [[255, 150, 0, 255]] * 3
+    files = {
+        "l": picture(1, 1, (255, 0, 255, 255)),
+        "u": picture(1, 1, (127, 0, 127, 255)),
+        "s": picture(1, 1, (51, 0, 10, 255)),
+        "q": picture(1, 1, (128, 128, 128, 253)),
+        "c": picture(1, 1, (2, 10, 0, 51)),
+        "p": images._Pillow().encode(palette),
+        "n": picture(1, 1, (1, 0, 0, 255)),
+        "meta.json": json.dumps(VERSION_1).encode(),
+    }
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+
+    file = read_splats(tmp_path / "meta.json")
+
+    splats = file.splats()
+    step = np.expm1(2 * 32767 / 65535)
+    assert file.format == "SOG version 1"
+    assert file.stored_bytes == sum(map(len, files.values()))
+    np.testing.assert_allclose(splats.means, [[step, 0.0, -step]], rtol=1e-6)
+    np.testing.assert_allclose(splats.log_scales, [[-8.0, 0.0, 2.0]], rtol=1e-6)
+    np.testing.assert_allclose(splats.sh_dc, [[0.4, 2.0, 0.0]], rtol=1e-6)
+    np.testing.assert_allclose(splats.opacity_logits, [-3.06], rtol=1e-6)
+    np.testing.assert_allclose(splats.sh_rest, [[[1.05, 0.0, -1.5]] * 3], atol=1e-6)
+
+
+def test_images_beside_a_meta_json_are_what_the_archive_holds(sog):
+    """To the bit; the size is that of all files."""
+    folder = sog.with_suffix("")
+    with zipfile.ZipFile(sog) as archive:
+        archive.extractall(folder)
+
+    file = read_splats(folder / "meta.json")
+
+    assert file.rows.tobytes() == read_splats(sog).rows.tobytes()
+    assert file.stored_bytes == sum(path.stat().st_size for path in folder.iterdir())
+
+
 def test_groups_are_halves_of_halves():
     """Four clumps of two: 8 rows become 4 groups at least, and no group spans two clumps."""
     random = np.random.default_rng(0)
@@ -123,7 +179,7 @@ FAULTS = {
     "many": (_meta("count", 10**9), "meta.json count: expected a whole number from 1 to "),
     "none": (_meta("count", 0), "meta.json count: expected a whole number from 1 to "),
     "half": (_meta("count", 1.5), "meta.json count: expected a whole number from 1 to "),
-    "a few too many": (_meta("count", 100), "image 'shN_labels.webp': "),
+    "a few too many": (_meta("count", 100), "image 'means_l.webp': "),
     "no means": (_meta("means", []), "meta.json means: expected an object, got a list"),
     "two limits": (
         _meta("means", "mins", [0, 0]),
@@ -194,6 +250,48 @@ def test_an_archive_without_meta_json_is_refused(sog):
 
     with pytest.raises(RefineError, match=re.escape(f"{sog}: no meta.json in the archive")):
         read_splats(sog)
+
+
+OUTSIDE = ["../a", "/etc/passwd", "a/../../b", "C:a", "a\\b", "a\0b", "", ".."]
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_a_name_that_leads_elsewhere_is_refused(tmp_path, name):
+    """Up, from the root, on a drive or a share: no file there is so much as looked for."""
+    meta = {**VERSION_1, "scales": {**VERSION_1["scales"], "files": [name]}}
+    (tmp_path / "meta.json").write_text(json.dumps(meta))
+    for known in ("l", "u", "q", "c", "p", "n"):
+        (tmp_path / known).write_bytes(picture(1, 1))
+
+    with pytest.raises(RefineError, match="expected a file in this folder or one below"):
+        read_splats(tmp_path / "meta.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (("means", "shape", []), "means shape [0]: expected a whole number from 1 to "),
+        (("means", "shape", [10**9]), "means shape [0]: expected a whole number from 1 to "),
+        (("sh0", "mins", [0, 0, 0]), "sh0 mins: expected a list of 4 numbers"),
+        (("shN", "mins", [0]), "shN mins: expected a number, got a list of 1"),
+        (("shN", "files", ["l", "n"]), "shN: a palette 1 pixels wide, expected 192, 512, 960"),
+        (("quats", "files", ["no"]), '"no" is not there'),
+        (("quats", "files", ["folder"]), '"folder" is not there'),
+    ],
+    ids=range(7),
+)
+def test_what_is_wrong_with_images_beside_a_meta_json_is_named(tmp_path, change, expected):
+    """With the file and the place."""
+    meta = json.loads(json.dumps(VERSION_1))
+    meta[change[0]][change[1]] = change[2]
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "meta.json").write_text(json.dumps(meta))
+    for name in ("l", "u", "s", "q", "c", "n"):
+        (tmp_path / name).write_bytes(picture(1, 1, (0, 0, 0, 253)))
+    (tmp_path / "p").write_bytes(picture(192, 1))
+
+    with pytest.raises(RefineError, match=re.escape(f"{tmp_path / 'meta.json'}: {expected}")):
+        read_splats(tmp_path / "meta.json")
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ from refine_addon.core import Splats, read_ply, survivor_columns
 from refine_addon.core.absorbing.absorb import Absorbed
 from refine_addon.core.affine import transformed
 from refine_addon.core.formats.ply_columns import values_by_name
+from refine_addon.core.splats import ARRAYS
 from tests.strategies import plain_ply
 
 CORE = Path(__file__).parents[2] / "refine_addon/core"
@@ -73,8 +74,8 @@ def test_every_property_keeps_its_type_and_is_rounded_to_it_once(file, kind):
     """A third of what doubles hold is the nearest number that the property can be."""
     with np.errstate(invalid="ignore"):  # of the signalling NaN, which turns quiet
         rows = file.rows.astype([(name, kind) for name in file.rows.dtype.names])
-        splats = vars(file.splats())
-        wide = Splats(**{name: values.astype(np.float64) for name, values in splats.items()})
+        splats = file.splats()
+        wide = Splats(**{name: getattr(splats, name).astype(np.float64) for name in ARRAYS})
     absorbed = absorbed_of(wide, KEEP, CHANGED, factor=1 / 3)
 
     columns = survivor_columns(rows, absorbed)

@@ -27,7 +27,7 @@ from refine_addon.core.seeing import projection
 from refine_addon.core.seeing.cast import cast
 from refine_addon.core.seeing.ray_sample import validation_rays
 from refine_addon.core.splats import joined
-from refine_addon.core.tiles import absorbing, gaussians, refitting, region_rays, units
+from refine_addon.core.tiles import absorbing, gaussians, refitting, units
 from refine_addon.core.views import ViewSet
 from tests.strategies import plain_header, splat_names
 from tests.tiles import COUNT, ROOM, cut, room_rows, write
@@ -43,8 +43,7 @@ def small(monkeypatch):
     monkeypatch.setattr(units, "ROWS", 1000)
     monkeypatch.setattr(gaussians, "CHUNK", 700)
     monkeypatch.setattr(absorbing, "REGION", 1500)
-    for module in (round_rays, region_rays):
-        monkeypatch.setattr(module, "MIN_RAYS", 1 << 14)
+    monkeypatch.setattr(round_rays, "MIN_RAYS", 1 << 14)
 
 
 @pytest.fixture

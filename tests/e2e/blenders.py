@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import json
 import os
+import signal
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ MODULES = ("bpy-4.2.23", "bpy-4.5.15", "bpy-5.0.1")
 BINARIES = ("trixie", "sid")
 
 # Seconds. The slowest step is the window's: about 80 on two idle cores, far more on busy ones.
+# A step in Blender gives up by itself a minute before, and says where it was.
 PATIENCE = 600
 
 
@@ -189,13 +191,28 @@ def without_blender(*words: str | Path) -> subprocess.CompletedProcess[str]:
     return _run([sys.executable, "-m", "refine_addon", *words], cwd=PROJECT)
 
 
-def _run(words: list[Any], **options: Any) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
+def _run(
+    words: list[Any], *, patience: float = PATIENCE, **options: Any
+) -> subprocess.CompletedProcess[str]:
+    """Run a command; after so many seconds end it with all that it has started."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen(
         words,
-        capture_output=True,
+        stdout=pipe,
+        stderr=pipe,
         text=True,
         stdin=subprocess.DEVNULL,
-        timeout=PATIENCE,
-        check=False,
+        start_new_session=True,  # a group of its own: what it starts holds the pipes open, too
         **options,
-    )
+    ) as process:
+        try:
+            printed = process.communicate(timeout=patience)
+        except BaseException as error:
+            os.killpg(process.pid, signal.SIGKILL)
+            if not isinstance(error, subprocess.TimeoutExpired):
+                raise
+            printed = process.communicate()
+            last = "\n".join("".join(printed).splitlines()[-80:])
+            message = f"{Path(words[0]).name} was ended after {patience:.0f} s:\n{last}"
+            raise StepError(message) from None
+    return subprocess.CompletedProcess(words, process.returncode, *printed)

@@ -8,17 +8,23 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 from blenders import PROJECT
 from PIL import Image
 
 from benchmarks.renderer.rasterizer import render
+from benchmarks.tables.models import version
 from refine_addon.core.formats.ply import read_ply
+from refine_addon.core.formats.ply_columns import columns_from_splats
+from refine_addon.core.formats.ply_header import new_header, with_model
 from refine_addon.core.views import View
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from blenders import Binary
+
+    from refine_addon.core.rendering import Model
 
 PICTURES = PROJECT / "build" / "e2e"
 
@@ -87,6 +93,35 @@ def test_the_viewport_shows_splats_as_the_reference_renderer(
     assert found["undone"] == found["one hidden"]
     assert found["stored"] == found["shown as"] == "TEXTURED"
     assert found["handlers"] == [1, 0]
+
+
+@pytest.mark.parametrize("model", ["antialiased", "2dgs"])
+def test_the_viewport_shows_every_model_as_the_reference_renderer(
+    same_binary: Binary, cloud: Path, cameras: Path, tmp_path: Path, model: Model
+):
+    """At least 28 dB, as for ordinary splats."""
+    splats = version(read_ply(cloud).splats(), model)
+    columns = columns_from_splats(splats)
+    header = new_header(((name, "float") for name in columns), len(splats))
+    tagged = tmp_path / "point_cloud.ply"
+    rows = np.column_stack([*columns.values()])
+    tagged.write_bytes(with_model(header, model) + rows.tobytes())
+    try:
+        found = same_binary.window_step(
+            "view",
+            size=(800, 500),
+            cloud=tagged,
+            cameras=cameras,
+            picture=same_binary.work / "view-{}.png",
+            blend=same_binary.work / "saved.blend",
+        )
+    finally:
+        PICTURES.mkdir(parents=True, exist_ok=True)
+        for picture in same_binary.work.glob("*.png"):
+            shutil.copy(picture, PICTURES / f"{same_binary.name}-{model}-{picture.name}")
+
+    assert found["failure"] == ""
+    assert _psnr(found["camera"], same_binary.work / "view-SCENE.png", tagged) > 28.0
 
 
 def test_apply_is_adjusted_as_the_last_operation(binary: Binary, blend: Path):

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..seeing.scene import scene_of, spatial_order, splat_fingerprint
-from ..splats import Splats, drawable
+from ..splats import ARRAYS, Splats, drawable
 from ..work import Progress, for_chunks, part, report, silent
 from . import merge_field, merging
 from .merge_field import ViewSums
@@ -162,7 +162,7 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     count = len(splats)
     spared = np.zeros(count, np.bool_) if protected is None else np.array(protected, np.bool_)
     goal = max(keep_count, int(np.count_nonzero(spared)), 0)
-    splats = _in_float64(splats, progress)
+    splats = in_float64(splats, progress)
     scene = scene_of(splats.means, drawable(splats), views)
     # Of each splat left: its row among the N, and how many of the N it stands for.
     origin, members = np.arange(count), np.ones(count, np.int64)
@@ -184,13 +184,13 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     return Absorbed(splats, keep, members > 1, merged, count - len(origin) - merged)
 
 
-def _in_float64(splats: Splats, progress: Progress) -> Splats:
+def in_float64(splats: Splats, progress: Progress = silent) -> Splats:
     """Return splats in float64: merged ones merge again, and rounding would depend on the frame."""
-    columns = {}
-    for name, values in vars(splats).items():
+    columns: dict[str, Any] = {}
+    for name in ARRAYS:
         report(progress, 0.0, "absorbing")
-        columns[name] = np.asarray(values, np.float64)
-    return Splats(**columns)
+        columns[name] = np.asarray(getattr(splats, name), np.float64)
+    return replace(splats, **columns)
 
 
 def stages(count: int, goal: int, alone: float = ALONE) -> list[int]:
@@ -387,11 +387,14 @@ def _put_shapes(
     def fill(piece: slice) -> None:
         logs[piece], quaternions[piece] = merging.axes(merged.covariances[piece])
 
+    opacity = merged.opacity
     with np.errstate(under="ignore"):
         for_chunks(fill, len(target), _CHUNK, progress=progress, what="absorbing", threads=threads)
+        if left.model == "2dgs":
+            logs, quaternions, opacity = merging.flattened(merged, logs, quaternions)
         left.means[target], left.log_scales[target] = merged.means, logs
         left.quaternions[target] = quaternions
-        left.opacity_logits[target] = np.log(merged.opacity) - np.log1p(-merged.opacity)
+        left.opacity_logits[target] = np.log(opacity) - np.log1p(-opacity)
 
 
 class _Blend:

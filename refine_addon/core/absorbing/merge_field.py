@@ -16,6 +16,7 @@ from ..work import Progress, for_chunks, part, silent
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ..rendering import Model
     from ..seeing.scene import Scene
     from ..splats import Splats
     from ..views import View, ViewSet
@@ -77,6 +78,8 @@ class Field:
         As viewed along `direction`.
     blur : (N,) float64
         Variance of the low-pass at the splat, world units squared.
+    model : {"default", "antialiased", "2dgs"}
+        How they are drawn, see `rendering.Model`.
     """
 
     means: Array
@@ -88,16 +91,20 @@ class Field:
     deviation: Array
     color: Array
     blur: Array
+    model: Model = "default"
 
     def put(self, rows: Index, other: Field) -> None:
         """Overwrite `rows` with the rows of `other`."""
-        for item in fields(self):
+        for item in fields(self)[:-1]:
             getattr(self, item.name)[rows] = getattr(other, item.name)
 
     def take(self, rows: Index) -> Field:
         """Return a copy of some rows."""
         # ndarray.take is twice as fast as indexing.
-        return Field(*(getattr(self, item.name).take(rows, axis=0) for item in fields(self)))
+        arrays: dict[str, Any] = {
+            item.name: getattr(self, item.name).take(rows, axis=0) for item in fields(self)[:-1]
+        }
+        return replace(self, **arrays)
 
 
 class Viewing(NamedTuple):
@@ -273,9 +280,12 @@ def measured_field(  # noqa: PLR0913 - which splats, seen by what, in which scen
         viewed.deviation,
         np.maximum(color, 0.0, out=color),
         LOW_PASS * viewed.pixel,
+        splats.model,
     )
     with np.errstate(under="ignore"):
-        xx, xy, yy = footprint(covariances, across(field.direction), field.blur)  # (M,) each
+        # Antialiasing keeps the mass that splats have without the low-pass.
+        blur = np.zeros(len(rows)) if splats.model == "antialiased" else field.blur
+        xx, xy, yy = footprint(covariances, across(field.direction), blur)  # (M,) each
         # In pixels of a view, over 2 pi; a constant factor does not matter here.
         mass = field.opacity * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / viewed.pixel
     return MeasuredField(field, mass, viewed.seen)

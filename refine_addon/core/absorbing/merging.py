@@ -16,7 +16,8 @@ to the direction that the pair is viewed along (derived in docs/method.md, secti
     |s_i|^2 = E_i / (tau_i <f_i, f_i>),   2 s_i.s_j = |s_i|^2 + |s_j|^2 - |c_i - c_j|^2
 
 The merged splat has the mean and covariance of the mixture of the two, weighted by mass, and their
-mean colour, weighted by contribution. Its mass is ``A_m = A_i + A_j - <f_i, f_j>``, since the area
+mean colour, weighted by contribution. Its mass, which of antialiased splats is the integral without
+the low-pass, since they keep that, is ``A_m = A_i + A_j - <f_i, f_j>``, since the area
 that both cover is covered only once; its opacity follows from that mass. Where the opacity would
 exceed `ALPHA_MAX`, the covariance grows instead.
 
@@ -32,10 +33,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..affine import quaternion
-from ..rendering import ALPHA_MAX
+from ..rendering import ALPHA_MAX, LOW_PASS
+from ..seeing.projection import disc_axes
+from ..splats import LOG_ZERO, rotation_matrices
 from .merge_field import Field, across, footprint, normalized
 
 if TYPE_CHECKING:
+    from ..rendering import Model
     from .merge_field import Array, Footprint, Index
 
 FLATTEST = 1e-14
@@ -177,7 +181,7 @@ def _price(ends: _Ends, tilt: float) -> Pairs:
     mixed = color * color * s_i + 2.0 * color * rest * both + rest * rest * s_j
     tau = (ends.one.contribution + ends.two.contribution) / (one.mass + two.mass)
     return Pairs(
-        tau * np.maximum(cost, 0.0), plane.position, color, merged.mass / merged.area, plane.growth,
+        tau * np.maximum(cost, 0.0), plane.position, color, merged.mass / merged.base, plane.growth,
         tau * np.maximum(mixed, 0.0) * mm,
     )  # fmt: skip
 
@@ -205,12 +209,16 @@ class _Signal(NamedTuple):
     ----------
     footprint : Footprint
         Covariances in the plane, low-pass included.
-    area, mass : (M,) float64
-        See `_area`; opacity times area.
+    area, base : (M,) float64
+        See `_area`, with the low-pass; and of what the opacity is meant for: of antialiased splats
+        without the low-pass, of discs with their own.
+    mass : (M,) float64
+        Opacity times `base`.
     """
 
     footprint: Footprint
     area: Array
+    base: Array
     mass: Array
 
     def squared(self) -> Array:
@@ -255,26 +263,52 @@ def _in_plane(ends: _Ends, tilt: float) -> _Plane:
     normal = normalized(ends.direction + tilt * ends.deviation) if tilt else ends.direction
     plane = across(normal)
     x, y = (np.einsum("ji,ji->i", (ends.two.means - ends.one.means).T, axis) for axis in plane)
-    one, two = (_signal(splats, plane, ends.blur) for splats in (ends.one, ends.two))
+    blur = ends.blur
+    one, two = (_signal(splats, plane, blur) for splats in (ends.one, ends.two))
     position, other = _shares(one.mass, two.mass)
     overlap = one.times(two, x, y)
-    between = position * other
-    mixed = _mixed(
-        one.footprint, two.footprint, position, (between * x * x, between * x * y, between * y * y)
-    )
+    if ends.one.model == "2dgs":
+        mixed = footprint(_mixture(ends.one, ends.two, position), plane, blur)
+    else:
+        between = position * other
+        mixed = _mixed(
+            one.footprint, two.footprint, position,
+            (between * x * x, between * x * y, between * y * y),
+        )  # fmt: skip
     # The estimated overlap of nearly opaque splats can exceed the smaller mass; the true one never.
     mass = one.mass + two.mass - np.minimum(overlap, np.minimum(one.mass, two.mass))
-    growth = np.maximum(mass / (_area(mixed) * ALPHA_MAX), 1.0)
+    base = _base(mixed, blur, ends.one.model)
+    growth = np.maximum(mass / (base * ALPHA_MAX), 1.0)
     mixed = (mixed[0] * growth, mixed[1] * growth, mixed[2] * growth)
-    merged = _Signal(mixed, _area(mixed), mass)
+    area = _area(mixed)
+    merged = _Signal(mixed, area, _base(mixed, blur * growth, ends.one.model), mass)
     return _Plane(one, two, merged, x, y, position, other, growth, overlap)
 
 
 def _signal(splats: Field, plane: tuple[Array, Array], blur: Array) -> _Signal:
     """Return splats in a plane, spanned by unit vectors, with a low-pass of variance `blur`."""
     ellipse = footprint(splats.covariances, plane, blur)
-    area = _area(ellipse)
-    return _Signal(ellipse, area, splats.opacity * area)
+    base = _base(ellipse, blur, splats.model)
+    return _Signal(ellipse, _area(ellipse), base, splats.opacity * base)
+
+
+def _base(footprint: Footprint, blur: Array, model: Model) -> Array:
+    """Return the area that opacity is meant for, (M,): see `_Signal`."""
+    if model == "default":
+        return _area(footprint)
+    xx, xy, yy = footprint
+    sharp = (np.maximum(xx - blur, _TINY), xy, np.maximum(yy - blur, _TINY))
+    return _area(sharp) if model == "antialiased" else _disc_area(sharp, blur / LOW_PASS)
+
+
+def _disc_area(footprint: Footprint, pixel: Array) -> Array:
+    """Return what discs cover with their low-pass, over 2 pi, (M,); `pixel` is a pixel's area."""
+    xx, xy, yy = footprint
+    mean = 0.5 * (xx + yy)
+    first = mean + np.hypot(0.5 * (xx - yy), xy)
+    axes_of = disc_axes(np.stack([first, _determinant(footprint) / first]) / pixel)
+    covered: Array = axes_of[0] * axes_of[1] * pixel
+    return covered
 
 
 def _contrasts(ends: _Ends, one: Array, two: Array) -> tuple[Array, Array, Array]:
@@ -297,9 +331,7 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
     one, two = splats.take(first), splats.take(second)
     position, color = pairs.position[:, None], pairs.color[:, None]
     step = two.means - one.means
-    rows, columns = np.triu_indices(3)
-    between = step[:, rows] * step[:, columns] * (position * (1.0 - position))  # (M, 6)
-    covariances = position * one.covariances + (1.0 - position) * two.covariances + between
+    covariances = _mixture(one, two, pairs.position)
     direction = normalized(color * one.direction + (1.0 - color) * two.direction)
     lost = ~direction.any(axis=1)
     direction[lost] = one.direction[lost]
@@ -313,7 +345,66 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
         _mean_deviation(one.deviation, two.deviation, pairs.color),
         color * one.color + (1.0 - color) * two.color,
         pairs.color * one.blur + (1.0 - pairs.color) * two.blur,
+        one.model,
     )
+
+
+def _mixture(one: Field, two: Field, share: Array) -> Array:
+    """Return the covariances of mixtures of pairs, (M, 6); of discs without the shortest axis.
+
+    `share`, (M,), is that of the first.
+    """
+    position, step = share[:, None], two.means - one.means
+    rows, columns = np.triu_indices(3)
+    between = step[:, rows] * step[:, columns] * (position * (1.0 - position))  # (M, 6)
+    apart = position * one.covariances + (1.0 - position) * two.covariances
+    whole = np.asarray(apart + between, np.float64)
+    return flat(whole) if one.model == "2dgs" else whole
+
+
+def flat(covariances: Array) -> Array:
+    """Return covariances, (M, 6), without what they have along their shortest axis.
+
+    That axis n is the eigenvector of the least eigenvalue, which is
+    ``t / 3 + 2 p cos((acos(det(B / p) / 2) + 2 pi) / 3)`` with t the trace, ``B = C - t / 3 I`` and
+    ``p^2 = tr(B^2) / 6`` (Smith 1961); what is left is ``P C P``, ``P = I - n n'``.
+    """
+    total = np.maximum(covariances[:, [0, 3, 5]].sum(axis=1), _TINY)
+    full = covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3) / total[:, None, None]
+    centered = full - np.eye(3) / 3.0
+    p = np.sqrt(np.maximum(np.einsum("nij,nij->n", centered, centered) / 6.0, FLATTEST))
+    angle = np.arccos(np.clip(_triple(centered) / (2.0 * p**3), -1.0, 1.0)) / 3.0
+    least = 1.0 / 3.0 + 2.0 * p * np.cos(angle + 2.0 * np.pi / 3.0)
+    normal = _null(full - least[:, None, None] * np.eye(3))
+    along = np.einsum("nij,nj->ni", full, normal)
+    own = np.einsum("ni,ni->n", along, normal)
+    outer = normal[:, :, None] * along[:, None, :]
+    left = full - outer - np.swapaxes(outer, 1, 2)
+    left += own[:, None, None] * normal[:, :, None] * normal[:, None, :]
+    rows, columns = np.triu_indices(3)
+    result: Array = left[:, rows, columns] * total[:, None]
+    return result
+
+
+def _triple(matrices: Array) -> Array:
+    """Return the determinants of matrices, (M, 3, 3)."""
+    first, second, third = np.moveaxis(matrices, 1, 0)
+    determinant: Array = np.einsum("ni,ni->n", first, np.cross(second, third))
+    return determinant
+
+
+def _null(matrices: Array) -> Array:
+    """Return unit vectors, (M, 3), that symmetric matrices of rank 2 or less map to 0."""
+    rows = np.moveaxis(matrices, 1, 0)  # (3, M, 3)
+    crossed = np.stack([np.cross(rows[k], rows[(k + 1) % 3]) for k in range(3)], axis=1)
+    best = np.argmax(np.einsum("nki,nki->nk", crossed, crossed), axis=1)
+    normal = crossed[np.arange(len(best)), best]
+    # Of rank 1, a needle: any vector at right angles to its axis. Of rank 0: any vector.
+    lengths = np.einsum("nki,nki->nk", matrices, matrices)
+    axis = matrices[np.arange(len(best)), np.argmax(lengths, axis=1)]
+    beside = across(normalized(axis))[0].T
+    lost = np.einsum("ni,ni->n", normal, normal) <= FLATTEST * lengths.max(axis=1) ** 2
+    return normalized(np.where(lost[:, None], beside, normal))
 
 
 def axes(covariances: Array) -> tuple[Array, Array]:
@@ -324,6 +415,35 @@ def axes(covariances: Array) -> tuple[Array, Array]:
     logs = 0.5 * (np.log(np.maximum(values, FLATTEST)) + np.log(total)[:, None])
     vectors[np.linalg.det(vectors) < 0.0] *= -1.0
     return logs, quaternion(vectors)
+
+
+def flattened(merged: Field, logs: Array, quaternions: Array) -> tuple[Array, Array, Array]:
+    """Return merged splats as discs of their two longest axes, with the mass that they had.
+
+    Parameters
+    ----------
+    merged : Field
+    logs, quaternions : (M, 3), (M, 4) float64
+        See `axes`: the shortest axis comes first.
+
+    Returns
+    -------
+    logs, quaternions, opacity : (M, 3), (M, 4), (M,) float64
+        The shortest axis comes last, and is 0.
+    """
+    flat = np.stack([logs[:, 1], logs[:, 2], np.full(len(logs), LOG_ZERO)], axis=1)
+    x, y, z, w = quaternions[:, 1], quaternions[:, 2], quaternions[:, 3], quaternions[:, 0]
+    # A third of a turn about (1, 1, 1) takes the first axis to the second, and so on.
+    turned = 0.5 * np.stack([w - x - y - z, w + x + y - z, w + y + z - x, w + z + x - y], axis=1)
+    vectors = rotation_matrices(turned)[:, :, :2] * np.exp(flat[:, None, :2])
+    rows, columns = np.triu_indices(3)
+    covariances = (vectors @ np.swapaxes(vectors, 1, 2))[:, rows, columns]
+    plane = across(merged.direction)
+    thick, thin = (
+        _base(footprint(each, plane, merged.blur), merged.blur, "2dgs")
+        for each in (merged.covariances, covariances)
+    )
+    return flat, turned, np.minimum(merged.opacity * thick / thin, ALPHA_MAX)
 
 
 def _shares(one: Array, two: Array) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ import numpy as np
 import plyfile
 
 from ..errors import RefineError
+from ..rendering import MODELS
 from ..splats import SH_C0, above_constant, opacity, opacity_logits, unit_quaternions
 from .format import (
     Format,
@@ -29,7 +30,16 @@ from .format import (
 from .ply import Origin, SplatFile
 from .ply_body import check_counts
 from .ply_columns import REST_COUNTS
-from .ply_header import HEADER_LIMIT, TEXT, Header, raw_header, read_header, shown
+from .ply_header import (
+    HEADER_LIMIT,
+    TEXT,
+    Header,
+    model_of,
+    raw_header,
+    read_header,
+    shown,
+    with_model,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -103,7 +113,9 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         raise RefineError(msg)
     rest = _rest(path, elements, len(packed))
     degree = REST_COUNTS[rest.shape[1]]
-    file, splats = new_file(path, Origin(NAME, len(data)), len(packed), degree)
+    file, splats = new_file(
+        path, Origin(NAME, len(data)), len(packed), degree, model_of(header.raw) or "default"
+    )
     with np.errstate(invalid="ignore", over="ignore"):  # ranges that are not finite
         for piece in pieces(len(packed)):
             rows, ranges = packed[piece], chunks[_chunks_of(piece)]
@@ -238,7 +250,7 @@ def write(stream: BinaryIO, splats: Splats) -> None:
     """Write splats as a compressed PLY, sorted so that neighbours in space share a chunk."""
     count, rest = len(splats), 3 * splats.sh_rest.shape[1]
     order = near_ones_together(splats.means)
-    stream.write(_header(count, rest))
+    stream.write(with_model(_header(count, rest), splats.model))
     ranges = np.empty((-(-count // SPLATS), 18), "<f4")
     packed = np.empty((count, 4), "<u4")
     harmonics = np.empty((count, rest), np.uint8)
@@ -302,10 +314,13 @@ def _header(count: int, rest: int) -> bytes:
 
 
 def sizes(count: int, degree: int) -> Sizes:
-    """Return how large a file is; the last chunk may have fewer splats than the others."""
+    """Return how large a file is, at most: the last chunk may have fewer splats than the others.
+
+    The header has a comment unless the splats are of the default model.
+    """
     rest = 3 * above_constant(degree)
-    chunk = 18 * 4
-    return Sizes(16 + rest + chunk / SPLATS, len(_header(count, rest)) + chunk)
+    chunk, header = 18 * 4, with_model(_header(count, rest), "antialiased")
+    return Sizes(16 + rest + chunk / SPLATS, len(header) + chunk)
 
 
 FORMAT = Format(
@@ -317,4 +332,5 @@ FORMAT = Format(
     read=read,
     write=write,
     sizes=sizes,
+    models=MODELS,
 )

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RefineError
+from ..rendering import MODELS
 from ..seeing.scene import spatial_order
 from ..work import chunks
 from .ply import Origin, SplatFile
 from .ply_columns import empty_rows
-from .ply_header import new_header
+from .ply_header import new_header, with_model
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..rendering import Model
     from ..splats import Splats
 
 CHUNK = 1 << 15
@@ -43,46 +45,65 @@ class Sizes:
     fixed: int
 
 
-@dataclass(frozen=True)
-class Format:
-    """A format of splat files.
+@dataclass(frozen=True, kw_only=True)
+class Reader:
+    """A format of splat files that is read.
 
     Attributes
     ----------
     name : str
         For messages.
     suffix : str
-        Ending of its files, lower case, by which an output is known.
-    degree : int
-        Highest degree of harmonics that it holds.
-    loss : str
-        What it does to splats, as a sentence without its subject.
+        Ending of its files, lower case.
     matches : callable
         ``matches(path, head)``: whether a file with these first bytes is of this format.
     read : callable
         ``read(path, data)`` returns a `SplatFile`; `data` is the file, (M,) uint8.
-    write : callable
-        ``write(stream, splats)``; all of the splats can be drawn.
-    sizes : callable or None
-        ``sizes(count, degree)`` returns `Sizes`; None if a file is compressed as a whole.
     """
 
     name: str
     suffix: str
-    degree: int
-    loss: str
     matches: Callable[[Path, bytes], bool]
     read: Callable[[Path, NDArray[np.uint8]], SplatFile]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Format(Reader):
+    """A format of splat files that is read and written; an output is known by its suffix.
+
+    Attributes
+    ----------
+    name, suffix, matches, read
+        See `Reader`.
+    degree : int
+        Highest degree of harmonics that it holds.
+    loss : str
+        What it does to splats, as a sentence without its subject.
+    write : callable
+        ``write(stream, splats)``; all of the splats can be drawn.
+    sizes : callable or None
+        ``sizes(count, degree)`` returns `Sizes`; None if a file is compressed as a whole.
+    models : tuple of str
+        Which of `rendering.MODELS` its files can tell: what `write` finds in `Splats.model`.
+    """
+
+    degree: int
+    loss: str
     write: Callable[[BinaryIO, Splats], None]
     sizes: Callable[[int, int], Sizes] | None
+    models: tuple[Model, ...] = MODELS[:1]
 
     def sizes_without_more(self, count: int, degree: int) -> Sizes | None:
         """Return `sizes` of splats of any degree: without the harmonics that it does not hold."""
         return self.sizes(count, min(degree, self.degree)) if self.sizes else None
 
 
-def new_file(path: Path, origin: Origin, count: int, degree: int) -> tuple[SplatFile, Splats]:
+def new_file(
+    path: Path, origin: Origin, count: int, degree: int, model: Model = "default"
+) -> tuple[SplatFile, Splats]:
     """Return a file of `count` splats whose values are still to be set.
+
+    The splats have a third scale, whatever their model.
 
     Returns
     -------
@@ -94,7 +115,8 @@ def new_file(path: Path, origin: Origin, count: int, degree: int) -> tuple[Splat
     rows, splats = empty_rows(count, degree)
     header = new_header(((name, "float") for name in rows.dtype.names or ()), count)
     nothing = np.empty(0, np.uint8)
-    return SplatFile(path, rows, header, nothing, nothing, origin=origin), splats
+    file = SplatFile(path, rows, with_model(header, model), nothing, nothing, origin=origin)
+    return file, splats
 
 
 def pieces(count: int) -> Iterator[slice]:

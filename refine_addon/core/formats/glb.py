@@ -8,7 +8,7 @@ about z into each other, which changes signs only. What nodes do to a primitive 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from ..affine import transformed
 from ..errors import RefineError
 from ..place import described
 from ..splats import (
+    ARRAYS,
     SINGLE_MARGIN,
     Splats,
     base_color,
@@ -219,8 +220,8 @@ class _Mesh:
             for node, target in reversed([*zip(self.nodes, (first, *others), strict=True)]):
                 for piece in pieces(len(self)):
                     shown_there = self._moved(first.take(piece), node)
-                    for field in fields(Splats):
-                        getattr(target, field.name)[piece] = getattr(shown_there, field.name)
+                    for name in ARRAYS:
+                        getattr(target, name)[piece] = getattr(shown_there, name)
 
     def _moved(self, splats: Splats, node: _Node) -> Splats:
         """Return splats as a node shows them, in the frame of captures."""

@@ -8,17 +8,35 @@ from __future__ import annotations
 
 import mmap
 import stat
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 import plyfile
 
 from ..errors import RefineError, reason_of
+from ..rendering import MODELS, Model
+from ..splats import with_model as drawn_as
 from ..whole_file import expanded, refuse_mapped, whole_file
 from .ply_body import check_counts, read_text, vertex_range
-from .ply_columns import REQUIRED, REST_COUNTS, columns_from_splats, splats_from_columns
-from .ply_header import TEXT, Header, format_of, read_header, shown, with_count, with_properties
+from .ply_columns import (
+    REQUIRED,
+    REST_COUNTS,
+    THIRD_SCALE,
+    columns_from_splats,
+    splats_from_columns,
+)
+from .ply_header import (
+    TEXT,
+    Header,
+    format_of,
+    model_of,
+    read_header,
+    shown,
+    with_count,
+    with_model,
+    with_properties,
+)
 from .ply_write import declarations, longest_line, text_lines, write_rows
 
 if TYPE_CHECKING:
@@ -160,9 +178,32 @@ class SplatFile:
         """Return how many of the kept rows a file does not hold: none."""
         return 0
 
+    @property
+    def model(self) -> Model:
+        """How its splats are drawn, by its header; discs if they have no third scale."""
+        return stated_model(self.header, self.rows.dtype) or "default"
+
+    def drawn_as(self, model: Model | None) -> SplatFile:
+        """Return the file with splats that are drawn in another way; None leaves it as it is.
+
+        Raises
+        ------
+        RefineError
+            If there is no such model, or splats without a third scale are to be anything but discs.
+        """
+        if model is None or model == self.model:
+            return self
+        if model not in MODELS:
+            msg = f"model is {model!r}, expected one of {', '.join(MODELS)}"
+            raise RefineError(msg)
+        if THIRD_SCALE not in (self.rows.dtype.names or ()):
+            msg = f"{self.path}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}"
+            raise RefineError(msg)
+        return replace(self, header=with_model(self.header, model))
+
     def splats(self) -> Splats:
         """Return the rows as splats; the arrays are views of the file if its layout permits."""
-        return splats_from_columns(self.rows)
+        return drawn_as(splats_from_columns(self.rows), self.model)
 
     def write(
         self,
@@ -219,6 +260,18 @@ class SplatFile:
         header = with_count(self.header, count)
         declared = declarations(self.path, self.rows, columns)
         return with_properties(header, declared) if declared else header
+
+
+def stated_model(header: bytes, rows: np.dtype[Any]) -> Model | None:
+    """Return how a PLY says that its splats are drawn; None if it does not.
+
+    Parameters
+    ----------
+    header : bytes
+    rows : structured dtype
+        Of its splats: without a third scale they are discs, whatever comments say.
+    """
+    return model_of(header) if THIRD_SCALE in (rows.names or ()) else "2dgs"
 
 
 def read_ply(path: Path | str) -> SplatFile:
@@ -313,7 +366,7 @@ def _check_properties(header: Header, vertex: int) -> None:
         )
         raise RefineError(msg)
     missing = [name for name in REQUIRED if name not in kinds]
-    if missing:
+    if missing and missing != [THIRD_SCALE]:
         present = _listed([*kinds])
         present += ", ..." if len(kinds) > _NAMES_SHOWN else ""
         msg = (

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..splats import Splats, above_constant
+from ..splats import LOG_ZERO, Splats, above_constant
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -19,6 +19,9 @@ REQUIRED = (
 )
 """Properties that every splat has."""
 
+THIRD_SCALE = "scale_2"
+"""The one of them that discs (2DGS) lack."""
+
 REST_COUNTS = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 """Number of ``f_rest_*`` properties -> spherical-harmonics degree."""
 
@@ -30,7 +33,8 @@ def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> S
     ----------
     columns : structured array or mapping of str to (N,)
         All of `REQUIRED`, and ``f_rest_*`` if there are any: all coefficients of red, then of
-        green, then of blue, as the reference implementation stores them.
+        green, then of blue, as the reference implementation stores them. Without ``scale_2`` they
+        are discs (2DGS).
 
     Returns
     -------
@@ -46,14 +50,22 @@ def splats_from_columns(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> S
         sh_rest = planes.transpose(0, 2, 1)
     else:
         sh_rest = np.zeros((size, 0, 3), np.float32)
+    flat = THIRD_SCALE not in names
     return Splats(
         means=_stack(columns, ["x", "y", "z"]),
-        log_scales=_stack(columns, ["scale_0", "scale_1", "scale_2"]),
+        log_scales=_flat_scales(columns) if flat else _stack(columns, REQUIRED[7:10]),
         quaternions=_stack(columns, ["rot_0", "rot_1", "rot_2", "rot_3"]),
         opacity_logits=columns["opacity"],
         sh_dc=_stack(columns, ["f_dc_0", "f_dc_1", "f_dc_2"]),
         sh_rest=sh_rest,
+        model="2dgs" if flat else "default",
     )
+
+
+def _flat_scales(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> NDArray[Any]:
+    """Return the log scales of discs, (N, 3), the third of which is 0."""
+    scales = _stack(columns, REQUIRED[7:9])
+    return np.column_stack([scales, np.full(len(scales), LOG_ZERO, scales.dtype)])
 
 
 def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:
@@ -86,8 +98,10 @@ def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
     """Return views of splats, (N,) each, by the names of properties in a 3DGS PLY.
 
     The order is that of the reference implementation, without normals; types are those of `splats`.
+    Discs (2DGS) have no third scale.
     """
     coefficients = splats.sh_rest.shape[1]
+    axes = 2 if splats.model == "2dgs" else 3
     return {
         **{name: splats.means[:, axis] for axis, name in enumerate("xyz")},
         **{f"f_dc_{channel}": splats.sh_dc[:, channel] for channel in range(3)},
@@ -97,7 +111,7 @@ def values_by_name(splats: Splats) -> dict[str, NDArray[Any]]:
             for index in range(coefficients)
         },
         "opacity": splats.opacity_logits,
-        **{f"scale_{axis}": splats.log_scales[:, axis] for axis in range(3)},
+        **{f"scale_{axis}": splats.log_scales[:, axis] for axis in range(axes)},
         **{f"rot_{index}": splats.quaternions[:, index] for index in range(4)},
     }
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from pathlib import Path
 
+    from ..rendering import Model
     from ..urls import Url
 
 HEADER_LIMIT = 1 << 20
@@ -27,6 +28,15 @@ HEADER_LIMIT = 1 << 20
 
 TEXT = "="
 """Byte order for ASCII files: their numbers are stored in that of the machine."""
+
+_MODES: dict[Model, bytes] = {"default": b"default", "antialiased": b"mip", "2dgs": b"2dgs"}
+"""Model -> Brush's word for it, in a comment ``SplatRenderMode: WORD``. Postshot's is
+``antialiased 0`` or ``1``."""
+
+_MODEL_COMMENT = re.compile(
+    rb"comment[ \t]+(?:splatrendermode:[ \t]*(default|mip|2dgs)|antialiased[ \t]+([01]))[ \t\r]*",
+    re.IGNORECASE,
+)
 
 _END = {
     b"\n": re.compile(rb"\n[ \t]*end_header[ \t]*\r?\n"),
@@ -132,6 +142,36 @@ def with_count(raw: bytes, count: int) -> bytes:
     if not announced or int(announced[2]) == count:
         return raw
     lines[index] = b"%s%d%s" % (announced[1], count, lines[index][announced.end() :])
+    return _line_end(raw).join(lines)
+
+
+def model_of(raw: bytes) -> Model | None:
+    """Return how the comments of a header say that its splats are drawn; None if they do not.
+
+    Of several comments the last counts, as in Brush and splat-transform.
+    """
+    model: Model | None = None
+    for line in _lines(raw):
+        found = _MODEL_COMMENT.fullmatch(line)
+        if found and found[1]:
+            word = found[1].lower()
+            model = next(name for name, mode in _MODES.items() if mode == word)
+        elif found:
+            model = "antialiased" if found[2] == b"1" else "default"
+    return model
+
+
+def with_model(raw: bytes, model: Model) -> bytes:
+    """Return the header with a comment on how its splats are drawn, in place of what it says.
+
+    A header that says so already stays as it is, and so does one that says nothing where `model` is
+    "default".
+    """
+    if (model_of(raw) or "default") == model:
+        return raw
+    lines = [line for line in _lines(raw) if not _MODEL_COMMENT.fullmatch(line)]
+    if model != "default":
+        lines.insert(2, b"comment SplatRenderMode: " + _MODES[model])
     return _line_end(raw).join(lines)
 
 

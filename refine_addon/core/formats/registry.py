@@ -12,9 +12,9 @@ import numpy as np
 
 from ..errors import RefineError, reason_of
 from ..foreign_files import refuse_pointer
-from ..splats import drawable
+from ..splats import drawable, with_model
 from ..whole_file import expanded, whole_file
-from . import compressed_ply, dot_splat, glb, sog, spz
+from . import compressed_ply, dot_splat, glb, ksplat, sog, spz, streamed_sog
 from .ply import SplatFile, read_ply
 from .ply_columns import REQUIRED, splats_from_columns
 
@@ -24,9 +24,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..rendering import Model
     from ..splats import Splats
     from ..urls import Url
-    from .format import Format, Sizes
+    from .format import Format, Reader, Sizes
 
 FORMATS: tuple[Format, ...] = (
     compressed_ply.FORMAT,
@@ -35,26 +36,54 @@ FORMATS: tuple[Format, ...] = (
     sog.FORMAT,
     dot_splat.FORMAT,  # known by its name alone, if it is none of the others
 )
-"""Every format but plain PLY, in the order in which an input is tried."""
+"""Every format that is written, but plain PLY."""
+
+READERS: tuple[Reader, ...] = (
+    *FORMATS,
+    ksplat.READER,
+    streamed_sog.READER,  # before SOG, whose name its own ends in
+    sog.META_READER,
+)
+"""Every format that is read, but plain PLY, in the order in which an input is tried."""
 
 SUFFIXES = (".ply", *(form.suffix for form in FORMATS))
-"""Endings of the files that are read and written."""
+"""Endings of the files that are written."""
 
-_LONGEST_FIRST = sorted(SUFFIXES, key=len, reverse=True)
+READ_SUFFIXES = (".ply", *(form.suffix for form in READERS))
+"""Endings of the files that are read."""
 
-NOT_WRITTEN = (".ksplat", ".gltf", ".lcc", ".gz", ".bz2", ".xz", ".zst", ".zip")
+INDEX_NAMES = (streamed_sog.INDEX, sog.META_READER.suffix)
+"""Names of files that stand for a folder."""
+
+_LONGEST_FIRST = sorted(READ_SUFFIXES, key=len, reverse=True)
+
+NOT_WRITTEN = (
+    ksplat.READER.suffix,
+    sog.META_READER.suffix,
+    ".gltf",
+    ".lcc",
+    ".gz",
+    ".bz2",
+    ".xz",
+    ".zst",
+    ".zip",
+)
 """Endings of other splat formats and of compressed files: a PLY of such a name would mislead."""
 
 _HEAD = 1 << 16  # bytes by which a format is known; the header of a compressed PLY has fewer
 
 
-def read_splats(path: Path | str) -> SplatFile:
+def read_splats(path: Path | str, model: Model | None = None, level: int = 0) -> SplatFile:
     """Open a file of splats of any format, known by its content.
 
     Parameters
     ----------
     path : path-like
         ``~`` is the home folder.
+    model : {"default", "antialiased", "2dgs"}, optional
+        How its splats are drawn, where it does not say or is wrong.
+    level : int
+        Which level of a streamed SOG, 0 being the finest; other files have none but 0.
 
     Returns
     -------
@@ -66,12 +95,19 @@ def read_splats(path: Path | str) -> SplatFile:
     ------
     RefineError
         If the file does not exist, is of no known format, or is damaged; the message names the
-        file, the place, what was found and what was expected.
+        file, the place, what was found and what was expected. See also `SplatFile.drawn_as`.
     """
-    path = expanded(path)
+    return _read(expanded(path), level).drawn_as(model)
+
+
+def _read(path: Path, level: int) -> SplatFile:
+    """Open a file of splats, see `read_splats`."""
     head = _beginning(path)
     refuse_pointer(path, head)
-    form = next((form for form in FORMATS if form.matches(path, head)), None)
+    form = next((form for form in READERS if form.matches(path, head)), None)
+    if level and form is not streamed_sog.READER:
+        msg = f"{path}: has no level {level}: only {streamed_sog.INDEX} has levels"
+        raise RefineError(msg)
     if form is None:
         return read_ply(path)
     try:
@@ -80,7 +116,8 @@ def read_splats(path: Path | str) -> SplatFile:
     except (OSError, ValueError) as error:
         msg = f"{path}: cannot be read ({reason_of(error)})"
         raise RefineError(msg) from error
-    return form.read(path, np.frombuffer(whole, np.uint8))
+    data = np.frombuffer(whole, np.uint8)
+    return streamed_sog.read(path, data, level) if level else form.read(path, data)
 
 
 def read_written(path: Path) -> Splats | None:
@@ -139,6 +176,19 @@ def without_suffix(name: str) -> str:
     """Return a file name without the ending of a format of splats, if it has one."""
     end = next((end for end in _LONGEST_FIRST if name.lower().endswith(end)), "")
     return name[: len(name) - len(end)]
+
+
+def scene_name(path: Path) -> str:
+    """Return what the splats of a file are called: as the file, or the folder of an index.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> [scene_name(Path(name)) for name in ("a/b.compressed.ply", "a/b", "a/lod-meta.json")]
+    ['b', 'b', 'a']
+    """
+    name = without_suffix(path.name)
+    return name or path.absolute().parent.name or path.name
 
 
 def refuse_unknown_size(form: Format) -> None:
@@ -224,6 +274,11 @@ class Packed:
                 f"{self.form.suffix} holds harmonics of degree {self.form.degree}, "
                 f"the file has degree {degree}: the others are left out"
             )
+        if self.file.model not in self.form.models:
+            notes.append(
+                f"{self.form.suffix} does not say that splats are {self.file.model}: read it with "
+                f"--model {self.file.model}"
+            )
         names = self.file.rows.dtype.names or ()
         known = ("nx", "ny", "nz", *REQUIRED)
         extra = [n for n in names if n not in known and not n.startswith("f_rest_")]
@@ -263,14 +318,14 @@ class Packed:
             or a column is none that the format holds.
         """
         path = expanded(path)
-        splats = self._chosen(path, keep, columns or {})
+        splats = self.chosen(path, keep, columns or {})
         with whole_file(path, overwrite=overwrite) as stream:
             self.form.write(stream, splats)
 
-    def _chosen(
+    def chosen(
         self, path: Path, keep: NDArray[np.bool_] | None, columns: Mapping[str, NDArray[Any]]
     ) -> Splats:
-        """Return the splats that are written."""
+        """Return the splats that `write` writes; errors name `path`."""
         rows = self.file.rows if keep is None else self.file.rows[keep]
         if columns:
             rows = rows.copy()
@@ -279,7 +334,7 @@ class Packed:
                     msg = f"{path}: {self.form.suffix} holds no property '{name}'; write to a .ply"
                     raise RefineError(msg)
                 rows[name] = values if keep is None else values[keep]
-        splats = splats_from_columns(rows)
+        splats = with_model(splats_from_columns(rows), self.file.model)
         good = drawable(splats)
         if not good.any():
             msg = f"{path}: none of the {len(splats)} splats can be drawn: nothing to write"

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..rendering import Model
     from ..splats import Splats
 
 NAME = "SPZ"
@@ -40,6 +41,8 @@ _TABLE_AT = struct.Struct("<I12x")
 """Behind the header in version 4: the byte at which the table of streams begins."""
 
 _STREAM = struct.Struct("<QQ")  # in that table: bytes of a stream, and of what is in it
+
+_ANTIALIASED = 1  # bit of the flags: trained with antialiasing
 
 _VERSIONS = (2, 3, 4)
 _ONE_TURN, _ZSTD = 2, 4  # versions: rotations without the smallest three, streams by zstd
@@ -74,6 +77,7 @@ class _Header:
     degree: int
     fraction: int
     streams: int
+    model: Model
 
     def blocks(self) -> dict[str, int]:
         """Return the bytes of each attribute by its name, in their order."""
@@ -110,7 +114,7 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
         else:
             blocks = _split(path, header, data[_HEADER.size :])
     origin = Origin(f"{NAME} version {header.version}", len(data))
-    file, splats = new_file(path, origin, header.count, header.degree)
+    file, splats = new_file(path, origin, header.count, header.degree, header.model)
     for piece in pieces(header.count):
         stored = {name: block[piece] for name, block in blocks.items()}
         splats.means[piece] = _positions(stored["mean"], header.fraction)
@@ -126,7 +130,7 @@ def read(path: Path, data: NDArray[np.uint8]) -> SplatFile:
 def _parsed(path: Path, head: bytes) -> _Header:
     """Return what the first bytes say, or refuse them."""
     refuse_short(path, _HEADER.size, len(head), "the first bytes of an SPZ file")
-    magic, version, count, degree, fraction, _, streams = _HEADER.unpack(head)
+    magic, version, count, degree, fraction, flags, streams = _HEADER.unpack(head)
     if magic != SPZ:
         msg = f"{path}: no SPZ file: its gzip stream begins with {magic!r}, expected {SPZ!r}"
         raise RefineError(msg)
@@ -139,7 +143,8 @@ def _parsed(path: Path, head: bytes) -> _Header:
     if fraction > _LARGEST_CODE.bit_length():
         msg = f"{path}: byte 13: {fraction} fractional bits, expected 0 to 23"
         raise RefineError(msg)
-    return _Header(version, count, degree, fraction, streams)
+    model: Model = "antialiased" if flags & _ANTIALIASED else "default"
+    return _Header(version, count, degree, fraction, streams, model)
 
 
 def _refuse_many(path: Path, header: _Header, size: int) -> None:
@@ -312,7 +317,8 @@ def write(stream: BinaryIO, splats: Splats) -> None:
     """
     count, rest = len(splats), 3 * splats.sh_rest.shape[1]
     fraction = _fraction(splats)
-    header = _Header(3, count, splats.sh_degree, fraction, 0)
+    header = _Header(3, count, splats.sh_degree, fraction, 0, splats.model)
+    flags = _ANTIALIASED if splats.model == "antialiased" else 0
     blocks = {name: np.empty((count, n // count), np.uint8) for name, n in header.blocks().items()}
     for piece in pieces(count):
         batch = splats.take(piece)
@@ -328,7 +334,7 @@ def write(stream: BinaryIO, splats: Splats) -> None:
         if rest:
             blocks["rest"][piece] = _harmonic_codes(batch.sh_rest).reshape(-1, rest)
     engine = zlib.compressobj(wbits=16 + zlib.MAX_WBITS)
-    stream.write(engine.compress(_HEADER.pack(SPZ, 3, count, header.degree, fraction, 0, 0)))
+    stream.write(engine.compress(_HEADER.pack(SPZ, 3, count, header.degree, fraction, flags, 0)))
     stream.writelines(engine.compress(block.data) for block in blocks.values())
     stream.write(engine.flush())
 
@@ -377,4 +383,5 @@ FORMAT = Format(
     read=read,
     write=write,
     sizes=None,
+    models=("default", "antialiased"),
 )

@@ -1,16 +1,20 @@
-"""Levels of detail as files in a folder, and the manifest that lists them."""
+"""Levels of detail as files in a folder, or as one streamed SOG."""
 
 from __future__ import annotations
 
 import contextlib
-import json
-import re
+from abc import ABC, abstractmethod
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ..errors import RefineError
 from ..estimate.quality import PSNR_CAP
-from ..formats.registry import SUFFIXES, as_written, without_suffix
+from ..formats import sog
+from ..formats.registry import Packed, as_written, scene_name
+from ..formats.streamed_sog import INDEX
+from ..formats.streamed_sog_write import StreamedSog, folder_for
 from ..operation.files import FileSource
 from ..operation.run import Request, Written, run
 from ..report import held, scoring_notes, seen_by
@@ -23,33 +27,27 @@ from ..whole_file import (
     refuse_existing,
     refuse_mapped,
     refuse_one_file,
-    whole_file,
 )
 from ..work import Progress, silent
-from .lod import each_level, short
+from .lod import MAX_LEVELS, each_level, short
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
+    from contextlib import AbstractContextManager
     from pathlib import Path
     from typing import Any
 
     from ..formats.format import Format
     from ..operation.loaded import Loaded
     from ..operation.run import Runtime
+    from ..rendering import Model
     from ..task import Settings
     from ..views import ViewSet
     from ..volumes import Zone
     from .lod import Level, Levels
 
-MANIFEST = "lod.json"
-
 GOAL = 40.0
 """The PSNR from which on a level is hard to tell from the original, dB."""
-
-_BEGINNING = b'{"lod":'
-
-_LEVEL = re.compile(r"[^/\\]*\.lod\d+(?:" + "|".join(map(re.escape, SUFFIXES)) + ")")
-"""Names of files of levels."""
 
 
 def level_paths(source: Path, folder: Path, count: int, suffix: str = ".ply") -> list[Path]:
@@ -61,15 +59,13 @@ def level_paths(source: Path, folder: Path, count: int, suffix: str = ".ply") ->
     >>> [path.as_posix() for path in level_paths(Path("a/b.compressed.ply"), Path("out"), 2)]
     ['out/b.lod1.ply', 'out/b.lod2.ply']
     """
-    name = without_suffix(source.name)
-    name = source.stem if name == source.name else name or source.name
+    name = scene_name(source)
     return [folder / f"{name}.lod{number}{suffix}" for number in range(1, count + 1)]
 
 
-def is_manifest(beginning: bytes) -> bool:
-    """Return whether a file that begins like this is a manifest of levels, or empty."""
-    words = b"".join(beginning.split())
-    return not words or words.startswith(_BEGINNING)
+def is_streamed(target: Path) -> bool:
+    """Return whether levels that go to `target` become a streamed SOG, by its name."""
+    return target.name == INDEX
 
 
 def check_goal(goal: float) -> None:
@@ -90,11 +86,11 @@ class LevelsRequest(Request["Loaded", "LevelSeries"]):
     zones : sequence of Zone
         Volumes that say which splats must stay and which must go, in the frame of the views.
     suffix : str
-        Of the files, which names their format.
+        Of the files, which names their format; a streamed SOG has none.
     goal : float
-        The PSNR that the manifest's ``distance_psnr`` is for, dB.
-    overwrite : bool
-        Whether files may be replaced.
+        The PSNR that ``distance_psnr`` of the report is for, dB.
+    overwrite, model
+        See `Request`.
     """
 
     views: ViewSet
@@ -104,6 +100,7 @@ class LevelsRequest(Request["Loaded", "LevelSeries"]):
     suffix: str = ".ply"
     goal: float = GOAL
     overwrite: bool = False
+    model: Model | None = None
 
     @contextlib.contextmanager
     def opened(self, _form: Format | None) -> Iterator[None]:
@@ -137,24 +134,21 @@ class LevelSeries:
 
 
 @dataclass(frozen=True, eq=False)
-class LevelSink:
-    """A folder to be filled with a file of each level, and `MANIFEST`, written last.
+class LevelSink(ABC):
+    """Where levels go.
 
     Attributes
     ----------
     source : Path
-        Level 0, which is not written again.
-    folder : Path
-        Made if it is not there.
+        Level 0.
+    target : Path
+        The folder, or the index of a streamed SOG.
     request : LevelsRequest
-    written : list of Path
-        The files that are written so far.
     """
 
     source: Path
-    folder: Path
+    target: Path
     request: LevelsRequest
-    written: list[Path] = field(default_factory=list)
     timing: str = "levels_s"
 
     @property
@@ -162,11 +156,66 @@ class LevelSink:
         """No budget of levels counts bytes."""
         return
 
-    @property
-    def paths(self) -> list[Path]:
-        """The files of the levels."""
-        request = self.request
-        return level_paths(self.source, self.folder, len(request.levels), request.suffix)
+    @abstractmethod
+    def opened(self) -> AbstractContextManager[None]:
+        """Refuse what cannot be written; if the block fails, remove what is new."""
+
+    @abstractmethod
+    def _add(self, loaded: Loaded, level: Level) -> tuple[dict[str, Any], list[str]]:
+        """Write a level; return what the report says of its file, and sentences."""
+
+    def _finish(self) -> list[str]:
+        """Do what is left when all levels are written; return sentences."""
+        return []
+
+    def write(self, loaded: Loaded, series: LevelSeries, _runtime: Runtime) -> Written:
+        """Write each level when it is made.
+
+        Raises
+        ------
+        RefineError, Cancelled
+            See `lod` and `SplatFile.write`.
+        """
+        request, entries = self.request, []
+        notes: list[str] = []
+        remarks: dict[float, str] = {}
+        for level in series.levels:
+            if level.number == 1:
+                facts = self._facts(loaded, level)
+                notes += scoring_notes(level.scores)
+            entry, more = self._add(loaded, level)
+            notes += [note for note in more if note not in notes]
+            entries.append({**level.facts(request.goal), **entry})
+            remarks[level.asked] = level.remark
+        notes += request.levels.notes(remarks) + self._finish()
+        facts["levels"] = entries
+        files = {"input": loaded.name, "output": str(self.target)}
+        return Written(files, notes=notes, facts=facts)
+
+    def _facts(self, loaded: Loaded, first: Level) -> dict[str, Any]:
+        """Return what the report says beside the levels, given the first of them."""
+        seen = seen_by(first.scores)
+        seen["splats"] |= {"before": len(loaded.splats), **loaded.forced.counts()}
+        return {
+            "source": {"file": self.source.name, "bytes": loaded.bytes},
+            **seen,
+            "distances": [short(distance) for distance, _ in first.reach.psnr],
+            "nested": self.request.levels.survivors == "unchanged",
+            "goal_psnr": self.request.goal,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class FolderSink(LevelSink):
+    """A folder to be filled with a file of each level; level 0 is not written again.
+
+    Attributes
+    ----------
+    written : list of Path
+        The files that are written so far.
+    """
+
+    written: list[Path] = field(default_factory=list)
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[None]:
@@ -177,8 +226,8 @@ class LevelSink:
         RefineError
             If the folder cannot be made, or a file exists and may not be replaced.
         """
-        paths = [*self.paths, self.folder / MANIFEST]
-        with new_folder(self.folder):
+        paths = self._paths(len(self.request.levels))
+        with new_folder(self.target):
             refuse_one_file(paths)
             for path in paths:
                 refuse_existing(path, overwrite=self.request.overwrite)
@@ -193,68 +242,104 @@ class LevelSink:
                             path.unlink()
                 raise
 
-    def write(self, loaded: Loaded, series: LevelSeries, _runtime: Runtime) -> Written:
-        """Write each level when it is made, then the manifest.
+    def _paths(self, count: int) -> list[Path]:
+        return level_paths(self.source, self.target, count, self.request.suffix)
 
-        Raises
-        ------
-        RefineError, Cancelled
-            See `lod` and `SplatFile.write`.
-        """
-        request, entries = self.request, []
-        notes: list[str] = []
-        remarks: dict[float, str] = {}
-        for level, path in zip(series.levels, self.paths, strict=False):
-            if level.number == 1:
-                # From here on files of an earlier run are replaced, so its manifest goes first.
-                before = _unlisted(self.folder) if request.overwrite else []
-                # Those that this run does not replace go while they are known: a killed run has
-                # no list of them.
-                notes += _remove(set(before) - {*self.paths}, self.source)
-                facts = self._facts(loaded, level)
-                notes += scoring_notes(level.scores)
-            entry, more = _write(loaded, level, path, overwrite=request.overwrite)
-            self.written.append(path)
-            notes += [note for note in more if note not in notes]
-            entries.append({**level.facts(request.goal), **entry})
-            remarks[level.asked] = level.remark
-        notes += request.levels.notes(remarks)
-        notes += _remove({*before} & {*self.paths} - {*self.written}, self.source)
-        facts["levels"] = entries
-        with whole_file(self.folder / MANIFEST, overwrite=request.overwrite) as stream:
-            stream.write(json.dumps(facts, indent=2, allow_nan=False).encode() + b"\n")
-        files = {"input": loaded.name, "folder": str(self.folder), "manifest": MANIFEST}
-        return Written(files, notes=notes, facts=facts)
-
-    def _facts(self, loaded: Loaded, first: Level) -> dict[str, Any]:
-        """Return what the manifest says beside the levels, given the first of them."""
-        seen = seen_by(first.scores)
-        seen["splats"] |= {"before": len(loaded.splats), **loaded.forced.counts()}
-        return {
-            "lod": 1,  # first: by this a manifest is known, see `is_manifest`
-            "source": {"file": self.source.name, "bytes": loaded.bytes},
-            **seen,
-            "distances": [short(distance) for distance, _ in first.reach.psnr],
-            "nested": self.request.levels.survivors == "unchanged",
-            "goal_psnr": self.request.goal,
+    def _add(self, loaded: Loaded, level: Level) -> tuple[dict[str, Any], list[str]]:
+        path = self._paths(level.number)[-1]
+        writer = as_written(loaded.file(), path)
+        columns = loaded.columns(level.absorbed)
+        writer.write(path, level.keep, columns=columns, overwrite=self.request.overwrite)
+        self.written.append(path)
+        counts = held(writer, level.keep)
+        facts = {
+            "splats": counts["written"],
+            "left_out": counts["left_out"],
+            "file": path.name,
+            "bytes": path.stat().st_size,
         }
+        return facts, writer.notes(level.keep)
+
+    def _finish(self) -> list[str]:
+        """Name levels of a run before, which had more."""
+        more = self._paths(MAX_LEVELS)[len(self.written) :]
+        return [f"{path.name} is of another run" for path in more if mode_of(path)]
+
+
+@dataclass(frozen=True, eq=False)
+class StreamedSink(LevelSink):
+    """A streamed SOG to be made of all levels, with level 0: what is not forced out of the source.
+
+    Attributes
+    ----------
+    made : list of Path
+        The folder in which it is made.
+    scene : list of StreamedSog
+        What is made there, once there is a level.
+    """
+
+    made: list[Path] = field(default_factory=list)
+    scene: list[StreamedSog] = field(default_factory=list)
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[None]:
+        """Refuse what cannot be written; see `streamed_sog_write.folder_for`."""
+        with folder_for(self.target, overwrite=self.request.overwrite) as made:
+            self.made.append(made)
+            yield
+
+    def _add(self, loaded: Loaded, level: Level) -> tuple[dict[str, Any], list[str]]:
+        writer = Packed(loaded.file(), sog.FORMAT)
+        notes = []
+        if level.number == 1:
+            out = loaded.forced.out
+            whole = np.ones(len(loaded.splats), np.bool_) if out is None else ~out
+            finest = writer.chosen(self.target, whole, {})
+            self.scene.append(StreamedSog(finest.means, _width(level), self.made[0]))
+            self.scene[0].add(finest)
+            notes = writer.notes(whole)
+        columns = loaded.columns(level.absorbed)
+        size = self.scene[0].add(writer.chosen(self.target, level.keep, columns))
+        counts = held(writer, level.keep)
+        facts = {
+            "splats": counts["written"],
+            "left_out": counts["left_out"],
+            "file": f"{level.number}_*/{sog.META_READER.suffix}",
+            "bytes": size,
+        }
+        return facts, notes
+
+    def _finish(self) -> list[str]:
+        """Put all in its place."""
+        self.scene[0].publish(self.target, overwrite=self.request.overwrite)
+        return []
+
+
+def _width(level: Level) -> float:
+    """Return how wide a chunk may be: as far as the views are from what they see.
+
+    So the near and the far end of a chunk are no more than twice as far away, seen from there.
+    """
+    return level.reach.psnr[0][0] if level.reach.psnr else np.inf
 
 
 def lod_file(
     source: Path | str,
-    folder: Path | str,
+    target: Path | str,
     request: LevelsRequest,
     *,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Make levels of detail of a file of splats: a file each, and `MANIFEST`, written last.
+    """Make levels of detail of a file of splats: a file each, or a streamed SOG of all.
 
     Parameters
     ----------
     source : path-like
-        The file to read, of any format (`read_splats`); level 0, which is not written again.
-    folder : path-like
-        Where the files go, named as by `level_paths`; made if it is not there.
+        The file to read, of any format (`read_splats`); level 0, which is not written again but in
+        a streamed SOG.
+    target : path-like
+        The folder where the files go, named as by `level_paths`; or the index of a streamed SOG,
+        ``lod-meta.json`` in such a folder. The folder is made if it is not there.
     request : LevelsRequest
         What is asked.
     progress : callable, optional
@@ -263,61 +348,15 @@ def lod_file(
     Returns
     -------
     dict
-        The report: what the manifest says, settings, timings, notes.
+        The report.
 
     Raises
     ------
     RefineError, Cancelled
         See `lod`, `volumes.forced`, `read_splats` and `SplatFile.write`. Files that were new are
-        removed again then, and where one was to be replaced, no manifest is left.
+        removed again then; a streamed SOG that was to be replaced is as it was.
     """
-    sink = LevelSink(expanded(source), expanded(folder), request)
-    read = FileSource(source, request.zones)
+    path = expanded(target)
+    sink = (StreamedSink if is_streamed(path) else FolderSink)(expanded(source), path, request)
+    read = FileSource(source, request.zones, request.model)
     return run(read, request, sink, progress=progress).report
-
-
-def _write(
-    loaded: Loaded, level: Level, path: Path, *, overwrite: bool
-) -> tuple[dict[str, Any], list[str]]:
-    """Write the file of a level; return what the manifest says of it, and sentences."""
-    writer = as_written(loaded.file(), path)
-    writer.write(path, level.keep, columns=loaded.columns(level.absorbed), overwrite=overwrite)
-    counts = held(writer, level.keep)
-    facts = {
-        "splats": counts["written"],
-        "left_out": counts["left_out"],
-        "file": path.name,
-        "bytes": path.stat().st_size,
-    }
-    return facts, writer.notes(level.keep)
-
-
-def _unlisted(folder: Path) -> list[Path]:
-    """Remove the manifest of an earlier run; return the files of levels that it lists.
-
-    Names that no level has, or of other folders, do not count.
-    """
-    path = folder / MANIFEST
-    try:
-        manifest = json.loads(path.read_bytes())
-        names = [str(entry["file"]) for entry in manifest["levels"]]
-    except (OSError, ValueError, LookupError, TypeError, RecursionError):  # none that we wrote
-        names = []
-    path.unlink(missing_ok=True)
-    return [folder / name for name in names if _LEVEL.fullmatch(name)]
-
-
-def _remove(paths: Iterable[Path], source: Path) -> list[str]:
-    """Remove files that are there, but not the source; return what there is to say."""
-    notes = []
-    for path in sorted(paths):
-        try:
-            if path.samefile(source):
-                continue
-            path.unlink()
-            notes.append(f"{path.name} of the run before is removed")
-        except FileNotFoundError:
-            continue
-        except OSError as error:
-            notes.append(f"{path.name} of the run before is not removed ({error.strerror})")
-    return notes

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ..formats.format import Format
+    from ..rendering import Model
     from ..task import Result
     from ..volumes import Zone
     from .requests import PruneRequest
@@ -89,7 +90,8 @@ def file_to_file(
         overwrite=request.overwrite,
         dry_run=request.dry_run,
     )
-    return run(FileSource(source, request.zones), request, sink, progress=progress, threads=threads)
+    read = FileSource(source, request.zones, request.model)
+    return run(read, request, sink, progress=progress, threads=threads)
 
 
 @dataclass(frozen=True)
@@ -101,10 +103,13 @@ class FileSource:
     path : path-like
     zones : sequence of Zone
         Volumes that say which splats must stay and which must go.
+    model : {"default", "antialiased", "2dgs"}, optional
+        How the splats are drawn, where the file does not say or is wrong.
     """
 
     path: Path | str
     zones: Sequence[Zone] = ()
+    model: Model | None = None
 
     def read(self, form: Format | None) -> Loaded:
         """Read the file; its frame is that of the views.
@@ -114,7 +119,7 @@ class FileSource:
         RefineError
             See `read_splats` and `volumes.forced`.
         """
-        file = read_splats(self.path)
+        file = read_splats(self.path, self.model)
         splats = file.splats()
         return Loaded(
             name=str(file.path),

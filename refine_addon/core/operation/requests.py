@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from ..cleaning.clean import Cleaned
     from ..formats.format import Format
     from ..picture_files import PictureFiles
+    from ..rendering import Model
     from ..selection import Budget
     from ..survivor_choice import SurvivorChoice
     from ..task import Result
@@ -53,7 +54,7 @@ class PruneRequest(Request["Loaded", "Result"]):
         How much goes.
     settings : Settings
         How to score.
-    zones, overwrite, dry_run
+    zones, overwrite, dry_run, model
         See `Request`.
     survivors : {"auto", "unchanged", "absorb", "refit"}
         What survivors may become; see `Task`.
@@ -71,6 +72,7 @@ class PruneRequest(Request["Loaded", "Result"]):
     cleaning: Cleaning | None = None
     pictures: PictureFiles | None = None
     overwrite: bool = False
+    model: Model | None = None
     dry_run: bool = False
 
     def __post_init__(self) -> None:
@@ -227,7 +229,7 @@ class CleanRequest(Request["Loaded", Kept]):
         Those that decide.
     cleaning : Cleaning
         What to clean away.
-    zones, overwrite
+    zones, overwrite, model
         See `Request`.
     """
 
@@ -235,6 +237,7 @@ class CleanRequest(Request["Loaded", Kept]):
     cleaning: Cleaning = field(default_factory=Cleaning)
     zones: Sequence[Zone] = ()
     overwrite: bool = False
+    model: Model | None = None
 
     def decide(self, loaded: Loaded, runtime: Runtime) -> Kept:
         """Return what `clean` leaves.
@@ -270,7 +273,7 @@ class ScoreRequest(Request["Loaded", Kept]):
         Those that decide.
     settings : Settings
         How to score.
-    zones, overwrite
+    zones, overwrite, model
         See `Request`. What must go scores 0.
     """
 
@@ -278,6 +281,7 @@ class ScoreRequest(Request["Loaded", Kept]):
     settings: Settings = DEFAULTS
     zones: Sequence[Zone] = ()
     overwrite: bool = False
+    model: Model | None = None
 
     def decide(self, loaded: Loaded, runtime: Runtime) -> Kept:
         """Return all splats, with their scores as a property.
@@ -314,11 +318,12 @@ class ConvertRequest(Request["Loaded", Kept]):
 
     Attributes
     ----------
-    overwrite
+    overwrite, model
         See `Request`.
     """
 
     overwrite: bool = False
+    model: Model | None = None
 
     def decide(self, loaded: Loaded, _runtime: Runtime) -> Kept:
         """Return all splats."""

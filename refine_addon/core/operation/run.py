@@ -6,7 +6,7 @@ A request says what is to be done, a source where the splats are, a sink where t
 |---|---|---|---|---|
 | `prune_file` | `FileSource` | `PruneRequest` | `FileSink` | `core/operation/files.py` |
 | `file_to_file` | `FileSource` | any of `requests.py` | `FileSink` | `core/operation/files.py` |
-| `lod_file` | `FileSource` | `LevelsRequest` | `LevelSink` | `core/levels/files.py` |
+| `lod_file` | `FileSource` | `LevelsRequest` | a `LevelSink` | `core/levels/files.py` |
 | `prune_object` | `ObjectSource` | `PruneRequest` | `ObjectSink` | `objects/operation.py` |
 | `score_object` | `ObjectSource` | `ScoreRequest` | `FileSink` | `objects/operation.py` |
 | `prune_tiles` | `TileScene` | `TilesRequest` | `TileSink` | `core/tiles/prune.py` |
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ..formats.format import Format
+    from ..rendering import Model
     from ..volumes import Zone
 
 
@@ -117,9 +118,12 @@ class Request(ABC, Generic[LoadedT_contra, DecisionT]):
         Whether files may be replaced.
     dry_run : bool
         Whether to decide as for the output, and write no splats.
+    model : {"default", "antialiased", "2dgs"}, optional
+        How the splats of a file are drawn, where it does not say or is wrong.
     """
 
     zones: Sequence[Zone] = ()
+    model: Model | None = None
     overwrite: bool = False
     dry_run: bool = False
 
@@ -191,15 +195,23 @@ def run(
     ------
     RefineError, Cancelled
         See the steps. Nothing is written then; but where comparing fails or is cancelled, after
-        writing, the file that was written stays.
+        writing, the file that was written stays; and where refitting is cancelled, what it had
+        reached is written.
     """
     runtime = Runtime(progress=progress, threads=threads)
     with request.opened(sink.form), sink.opened():
         loaded = source.read(sink.form)
         runtime.clock.lap("read_s")
         decision = request.decide(loaded, runtime)
+        stopped = getattr(decision, "stopped", None)
+        if stopped is not None:  # what was reached is written
+            runtime = replace(runtime, progress=silent)
         written = sink.write(loaded, decision, runtime)
         runtime.clock.lap(sink.timing)
+        if stopped is not None:
+            if written.path is not None:
+                stopped.add_note(f"{written.path} is written with what that had reached")
+            raise stopped
         try:
             compared = request.compare(loaded, decision, written.path, runtime)
         except (Cancelled, KeyboardInterrupt) as stop:

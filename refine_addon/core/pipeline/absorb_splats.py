@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -17,10 +17,12 @@ from ..scoring import occlusion
 from ..selection import Budget, quality_of, select
 from ..task import DEFAULTS, Settings
 from ..work import Progress, part, silent
-from .refit_splats import Made, refit_absorbed
+from .refit_splats import Made, refit_made
 from .score_splats import score_once, with_quality
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from ..absorbing.absorb import Absorbed
@@ -51,7 +53,7 @@ ABSORBED = 0.3
 
 def absorb_task(
     task: Task,
-    count: int,
+    keep: NDArray[np.bool_],
     known: tuple[Scores, Measured] | None,
     progress: Progress,
     threads: int | None,
@@ -61,8 +63,9 @@ def absorb_task(
     Parameters
     ----------
     task : Task
-    count : int
-        How many survive, unless the budget is a PSNR: then as few as keep it.
+    keep : (N,) bool
+        Which splats plain deletion keeps: as many survive, unless the budget is a PSNR: then as few
+        as keep it.
     known : tuple of Scores and Measured, optional
         See `absorb_removed`.
     progress : callable
@@ -81,36 +84,52 @@ def absorb_task(
         )  # fmt: skip
     progress = part(progress, start, 1.0)
     if goal is None:
-        return _absorb_to_count(task, count, known, progress, threads)
+        return _absorb_to_count(task, keep, known, progress, threads)
     return _absorb_to_psnr(task, goal, known, progress, threads)
 
 
 def _absorb_to_count(
     task: Task,
-    count: int,
+    keep: NDArray[np.bool_],
     known: tuple[Scores, Measured],
     progress: Progress,
     threads: int | None,
 ) -> Made:
-    """Return what so many survivors become, and the estimated PSNR of it, dB."""
+    """Return what as many survivors become as deletion keeps, and the estimated PSNR of it, dB."""
     splats, views = task.scene()
     origin, refits = task.origin, task.survivors == "refit"
+    truth = known[0].ray_sample if origin is None else origin.ray_sample
+    used = views.spread(task.settings.views)
+
+    def estimated(survivors: Splats, share: float) -> float | None:
+        if truth is None:
+            return None
+        last = part(progress, share, min(share + 0.05, 1.0))
+        return psnr_against(truth, survivors, used, progress=last, threads=threads)
+
     absorbed = absorb_removed(
-        splats, views, count, task.settings, known=known, protected=task.protected,
+        splats, views, int(np.count_nonzero(keep)), task.settings,
+        known=known, protected=task.protected,
         began=None if origin is None else len(origin.splats),
         progress=part(progress, 0.0, ABSORBED if refits else 0.95), threads=threads,
     )  # fmt: skip
-    made = Made(absorbed)
-    if refits:
-        made = refit_absorbed(task, made, part(progress, ABSORBED, 0.95), threads)
-    truth = known[0].ray_sample if origin is None else origin.ray_sample
-    if truth is None:
+    if not refits:
+        return Made(absorbed, estimated(absorbed.splats, 0.95))
+    plain = estimated(splats.take(keep), ABSORBED)
+    psnr = estimated(absorbed.splats, ABSORBED + 0.05)
+    made = Made(absorbed, psnr, before={"unchanged": plain, "absorb": psnr})
+    if plain is not None and psnr is not None and plain > psnr:
+        made = replace(made, absorbed=_deleted(splats, keep), psnr=plain, began="unchanged")
+    made = refit_made(task, made, part(progress, ABSORBED + 0.1, 0.95), threads)
+    if made.refitted is None or made.stopped is not None:
         return made
-    used = views.spread(task.settings.views)
-    progress = part(progress, 0.95, 1.0)
-    survivors = made.survivors.splats
-    psnr = psnr_against(truth, survivors, used, progress=progress, threads=threads)
-    return replace(made, psnr=psnr)
+    return replace(made, psnr=estimated(made.refitted.splats, 0.95))
+
+
+def _deleted(splats: Splats, keep: NDArray[np.bool_]) -> Absorbed:
+    """Return what plain deletion leaves, as absorbing returns it."""
+    left = absorbing.in_float64(splats.take(keep))
+    return absorbing.Absorbed(left, keep, np.zeros(len(left), np.bool_), 0, len(keep) - len(left))
 
 
 def _absorb_to_psnr(
@@ -122,32 +141,63 @@ def _absorb_to_psnr(
 ) -> Made:
     """Return the result with as few survivors as keep a PSNR, dB.
 
-    What a number of survivors reaches is read from the curve of the scores, and put right by what
-    the last try reached.
+    What a number of survivors reaches is read from the curve of the scores, put right by what the
+    last try reached; between a try that keeps the PSNR and one that does not, from these two.
     """
     scores, total = known[0], len(task.scene()[0])
     if scores.quality is None:
         scores = with_quality(scores, protected=task.protected, threads=threads)
     curve = quality_of(scores)
     way: Became = "refit" if task.survivors == "refit" else "absorb"
-    # By how much results are closer than the curve expects, dB.
-    offset = 0.0 if task.origin is None else goal - left_to_lose(goal, task.origin.psnr)
-    best: Made | None = None
-    missed = math.inf
+    origin = None if task.origin is None else task.origin.psnr
+    gone, tried, best = curve.share(left_to_lose(goal, origin), way), list[_Try](), None
     for number in range(TRIES):
-        count = total - math.floor(curve.share(goal - offset, way) * total)
+        count = max(total - math.floor(gone * total), 1)
+        if any(count == one.survivors for one in tried):
+            break
         try_progress = part(progress, number / TRIES, (number + 1) / TRIES)
-        made = _absorb_to_count(task, count, known, try_progress, threads)
+        keep = select(known[0], Budget(keep=count), protected=task.protected)
+        made = _absorb_to_count(task, keep, known, try_progress, threads)
+        if made.stopped is not None:
+            return replace(best or made, stopped=made.stopped)
         if made.psnr is None:
             return made
-        if best is None or abs(made.psnr - goal) < missed:
-            best, missed = made, abs(made.psnr - goal)
-        if missed <= CLOSE:
+        tried.append(_Try(count, made.psnr))
+        if best is None or min(tried, key=lambda one: one.misses(goal)) is tried[-1]:
+            best = made
+        if abs(made.psnr - goal) <= CLOSE:
             break
         gone = 1.0 - len(made.absorbed.splats) / total
-        offset = made.psnr - curve.at(gone, way)
+        gone = _between(tried, goal, total) or curve.share(
+            goal - made.psnr + curve.at(gone, way), way
+        )
     assert best is not None  # noqa: S101 - every try gives one
     return best
+
+
+class _Try(NamedTuple):
+    """How many survivors reached which PSNR, dB."""
+
+    survivors: int
+    psnr: float
+
+    def misses(self, goal: float) -> tuple[bool, float]:
+        """Return by how much it misses a PSNR, as a key: above is better than below."""
+        return self.psnr < goal - CLOSE, abs(self.psnr - goal)
+
+
+def _between(tried: Sequence[_Try], goal: float, total: int) -> float | None:
+    """Return which share of `total` has to go by the tries next to a PSNR; None without both.
+
+    The PSNR is taken as linear in the logarithm of the odds of that share, as by `Quality.at`.
+    """
+    above = min((one for one in tried if one.psnr >= goal), default=None)
+    below = max((one for one in tried if one.psnr < goal), default=None)
+    if above is None or below is None:
+        return None
+    odds = np.log([total / one.survivors - 1.0 for one in (below, above)])
+    place = np.interp(goal, [below.psnr, above.psnr], odds)
+    return float(1.0 / (1.0 + np.exp(-place)))
 
 
 def absorb_removed(  # noqa: PLR0913 - as `pipeline.prune`

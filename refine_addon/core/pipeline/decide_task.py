@@ -15,11 +15,11 @@ import numpy as np
 from .. import selection
 from ..estimate.cost import expected_seconds
 from ..estimate.psnr import psnr_kept
-from ..estimate.quality import AS_GOOD, PLAIN, deletion_will_do, needed
+from ..estimate.quality import AS_GOOD, PLAIN, deletion_will_do, in_words, needed
 from ..report import MEASURES, Clock, conclude, expected_psnr, in_tenths, make_report, remark
 from ..task import DEFAULTS, Result, Settings, Task
 from ..work import Progress, part, report, silent
-from .absorb_splats import absorb_task
+from .absorb_splats import CLOSE, absorb_task
 from .refit_splats import unchanged_note
 from .score_splats import score, score_once, with_quality
 
@@ -87,7 +87,10 @@ def prune(  # noqa: PLR0913 - the main function of core; all but three are optio
         row_bytes=row_bytes,
         fixed_bytes=fixed_bytes,
     )
-    return decide(task, progress=progress, threads=threads)
+    result = decide(task, progress=progress, threads=threads)
+    if result.stopped is not None:
+        raise result.stopped
+    return result
 
 
 def decide(
@@ -101,7 +104,8 @@ def decide(
 
     Step 1 selects by scores, which are computed unless the task has them. Step 2, only if survivors
     may change, keeps the number of survivors, but finds them and their new values by merging, and
-    refits them, if asked.
+    refits them, if asked. If it is cancelled while it refits, or by a signal, the result is what
+    refitting had reached; `Result.stopped` says so.
 
     Parameters
     ----------
@@ -145,8 +149,7 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     clock.lap("select_s")
     made = None
     if not (by_default and _will_do(task, scores, plain)):
-        count = int(np.count_nonzero(keep))
-        made = absorb_task(task, count, known, part(progress, 0.2, 1.0), threads)
+        made = absorb_task(task, keep, known, part(progress, 0.2, 1.0), threads)
         clock.lap("absorb_s")
         if not (by_default and _as_good(task, keep, plain, made)):
             return _absorbed(task, scores, plain, made, clock)
@@ -157,7 +160,7 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     if made is not None and task.budget.psnr is None:  # of as many survivors
         measured |= made.measured()
     gone = facts["splats"]["removed"] / len(result.keep)
-    facts["survivors"] |= {"asked": "auto", **expected_psnr(scores.quality, gone, measured)}
+    facts["survivors"] |= {"asked": "auto", **expected_psnr(scores, gone, measured)}
     if gone:
         facts["notes"].append(unchanged_note(psnr, made))
     return result
@@ -173,7 +176,7 @@ def _delete(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     facts["survivors"] = {
         "asked": task.survivors,
         "became": "unchanged",
-        **expected_psnr(scores.quality, gone, {"unchanged": psnr}),
+        **expected_psnr(scores, gone, {"unchanged": psnr}),
         "seconds": _seconds(task, clock, gone, once=False),
     }
     return Result(keep, scores, facts)
@@ -197,19 +200,22 @@ def _absorbed(task: Task, scores: Scores, plain: float | None, made: Made, clock
     gone = facts["splats"]["removed"] / len(absorbed.keep)
     measured = made.measured()
     if task.budget.psnr is None:  # else deletion keeps another number of splats
-        measured["unchanged"] = plain
+        measured.setdefault("unchanged", plain)
     once = task.survivors == "auto" or (task.scores is None and not task.budget.needs_scores)
     facts["survivors"] = {
         "asked": task.survivors,
         "became": made.became,
-        **expected_psnr(scores.quality, gone, measured),
+        **expected_psnr(scores, gone, measured),
         "seconds": _seconds(task, clock, gone, once=once),
     }
     facts |= made.facts()
     facts["notes"] += made.notes()
+    if made.became == "absorb" and plain is not None and plain > (made.psnr or plain):
+        facts["notes"].append(f"plain deletion reaches more: {in_words(plain)}")
     if once and task.settings.method == "closed-form":
         facts["notes"].append(MEASURES)
-    return Result(absorbed.keep, scores, facts, made.survivors)
+    survivors = None if made.became == "unchanged" else made.survivors
+    return Result(absorbed.keep, scores, facts, survivors, made.stopped)
 
 
 def _facts(
@@ -292,9 +298,9 @@ def _as_good(task: Task, keep: NDArray[np.bool_], plain: float | None, made: Mad
     """
     if plain is None or made.psnr is None:
         return True
-    fewer = np.count_nonzero(keep) - len(made.absorbed.splats)
-    if task.budget.psnr is not None:  # both keep it
-        return bool(fewer <= 0)
+    if task.budget.psnr is not None:
+        missed = made.psnr < task.budget.psnr - CLOSE and made.psnr < plain
+        return missed or np.count_nonzero(keep) <= len(made.absorbed.splats)
     return plain > made.psnr - AS_GOOD
 
 

@@ -1,13 +1,14 @@
-"""Refitting what absorbing made, and what there is to say of it."""
+"""Refitting what deleting or absorbing left, and what there is to say of it."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from ..estimate.quality import in_words
-from ..refitting.refit import refit
+from ..refitting.refit import refit_rounds
+from ..work import Cancelled
 
 if TYPE_CHECKING:
     from ..absorbing.absorb import Absorbed
@@ -15,6 +16,10 @@ if TYPE_CHECKING:
     from ..survivor_choice import Became
     from ..task import Task
     from ..work import Progress
+
+DOING = "refitting"
+"""What a progress callback is told while survivors are refitted: from here on a cancelled prune
+still has something to offer; see `Result.stopped`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,30 +29,37 @@ class Made:
     Attributes
     ----------
     absorbed : Absorbed
-        By absorbing alone.
+        Before refitting: by absorbing, or by deletion where that is better to begin with.
     psnr : float or None
         The estimated PSNR of what they became in the end, dB; None if too little is seen.
     refitted : Refitted or None
         By refitting; None where they were not refitted.
     seconds : float
         How long refitting took.
+    before : dict of str to (float or None)
+        Where refitting was asked for: the estimates before it, by what survivors had become, dB.
+    began : {"unchanged", "absorb"}
+        Which of these refitting began with.
+    stopped : Cancelled or KeyboardInterrupt or None
+        What ended refitting before it was done; see `Result.stopped`.
     """
 
     absorbed: Absorbed
     psnr: float | None = None
     refitted: Refitted | None = None
     seconds: float = 0.0
+    before: dict[Became, float | None] = field(default_factory=dict)
+    began: Became = "absorb"
+    stopped: Cancelled | KeyboardInterrupt | None = None
 
     @property
     def became(self) -> Became:
         """What survivors became."""
-        return "absorb" if self.refitted is None else "refit"
+        return self.began if self.refitted is None else "refit"
 
     def measured(self) -> dict[Became, float | None]:
         """Return the estimates of the PSNR by what survivors became, dB."""
-        if self.refitted is None:
-            return {"absorb": self.psnr}
-        return {"absorb": self.refitted.psnr_before, "refit": self.psnr}
+        return {**self.before, self.became: self.psnr}
 
     @property
     def survivors(self) -> Absorbed:
@@ -59,11 +71,20 @@ class Made:
 
     def facts(self) -> dict[str, Any]:
         """Return what a report says of refitting: nothing where survivors were not refitted."""
-        return {} if self.refitted is None else {"refitted": self.refitted.facts(self.seconds)}
+        if self.refitted is None:
+            return {}
+        return {"refitted": {"began": self.began, **self.refitted.facts(self.seconds)}}
 
     def notes(self) -> list[str]:
         """Return the same as sentences, for the user."""
-        return [] if self.refitted is None else [self.refitted.note(self.seconds)]
+        notes = []
+        if self.refitted is not None:
+            none = "refitting gains nothing on rays that nothing was fitted to"
+            notes.append(self.refitted.note(self.seconds) if self.refitted.rounds else none)
+        if self.began == "unchanged":
+            told = [in_words(psnr) for psnr in self.before.values() if psnr is not None]
+            notes.append(f"refitting began with plain deletion: {told[0]}, absorbing {told[1]}")
+        return [*notes, *getattr(self.stopped, "__notes__", ())]
 
 
 def unchanged_note(plain: float | None, tried: Made | None) -> str:
@@ -85,30 +106,48 @@ def unchanged_note(plain: float | None, tried: Made | None) -> str:
     return f"survivors stay unchanged: {why}"
 
 
-def refit_absorbed(task: Task, made: Made, progress: Progress, threads: int | None) -> Made:
-    """Refit what absorbing made of a task to what the views see of the unpruned splats.
+def refit_made(task: Task, made: Made, progress: Progress, threads: int | None) -> Made:
+    """Refit what was made of a task to what the views see of the unpruned splats.
 
     Parameters
     ----------
     task : Task
     made : Made
-        By absorbing alone.
+        Before refitting.
     progress : callable
+        Is told `DOING`; where it cancels, and where a signal does, the rounds so far are returned.
     threads : int or None
 
     Returns
     -------
     Made
-        Without an estimate of the PSNR; as it is where nothing was removed.
+        With the PSNR by the rays that told what rounds gained; as it is where nothing was removed.
     """
     splats, views = task.scene()
     original = splats if task.origin is None else task.origin.splats
     absorbed, start = made.absorbed, time.perf_counter()
     if absorbed.keep.all() and task.origin is None:
         return made
-    done = refit(
-        absorbed.splats, original, views.spread(task.settings.views),
-        protected=None if task.protected is None else task.protected[absorbed.keep],
-        progress=progress, threads=threads,
-    )  # fmt: skip
-    return Made(absorbed, None, done, time.perf_counter() - start)
+    done: Refitted | None = None
+    stopped = None
+    try:
+        for reached in refit_rounds(
+            absorbed.splats, original, views.spread(task.settings.views),
+            protected=None if task.protected is None else task.protected[absorbed.keep],
+            progress=lambda fraction, _what: progress(fraction, DOING), threads=threads,
+        ):  # fmt: skip
+            done = reached
+    except (Cancelled, KeyboardInterrupt) as stop:
+        stopped = _noted(stop, 0 if done is None else done.rounds)
+        if done is None or not done.rounds:
+            return replace(made, stopped=stopped)
+    assert done is not None  # noqa: S101 - what is to be refitted is yielded first
+    seconds = time.perf_counter() - start
+    return replace(made, psnr=done.psnr, refitted=done, seconds=seconds, stopped=stopped)
+
+
+def _noted(stop: Cancelled | KeyboardInterrupt, rounds: int) -> Cancelled | KeyboardInterrupt:
+    """Return what stopped refitting, with a note of that, and without what was worked on."""
+    after = f"after round {rounds}" if rounds else "before its first round was done"
+    stop.add_note(f"refitting was stopped {after}")
+    return stop.with_traceback(None)

@@ -14,7 +14,8 @@ along the splat's axis j, whose scale is s_j and the longest of which is s::
     da / d log s_j       = a (s_j h_j)^2
     da / d turn_1        = a (s_2^2 - s_3^2) h_2 h_3    a small turn about axis 1; others in turn
 
-That J changes with the mean, and the colour with the direction of view, is left out. Parameters are
+That J changes with the mean, the colour with the direction of view, and what antialiasing keeps of
+the opacity with the scales, is left out. Of discs, d is scaled to their plane first. Parameters are
 those of the splat's own axes, so results turn and grow with the scene.
 
 With ``e = A d``, h_j is ``r_j e``, r_j the splat's axis in the image, in pixels. So the ten
@@ -29,8 +30,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..rendering import ALPHA_CUT, ALPHA_MAX
+from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..seeing import projection
+from ..seeing.cast import BEHIND
 from ..seeing.ray_sums import in_front
 from ..seeing.rays import LEAST_LEFT, LOG_OPAQUE
 from ..splats import SH_C0, rotation_matrices
@@ -99,30 +101,29 @@ class LinearView:
     ----------
     rows : (u,) int64
         Rows of the splats that are hit, among all that are refitted.
-    colors : (3, P) float64
-        What the rays see now, 0..1.
-    ray, owner : (h,) int64
+    errors : (3, P) float32
+        The colours that the rays should see, less those that they see now.
+    ray : (h,) uint16
+    owner : (h,) int32
         Of each hit: its ray, and the splat as a place in `rows`.
-    weight : (h,) float32
-        T a.
-    by_alpha : (3, h) float32
-        How the colour changes with alpha, ``T (c - B)``.
-    alpha : (h,) float32
-        0 where it is clipped, and does not change.
-    steepness : (2, h) float32, optional
+    weight : (h,) uint16
+        T a, see `_halves`.
+    by_log_alpha : (3, h) uint16
+        How the colour changes with the logarithm of alpha, ``T a (c - B)``; 0 where alpha is
+        clipped, and does not change.
+    steepness : (2, h) uint16, optional
         ``A d`` across and down, 1/px; none if geometry does not change.
     slopes : Slopes
         Of the splats that are hit.
     """
 
     rows: NDArray[np.int64]
-    colors: NDArray[np.float64]
-    ray: NDArray[np.int64]
-    owner: NDArray[np.int64]
-    weight: NDArray[np.float32]
-    by_alpha: NDArray[np.float32]
-    alpha: NDArray[np.float32]
-    steepness: NDArray[np.float32] | None
+    errors: NDArray[np.float32]
+    ray: NDArray[np.uint16]
+    owner: NDArray[np.int32]
+    weight: NDArray[np.uint16]
+    by_log_alpha: NDArray[np.uint16]
+    steepness: NDArray[np.uint16] | None
     slopes: Slopes
 
     def forward(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -133,20 +134,20 @@ class LinearView:
         change : (13, N) float32
             Of the parameters of all splats.
         """
-        mine = change[:, self.rows]
-        alpha = (self.slopes.opacity * mine[OPACITY][0]).take(self.owner)
+        mine = change.take(self.rows, axis=1)
+        ray, owner = self.ray.astype(np.intp), self.owner.astype(np.intp)
+        log_alpha = (self.slopes.opacity * mine[OPACITY][0]).take(owner)
         if self.steepness is not None:
-            x, y, xx, xy, yy = (each.take(self.owner) for each in self.slopes.polynomials(mine))
-            across, down = self.steepness
-            alpha += across * (x + across * xx + down * xy)
-            alpha += down * (y + down * yy)
-        alpha *= self.alpha
-        result = np.empty((3, self.colors.shape[1]), np.float32)
+            x, y, xx, xy, yy = (each.take(owner) for each in self.slopes.polynomials(mine))
+            across, down = map(_floats, self.steepness)
+            log_alpha += across * (x + across * xx + down * xy)
+            log_alpha += down * (y + down * yy)
+        result, weight = np.empty_like(self.errors), _floats(self.weight)
         for channel in range(3):
-            light = (self.slopes.light[channel] * mine[channel]).take(self.owner)
-            light *= self.weight
-            light += self.by_alpha[channel] * alpha
-            result[channel] = np.bincount(self.ray, light, self.colors.shape[1])
+            light = (self.slopes.light[channel] * mine[channel]).take(owner)
+            light *= weight
+            light += _floats(self.by_log_alpha[channel]) * log_alpha
+            result[channel] = np.bincount(ray, light, self.errors.shape[1])
         return result
 
     def backward(self, errors: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -157,40 +158,45 @@ class LinearView:
         errors : (3, P) float32
         """
         result = np.zeros((COUNT, len(self.rows)))
-        value = np.zeros(len(self.owner), np.float32)
+        ray, owner = self.ray.astype(np.intp), self.owner.astype(np.intp)
+        value, weight = np.zeros(len(owner), np.float32), _floats(self.weight)
         for channel in range(3):
-            error = errors[channel].take(self.ray)
-            value += self.by_alpha[channel] * error
-            error *= self.weight
-            result[channel] = self.slopes.light[channel] * self._sum(error)
-        value *= self.alpha
-        result[OPACITY] = self.slopes.opacity * self._sum(value)
+            error = errors[channel].take(ray)
+            value += _floats(self.by_log_alpha[channel]) * error
+            error *= weight
+            result[channel] = self.slopes.light[channel] * self._sum(error, owner)
+        result[OPACITY] = self.slopes.opacity * self._sum(value, owner)
         if self.steepness is not None:
-            across, down = self.steepness
+            across, down = map(_floats, self.steepness)
             x, y = value * across, value * down
-            moments = (x, y, x * across, x * down, y * down)
-            result[MEAN.start :] = self.slopes.gradients([self._sum(each) for each in moments])
+            moments = [x, y, x * across, x * down, y * down]
+            sums = np.stack([self._sum(each, owner).astype(np.float32) for each in moments])
+            result[MEAN.start :] = self.slopes.gradients(sums)
         return result
 
     def diagonal(self) -> NDArray[np.float64]:
         """Return the squared length of each column, that is of each parameter, (13, u)."""
         result = np.zeros((COUNT, len(self.rows)))
-        result[COLOR] = np.square(self.slopes.light) * self._sum(np.square(self.weight))
-        value = np.square(self.by_alpha).sum(axis=0) * np.square(self.alpha)
-        result[OPACITY.start] = np.square(self.slopes.opacity) * self._sum(value)
+        owner = self.owner.astype(np.intp)
+        result[COLOR] = np.square(self.slopes.light) * self._sum(
+            np.square(_floats(self.weight)), owner
+        )
+        value = np.square(_floats(self.by_log_alpha)).sum(axis=0)
+        result[OPACITY.start] = np.square(self.slopes.opacity) * self._sum(value, owner)
         if self.steepness is None:
             return result
-        x, y = self.steepness
+        x, y = map(_floats, self.steepness)
         squares = (x * x, x * y, y * y)
         second = [value * each for each in squares]
         fourth = [each * squares[0] for each in second[:2]] + [each * squares[2] for each in second]
-        result[MEAN] = self.slopes.squared_linear([self._sum(each) for each in second])
-        result[SCALE.start :] = self.slopes.squared_quadratic([self._sum(each) for each in fourth])
+        sums = [self._sum(each, owner) for each in (*second, *fourth)]
+        result[MEAN] = self.slopes.squared_linear(sums[:3])
+        result[SCALE.start :] = self.slopes.squared_quadratic(sums[3:])
         return result
 
-    def _sum(self, values: NDArray[np.float32]) -> NDArray[np.float64]:
+    def _sum(self, values: NDArray[np.float32], owner: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the sum of values of hits over the hits of each splat, (u,)."""
-        return np.asarray(np.bincount(self.owner, values, len(self.rows)), np.float64)
+        return np.asarray(np.bincount(owner, values, len(self.rows)), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,12 +232,12 @@ class Slopes:
             *np.einsum("kiu,ku->iu", self.quadratic, change[SCALE.start :]),
         ]
 
-    def gradients(self, moments: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the transpose of `polynomials`: nine parameters of five sums, (9, u)."""
+    def gradients(self, moments: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the transpose of `polynomials`: nine parameters, (9, u), of five sums, (5, u)."""
         return np.concatenate(
             [
-                np.einsum("kiu,iu->ku", self.linear, np.stack(moments[:2])),
-                np.einsum("kiu,iu->ku", self.quadratic, np.stack(moments[2:])),
+                np.einsum("kiu,iu->ku", self.linear, moments[:2]),
+                np.einsum("kiu,iu->ku", self.quadratic, moments[2:]),
             ]
         )
 
@@ -266,6 +272,7 @@ class Slopes:
 def linear_view(
     rays: Rays,
     footprints: Footprints,
+    truth: NDArray[np.float32],
     colors: NDArray[np.float64],
     shapes: Shapes,
     view: View,
@@ -275,8 +282,11 @@ def linear_view(
     Parameters
     ----------
     rays : Rays
+        At most 2^16 of them.
     footprints : Footprints
         In the view.
+    truth : (3, P) float32
+        The colours that the rays should see.
     colors : (3, u) float64
         Of the splats that are hit.
     shapes : Shapes
@@ -289,27 +299,38 @@ def linear_view(
     transmittance = np.exp(np.where(log_front > LOG_OPAQUE, log_front, -np.inf)).astype(np.float32)
     weight = transmittance * rays.alpha
     kept = np.flatnonzero((weight > LEAST_WEIGHT) & (rays.owner < movable))
-    owner, ray = rays.owner[kept].astype(np.intp), rays.ray[kept].astype(np.intp)
+    owner = rays.owner.take(kept)
     left = np.maximum((transmittance - weight)[kept], np.float32(LEAST_LEFT))
     ends = np.cumsum(counts)
     last = np.repeat(ends, counts)[kept]  # behind the last hit of the same ray
     hitting = rays.ray.take(ends - 1)
-    seen, by_alpha = np.zeros((3, rays.count)), np.empty((3, len(kept)), np.float32)
+    alpha = rays.alpha[kept]
+    changing = np.where(alpha < ALPHA_MAX, alpha, np.float32(0.0)) * transmittance[kept]
+    seen, by_log_alpha = np.zeros((3, rays.count)), np.empty((3, len(kept)), np.float32)
     for channel, of_splats in enumerate(colors.astype(np.float32)):
         sums = np.zeros(len(weight) + 1)  # of what all hits in front have of the colours of rays
         np.cumsum(weight * of_splats.take(rays.owner), dtype=np.float64, out=sums[1:])
         seen[channel, hitting] = sums.take(ends) - sums.take(ends - counts)
         background = (sums.take(last) - sums.take(kept + 1)).astype(np.float32) / left
-        by_alpha[channel] = transmittance[kept] * (of_splats.take(owner) - background)
-    alpha = rays.alpha[kept]
-    alpha = np.where(alpha < ALPHA_MAX, alpha, np.float32(0.0))  # clipped: it does not change
+        by_log_alpha[channel] = changing * (of_splats.take(owner) - background)
     unclipped = (colors > 0.0) & (colors < projection.BRIGHTEST)
     hit = rays.hit[:movable]
     return LinearView(
-        shapes.gaussians.index[hit], seen.clip(0.0, 1.0), ray, owner, weight[kept], by_alpha, alpha,
-        _steepness(replace(rays, hit=hit), kept, footprints) if shapes.geometry else None,
+        shapes.gaussians.index[hit], (truth - seen.clip(0.0, 1.0)).astype(np.float32),
+        rays.ray.take(kept).astype(np.uint16), owner, _halves(weight[kept]), _halves(by_log_alpha),
+        _halves(_steepness(replace(rays, hit=hit), kept, footprints)) if shapes.geometry else None,
         _slopes(hit, unclipped[:, :movable], shapes, view),
     )  # fmt: skip
+
+
+def _halves(values: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Return the upper halves of the bits of some numbers, rounded: they keep them to 1 / 256."""
+    return ((values.view(np.uint32) + np.uint32(1 << 15)) >> np.uint32(16)).astype(np.uint16)
+
+
+def _floats(halves: NDArray[np.uint16]) -> NDArray[np.float32]:
+    """Return the numbers of `_halves`."""
+    return (halves.astype(np.uint32) << np.uint32(16)).view(np.float32)
 
 
 def _slopes(
@@ -347,6 +368,29 @@ def _slopes(
     )
 
 
+def _steepness_on_discs(
+    discs: NDArray[np.float32], step: list[NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """Return `_steepness` of hits on discs, (7, h), at a step from their centres, (h,) each.
+
+    With d scaled to the plane of the disc, ``d / (1 + g d)``, C of the disc is that of a Gaussian;
+    where its low-pass is what is drawn, only the mean matters.
+    """
+    across, down = step
+    depth = 1.0 + discs[4] * across + discs[5] * down
+    ahead = depth > BEHIND
+    first, second = (
+        (discs[k] * across + discs[k + 1] * down) / np.where(ahead, depth, 1.0) for k in (0, 2)
+    )
+    low_pass = np.float32(1.0 / DISC_LOW_PASS)
+    blob = (across * across + down * down) * low_pass
+    plane = ahead & (first * first + second * second <= blob)
+    result = np.empty((2, len(across)), np.float32)
+    for k, of_blob in enumerate((across, down)):
+        result[k] = np.where(plane, discs[k] * first + discs[2 + k] * second, low_pass * of_blob)
+    return result
+
+
 def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> NDArray[np.float32]:
     """Return ``A d`` of some hits, across and down, (2, h), 1/px."""
     place = np.empty(int(footprints.index.max(initial=-1)) + 1, np.intp)
@@ -359,6 +403,8 @@ def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> N
         for at, center in zip(pixel, mine.centers, strict=True)
     ]
     result = np.zeros((2, len(owner)), np.float32)
+    if mine.discs is not None:
+        return _steepness_on_discs(mine.discs.take(owner, axis=1), step)
     for axes, sigma in zip((mine.major, mine.minor), mine.sigmas, strict=True):
         inverse = (1.0 / np.square(np.square(sigma.astype(np.float64)))).astype(np.float32)
         along = step[0] * axes[0].take(owner) + step[1] * axes[1].take(owner)

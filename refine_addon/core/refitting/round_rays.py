@@ -1,7 +1,8 @@
 """The rays of all rounds of refitting: what the unpruned splats look like on them, and survivors.
 
-Each round learns from rays through other pixels. Validation rays, which no round learns from, tell
-what a round has gained.
+Each round learns from rays through other pixels, of views that stand a little beside the given ones
+(`SHIFT`): what the given ones alone tell does not hold between them. Validation rays, which no
+round learns from, go through the given views, and tell what a round has gained.
 
 Views are cast in processes of their own, as they are measured (`processes`).
 """
@@ -35,20 +36,25 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-RAYS_OF_SPLAT = 8.0
+RAYS_OF_SPLAT = 4.0
 """Rays of a round for each survivor: with fewer, survivors learn them by heart."""
 
 MIN_RAYS = 1 << 17
 """Rays of a round where that would be fewer."""
 
-MAX_HITS = 3 << 21
-"""About how many hits of a round may show in the unpruned splats (`linear.LEAST_WEIGHT`). Survivors
-have fewer; each takes 48 bytes."""
+HITS_OF_SPLAT, MIN_HITS = 64, 3 << 21
+"""About how many hits of a round may show in the unpruned splats (`linear.LEAST_WEIGHT`), for each
+survivor, and where that would be fewer. Each takes 18 bytes."""
+
+SHIFT, MAX_SHIFT = 0.7, 0.1
+"""About how far a view is moved in a round: so many times as far as the view next to it is, at most
+so many scene sizes."""
 
 SECONDS, SECONDS_OF_RAY = 2.5e-7, 4e-6
 """About how long one core takes to project a splat into a view, and to cast a ray, to tell what is
 worth a process."""
 
+_SAME = 1e-6  # scene sizes; views nearer to each other stand in one place
 _EVERY = 2  # validation rays go through every second column and row of a round's rays
 _LEAST_ERROR = 10.0 ** (-PSNR_CAP / 10.0)
 
@@ -68,6 +74,8 @@ class Window:
         About how many rays there are, and how many hits on the unpruned splats may show.
     left, top, width, height : int
         The part of the image that they go through, pixels; by default all of it.
+    step : float
+        About how far the view is moved in a round, world units.
     """
 
     view: View
@@ -79,6 +87,7 @@ class Window:
     top: int = 0
     width: int = 0
     height: int = 0
+    step: float = 0.0
 
     @cached_property
     def part(self) -> View:
@@ -90,6 +99,13 @@ class Window:
             view, cx=view.cx - self.left, cy=view.cy - self.top,
             width=self.width, height=self.height,
         )  # fmt: skip
+
+    def moved(self, number: int) -> Window:
+        """Return the same window of the view as it stands in a round, from 1."""
+        random = np.random.default_rng([self.number, number])
+        shift = self.step * random.normal(size=3) / np.sqrt(3.0)  # along the camera's axes
+        center = self.view.center + shift @ self.view.rotation
+        return replace(self, view=replace(self.view, center=center))
 
     def pixels(self, hits: float, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the columns and rows that the rays of a round go through.
@@ -156,22 +172,25 @@ class InMemory:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Rays of one view and round, and the colours that the unpruned splats have on them.
+    """Rays of one view, and the colours that the unpruned splats have on them.
 
     Attributes
     ----------
     columns, rows : (C,), (R,) int64
         See `Rays`.
     colors : (3, P) float32
+    hits : float
+        How many hits each ray has, of those that count for `Window.hits`.
     """
 
     columns: NDArray[np.int64]
     rows: NDArray[np.int64]
     colors: NDArray[np.float32]
+    hits: float
 
 
 class RoundRays:
-    """The rays of all rounds, with the colours that the unpruned splats have on them.
+    """The rays of all rounds, of which it is known what the unpruned splats look like on them.
 
     Parameters
     ----------
@@ -179,8 +198,10 @@ class RoundRays:
         Of the views that rays are cast from; also an attribute.
     scene : Scene
         Of the unpruned splats; also an attribute.
-    truths : sequence of sequence of Truth
-        Of each window, the validation rays and the rays of each round.
+    original : Target
+        The unpruned splats.
+    count : int
+        How many of these there are.
     threads : int, optional
     """
 
@@ -191,11 +212,13 @@ class RoundRays:
         self,
         windows: Sequence[Window],
         scene: Scene,
-        truths: Sequence[Sequence[Truth]],
+        original: Target,
+        count: int,
         threads: int | None,
     ) -> None:
-        self.windows, self.scene, self._truths = windows, scene, truths
-        self._threads = threads
+        self.windows, self.scene = windows, scene
+        self._original, self._count, self._threads = original, count, threads
+        self._validation: list[Truth] = []
 
     @classmethod
     def of(
@@ -203,7 +226,6 @@ class RoundRays:
         original: Splats,
         views: ViewSet,
         count: int,
-        rounds: int,
         progress: Progress,
         threads: int | None,
     ) -> RoundRays:
@@ -216,34 +238,20 @@ class RoundRays:
         views : ViewSet
         count : int
             How many survivors there are.
-        rounds : int
-            How many rounds are refitted.
         progress : callable
         threads : int, optional
         """
         gaussians, scene, _ = projection.prepare(
-            original, views, progress=part(progress, 0.0, 0.2), threads=threads
+            original, views, progress=progress, threads=threads
         )
         chosen = views.by_distance()
-        rays = max(RAYS_OF_SPLAT * count, MIN_RAYS) / len(chosen)
+        rays, hits = (each / len(chosen) for each in limits(count))
+        steps = steps_of([view for view, _ in chosen], scene)
         windows = [
-            Window(view, number, weight, rays, MAX_HITS / len(chosen))
+            Window(view, number, weight, rays, hits, step=steps[number])
             for number, (view, weight) in enumerate(chosen)
         ]
-        target = InMemory(original, gaussians, scene)
-        truths = cast_truths(
-            CastTruth(target, windows, range(rounds + 1)), len(original),
-            part(progress, 0.2, 1.0), threads,
-        )  # fmt: skip
-        return cls(windows, scene, truths, threads)
-
-    def truths(self, number: int) -> list[Truth]:
-        """Return the rays of a round, of each view; those of round 0 validate."""
-        return [of_rounds[number] for of_rounds in self._truths]
-
-    def count(self, number: int) -> int:
-        """Return how many rays a round has."""
-        return sum(truth.colors.shape[1] for truth in self.truths(number))
+        return cls(windows, scene, InMemory(original, gaussians, scene), len(original), threads)
 
     def linear(
         self, splats: Splats, number: int, *, geometry: bool, progress: Progress
@@ -253,25 +261,33 @@ class RoundRays:
         Parameters
         ----------
         splats : Splats
-            The survivors.
+            The survivors; `psnr` has been asked for before, of these or others.
         number : int
             Of the round, from 1.
         geometry : bool
             Whether it is wanted how they change with means, scales and turns.
         progress : callable
         """
-        gaussians = self._gaussians(splats, part(progress, 0.0, 0.1))
+        gaussians = self._gaussians(splats, part(progress, 0.0, 0.05))
         shapes = Shapes.of(splats, gaussians, self.scene, geometry=geometry)
-        truths = self.truths(number)
-        work = _Linearize(self.target(splats, gaussians), self.windows, truths, shapes)
-        return self._each(work, truths, len(splats), part(progress, 0.1, 1.0))
+        windows = [window.moved(number) for window in self.windows]
+        hits = [truth.hits for truth in self._validation]
+        truth = CastTruth(self._original, windows, number, hits)
+        work = _Linearize(truth, self.target(splats, gaussians), shapes)
+        count = self._count + len(splats)
+        return self._each(work, windows, count, 1.0, part(progress, 0.05, 1.0))
 
     def psnr(self, splats: Splats, progress: Progress) -> float:
         """Return the mean PSNR of survivors on validation rays, weighted as the views are, dB."""
-        gaussians = self._gaussians(splats, part(progress, 0.0, 0.1))
-        truths = self.truths(0)
-        work = _CastErrors(self.target(splats, gaussians), self.windows, truths)
-        errors = self._each(work, truths, len(splats), part(progress, 0.1, 1.0))
+        share = 1.0 / _EVERY**2
+        if not self._validation:
+            self._validation = self._each(
+                CastTruth(self._original, self.windows, 0), self.windows, self._count, share,
+                part(progress, 0.0, 0.5),
+            )  # fmt: skip
+        gaussians = self._gaussians(splats, part(progress, 0.5, 0.6))
+        work = _CastErrors(self.target(splats, gaussians), self.windows, self._validation)
+        errors = self._each(work, self.windows, len(splats), share, part(progress, 0.6, 1.0))
         weights = [window.weight for window in self.windows]
         return float(np.average(-10.0 * np.log10(errors), weights=weights))
 
@@ -289,69 +305,78 @@ class RoundRays:
     def _each(
         self,
         work: Callable[[int], Result],
-        truths: Sequence[Truth],
+        windows: Sequence[Window],
         count: int,
+        share: float,
         progress: Progress,
     ) -> list[Result]:
-        """Return what is found on the rays of each view, of `count` survivors."""
-        rays = sum(truth.colors.shape[1] for truth in truths)
-        seconds = SECONDS * (count + self.around) * len(self.windows) + SECONDS_OF_RAY * rays
+        """Return what is found on a share of the rays of windows, cast into `count` splats."""
+        rays = share * sum(window.rays for window in windows)
+        seconds = SECONDS * (count + self.around) * len(windows) + SECONDS_OF_RAY * rays
         return [
             *for_each(
-                work, len(self.windows), seconds,
+                work, len(windows), seconds,
                 progress=progress, what="refitting", threads=self._threads,
             )
         ]  # fmt: skip
 
 
+def limits(count: int) -> tuple[float, float]:
+    """Return about how many rays and hits a round of `count` survivors may have."""
+    return max(RAYS_OF_SPLAT * count, MIN_RAYS), max(HITS_OF_SPLAT * count, MIN_HITS)
+
+
+def steps_of(views: Sequence[View], scene: Scene) -> list[float]:
+    """Return how far each view is moved, world units; see `SHIFT`."""
+    centers = np.stack([view.center for view in views])
+    steps = []
+    for center in centers:
+        away = np.linalg.norm(centers - center, axis=1)
+        apart = away[away > _SAME * scene.size]
+        nearest = SHIFT * apart.min() if len(apart) else 0.0
+        steps.append(float(min(nearest, MAX_SHIFT * scene.size)))
+    return steps
+
+
 @dataclass(frozen=True, eq=False)
 class CastTruth:
-    """Casts the rays of all rounds of a view into the unpruned splats; any process can.
+    """Casts the rays of a round of a view into the unpruned splats; any process can.
 
     Attributes
     ----------
     target : Target
         The unpruned splats.
     windows : sequence of Window
-    rounds : sequence of int
-        Their numbers; 0 for the validation rays.
+    round : int
+        Its number; 0 for the validation rays.
+    hits : sequence of float
+        Of the validation rays, see `Truth`; none before these are cast.
     """
 
     target: Target
     windows: Sequence[Window]
-    rounds: Sequence[int]
+    round: int
+    hits: Sequence[float] = ()
 
-    def __call__(self, place: int) -> list[Truth]:
-        """Return the rays of a view, of each round."""
+    def __call__(self, place: int) -> Truth:
+        """Return the rays of a view."""
         window = self.windows[place]
-        truths = []
         with np.errstate(under="ignore"):
             footprints = self.target.footprints(window)
             # Casting takes memory for all hits, also hidden ones, but for one view at a time.
             share = window.hits / MAX_HITS_OF_VIEW
-            hits = share * depth_complexity(footprints, window.part)
-            for number in self.rounds:
-                columns, rows = window.pixels(hits, number)
-                rays = cast(footprints, columns, rows)
-                colors = rays.colors(self.target.colors(rays.hit, window.view))
-                truths.append(Truth(columns, rows, colors.astype(np.float32)))
-                shown = np.count_nonzero(rays.contributions()[2] > LEAST_WEIGHT)
-                hits = max(shown, share * len(rays.ray)) / max(rays.count, 1)
-        return truths
-
-
-def cast_truths(
-    work: CastTruth, count: int, progress: Progress, threads: int | None
-) -> list[list[Truth]]:
-    """Return the rays of each view and round into `count` unpruned splats."""
-    rays = sum(window.rays for window in work.windows) * len(work.rounds)
-    seconds = SECONDS * count * len(work.windows) + SECONDS_OF_RAY * rays
-    return [
-        *for_each(
-            work, len(work.windows), seconds,
-            progress=progress, what="casting rays", threads=threads,
-        )
-    ]  # fmt: skip
+            if self.hits:
+                hits = self.hits[place]
+            else:
+                hits = share * depth_complexity(footprints, window.part)
+            columns, rows = window.pixels(hits, self.round)
+            rays = cast(footprints, columns, rows)
+            most = share * len(rays.ray)
+            rays = rays.visible()
+            shown = np.count_nonzero(rays.contributions()[2] > LEAST_WEIGHT)
+            colors = rays.colors(self.target.colors(rays.hit, window.view))
+        each = max(shown, most) / max(rays.count, 1)
+        return Truth(columns, rows, colors.astype(np.float32), each)
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,7 +391,7 @@ class _CastErrors:
         """Return the mean squared error of the colours that the rays of a view see."""
         window, truth = self.windows[number], self.truths[number]
         with np.errstate(under="ignore"):
-            rays = cast(self.target.footprints(window), truth.columns, truth.rows)
+            rays = cast(self.target.footprints(window), truth.columns, truth.rows).visible()
             seen = rays.colors(self.target.colors(rays.hit, window.view))
         return float(max(np.mean(np.square(truth.colors - seen)), _LEAST_ERROR))
 
@@ -375,16 +400,15 @@ class _CastErrors:
 class _Linearize:
     """Casts the rays of a round of a view, and finds how their colours change; any process can."""
 
+    truth: CastTruth
     target: Target
-    windows: Sequence[Window]
-    truths: Sequence[Truth]
     shapes: Shapes
 
     def __call__(self, number: int) -> LinearView:
         """Return how the colours of a view's rays change with the survivors."""
-        window, truth = self.windows[number], self.truths[number]
+        window, truth = self.truth.windows[number], self.truth(number)
         with np.errstate(under="ignore"):
             footprints = self.target.footprints(window)
-            rays = cast(footprints, truth.columns, truth.rows)
+            rays = cast(footprints, truth.columns, truth.rows).visible()
             colors = self.target.colors(rays.hit, window.view)
-            return linear_view(rays, footprints, colors, self.shapes, window.view)
+            return linear_view(rays, footprints, truth.colors, colors, self.shapes, window.view)

@@ -275,6 +275,8 @@ class RowBlock:
             red, green, blue = base_color(chunk.sh_dc).T
             self.luma[piece] = LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
             logs = chunk.log_scales.astype(np.float64)
+            if chunk.model == "2dgs":  # how long they are is told by the axes that they have
+                logs[:, 2] = logs[:, :2].min(axis=1)
             self.area[piece], ratio, longest = self._axes(logs)
             self.reach[piece] = REACH * longest
             alpha, luma = alpha[good], self.luma[piece][good].astype(np.float64)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..rendering import ALPHA_CUT, ALPHA_MAX
+from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..work import checkpoint
 from .rays import Rays
 
@@ -24,8 +24,15 @@ if TYPE_CHECKING:
 MIN_RAYS_OF_VIEW = 16
 """A view has at least this many rays, if it has as many pixels."""
 
+BEHIND = 1e-4
+"""Of a disc: a plane that a ray hits behind the camera, or at 1 / this times the centre's depth, is
+not hit."""
+
 _PAIRS = 1 << 17  # pairs of footprint and pixel at a time, which limits temporary memory
 _MAX_TABLE = 1 << 14  # pixels; images up to this size are looked up in a table, see `_before`
+
+_CROSSING = 1e-3  # a disc of which this much is left of a plane through the camera crosses it
+_NO_END = 1e9  # px; beyond any image
 
 _STEPS = (0.7548776662466927, 0.5698402909980532)
 """1 / p and 1 / p^2 of the plastic number p: their multiples modulo 1 spread evenly over the unit
@@ -74,7 +81,8 @@ def depth_complexity(footprints: Footprints, view: View) -> float:
 def cast(footprints: Footprints, columns: NDArray[np.int64], rows: NDArray[np.int64]) -> Rays:
     """Return the rays through some pixels with all that they hit.
 
-    A ray hits a footprint where its alpha there is at least `ALPHA_CUT`.
+    A ray hits a footprint where its alpha there is at least `ALPHA_CUT`. Discs are hit where the
+    ray meets their plane: see `projection.Footprints.discs`.
 
     Parameters
     ----------
@@ -139,7 +147,7 @@ def hits(
             left = np.flatnonzero(wanted(owner, pixel))
             owner, pixel = owner[left], pixel[left]
             column, row = column[left], row[left]
-        squared = _mahalanobis(footprints, owner, columns.take(column), rows.take(row))
+        squared = _squared_distances(footprints, owner, columns.take(column), rows.take(row))
         inside = np.flatnonzero(squared < squared_radius.take(owner))
         owner = owner[inside]
         alpha = footprints.alphas.take(owner) * np.exp(squared[inside] / np.float32(-2.0))
@@ -222,9 +230,38 @@ def _bounding_boxes(
         Numbers of the columns or rows, ascending; their centres are at + 0.5.
     """
     center = footprints.centers[axis] - np.float32(0.5)
-    half = np.sqrt(squared_radius * (footprints.major[axis] ** 2 + footprints.minor[axis] ** 2))
-    first, end = (_before(places, np.ceil(edge)) for edge in (center - half, center + half))
+    if footprints.discs is None:
+        half = np.sqrt(squared_radius * (footprints.major[axis] ** 2 + footprints.minor[axis] ** 2))
+        low, high = center - half, center + half
+    else:
+        low, high = (center + edge for edge in _disc_extent(footprints.discs, squared_radius, axis))
+    first, end = (_before(places, np.ceil(edge)) for edge in (low, high))
     return first, end - first
+
+
+def _disc_extent(
+    discs: NDArray[np.float32], squared_radius: NDArray[np.float32], axis: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return from where to where discs reach from their centres along an axis, (n,) each, px.
+
+    With C, g and the squared radius r^2 of `projection.Footprints.discs`, the edge
+    ``d' C^-1 d = r^2 (1 + g d)^2`` is an ellipse about ``r^2 C g / s``, ``s = 1 - r^2 g' C g``, and
+    reaches ``sqrt(r^2 / s (C_xx + r^2 (C g)_x^2 / s))`` from there. The low-pass reaches as far as
+    a circle of its variance. A disc with parts behind the camera has no end.
+    """
+    one, two, tilt = discs[:2], discs[2:4], discs[4:6]
+    axes = [each / np.square(each).sum(axis=0) for each in (one, two)]  # half axes, (2, n) each
+    along = [(each * tilt).sum(axis=0) for each in axes]  # of g, in standard deviations
+    left = 1.0 - squared_radius * (along[0] ** 2 + along[1] ** 2)
+    bounded = left > _CROSSING
+    share = squared_radius / np.where(bounded, left, 1.0)
+    shift = along[0] * axes[0][axis] + along[1] * axes[1][axis]  # (C g) along the axis
+    half = np.sqrt(share * (axes[0][axis] ** 2 + axes[1][axis] ** 2 + share * shift**2))
+    least = np.sqrt(squared_radius * np.float32(DISC_LOW_PASS))
+    ends = share * shift - half, share * shift + half
+    low = np.where(bounded, np.minimum(ends[0], -least), np.float32(-_NO_END))
+    high = np.where(bounded, np.maximum(ends[1], least), np.float32(_NO_END))
+    return low, high
 
 
 def _before(places: NDArray[np.int64], edges: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -236,7 +273,7 @@ def _before(places: NDArray[np.int64], edges: NDArray[np.float32]) -> NDArray[np
     return np.asarray(table.take(edges.clip(0.0, size).astype(np.int64)))
 
 
-def _mahalanobis(
+def _squared_distances(
     footprints: Footprints,
     owner: NDArray[np.int64],
     column: NDArray[np.integer[Any]],
@@ -244,16 +281,34 @@ def _mahalanobis(
 ) -> NDArray[np.float32]:
     """Return the squared Mahalanobis distance of pixels to footprints, (p,).
 
-    `owner`, (p,), is the row of the footprint; the centre of a pixel is at + 0.5.
+    `owner`, (p,), is the row of the footprint; the centre of a pixel is at + 0.5. Of discs it is
+    that of where the ray meets them, at most that of their low-pass; see `projection`.
     """
     across = column.astype(np.float32) + np.float32(0.5) - footprints.centers[0].take(owner)
     down = row.astype(np.float32) + np.float32(0.5) - footprints.centers[1].take(owner)
+    if footprints.discs is not None:
+        return _on_discs(footprints.discs.take(owner, axis=1), across, down)
     squared = np.zeros(len(owner), np.float32)
     for axes, sigma in zip((footprints.major, footprints.minor), footprints.sigmas, strict=True):
         along = across * axes[0].take(owner) + down * axes[1].take(owner)
         along /= np.square(sigma.take(owner))
         squared += along * along
     return squared
+
+
+def _on_discs(
+    discs: NDArray[np.float32], across: NDArray[np.float32], down: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return what `_squared_distances` does of discs, (7, p), at a step from their centres."""
+    depth = 1.0 + discs[4] * across + discs[5] * down  # of the centre over that of the hit
+    first, second = (discs[k] * across + discs[k + 1] * down for k in (0, 2))
+    ahead = depth > BEHIND
+    squared = (first * first + second * second) / np.square(np.where(ahead, depth, 1.0))
+    low_pass = (across * across + down * down) * np.float32(1.0 / DISC_LOW_PASS)
+    on_plane = ahead & (squared <= low_pass)
+    squared = np.where(on_plane, squared, low_pass)
+    squared[on_plane & (depth > discs[6])] = np.inf  # nearer than the near plane
+    return np.asarray(squared, np.float32)
 
 
 def _squared_radius(alphas: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from ..rendering import ALPHA_CUT, LOW_PASS, NEAR_RELATIVE
+from ..rendering import ALPHA_CUT, DISC_LOW_PASS, LOW_PASS, NEAR_RELATIVE
 from ..splats import SH_C0, drawable, opacity, rotation_matrices
 from ..work import Progress, checkpoint, for_chunks, part, report, silent
 from . import frustum
@@ -19,8 +19,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..rendering import Model
     from ..splats import Splats
     from ..views import View, ViewSet
+
+FloatT = TypeVar("FloatT", np.float32, np.float64)
 
 CUT_SIGMAS = 3.3
 """Standard deviations to which a footprint counts as reaching: alpha = 1 falls to `ALPHA_CUT` at
@@ -41,6 +44,9 @@ _NEAREST = 1e-5  # scene sizes; nearer footprints could overflow float32, and no
 _NO_END = 1e30  # scene sizes; farther than any splat, and still in float32's range
 _SLACK = 1e-4  # of a coordinate; far more than rounding moves a mean by
 _BEYOND = 0.15  # of the image's size; farther outside, the projection is linearised at this edge
+_THINNEST_DISC = 1e-3  # px; seen from the edge a disc is a line, which covers no pixel's centre
+_EDGE_ON = 1e-6  # cosine; a plane seen from the edge has no depths
+_Axes = tuple["NDArray[np.float32]", "NDArray[np.float32]", "NDArray[np.float32]"]
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
@@ -62,6 +68,10 @@ class Gaussians:
         Opacity, 0..1.
     colors : (M, 3) float32
         The constant of the harmonics as a colour, >= 0: the same from all directions.
+    normals : (3, M) float32 or None
+        Of discs: unit vectors at right angles to them, in the scene's frame.
+    model : {"default", "antialiased", "2dgs"}
+        How they are drawn, see `rendering.Model`.
     """
 
     index: NDArray[np.int64]
@@ -70,6 +80,8 @@ class Gaussians:
     largest: NDArray[np.float32]
     alphas: NDArray[np.float32]
     colors: NDArray[np.float32]
+    normals: NDArray[np.float32] | None = None
+    model: Model = "default"
 
     def __len__(self) -> int:
         """Return the number of splats."""
@@ -78,9 +90,10 @@ class Gaussians:
     def take(self, keep: NDArray[Any]) -> Gaussians:
         """Return the splats at `keep` (a mask or integers)."""
         return Gaussians(
-            **{field.name: getattr(self, field.name)[..., keep] for field in fields(self)[:-1]},
-            colors=self.colors[keep],
-        )
+            self.index[keep], self.means[:, keep], self.covariances[:, keep], self.largest[keep],
+            self.alphas[keep], self.colors[keep],
+            None if self.normals is None else self.normals[:, keep], self.model,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +107,16 @@ class Footprints:
     centers : (2, n) float32
         Column and row, pixels.
     major, minor : (2, n) float32
-        Half axes: one standard deviation along each principal direction, pixels.
+        Half axes: one standard deviation along each principal direction, pixels. Of discs: those of
+        an ellipse that covers as much, see `disc_axes`.
     sigmas : (2, n) float32
         Their lengths, the longer first.
     inside : (n,) bool
         Which centres lie in the view's frustum; see `frustum`.
     alphas : (n,) float32
-        Of the Gaussians.
+        Of the Gaussians at their centres.
+    discs : (7, n) float32 or None
+        Of discs: what a ray hits of them exactly, see `_discs` and `cast.hits`.
     """
 
     index: NDArray[np.int64]
@@ -110,12 +126,16 @@ class Footprints:
     sigmas: NDArray[np.float32]
     inside: NDArray[np.bool_]
     alphas: NDArray[np.float32]
+    discs: NDArray[np.float32] | None = None
 
     def take(self, rows: NDArray[np.int64]) -> Footprints:
         """Return some footprints, in that order."""
-        return Footprints(
-            *(np.take(getattr(self, item.name), rows, axis=-1) for item in fields(self))
-        )
+        every = {item.name: getattr(self, item.name) for item in fields(self)}
+        taken: dict[str, Any] = {
+            name: None if values is None else np.take(values, rows, axis=-1)
+            for name, values in every.items()
+        }
+        return Footprints(**taken)
 
 
 def prepare(
@@ -218,13 +238,18 @@ def activate(
         np.empty(count, np.float32),
         np.empty(count, np.float32),
         np.empty((count, 3), np.float32),
+        np.empty((3, count), np.float32) if splats.model == "2dgs" else None,
+        splats.model,
     )
 
     def fill(piece: slice) -> None:
         chunk = splats.take(index[piece])
         relative = np.asarray(chunk.log_scales, np.float64) - np.log(scene.size)
         scales = np.exp(relative.clip(*LOG_SCALE_RANGE))
-        axes = scene.axes @ rotation_matrices(chunk.quaternions) * scales[:, None, :]  # (n, 3, 3)
+        axes = scene.axes @ rotation_matrices(chunk.quaternions)  # (n, 3, 3)
+        if result.normals is not None:
+            result.normals[:, piece] = axes[:, :, 2].T
+        axes *= scales[:, None, :]
         for row, (a, b) in enumerate(_PAIRS):
             result.covariances[row, piece] = np.einsum("ij,ij->i", axes[:, a], axes[:, b])
         result.largest[piece] = scales.max(axis=1)
@@ -240,8 +265,9 @@ def activate(
 def project(gaussians: Gaussians, scene: Scene, view: View) -> Footprints:
     """Return the footprints of the Gaussians that may reach into the image of a view.
 
-    The footprint is the Gaussian of covariance ``J W S W' J' + 0.3 I`` (Zwicker et al., "EWA
-    splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean.
+    The footprint is the Gaussian of covariance ``C + 0.3 I``, ``C = J W S W' J'`` (Zwicker et al.,
+    "EWA splatting", 2002, Eq. 31), J the Jacobian of the projection at the mean. Antialiased ones
+    have the opacity ``o sqrt(det C / det(C + 0.3 I))``. For discs see `_discs`.
     """
     return front_to_back([footprints_and_depths(gaussians, scene, view)])
 
@@ -263,14 +289,16 @@ def footprints_and_depths(
     if not _computable(scene, view):
         return _joined([])
     planes = clip_planes(scene, view)
+    turned = (view.rotation @ scene.axes.T).astype(np.float32)
     rotation = _rotation6(view.rotation @ scene.axes.T)
+    low_pass = LOW_PASS if gaussians.normals is None else DISC_LOW_PASS
     pieces = []
     for start in range(0, len(gaussians), _CHUNK):
         checkpoint()
         piece = slice(start, start + _CHUNK)
         local = _local(gaussians.means[:, piece], scene, view)  # (3, chunk)
         touching = np.flatnonzero(
-            _touches(local, gaussians.largest[piece], (view, window or view), planes)
+            _touches(local, gaussians.largest[piece], (view, window or view), planes, low_pass)
         )
         if len(touching):
             local = np.take(local, touching, axis=1)  # (3, n), as all that follows
@@ -278,9 +306,20 @@ def footprints_and_depths(
             inside = frustum.contains(view, local, planes)
             index = touching + start
             alphas = gaussians.alphas.take(index)
-            centers, major, minor, sigmas = _ellipses(local, shape, view)
-            footprints = Footprints(index, centers, major, minor, sigmas, inside, alphas)
-            pieces.append((footprints, local[2]))
+            discs = None
+            if gaussians.normals is not None:
+                normals = turned @ np.take(gaussians.normals, index, axis=1)
+                centers, axes, discs = _discs(local, shape, normals, view, planes[0])
+            else:
+                centers, axes, kept = _ellipses(local, shape, view)
+                if gaussians.model == "antialiased":
+                    alphas *= kept
+            footprints = Footprints(index, centers, *axes, inside, alphas, discs)
+            depths_of_piece = local[2]
+            if gaussians.model == "antialiased":  # some are now too faint to be drawn
+                drawn = np.flatnonzero(alphas > ALPHA_CUT)
+                footprints, depths_of_piece = footprints.take(drawn), depths_of_piece.take(drawn)
+            pieces.append((footprints, depths_of_piece))
     return _joined(pieces)
 
 
@@ -306,9 +345,13 @@ def _joined(
     every = [_NOTHING, *(footprints for footprints, _ in pieces)]
     arrays = (
         np.concatenate([getattr(footprints, item.name) for footprints in every], axis=-1)
-        for item in fields(Footprints)
+        for item in fields(Footprints)[:-1]
     )
-    return Footprints(*arrays), np.concatenate([_NONE[0], *(depth for _, depth in pieces)])
+    discs = [footprints.discs for footprints, _ in pieces if footprints.discs is not None]
+    all_footprints = Footprints(*arrays)
+    if discs:
+        all_footprints = replace(all_footprints, discs=np.concatenate(discs, axis=-1))
+    return all_footprints, np.concatenate([_NONE[0], *(depth for _, depth in pieces)])
 
 
 def in_camera(
@@ -351,6 +394,7 @@ def _touches(
     largest: NDArray[np.float32],
     views: tuple[View, View],
     planes: tuple[float, float],
+    low_pass: float,
 ) -> NDArray[np.bool_]:
     """Return which footprints may reach into the image, (M,); on the safe side.
 
@@ -362,7 +406,7 @@ def _touches(
     drawn, sides = map(frustum.image_sides, views)
     for coordinate, whole, side in zip((x, y), drawn, sides, strict=True):
         margin = _margin(whole) * largest  # (M,), px times depth
-        pixels = side.half + CUT_SIGMAS * LOW_PASS**0.5
+        pixels = side.half + CUT_SIGMAS * low_pass**0.5
         touching &= np.abs(side.focal * coordinate + side.offset * z) <= pixels * z + margin
     return touching
 
@@ -392,7 +436,7 @@ def boxes_touch(
     drawn, sides = map(frustum.image_sides, (view, window or view))
     for coordinate, whole, side in zip((x, y), drawn, sides, strict=True):
         margin = _margin(whole) * (boxes[:, 6].astype(np.float64) + slack)
-        shown = (side.half + CUT_SIGMAS * LOW_PASS**0.5) * z
+        shown = (side.half + CUT_SIGMAS * max(LOW_PASS, DISC_LOW_PASS) ** 0.5) * z
         across = side.focal * coordinate + side.offset * z
         for way in (1.0, -1.0):
             # It is linear in the position, so it is least in a corner.
@@ -421,16 +465,32 @@ def _rotation6(rotation: NDArray[np.float64]) -> NDArray[np.float32]:
 
 def _ellipses(
     local: NDArray[np.float32], shape: NDArray[np.float32], view: View
-) -> tuple[NDArray[np.float32], ...]:
-    """Return centres, major and minor half axes and their lengths, each (2, n), pixels.
+) -> tuple[NDArray[np.float32], _Axes, NDArray[np.float32]]:
+    """Return the footprints of Gaussians, and how much of their opacity antialiasing keeps.
 
-    `local`, (3, n), are the camera coordinates of the centres, scene sizes, and `shape`, (6, n),
-    the covariances in camera coordinates, squared scene sizes.
+    Parameters
+    ----------
+    local : (3, n) float32
+        Camera coordinates of the centres, scene sizes.
+    shape : (6, n) float32
+        Covariances in camera coordinates, squared scene sizes.
+    view : View
+
+    Returns
+    -------
+    centers : (2, n) float32
+    axes : three (2, n) float32
+        Major and minor half axes and their lengths, pixels.
+    kept : (n,) float32
+        ``sqrt(det C / det(C + LOW_PASS I))``.
     """
     x, y, z = local
     across, down = x / z, y / z
     centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
-    return centers, *_half_axes(*_image_covariance((across, down, z), shape, view))
+    variances, directions = _principal(*_image_covariance((across, down, z), shape, view))
+    sigmas = np.sqrt(variances + LOW_PASS)
+    kept = np.sqrt(variances[0] * variances[1]) / (sigmas[0] * sigmas[1])
+    return centers, _half_axes(sigmas, directions), kept
 
 
 def _image_covariance(
@@ -443,8 +503,14 @@ def _image_covariance(
     For a centre far outside the image, J is computed at the edge that `_BEYOND` sets, because J
     grows without bound. `shape` is S: xx, xy, xz, yy, yz, zz, (6, n).
     """
-    z = ray[2]
-    across, down = _near_image(ray[0], ray[1], view)
+    return _projected((*_near_image(ray[0], ray[1], view), ray[2]), shape, view)
+
+
+def _projected(
+    ray: tuple[NDArray[np.float32], ...], shape: NDArray[np.float32], view: View
+) -> tuple[NDArray[np.float32], ...]:
+    """Return what `_image_covariance` does, with J at ``x / z`` and ``y / z`` as they are."""
+    across, down, z = ray
     fx, fy = view.fx / z, view.fy / z
     xx = fx * fx * (shape[0] + across * (across * shape[5] - 2 * shape[2]))
     yy = fy * fy * (shape[3] + down * (down * shape[5] - 2 * shape[4]))
@@ -481,21 +547,109 @@ def jacobian(
     )
 
 
-def _half_axes(
+def _principal(
     xx: NDArray[np.float32], xy: NDArray[np.float32], yy: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], ...]:
-    """Return the half axes of ``C + LOW_PASS I`` and their lengths, (2, n) each, the longer first.
+) -> tuple[NDArray[np.float32], tuple[NDArray[np.float32], NDArray[np.float32]]]:
+    """Return the eigenvalues of C, (2, n), the larger first, and the direction of the major axis.
 
     With ``m = (xx + yy) / 2`` and ``r = hypot((xx - yy) / 2, xy)`` the eigenvalues of C are m + r
     and m - r; the latter is computed as ``det C / (m + r)``, which loses no digits by cancellation.
+    For the direction see `_major_direction`.
     """
     mean, half = (xx + yy) / 2, (xx - yy) / 2
     root = np.sqrt(half * half + xy * xy)
-    first = np.sqrt(np.maximum(mean + root, 0.0) + LOW_PASS)
+    first = np.maximum(mean + root, 0.0)
     second = np.maximum(xx * yy - xy * xy, 0.0) / np.maximum(mean + root, 1e-30)
-    second = np.sqrt(second + LOW_PASS)
-    c, s = _major_direction(half, xy, root)
-    return first * np.stack([c, s]), second * np.stack([-s, c]), np.stack([first, second])
+    return np.stack([first, second]), _major_direction(half, xy, root)
+
+
+def _half_axes(
+    sigmas: NDArray[np.float32], direction: tuple[NDArray[np.float32], NDArray[np.float32]]
+) -> _Axes:
+    """Return the half axes of these lengths, and the lengths, (2, n) each, the longer first."""
+    c, s = direction
+    return sigmas[0] * np.stack([c, s]), sigmas[1] * np.stack([-s, c]), sigmas
+
+
+def _discs(
+    local: NDArray[np.float32],
+    shape: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    view: View,
+    near: float,
+) -> tuple[NDArray[np.float32], _Axes, NDArray[np.float32]]:
+    """Return the footprints of discs: centres, axes, and what rays hit.
+
+    The ray through a pixel hits the plane of a disc at ``(u, v)``, in units of its two scales, and
+    its alpha there is ``o exp(-(u^2 + v^2) / 2)``, at least ``o exp(-|d|^2 / (2 DISC_LOW_PASS))``,
+    d the step in pixels from the centre (Huang et al. 2024, Eq. 8 to 11). Since depths on a plane
+    are the inverse of a linear function of the pixel, the intersection is, with ``C = J W S W' J'``
+    as for Gaussians, n the normal and r the ray to the centre, of depth 1, in camera coordinates::
+
+        u^2 + v^2 = d' C^-1 d / (1 + g d)^2        g = (n_x / fx, n_y / fy) / (n r)
+
+    Parameters
+    ----------
+    local, shape, view
+        See `_ellipses`.
+    normals : (3, n) float32
+        In camera coordinates.
+    near : float
+        Depth of the near plane, scene sizes; what rays hit before it is not drawn.
+
+    Returns
+    -------
+    centers, axes
+        See `_ellipses`; the ellipse is that of `disc_axes`.
+    discs : (7, n) float32
+        Two vectors p with ``d' C^-1 d = (p_1 d)^2 + (p_2 d)^2``, 1/px, g, 1/px, and the largest
+        ``1 + g d`` that is drawn: the depth of the centre over that of the near plane.
+    """
+    x, y, z = local
+    across, down = x / z, y / z
+    centers = np.stack([view.fx * across + view.cx, view.fy * down + view.cy])
+    variances, direction = _principal(*_projected((across, down, z), shape, view))
+    sigmas = np.sqrt(np.maximum(variances, _THINNEST_DISC**2))
+    c, s = direction
+    facing = normals[0] * across + normals[1] * down + normals[2]
+    facing = np.where(np.abs(facing) > _EDGE_ON, facing, np.float32(np.inf))
+    discs = np.stack(
+        [
+            *(c / sigmas[0], s / sigmas[0], -s / sigmas[1], c / sigmas[1]),
+            normals[0] / facing / np.float32(view.fx),
+            normals[1] / facing / np.float32(view.fy),
+            z / np.float32(near),
+        ]
+    )
+    return centers, _half_axes(disc_axes(variances), direction), discs.astype(np.float32)
+
+
+def disc_axes(variances: NDArray[FloatT]) -> NDArray[FloatT]:
+    """Return the half axes, (2, n), of ellipses that cover as much as discs with their low-pass.
+
+    The larger of two Gaussians of variance l along both axes, the low-pass, and of a and b, has the
+    integral ``2 pi l`` where ``a < l``, ``2 pi sqrt(a b)`` where ``b > l``, and else, with t the
+    angle from the major axis at which they are equal::
+
+        4 sqrt(a b) atan(sqrt(a / b) tan t) + l (2 pi - 4 t)
+
+    Parameters
+    ----------
+    variances : (2, n) floating
+        a and b, px^2, the larger first; without the low-pass.
+    """
+    low = variances.dtype.type(DISC_LOW_PASS)
+    first = np.maximum(variances[0], low)
+    thin = np.maximum(variances[1], variances.dtype.type(_THINNEST_DISC**2))
+    second = np.minimum(thin, variances.dtype.type(0.999 * DISC_LOW_PASS))
+    square = (1.0 / low - 1.0 / first) / (1.0 / second - 1.0 / first)  # of the sine of t
+    angle = np.arcsin(np.sqrt(np.clip(square, 0.0, 1.0)))
+    product = np.sqrt(first * second)
+    covered = 4.0 * product * np.arctan(np.sqrt(first / second) * np.tan(angle))
+    covered += low * (2.0 * np.pi - 4.0 * angle)
+    whole = np.where(variances[1] >= low, np.sqrt(first * thin), covered / (2.0 * np.pi))
+    major = np.sqrt(first)
+    return np.asarray(np.stack([major, np.minimum(whole / major, major)]), variances.dtype)
 
 
 def _major_direction(

@@ -85,6 +85,23 @@ class Rays:
             log_passed=self.log_passed.take(kept),
         )
 
+    def visible(self) -> Rays:
+        """Return the rays with the hits that are not hidden alone: they see the same."""
+        log_front = in_front(self.log_passed.astype(np.float64), self.counts())
+        kept = np.flatnonzero(log_front > LOG_OPAQUE)
+        owner = self.owner.take(kept)
+        used = np.zeros(len(self.hit), np.bool_)
+        used[owner] = True
+        place = np.cumsum(used, dtype=np.int32) - np.int32(1)
+        return replace(
+            self,
+            ray=self.ray.take(kept),
+            owner=place.take(owner),
+            alpha=self.alpha.take(kept),
+            log_passed=self.log_passed.take(kept),
+            hit=self.hit[used],
+        )
+
     def contributions(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
         """Return what the rays see: the r hits that are not hidden.
 

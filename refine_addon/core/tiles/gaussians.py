@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..operation.run import Runtime
+    from ..rendering import Model
     from ..seeing.measuring import Sampling
     from ..seeing.scene import Scene
     from ..views import View, ViewSet
@@ -35,7 +36,10 @@ CHUNK = 1 << 16
 """Splats of a chunk, 3.7 MB."""
 
 _MEANS, _COVARIANCES, _LARGEST, _ALPHAS, _COLORS = slice(3), slice(3, 9), 9, 10, slice(11, 14)
-"""Rows of a chunk, (14, n) float32: see `Gaussians`."""
+"""Rows of a chunk, (14, n) float32: see `Gaussians`. Discs have their normals besides, (17, n), and
+antialiased splats one row of no meaning, (15, n)."""
+
+_ROWS: dict[Model, int] = {"default": 14, "antialiased": 15, "2dgs": 17}
 
 
 @dataclass(frozen=True)
@@ -82,9 +86,11 @@ class SceneContext:
     def chunk(self, number: int) -> Gaussians:
         """Return the Gaussians of a chunk."""
         table = self.folder.load(number, ["chunk"])["chunk"]
+        model = next(model for model, rows in _ROWS.items() if rows == len(table))
         return Gaussians(
             np.arange(table.shape[1]), table[_MEANS], table[_COVARIANCES], table[_LARGEST],
             table[_ALPHAS], np.ascontiguousarray(table[_COLORS].T),
+            table[14:] if model == "2dgs" else None, model,
         )  # fmt: skip
 
 
@@ -122,10 +128,12 @@ class ActivateSplats:
                 splats, rows, place, scene, runtime.progress, runtime.threads
             )
             code = spatial_code(place)
-        table = np.empty((len(rows), 14), np.float32)
+        table = np.zeros((len(rows), _ROWS[splats.model]), np.float32)
         table[:, _MEANS], table[:, _COVARIANCES] = activated.means.T, activated.covariances.T
         table[:, _LARGEST], table[:, _ALPHAS] = activated.largest, activated.alphas
         table[:, _COLORS] = activated.colors
+        if activated.normals is not None:
+            table[:, 14:] = activated.normals.T
         arrays = {"good": good, "rows": rows, "code": code, "gaussians": table}
         arrays["ties"] = splat_fingerprint(splats, rows)
         context.folder.save(self.source.index, arrays)
@@ -152,6 +160,8 @@ class GatherChunk:
         for index in np.unique(source).tolist():
             here = np.flatnonzero(source == index)
             table = folder.map(index, "gaussians")
+            if len(chunk) != table.shape[1]:  # of another model
+                chunk = np.empty((table.shape[1], len(order)), np.float32)
             chunk[:, here] = table[order[here] - self.starts[index]].T
         folder.save(self.number, {"chunk": chunk})
         means = chunk[_MEANS]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..refitting.refit import Gains, Refit, refit, refit_on
-from ..splats import joined
+from ..splats import ARRAYS, joined
 from . import absorbing
 from .region_rays import RegionRays, StoredSplats
 from .regions import Region, StageContext
@@ -75,7 +75,7 @@ class SaveSplats:
     def _saved(self, folder: Folder) -> NDArray[np.int64]:
         splats = self.source.splats()
         splats = splats if self.rows is None else splats.take(self.rows)
-        kind = np.result_type(*vars(splats).values())
+        kind = np.result_type(*(getattr(splats, name) for name in ARRAYS))
         folder.save(self.source.index, {"splats": packed(splats).astype(kind, copy=False)})
         return np.array(len(splats))
 
@@ -140,13 +140,11 @@ class RefitRegion:
     def _refitted(self, context: RegionsContext, runtime: Runtime) -> NDArray[np.int64]:
         rows, settings = context.folder.load(self.index, ["rows"])["rows"], context.settings
         splats, changed, rounds = context.after.take(rows), np.zeros(len(rows), np.bool_), 0
-        rays = RegionRays(
-            splats, rows, context.before, context.after, settings.rounds, runtime.part(0.0, 0.3)
-        )
+        rays = RegionRays(splats, rows, context.before, context.after, runtime.threads)
         if rays.windows:
             *_, done = refit_on(
                 rays, splats, settings,
-                progress=runtime.part(0.3, 1.0).progress, threads=runtime.threads,
+                progress=runtime.progress, threads=runtime.threads,
             )  # fmt: skip
             splats, changed, rounds = done.splats, done.changed, done.rounds
         context.folder.save(self.index, {"splats": packed(splats), "changed": changed})

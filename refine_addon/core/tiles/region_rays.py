@@ -11,14 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..refitting.round_rays import (
-    MAX_HITS,
-    MIN_RAYS,
-    RAYS_OF_SPLAT,
-    CastTruth,
     InMemory,
     RoundRays,
     Window,
-    cast_truths,
+    limits,
+    steps_of,
 )
 from ..seeing import projection
 from ..seeing.ray_sample import colors_from
@@ -30,7 +27,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..operation.run import Runtime
     from ..seeing.projection import Footprints, Gaussians
     from ..seeing.scene import Scene
     from ..splats import Splats
@@ -120,9 +116,7 @@ class RegionRays(RoundRays):
         Which of the survivors of all regions these are.
     before, after : StoredSplats
         The unpruned splats, and the survivors of all regions.
-    rounds : int
-        How many rounds are refitted.
-    runtime : Runtime
+    threads : int, optional
     """
 
     def __init__(
@@ -131,14 +125,11 @@ class RegionRays(RoundRays):
         rows: NDArray[np.int64],
         before: StoredSplats,
         after: StoredSplats,
-        rounds: int,
-        runtime: Runtime,
+        threads: int | None,
     ) -> None:
         views, scene = before.context.views.by_distance(), before.context.scene
         windows = _windows(splats, len(after), scene, views)
-        work = CastTruth(before, windows, range(rounds + 1))
-        truths = cast_truths(work, len(before), runtime.progress, runtime.threads)
-        super().__init__(windows, scene, truths, runtime.threads)
+        super().__init__(windows, scene, before, len(before), threads)
         self._after, self.around = after, len(after)
         others = np.ones(len(after), np.bool_)
         others[rows] = False
@@ -168,14 +159,17 @@ def _windows(
         if centers.shape[1]:
             boxes[number] = centers.shape[1], _box(centers, view)
     shown = sum(count for count, _ in boxes.values())
-    rays = max(RAYS_OF_SPLAT * total, MIN_RAYS) / len(views)
-    windows = []
+    rays, hits = limits(total)[0] / len(views), limits(len(splats))[1]
+    steps, windows = steps_of([view for view, _ in views], scene), []
     for number, (count, box) in boxes.items():
         (view, weight), share = views[number], count / shown
         part_of_image = box[2] * box[3] / (view.width * view.height)
         windows.append(
-            Window(view, number, weight * share, rays * part_of_image, MAX_HITS * share, *box)
-        )
+            Window(
+                view, number, weight * share, rays * part_of_image, hits * share, *box,
+                steps[number],
+            )
+        )  # fmt: skip
     return windows
 
 

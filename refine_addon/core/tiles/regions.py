@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from ..absorbing.absorb import mergeable, reduced
 from ..absorbing.merge_field import Field, ViewSums
 from ..absorbing.merge_graph import MergeGraph
 from ..pipeline.absorb_splats import absorb_removed
+from ..rendering import MODELS
 from ..scores import Scores
 from ..seeing.measuring import Measured
 from ..splats import joined
@@ -138,7 +139,8 @@ class GatherRegion:
         )  # fmt: skip
         arrays = dict(zip(_GATHERED, (table, origin, members, places), strict=True))
         arrays |= {"mass": measured.mass, "seen_by": measured.seen}
-        context.folder.save(self.index, arrays | vars(measured.field))
+        number = {"model": np.array(MODELS.index(splats.model))}
+        context.folder.save(self.index, arrays | vars(measured.field) | number)
         return measured.seen_and_whole()
 
 
@@ -157,7 +159,7 @@ class PriceRegion:
     def _price(self, context: StageContext, runtime: Runtime) -> None:
         folder = context.folder
         arrays = folder.load(self.index, (*_FIELD, "mass", "seen_by", "rows", "mergeable"))
-        field = Field(*(arrays[name] for name in _FIELD))
+        field = _field(*(arrays[name] for name in _FIELD))
         measured = merge_field.MeasuredField(field, arrays["mass"], arrays["seen_by"])
         graph = MergeGraph(
             measured.with_allowance(self.whole), context.scene, context.factor,
@@ -215,9 +217,16 @@ class AbsorbRegion:
         priced = context.folder.load(self.index, (*_FIELD, *_PRICED)).values()
         *field, contribution, error, first, second, cost = priced
         return MergeGraph.connected_by(
-            replace(Field(*field), contribution=contribution, error=error),
+            replace(_field(*field), contribution=contribution, error=error),
             context.scene, context.factor, (first, second, cost), threads=threads,
         )  # fmt: skip
+
+
+def _field(*arrays: NDArray[Any]) -> Field:
+    """Return a field from its arrays as they are saved; the last is the number of the model."""
+    *values, number = arrays
+    named: dict[str, Any] = dict(zip(_FIELD, values, strict=False))
+    return Field(**named, model=MODELS[int(number)])
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from ..errors import RefineError
-from ..formats.ply import splat_header
+from ..formats.ply import splat_header, stated_model
 from ..formats.ply_body import check_counts, has_lists, vertex_range
-from ..formats.ply_columns import splats_from_columns
+from ..formats.ply_columns import THIRD_SCALE, splats_from_columns
 from ..formats.ply_header import HEADER_LIMIT, TEXT, format_of
 from ..formats.registry import read_splats
+from ..rendering import MODELS
 from ..scoring.closed_form_block import ROWS
-from ..splats import Splats, joined
+from ..splats import Splats, joined, with_model
 from ..urls import Url
 from . import storage
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..rendering import Model
 
 _HEADER = 1 << 16
 """Bytes that are fetched of a tile behind a URL for its header, which hardly ever has more."""
@@ -57,10 +59,16 @@ class Tile(NamedTuple):
     path: str  # absolute, or a URL
     splats: int  # how many it holds
     dtype: np.dtype[Any]  # of a row
+    model: Model  # how they are drawn
     header: int  # bytes of the header
     begin: int  # bytes before the first row
     size: int  # bytes of the file
     changed: int | str  # see `storage.state`
+
+    @property
+    def model_can_change(self) -> bool:
+        """Whether its splats may be drawn otherwise: those without a third scale are discs."""
+        return THIRD_SCALE in (self.dtype.names or ())
 
     @property
     def place(self) -> Path | Url:
@@ -148,7 +156,8 @@ class Unit:
                 begin = part.start - place.start
                 chosen.append(Part(part.tile, begin + start, begin + stop))
         chosen = chosen or [*kinds.values()]
-        return joined([splats_from_columns(rows_of(part)) for part in chosen])
+        splats = joined([splats_from_columns(rows_of(part)) for part in chosen])
+        return with_model(splats, self.parts[0].tile.model)
 
     def slices(self) -> list[slice]:
         """Return where in the unit each part lies."""
@@ -170,27 +179,49 @@ class Piece(NamedTuple):
     part: Part
 
 
-def tiles_at(paths: Sequence[Path | str]) -> list[Tile]:
+def tiles_at(paths: Sequence[Path | str], model: Model | None = None) -> list[Tile]:
     """Look at the files of a scene.
+
+    Parameters
+    ----------
+    paths : sequence of path-like
+    model : {"default", "antialiased", "2dgs"}, optional
+        How their splats are drawn, where they do not say or are wrong.
 
     Raises
     ------
     RefineError
-        See `tile_at`; also if a file is given twice, since its splats would count twice, or none
-        has a splat.
+        See `tile_at`; also if a file is given twice, since its splats would count twice, if they
+        are of different models, or none has a splat.
     """
     tiles: list[Tile] = []
     given: dict[Hashable, Tile] = {}
-    for tile in map(tile_at, paths):
+    for tile in (_drawn_as(tile_at(path), model) for path in paths):
         first = given.setdefault(storage.file_key(tile.place), tile)
         if first is not tile:
             msg = f"{tile.path}: is given twice"
             raise RefineError(msg if first.path == tile.path else f"{msg}, also as {first.path}")
         tiles.append(tile)
+        if tile.model != tiles[0].model:
+            msg = (
+                f"{tile.path}: its splats are {tile.model}, those of {tiles[0].path} "
+                f"{tiles[0].model}; expected one model in all tiles"
+            )
+            raise RefineError(msg)
     if not any(tile.splats for tile in tiles):
         msg = f"none of {len(tiles)} tiles has a splat: there is nothing to prune"
         raise RefineError(msg)
     return tiles
+
+
+def _drawn_as(tile: Tile, model: Model | None) -> Tile:
+    """Return a tile with splats of another model; None leaves it as it is."""
+    if model is None or model == tile.model:
+        return tile
+    if not tile.model_can_change:
+        msg = f"{tile.path}: splats without {THIRD_SCALE} are drawn as 2dgs, got {model}"
+        raise RefineError(msg)
+    return tile._replace(model=model)
 
 
 def tile_at(path: Path | str) -> Tile:
@@ -215,8 +246,8 @@ def tile_at(path: Path | str) -> Tile:
     size, changed = storage.state(place)
     header = len(file.header)
     return Tile(
-        str(place.absolute()), len(file), file.rows.dtype, header, header + len(file.before),
-        size, changed,
+        str(place.absolute()), len(file), file.rows.dtype, file.model, header,
+        header + len(file.before), size, changed,
     )  # fmt: skip
 
 
@@ -241,7 +272,10 @@ def _tile_behind(url: Url) -> Tile:
     start, _ = vertex_range(header, vertex, body)
     begin = len(header.raw) + start
     dtype = header.elements[vertex].dtype(header.order)
-    return Tile(str(url), header.counts[vertex], dtype, len(header.raw), begin, size, changed)
+    model = stated_model(header.raw, dtype) or "default"
+    return Tile(
+        str(url), header.counts[vertex], dtype, model, len(header.raw), begin, size, changed
+    )
 
 
 def _no_tile(path: Path | Url, form: str) -> RefineError:
@@ -320,10 +354,15 @@ def pieces_of(tiles: Sequence[Tile], units: Sequence[Unit]) -> list[list[Piece]]
 
 
 def packed(splats: Splats) -> NDArray[np.float64]:
-    """Return splats as one table, (n, 14 + 3 K), for harmonics of K coefficients a channel."""
+    """Return splats as one table, (n, 14 + 3 K), for harmonics of K coefficients a channel.
+
+    Unless they are of the default model, there is a last column with the number of their model.
+    """
     harmonics = splats.sh_rest.reshape(len(splats), 3 * splats.sh_rest.shape[1])
     columns = [splats.means, splats.log_scales, splats.quaternions]
     columns += [splats.opacity_logits[:, None], splats.sh_dc, harmonics]
+    if splats.model != MODELS[0]:
+        columns += [np.full((len(splats), 1), MODELS.index(splats.model))]
     with np.errstate(invalid="ignore"):  # signalling NaN
         return np.concatenate([np.asarray(values, np.float64) for values in columns], axis=1)
 
@@ -331,5 +370,7 @@ def packed(splats: Splats) -> NDArray[np.float64]:
 def unpacked(table: NDArray[np.float64]) -> Splats:
     """Return the splats of a table, in float64."""
     means, scales, quaternions, logits, constant, rest = np.split(table, [3, 6, 10, 11, 14], axis=1)
-    harmonics = rest.reshape(len(table), rest.shape[1] // 3, 3)
-    return Splats(means, scales, quaternions, logits[:, 0], constant, harmonics)
+    of_model = rest.shape[1] % 3
+    harmonics = rest[:, : rest.shape[1] - of_model].reshape(len(table), rest.shape[1] // 3, 3)
+    model = MODELS[int(rest[0, -1])] if of_model and len(table) else MODELS[0]
+    return Splats(means, scales, quaternions, logits[:, 0], constant, harmonics, model)

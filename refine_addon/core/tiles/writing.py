@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import RefineError
 from ..formats.ply_columns import splats_from_columns
-from ..formats.ply_header import with_count
+from ..formats.ply_header import with_count, with_model
 from ..formats.ply_write import write_rows
 from ..survivors import columns_with
 from ..urls import Url
@@ -58,7 +58,8 @@ class WriteTile:
     def _write(self, folder: Folder, waiting_file: Path) -> int:
         tile = self.tile
         with folder.writing(waiting_file) as stream:
-            stream.write(with_count(header_of(tile), self.kept))
+            header = with_count(header_of(tile), self.kept)
+            stream.write(with_model(header, tile.model) if tile.model_can_change else header)
             for beside in bytes_of(tile, tile.header, tile.begin):
                 stream.write(beside.data)
             for piece in self.pieces:

@@ -7,6 +7,7 @@ handles events; then Blender is closed.
 
 from __future__ import annotations
 
+import faulthandler
 import importlib
 import inspect
 import json
@@ -16,6 +17,10 @@ import traceback
 from pathlib import Path
 
 import bpy
+
+# Seconds. Ended from outside a step would not say where it was; Blender that quits amid a render of
+# its own may never end.
+PATIENCE, PATIENCE_TO_QUIT = 540, 60
 
 
 def answer_with(answer: str, value: object) -> None:
@@ -35,6 +40,7 @@ def drive(steps, answer: str) -> None:
             traceback.print_exc()
             sys.stderr.flush()
             os._exit(1)
+        faulthandler.dump_traceback_later(PATIENCE_TO_QUIT, exit=True)
         bpy.ops.wm.quit_blender()
         return None
 
@@ -44,6 +50,7 @@ def drive(steps, answer: str) -> None:
 
 def run() -> None:
     """Run the step that the command line names."""
+    faulthandler.dump_traceback_later(PATIENCE, exit=True)
     name, arguments, answer = sys.argv[sys.argv.index("--") + 1 :]
     sys.path.insert(0, str(Path(__file__).parent))
     value = importlib.import_module(name).main(**json.loads(arguments))

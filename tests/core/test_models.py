@@ -1,0 +1,265 @@
+"""How splats are drawn: what files say of it, and that it survives them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from refine_addon.core import RefineError, Splats, View, ViewSet, read_splats
+from refine_addon.core.absorbing import merging
+from refine_addon.core.absorbing.absorb import absorb
+from refine_addon.core.absorbing.merge_field import ViewSums
+from refine_addon.core.formats import ply_header
+from refine_addon.core.formats.ply_columns import columns_from_splats
+from refine_addon.core.formats.registry import FORMATS
+from refine_addon.core.levels.files import LevelsRequest, lod_file
+from refine_addon.core.levels.lod import Levels
+from refine_addon.core.operation.files import file_to_file
+from refine_addon.core.operation.requests import ConvertRequest, ScoreRequest
+from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS, MODELS
+from refine_addon.core.seeing import projection
+from refine_addon.core.seeing.cast import hits
+from refine_addon.core.splats import LOG_ZERO, joined, opacity, rotation_matrices, with_model
+
+
+def cloud(count, seed=0):
+    """Return splats of all shapes; all numbers are floats of single precision."""
+    random = np.random.default_rng(seed)
+    return Splats(
+        means=random.normal(size=(count, 3)).astype(np.float32),
+        log_scales=random.uniform(-5.0, -2.0, (count, 3)).astype(np.float32),
+        quaternions=random.normal(size=(count, 4)).astype(np.float32),
+        opacity_logits=random.normal(size=count).astype(np.float32),
+        sh_dc=random.normal(size=(count, 3)).astype(np.float32),
+        sh_rest=np.zeros((count, 0, 3), np.float32),
+    )
+
+
+def write(path, splats, comments=()):
+    """Write splats as a plain PLY whose header has these comments."""
+    columns = columns_from_splats(splats)
+    header = ply_header.new_header(((name, "float") for name in columns), len(splats)).split(b"\n")
+    header[1:1] = [b"comment " + comment for comment in comments]
+    path.write_bytes(b"\n".join(header) + np.column_stack([*columns.values()]).tobytes())
+    return path
+
+
+@pytest.mark.parametrize(
+    ("comments", "model"),
+    [
+        ([], "default"),
+        ([b"SplatRenderMode: mip"], "antialiased"),
+        ([b"splatrendermode:  MIP "], "antialiased"),
+        ([b"SplatRenderMode: 2dgs"], "2dgs"),
+        ([b"antialiased 1"], "antialiased"),
+        ([b"antialiased 0"], "default"),
+        ([b"antialiased 1", b"SplatRenderMode: default"], "default"),
+        ([b"SplatRenderMode: something new"], "default"),
+        ([b"of antialiased 1"], "default"),
+    ],
+)
+def test_comments_of_a_ply_say_how_it_is_drawn(tmp_path, comments, model):
+    """Brush's and Postshot's; of several the last counts, and what nobody knows does not."""
+    file = read_splats(write(tmp_path / "in.ply", cloud(5), comments))
+
+    assert file.model == file.splats().model == model
+    assert file.splats().take(slice(2)).model == model
+
+
+def test_splats_without_a_third_scale_are_discs_and_stay_so(tmp_path):
+    """They are read as of size 0 along their third axis, and written without it."""
+    splats = replace(cloud(5), model="2dgs")
+    path = write(tmp_path / "in.ply", splats, [b"antialiased 1"])
+    assert b"scale_2" not in path.read_bytes()
+
+    file_to_file(path, tmp_path / "out.ply", ConvertRequest())
+
+    read = read_splats(tmp_path / "out.ply")
+    assert read.model == "2dgs"
+    np.testing.assert_array_equal(read.splats().log_scales[:, 2], np.float32(LOG_ZERO))
+    np.testing.assert_array_equal(read.splats().log_scales[:, :2], splats.log_scales[:, :2])
+    assert (tmp_path / "out.ply").read_bytes() == path.read_bytes()
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("form", FORMATS, ids=lambda form: form.suffix)
+def test_a_format_tells_the_model_or_its_notes_do(tmp_path, form, model):
+    """Every tag that a format holds comes back from it; of the others is said how to read it."""
+    source = write(tmp_path / "in.ply", cloud(40))
+    between, back = tmp_path / f"between{form.suffix}", tmp_path / "back.ply"
+
+    report = file_to_file(source, between, ConvertRequest(model=model)).report
+    file_to_file(between, back, ConvertRequest())
+
+    held = model in form.models
+    assert read_splats(back).model == (model if held else "default")
+    assert any(f"--model {model}" in note for note in report["notes"]) != held
+
+
+def test_what_is_asked_for_replaces_what_the_file_says(tmp_path):
+    path = write(tmp_path / "in.ply", cloud(5), [b"SplatRenderMode: mip", b"by hand"])
+
+    file = read_splats(path, "2dgs")
+    plain = read_splats(path, "default")
+
+    assert file.model == "2dgs"
+    assert b"comment SplatRenderMode: 2dgs\n" in file.header
+    assert plain.model == "default"
+    assert b"mip" not in plain.header
+    assert b"comment by hand\n" in plain.header
+    assert read_splats(path, "antialiased").header == read_splats(path).header
+
+
+@pytest.mark.parametrize(
+    ("model", "expected"),
+    [("default", "in.ply: splats without scale_2 are drawn as 2dgs, got default"),
+     ("mip", "model is 'mip', expected one of default, antialiased, 2dgs")],
+)  # fmt: skip
+def test_a_model_that_cannot_be_is_refused(tmp_path, model, expected):
+    path = write(tmp_path / "in.ply", replace(cloud(5), model="2dgs"))
+
+    with pytest.raises(RefineError) as caught:
+        read_splats(path, model)
+
+    assert expected in str(caught.value)
+
+
+VIEW = View(np.eye(3), np.zeros(3), 100.0, 110.0, 60.3, 41.7, 120, 80, near=0.2)
+
+
+def footprints_of(splats):
+    """Return the footprints in `VIEW`, and the Gaussians."""
+    gaussians, scene, _ = projection.prepare(splats, ViewSet((VIEW,)))
+    return projection.project(gaussians, scene, VIEW), gaussians
+
+
+def before_the_camera(count, size, model):
+    """Return opaque splats of all shapes before `VIEW`."""
+    random = np.random.default_rng(3)
+    splats = replace(
+        cloud(count),
+        means=random.uniform([-1.5, -1.0, 2.0], [1.5, 1.0, 4.0], (count, 3)),
+        log_scales=random.normal(size, 0.5, (count, 3)),
+        opacity_logits=np.full(count, 3.0),
+    )
+    return with_model(splats, model)
+
+
+@pytest.mark.parametrize("size", [-4.0, -3.0, -2.0])
+def test_an_antialiased_footprint_keeps_the_integral_of_its_alpha(size):
+    """``o' 2 pi sqrt(det(C + .3 I))`` is ``o 2 pi sqrt(det C)``: by the sigmas of both."""
+    plain, _ = footprints_of(before_the_camera(50, size, "default"))
+    faint, gaussians = footprints_of(before_the_camera(50, size, "antialiased"))
+    rows = np.searchsorted(np.sort(plain.index), faint.index)
+    plain = plain.take(np.argsort(plain.index)[rows])
+
+    np.testing.assert_array_equal(faint.sigmas, plain.sigmas)
+    sharp = np.sqrt(np.prod(plain.sigmas.astype(np.float64) ** 2 - LOW_PASS, axis=0))
+    kept = faint.alphas * np.prod(faint.sigmas, axis=0)
+    np.testing.assert_allclose(kept, gaussians.alphas[faint.index] * sharp, rtol=2e-3, atol=1e-5)
+
+
+def test_a_ray_hits_a_disc_where_it_meets_its_plane():
+    """Alpha is ``o exp(-q / 2)``, q where line and plane meet, or twice px^2 if less."""
+    splats = before_the_camera(60, -2.0, "2dgs")
+    footprints, gaussians = footprints_of(splats)
+    columns, rows = np.arange(VIEW.width), np.arange(VIEW.height)
+    turns, sizes = rotation_matrices(splats.quaternions), np.exp(splats.log_scales)
+    found = 0
+
+    for owner, pixel, alpha in hits(footprints, columns, rows, 1 << 16):
+        for place, at, got in zip(owner[::97], pixel[::97], alpha[::97], strict=True):
+            index = gaussians.index[footprints.index[place]]
+            mean, turn = splats.means[index], turns[index]
+            x, y = at % VIEW.width + 0.5, at // VIEW.width + 0.5
+            ray = np.array([(x - VIEW.cx) / VIEW.fx, (y - VIEW.cy) / VIEW.fy, 1.0])
+            hit = ray * (turn[:, 2] @ mean) / (turn[:, 2] @ ray)
+            on_plane = np.sum((turn[:, :2].T @ (hit - mean) / sizes[index, :2]) ** 2)
+            center = mean[:2] / mean[2] * [VIEW.fx, VIEW.fy] + [VIEW.cx, VIEW.cy]
+            square = min(on_plane, 2.0 * np.sum((center - [x, y]) ** 2))
+            expected = min(opacity(splats.opacity_logits[index]) * np.exp(-0.5 * square), 0.99)
+            assert got == pytest.approx(expected, rel=2e-3)
+            found += 1
+    assert found > 50
+
+
+@pytest.mark.parametrize(
+    ("a", "b"), [(4.0, 2.0), (9.0, 0.01), (0.3, 0.1), (0.6, 0.4), (30.0, 1e-6)]
+)
+def test_the_ellipse_of_a_disc_covers_what_the_disc_covers(a, b):
+    """Half axes s and t stand for ``2 pi s t``: the integral of the larger of both Gaussians."""
+    axes = projection.disc_axes(np.array([[a], [b]], np.float32))[:, 0]
+
+    angle = (np.arange(200_000) + 0.5) * 2.0 * np.pi / 200_000
+    falls = np.cos(angle) ** 2 / a + np.sin(angle) ** 2 / b
+    expected = np.mean(1.0 / np.minimum(falls, 1.0 / DISC_LOW_PASS))
+    assert np.prod(axes) == pytest.approx(expected, rel=2e-3)
+    assert axes[0] >= axes[1]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_two_small_splats_merge_into_one_of_their_mass(model):
+    """Seen by the camera that measured them, what they cover together stays, but for overlap."""
+    count = 2
+    splats = replace(
+        cloud(count),
+        means=np.array([[-0.02, 0.0, 2.0], [0.02, 0.0, 2.0]]),
+        log_scales=np.full((count, 3), np.log(0.01)),
+        quaternions=np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)),
+        opacity_logits=np.full(count, -1.0),
+        sh_dc=np.ones((count, 3)),
+    )
+    splats = with_model(splats, model)
+    views = ViewSet((VIEW,))
+
+    merged = absorb(splats, views, seen_whole, 1).splats
+
+    assert merged.model == model
+    before, after = (
+        np.prod(f.sigmas, axis=0) @ f.alphas for f, _ in map(footprints_of, (splats, merged))
+    )
+    assert after == pytest.approx(before, rel=0.12)
+
+
+def seen_whole(left, _sums, _progress):
+    """Return what absorbing asks of views: all splats contribute alike."""
+    return ViewSums(np.full(len(left), 10.0), np.full(len(left), 1.0))
+
+
+def test_splats_of_different_models_are_no_scene():
+    with pytest.raises(RefineError, match="different models"):
+        joined([cloud(2), with_model(cloud(2), "2dgs")])
+
+
+def test_discs_are_without_the_shortest_axis_of_what_they_were():
+    """Against the eigenvectors that LAPACK finds; of a needle and a ball any axis will do."""
+    random = np.random.default_rng(5)
+    shapes = random.normal(size=(300, 3, 3)) * np.exp(random.normal(0.0, 2.0, (300, 1, 3)))
+    whole = shapes @ np.swapaxes(shapes, 1, 2)
+    whole[:2] = np.diag([4.0, 0.0, 0.0]), np.eye(3)
+    rows, columns = np.triu_indices(3)
+
+    found = merging.flat(whole[:, rows, columns])
+
+    values, axes = np.linalg.eigh(whole)
+    shortest = np.einsum("n,ni,nj->nij", values[:, 0], axes[:, :, 0], axes[:, :, 0])
+    sizes = np.trace(whole, axis1=1, axis2=2)[:, None]
+    expected = (whole - shortest)[:, rows, columns]
+    np.testing.assert_allclose((found / sizes)[2:], (expected / sizes)[2:], atol=1e-6)
+    np.testing.assert_allclose(found[:2, [0, 3, 5]].sum(axis=1), [4.0, 2.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_levels_and_scores_are_files_of_the_same_model(tmp_path, model):
+    """Of splats that the file calls ordinary and `model=` does not; discs stay discs."""
+    source = write(tmp_path / "in.ply", before_the_camera(60, -2.0, "default"))
+    views = ViewSet((VIEW,))
+    levels = Levels((0.5,), survivors="absorb")
+
+    lod_file(source, tmp_path / "levels", LevelsRequest(views, levels, model=model))
+    file_to_file(source, tmp_path / "scored.ply", ScoreRequest(views, model=model))
+
+    assert read_splats(tmp_path / "levels/in.lod1.ply").model == model
+    assert read_splats(tmp_path / "scored.ply").model == model
