@@ -108,7 +108,7 @@ class _Suspects(NamedTuple):
     small: NDArray[np.bool_]
 
     @property
-    def any(self) -> NDArray[np.bool_]:
+    def mask(self) -> NDArray[np.bool_]:
         """Which are suspect for one of these, (M,)."""
         return self.doubted | self.giant | self.needle | self.small
 
@@ -206,7 +206,7 @@ class Search:
             doubted = suspects.doubted | new
             small = self._clusters(~doubted & ~giant, part(progress, start, start + 0.02))
             suspects = _Suspects(doubted, giant, needle, suspects.small | small)
-            absent = suspects.any
+            absent = suspects.mask
             wanted = open_ & ~absent
             sight = self._look(absent, wanted, part(progress, start + 0.02, start + 0.25))
             self.evidence = sight.evidence
