@@ -135,11 +135,14 @@ def seen_as(monkeypatch, near, behind, contrast, views, past):
         ((0.36, 0.64, 0.8, 30, 24), {}),
         ((0.0, 1.0, 0.021, 6, 6), {"front": 1}),
         ((0.0, 1.0, 0.018, 6, 6), {"transparent": 1}),
+        ((0.0, 1.0, 0.018, 16, 16), {"front": 1}),
+        ((0.0, 1.0, 0.009, 16, 16), {"transparent": 1}),
     ],
 )
 def test_evidence_decides_of_what_is_doubted(monkeypatch, evidence, expected):
     """Support below .2; two views at least and three in five; .8 of a contrast of .0196 (4/255).
 
+    Half of that is enough of what 16 views see past.
     Of 3 views 2 are not enough: 2 x 2/3 are clear, which is under 1.6.
     What changes a pixel by 10/255, .8 of a contrast of .049, goes if 6 and three in ten see past,
     and up to a support of .35 if 16 views are clear: 20 of 20, or 24 of 30 (19.2), not 20 of 30.

@@ -91,7 +91,7 @@ VISIBLE, WIDE = 4 / 255, 0.05
 """By how much a splat must change a pixel, as its opacity times its contrast to what lies behind.
 One whose standard deviation reaches across more than this share of a picture's longer side changes
 more pixels, and must change each by so much less: the root mean square of the picture's change is
-the same."""
+the same. Half is enough of what `MANY` views see past."""
 
 NEAR = 0.3
 """Haze is at most so far from a camera, scene sizes."""
@@ -177,7 +177,8 @@ class Search:
         suspects = self._suspects(progress)
         large = suspects.giant | suspects.needle
         effect = self._effect()
-        shows = effect >= VISIBLE * (WIDE / np.maximum(self.width, WIDE))
+        least = np.where(self.evidence.past >= MANY, VISIBLE / 2.0, VISIBLE)
+        shows = effect >= least * (WIDE / np.maximum(self.width, WIDE))
         floats = self._floats(suspects, effect, shows)
         visible, faint = floats & shows, floats & ~shows & suspects.doubted & ~large
         haze = faint & (self.gaussians.alphas < FAINT) & self._near_cameras(faint)
