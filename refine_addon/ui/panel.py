@@ -150,9 +150,12 @@ class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
         layout.operator("refine.find_floaters", icon="VIEWZOOM")
         obj = context.object
         counts = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        sure = {} if counts is None else floaters.surety(obj.data)
         column = layout.column(align=True)
         for name, text, _ in FLOATERS:
             shown = text if counts is None else f"{text}: {counts[name]:,}"
+            if sure.get(name) is not None:
+                shown += f" ({100.0 * sure[name]:.0f} %)"
             column.prop_enum(settings, "reasons", name, text=shown)
         if counts is not None:
             total = sum(counts[name] for name in settings.reasons)
