@@ -24,7 +24,7 @@ from .ui import (
 from .ui.camera_import import REFINE_FH_cameras, REFINE_OT_import_cameras
 from .ui.camera_list import REFINE_UL_cameras, RefineCamera
 from .ui.compare import REFINE_OT_compare
-from .ui.export_operators import REFINE_OT_export_ply
+from .ui.export_operators import REFINE_OT_export_levels, REFINE_OT_export_ply
 from .ui.floaters import REFINE_OT_delete_floaters, REFINE_OT_find_floaters
 from .ui.import_operators import REFINE_FH_ply, REFINE_OT_import_ply
 from .ui.instances import REFINE_OT_make_real, REFINE_PT_instances
@@ -49,6 +49,7 @@ from .ui.preferences import RefinePreferences
 from .ui.properties import RefineSettings
 from .ui.protect import REFINE_OT_protect
 from .ui.remedies import (
+    REFINE_OT_add_between,
     REFINE_OT_add_ring,
     REFINE_OT_keep_unseen,
     REFINE_OT_leave_out,
@@ -105,9 +106,11 @@ CLASSES = (
     REFINE_OT_bake_transform,
     REFINE_OT_join,
     REFINE_OT_mend,
+    REFINE_OT_export_levels,
     REFINE_OT_export_ply,
     REFINE_OT_levels,
     REFINE_OT_turn_cameras,
+    REFINE_OT_add_between,
     REFINE_OT_add_ring,
     REFINE_OT_leave_out,
     REFINE_OT_keep_unseen,

@@ -11,7 +11,7 @@ from ..core.formats.registry import SUFFIXES, format_named, without_suffix
 from ..core.levels.files import check_goal, is_streamed, level_paths
 from ..core.urls import Url, refuse_url
 from . import zones
-from .options import DEFAULT_LEVELS, budget, cleaning, levels, settings, survivors
+from .options import DEFAULT_LEVELS, arrangement, budget, cleaning, levels, settings, survivors
 from .report import is_report
 from .zones import ROLES
 
@@ -35,6 +35,16 @@ def check(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
         _check_render(parser, options)
     else:
         _check_splats(parser, options)
+    if options.command == "convert":
+        _check_convert(parser, options)
+
+
+def _check_convert(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
+    """Refuse to move what cannot be moved so."""
+    try:
+        arrangement(options)
+    except RefineError as error:
+        parser.error(str(error))
 
 
 def _check_render(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:

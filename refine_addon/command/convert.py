@@ -4,25 +4,28 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from ..core import ConvertRequest, file_to_file
+from ..core import ConvertRequest, convert_files
+from .options import arrangement
 from .words import sizes, written
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from .run import Run
 
 
 def convert(run: Run) -> None:
-    """Convert the input."""
-    source = run.options.inputs[0]
-    run.attempt(str(source), lambda: _convert(run, source))
+    """Convert the inputs to one file."""
+    sources = run.options.inputs
+    name = " + ".join(map(str, sources))
+    run.attempt(str(sources[0]), lambda: _convert(run, sources, name))
 
 
-def _convert(run: Run, source: Path) -> dict[str, Any]:
+def _convert(run: Run, sources: Sequence[Path], source: str) -> dict[str, Any]:
     output = run.options.output
     request = ConvertRequest(run.options.overwrite, run.options.model)
-    done = file_to_file(source, output, request).report
+    done = convert_files(sources, output, request, arrangement(run.options)).report
     splats, files = done["splats"], done["files"]
     size = sizes(files["input_bytes"], files["output_bytes"])
     run.terminal.say(f"{source}: {splats['before']:,} splats{written(splats)}, {size} -> {output}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -11,9 +12,11 @@ from ..core import (
     METHODS,
     REASONS,
     SURVIVORS,
+    Arrangement,
     Budget,
     Cleaning,
     Levels,
+    Move,
     RefineError,
     Settings,
 )
@@ -72,7 +75,11 @@ EXAMPLES = {
         "refine lod in.ply --cameras cameras.json -o web/lod-meta.json",
         "refine lod in.ply --cameras cameras.json --psnr 45,40,35 --format .spz -o levels",
     ),
-    "convert": ("refine convert in.ply out.spz",),
+    "convert": (
+        "refine convert in.ply out.spz",
+        "refine convert room.ply statue.spz both.ply --rotate 2:0,90,0 --translate 2:0,-1.5,0",
+        "refine convert in.ply out.ply --degree 1 --morton",
+    ),
     "info": ("refine info in.ply", "refine info *.ply --report report.json"),
     "render": (
         f"{BLENDER}refine render",
@@ -313,9 +320,43 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
 
 
 def _add_convert(commands: Any) -> None:  # noqa: ANN401 - argparse does not name the type
-    convert = _add(commands, "convert", "write a file of splats in another format")
-    convert.add_argument("inputs", nargs=1, type=_given, metavar="IN", help="known by its content")
+    convert = _add(commands, "convert", "write files of splats as one, in another format")
+    convert.add_argument(
+        "inputs", nargs="+", type=_given, metavar="IN", help="known by its content; several merge"
+    )
     convert.add_argument("output", type=_path, metavar="OUT", help=f"by its suffix: {FORMATS}")
+    for name, metavar, what in (
+        ("translate", "[N:]X,Y,Z", "by so many units, after the others"),
+        ("rotate", "[N:]X,Y,Z", "by degrees about x, then y, then z"),
+        ("scale", "[N:]S", "by a factor, before the others"),
+    ):
+        convert.add_argument(
+            f"--{name}",
+            type=partial(_numbered, count=metavar.count(",") + 1),
+            action="append",
+            default=[],
+            metavar=metavar,
+            help=f"move the N-th input {what}; without N all of them; --{name}=-1 for a minus",
+        )
+    convert.add_argument(
+        "--degree",
+        type=int,
+        choices=range(5),
+        metavar="D",
+        help="leave out harmonics above this degree, 0 to 4",
+    )
+    convert.add_argument(
+        "--morton",
+        action="store_true",
+        help="sort splats along a Z-shaped (Morton) curve, so that near ones follow each other",
+    )
+    convert.add_argument(
+        "--level",
+        type=int,
+        default=0,
+        metavar="L",
+        help="of a streamed SOG (lod-meta.json): 0, the default, is the finest",
+    )
     _add_model(convert)
     _add_common(convert)
 
@@ -396,6 +437,14 @@ def _add_views(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"use at most N views, spread out evenly; 0 uses all (default {Settings.views})",
     )
+    parser.add_argument(
+        "--views-between",
+        type=int,
+        default=0,
+        metavar="N",
+        help="besides, use N more views, halfway between neighbouring ones: for pictures from "
+        "where no camera stood (default 0)",
+    )
 
 
 def _add_scoring(parser: argparse.ArgumentParser) -> None:
@@ -440,6 +489,16 @@ def _numbers(text: str) -> tuple[float, ...]:
     except ValueError as error:
         msg = f"expected numbers with commas between them, got {text!r}"
         raise argparse.ArgumentTypeError(msg) from error
+
+
+def _numbered(text: str, count: int) -> tuple[int | None, tuple[float, ...]]:
+    """Return the number of an input, None for all, and so many numbers."""
+    first, colon, rest = text.rpartition(":")
+    numbers = _numbers(rest)
+    if len(numbers) != count or (colon and not (first.isdecimal() and int(first))):
+        msg = f"expected {count} numbers with commas between them, or N: and these, got {text!r}"
+        raise argparse.ArgumentTypeError(msg)
+    return int(first) if colon else None, numbers
 
 
 def _words(text: str) -> tuple[str, ...]:
@@ -520,7 +579,18 @@ def _path(text: str) -> Path:
 def settings(options: argparse.Namespace) -> Settings:
     """Return how to score, or raise `RefineError` where a value cannot be."""
     method = options.method or Settings.method
-    return Settings(method, options.views, tolerance=options.tolerance)
+    return Settings(method, most_views(options), tolerance=options.tolerance)
+
+
+def most_views(options: argparse.Namespace) -> int:
+    """Return how many views may be used, with those in between; 0 for all.
+
+    Raise `RefineError` where their number cannot be.
+    """
+    if options.views_between < 0:
+        msg = f"--views-between is {options.views_between}, expected 0 or more"
+        raise RefineError(msg)
+    return options.views + options.views_between if options.views > 0 else options.views
 
 
 def survivors(options: argparse.Namespace) -> SurvivorChoice:
@@ -531,13 +601,29 @@ def survivors(options: argparse.Namespace) -> SurvivorChoice:
 
 def cleaning(options: argparse.Namespace) -> Cleaning:
     """Return what to clean away, or raise `RefineError` where a value cannot be."""
-    return Cleaning(getattr(options, "reasons", Cleaning.reasons), options.views)
+    return Cleaning(getattr(options, "reasons", Cleaning.reasons), most_views(options))
 
 
 def levels(options: argparse.Namespace) -> Levels:
     """Return which levels to make, or raise `RefineError` where a value cannot be."""
     shares = () if options.psnr else options.levels or DEFAULT_LEVELS
     return Levels(shares, options.psnr, options.survivors)
+
+
+def arrangement(options: argparse.Namespace) -> Arrangement:
+    """Return what becomes of splats besides their format; raise `RefineError` where none can."""
+    asked: list[dict[str, Any]] = [{} for _ in options.inputs]
+    for name in ("translate", "rotate", "scale"):
+        # Those of all inputs first, so that an input's own takes their place.
+        for number, values in sorted(getattr(options, name), key=lambda item: item[0] or 0):
+            if number is not None and number > len(asked):
+                msg = f"--{name} {number}: there are {len(asked)} inputs"
+                raise RefineError(msg)
+            for move in asked if number is None else [asked[number - 1]]:
+                move[name] = values if len(values) > 1 else values[0]
+    moves = tuple(Move(**move) for move in asked)
+    moved = moves if any(move != Move() for move in moves) else ()
+    return Arrangement(moved, options.degree, options.morton, options.level)
 
 
 def budget(options: argparse.Namespace) -> Budget:

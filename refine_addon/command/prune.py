@@ -6,7 +6,7 @@ import contextlib
 from typing import TYPE_CHECKING, Any
 
 from ..core import PruneRequest, picture_files, prune_file, prune_tiles
-from ..core.estimate.quality import UNSEEN, in_words
+from ..core.estimate.quality import UNSEEN, in_views, in_words
 from ..core.formats.registry import without_suffix
 from ..core.picture_files import PictureFiles
 from ..core.tiles.storage import located
@@ -140,7 +140,7 @@ def _quality(done: dict[str, Any]) -> str:
     psnr, survivors = done["estimated_psnr"], done["survivors"]
     if psnr is None:
         return ""
-    words = f"{in_words(psnr)} in these views"
+    words = in_views(psnr, done["estimated_psnr_between"])
     if done.get("written_psnr") is not None:
         words += f", {in_words(done['written_psnr'])} as written"
     if psnr > UNSEEN:

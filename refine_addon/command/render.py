@@ -40,6 +40,7 @@ def render(run: Run) -> None:
         return
     among = f" among what {shared.engine} rendered" if shared.engine else ""
     run.terminal.say(f"  {shared.splats:,} splats{among}")
+    run.terminal.notes(frames.left_out(scene))
     if shared.engine and shared.engine != scene.render.engine:
         engines = f"all but splats is by {shared.engine}, not {scene.render.engine}"
         run.terminal.notes([f"{engines}: there is no graphics card, or only the world to render"])

@@ -7,9 +7,10 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..core import RefineError, read_cameras
+from ..core import RefineError, read_cameras, with_views_between
 from ..core.errors import printable
 from ..core.pace import Pace
+from ..core.report import MANY_UNSEEN
 from ..core.urls import Url
 from ..core.whole_file import new_folder
 from . import report
@@ -62,7 +63,8 @@ class Run:
 
             views, facts = scene_cameras.chosen(self.options)
         self._cameras = {"cameras": facts}
-        return views
+        more = self.options.views_between
+        return with_views_between(views.spread(self.options.views), more) if more else views
 
     def named(self, name: str) -> str:
         """Return what to call the file under way; see `Pace.named`."""
@@ -86,6 +88,9 @@ class Run:
         if splats["unseen"]:
             scored = splats["before"] - splats["forced"] - cleaned
             self.terminal.say(f"  {splats['unseen']:,} of {scored:,} splats lie in no view")
+            if splats.get("unseen_removed", 0) and splats["unseen"] >= MANY_UNSEEN * scored:
+                share = splats["unseen_removed"] / splats["unseen"]
+                self.terminal.say(f"  {share:.0%} of these go: add views if others can see them")
 
     def each(self, work: Callable[[Run, Path, Path | None, ViewSet], dict[str, Any]]) -> None:
         """Do the work of every input: with its output, if there is to be one, and the views."""

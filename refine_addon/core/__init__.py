@@ -15,6 +15,7 @@ from .formats.ply import SplatFile, read_ply
 from .formats.registry import as_written, read_splats
 from .levels.files import LevelsRequest, lod_file
 from .levels.lod import Level, Levels, lod
+from .operation.arranged import Arrangement, Move, convert_files
 from .operation.files import file_to_file, prune_file
 from .operation.requests import CleanRequest, ConvertRequest, PruneRequest, ScoreRequest
 from .pipeline import prune, score
@@ -30,6 +31,7 @@ from .survivors import survivor_columns
 from .task import METHODS, Result, Settings
 from .tiles.prune import prune_tiles
 from .views import View, ViewSet
+from .views_between import with_views_between
 from .volumes import Box, MovedVolume, Sphere, Zone, forced
 from .work import Cancelled
 
@@ -38,6 +40,7 @@ __all__ = [
     "METHODS",
     "REASONS",
     "SURVIVORS",
+    "Arrangement",
     "Box",
     "Budget",
     "Cancelled",
@@ -49,6 +52,7 @@ __all__ = [
     "Level",
     "Levels",
     "LevelsRequest",
+    "Move",
     "MovedVolume",
     "Occlusion",
     "PruneRequest",
@@ -68,6 +72,7 @@ __all__ = [
     "Zone",
     "as_written",
     "clean",
+    "convert_files",
     "file_to_file",
     "forced",
     "lod",
@@ -84,4 +89,5 @@ __all__ = [
     "score",
     "select",
     "survivor_columns",
+    "with_views_between",
 ]

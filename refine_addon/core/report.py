@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .estimate.cost import expected_seconds
-from .estimate.quality import FEWEST, expected, out_of_reach
+from .estimate.quality import FEWEST, expected, in_words, out_of_reach, parted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -32,6 +32,9 @@ NOT_FORETOLD = (
     f"what absorbing and refitting reach is not foretold for fewer than {FEWEST:,} splats"
 )
 """Why there is no estimate: notes of the report."""
+
+MANY_UNSEEN = 0.05
+"""Share of the splats from which on it is said how many of those that lie in no view go."""
 
 MEASURES = "absorbing measures by occlusion: closed-form was not used"
 """A note of the report."""
@@ -240,6 +243,24 @@ def conclude(
     if absorbed is not None:
         facts["absorbed"] = absorbed.facts()
         facts["notes"].append(absorbed.note())
+
+
+def conclude_between(facts: dict[str, Any], between: float | None) -> None:
+    """Add to a report what views between those that decided will see.
+
+    Parameters
+    ----------
+    facts : dict
+        The report; changed. It has the estimate in the views that decided.
+    between : float or None
+        The estimate between them, dB.
+    """
+    facts["estimated_psnr_between"] = None if between is None else round(between, 2)
+    if between is not None and parted(facts["estimated_psnr"], between):
+        facts["notes"].append(
+            f"views between these lose more, {in_words(between)}: have views in between decide "
+            "too, or remove less"
+        )
 
 
 PRICED = (0.3, 0.5, 0.7, 0.9)

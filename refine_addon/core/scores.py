@@ -48,6 +48,8 @@ class Scores:
         How many views were given; those used were chosen from them.
     ray_sample : RaySample, optional
         Validation rays, which tell the PSNR of any choice of the splats that were scored.
+    between : RaySample, optional
+        Rays of views between those that scored.
     quality : Quality, optional
         The PSNR over the share removed in the order of the scores.
     alignment : Alignment, optional
@@ -69,6 +71,7 @@ class Scores:
     frustum: bool = True
     views_given: int = 0
     ray_sample: RaySample | None = None
+    between: RaySample | None = None
     quality: Quality | None = None
     alignment: Alignment | None = None
     settled: int | None = None
@@ -101,9 +104,11 @@ class Scores:
         """
         self.refuse_unscored(rest)
         values, count = self.values[rest], int(np.count_nonzero(rest))
-        ray_sample = self.ray_sample
-        if ray_sample is not None and len(ray_sample.splats) != count:
-            ray_sample = None  # of a scene with other splats
+        # Of a scene with other splats they tell nothing.
+        ray_sample, between = (
+            None if rays is None or len(rays.splats) != count else rays
+            for rays in (self.ray_sample, self.between)
+        )
         settled = self.settled
         if settled is not None:
             settled = max(settled - (len(rest) - count), 0)
@@ -112,6 +117,7 @@ class Scores:
             values=values,
             seen=self.seen[rest],
             ray_sample=ray_sample,
+            between=between,
             settled=settled,
             scored=None,
         )

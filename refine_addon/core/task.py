@@ -117,12 +117,15 @@ class Origin:
         As they were.
     ray_sample : RaySample or None
         What the views saw of them: the estimated PSNR is against that.
+    between : RaySample or None
+        The same of views between these.
     psnr : float or None
         The estimated PSNR that is left before the task, dB.
     """
 
     splats: Splats
     ray_sample: RaySample | None
+    between: RaySample | None
     psnr: float | None
 
 

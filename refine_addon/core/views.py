@@ -248,10 +248,10 @@ class ViewSet:
     def spread(self, count: int) -> ViewSet:
         """Return at most `count` views that cover the set evenly, in the order of the set.
 
-        Farthest-point sampling over position and viewing direction, starting from the view that is
-        farthest from the middle of the set. Positions are divided by the root of `middle`'s
-        variance. The choice depends neither on the frame and the unit of the set nor, as far as
-        names differ, on its order; a stray view takes up only one place.
+        Farthest-point sampling over position and viewing direction (`places`), starting from the
+        view that is farthest from the middle of the set. The choice depends neither on the frame
+        and the unit of the set nor, as far as names differ, on its order; a stray view takes up
+        only one place.
 
         Parameters
         ----------
@@ -262,9 +262,7 @@ class ViewSet:
         usable = np.array([index for index in self.by_name() if self.views[index].weight > 0])
         if count <= 0 or len(usable) <= count:
             return self if len(usable) == len(self) else self.take(np.sort(usable))
-        middle, variance = self.middle()
-        offset = self.centers[usable] - middle
-        place = np.hstack([offset / (np.sqrt(variance) or 1.0), self.rotations[usable][:, 2]])
+        place = self.places()[usable]
         chosen = [int(np.argmax(np.round(np.sum(place * place, axis=1), 9)))]
         distance = np.full(len(place), np.inf)
         while len(chosen) < count:
@@ -273,6 +271,16 @@ class ViewSet:
             distance[chosen] = -1.0
             chosen.append(int(np.argmax(np.round(distance, 9))))
         return self.take(np.sort(usable[chosen]))
+
+    def places(self) -> NDArray[np.float64]:
+        """Return where each view stands and looks, (V, 6), for distances between views.
+
+        Positions are from the middle of the set and divided by the root of `middle`'s variance;
+        then come the viewing directions.
+        """
+        middle, variance = self.middle()
+        offset = (self.centers - middle) / (np.sqrt(variance) or 1.0)
+        return np.hstack([offset, self.rotations[:, 2]])
 
     def by_name(self) -> list[int]:
         """Return the indices of the views sorted by name; views of one name keep their order.

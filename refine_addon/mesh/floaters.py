@@ -27,7 +27,7 @@ REASON = "refine_floats"
 """Integer point attribute: 0, or the place of the splat's reason in `REASONS`, from 1."""
 
 FOUND = "refine_floaters"
-"""Custom property of the mesh: how many floaters were found for each reason, as JSON."""
+"""Custom property of the mesh: how many floaters were found for each reason, how sure, as JSON."""
 
 
 def store(checked: SplatObject, cleaned: Cleaned) -> None:
@@ -50,7 +50,8 @@ def store(checked: SplatObject, cleaned: Cleaned) -> None:
         reasons[cleaned.by_reason[name]] = number
     mesh_attributes.write_attribute(checked.mesh, REASON, "INT", reasons)
     counts = {name: int(np.count_nonzero(mask)) for name, mask in cleaned.by_reason.items()}
-    checked.mesh[FOUND] = json.dumps({"splats": len(reasons), "counts": counts})
+    noted = {"splats": len(reasons), "counts": counts, "sure": cleaned.surety()}
+    checked.mesh[FOUND] = json.dumps(noted)
     mesh_attributes.updated(checked.mesh)
 
 
@@ -63,6 +64,18 @@ def counts(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, int] | None
     except (KeyError, TypeError, ValueError):
         return None
     return counted if current else None
+
+
+def surety(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> dict[str, float]:
+    """Return how sure it is of each reason that further views see past its splats, 0..1.
+
+    Reasons that nothing is known of are left out, such as all of them where `counts` is None.
+    """
+    try:
+        noted = parsed(mesh[FOUND])["sure"].items()
+        return {name: float(share) for name, share in noted if share is not None}
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return {}
 
 
 def mask(checked: SplatObject, reasons: Collection[str]) -> NDArray[np.bool_]:

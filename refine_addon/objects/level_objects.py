@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import bpy
 
+from ..core.errors import RefineError
 from ..core.levels.files import GOAL
 from ..mesh.layout import SplatObject, check
 from . import splat_object
@@ -17,7 +18,10 @@ if TYPE_CHECKING:
     from ..core.levels.lod import Level
 
 FACTS = "refine_lod"
-"""Custom property of the object of a level: what is known of it, as in the manifest of files."""
+"""Custom property of the object of a level: what is known of it, as in the report of files."""
+
+LEVEL_OF = "refine_level_of"
+"""Custom property of the object of a level: the object that it was made of."""
 
 
 def add_levels(checked: SplatObject, levels: Sequence[Level]) -> bpy.types.Collection:
@@ -49,13 +53,42 @@ def add_levels(checked: SplatObject, levels: Sequence[Level]) -> bpy.types.Colle
             copy.name = copy.data.name = f"{name}_lod{level.number}"
             bpy.context.view_layer.update()  # its place in the world
             splat_object.apply_object(check(copy), level)
-            facts = level.facts(GOAL)
+            facts = {**level.facts(GOAL), "distance": _distance(level)}
+            copy[LEVEL_OF] = checked.obj
             copy[FACTS] = {key: value for key, value in facts.items() if value is not None}
             copy.select_set(False)
         for obj in collection.objects:  # all stand in one place
             obj.hide_set(True)
             obj.hide_render = True
     return collection
+
+
+def _distance(level: Level) -> float | None:
+    """Return how far the views are from what they see, world units; None if they see too little."""
+    return level.reach.psnr[0][0] if level.reach.psnr else None
+
+
+def has_levels(obj: bpy.types.Object | None) -> bool:
+    """Return whether an object is a level, or has some."""
+    if obj is None:
+        return False
+    return LEVEL_OF in obj or any(each.get(LEVEL_OF) == obj for each in bpy.data.objects)
+
+
+def levels_of(obj: bpy.types.Object) -> list[bpy.types.Object]:
+    """Return an object and its levels, the finest first, given it or one of them.
+
+    Raises
+    ------
+    RefineError
+        If it has none.
+    """
+    original = obj.get(LEVEL_OF) or obj
+    levels = [each for each in bpy.data.objects if each.get(LEVEL_OF) == original]
+    if not levels:
+        msg = f"object '{obj.name}': has no levels; make them first"
+        raise RefineError(msg)
+    return [original, *sorted(levels, key=lambda each: each[FACTS]["level"])]
 
 
 @contextmanager

@@ -13,6 +13,7 @@ import bpy
 import gpu
 import numpy as np
 
+from ..core.rendering import MODELS
 from ..viewport import shader
 from ..viewport.arrays import Eye, as_texture, colors, farthest_first, in_front, pack
 
@@ -72,6 +73,8 @@ def prepare(splats: Splats, view: View, layers: Layers | None) -> Sheet:
     matrix[:, 3] = -matrix[:, :3] @ view.center
     projection = _projection(view)
     packed = pack(splats)
+    rest = np.zeros((len(packed), 4), np.float32)  # as `Atlas` has it
+    rest[:, :2], rest[:, 2] = packed.covariances[:, 4:], MODELS.index(packed.model)
     eye = Eye(-matrix[2], view.center, perspective=True)
     rows, depths = in_front(packed.means, eye, view.near)
     rows = rows[depths < view.far]
@@ -91,7 +94,7 @@ def prepare(splats: Splats, view: View, layers: Layers | None) -> Sheet:
         "order": (as_texture(order), 1, "R32F"),
         "means": (as_texture(means), 4, "RGBA32F"),
         "covariances": (as_texture(packed.covariances[:, :4]), 4, "RGBA32F"),
-        "more_covariances": (as_texture(packed.covariances[:, 4:]), 2, "RG32F"),
+        "more_covariances": (as_texture(rest), 4, "RGBA32F"),
         "colors": (as_texture(colors(packed)), 4, "RGBA16F"),
         "selection": (as_texture(np.zeros(len(packed), np.float32)), 1, "R32F"),
         "matrices": (matrix.astype(np.float32).reshape(1, 12), 4, "RGBA32F"),

@@ -53,12 +53,38 @@ def refuse(scene: bpy.types.Scene) -> None:
     if scene.camera is None:
         msg = f"{label}: has no camera; add one, or make one the active camera"
         raise RefineError(msg)
-    if not any(drawn_by_us(obj) for obj in bpy.data.objects):
+    instanced = {obj.instance_collection for obj in bpy.data.objects} - {None}
+    members = [member for collection in instanced for member in collection.all_objects]
+    if not any(drawn_by_us(obj) for obj in (*scene.objects, *members)):
         msg = f"{label}: has no splats to draw; import some, or use Render Image"
         raise RefineError(msg)
     if scene.render.use_multiview:
         msg = f"{label}: splats are not drawn in stereo; switch off Stereoscopy"
         raise RefineError(msg)
+
+
+def left_out(scene: bpy.types.Scene) -> list[str]:
+    """Return what the scene asks for and a render with splats does without, in sentences."""
+    render, told = scene.render, []
+    blurred = [
+        name
+        for name, asked in (
+            ("depth of field", scene.camera.data.dof.use_dof),
+            ("motion blur", render.use_motion_blur),
+        )
+        if asked
+    ]
+    if blurred:
+        told.append(f"Splats are drawn without {' and '.join(blurred)}")
+    if hasattr(scene, "compositing_node_group"):  # since 5.0
+        nodes = scene.compositing_node_group
+    else:
+        nodes = scene.use_nodes and scene.node_tree
+    if render.use_compositing and nodes:
+        told.append("Compositing nodes are left out")
+    if sum(layer.use for layer in scene.view_layers) > 1:
+        told.append("Of several view layers the first is rendered")
+    return told
 
 
 def steps(

@@ -109,6 +109,7 @@ class Meshes:
                 depths = self._copy(scene, "REFINE depths", transparent=True)
                 depths.render.engine = "CYCLES"
                 depths.cycles.samples, depths.cycles.use_denoising = 1, False
+                depths.cycles.device = "CPU"  # whose kernels are there already
                 self._depths = depths.name
         if not scene.render.film_transparent and scene.world is not None:
             world = self._copy(scene, "REFINE world", transparent=False)

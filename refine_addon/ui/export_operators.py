@@ -1,4 +1,4 @@
-"""The operator that writes splats to a file."""
+"""The operators that write splats to a file, and levels to a folder."""
 
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
@@ -13,11 +13,15 @@ import numpy as np
 from bpy.props import BoolProperty, EnumProperty, StringProperty
 from bpy_extras.io_utils import ExportHelper
 
+from ..core.formats import sog
 from ..core.formats.registry import FORMATS, SUFFIXES, Packed, as_written, without_suffix
+from ..core.formats.streamed_sog import INDEX
+from ..core.formats.streamed_sog_write import StreamedSog, folder_for
 from ..core.whole_file import expanded, refuse_existing
 from ..core.work import report
+from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..objects import splat_object
+from ..objects import level_objects, splat_object
 from .on_thread import AskedFirst
 from .operator_bases import Answer, OnSplats
 
@@ -124,6 +128,95 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
         for note in job.notes:
             self.report({"WARNING"}, note)
         self.report({"INFO"}, f"Wrote the splats to {self.filepath}")
+        return {"FINISHED"}
+
+
+@dataclass(frozen=True, eq=False)
+class _LevelExport:
+    """What is to be written where: the finest level first."""
+
+    files: list[SplatFile]
+    width: float
+    target: Path
+    overwrite: bool
+    notes: list[str]
+
+
+class REFINE_OT_export_levels(AskedFirst, OnSplats, bpy.types.Operator, ExportHelper):
+    """Write the active object and its levels as a streamed SOG: a folder that web viewers load"""
+
+    bl_idname = "refine.export_levels"
+    bl_label = "Export Levels"
+    bl_options = {"REGISTER", "PRESET"}
+    doing = "Writing levels"
+
+    filename_ext = ""
+    check_extension = None
+    filter_glob: StringProperty(default=INDEX, options={"HIDDEN"})
+    apply_transform: BoolProperty(
+        name="Apply Transform",
+        description="Write the splats as they stand in the world",
+    )
+    overwrite: BoolProperty(
+        name="Overwrite",
+        description="Replace the levels that are in the folder",
+        options={"SKIP_SAVE"},
+    )
+
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+        """Ask for the folder; it is made."""
+        if not self.filepath:
+            self.filepath = f"{level_objects.levels_of(context.object)[0].name}_levels"
+        self.overwrite = True
+        return ExportHelper.invoke(self, context, event)
+
+    def written(
+        self, _context: bpy.types.Context, _checked: SplatObject | None
+    ) -> list[SplatObject]:
+        """Return none: the objects are only read."""
+        return []
+
+    def prepare(self, _context: bpy.types.Context, checked: SplatObject) -> _LevelExport:
+        """Gather what is written."""
+        objects = level_objects.levels_of(checked.obj)
+        moved = self.apply_transform
+        each = [mesh_layout.check(obj) for obj in objects]
+        files = [splat_object.exported_file(one, apply_transform=moved) for one in each]
+        notes = [
+            note for one in each for note in splat_object.export_notes(one, apply_transform=moved)
+        ]
+        width = objects[1][level_objects.FACTS].get("distance", np.inf)
+        if not moved:  # as long in the object's own unit
+            width /= np.cbrt(abs(objects[0].matrix_world.to_3x3().determinant())) or 1.0
+        path = expanded(bpy.path.abspath(self.filepath))
+        target = path if path.name == INDEX else path / INDEX
+        return _LevelExport(files, float(width), target, self.overwrite, list(dict.fromkeys(notes)))
+
+    @staticmethod
+    def work(job: _LevelExport, progress: Progress) -> int:
+        """Write the levels; return how many."""
+        with folder_for(job.target, overwrite=job.overwrite) as made:
+            scene = None
+            for number, file in enumerate(job.files):
+                report(progress, number / len(job.files), f"level {number}")
+                splats = Packed(file, sog.FORMAT).chosen(job.target, None, {})
+                scene = scene or StreamedSog(splats.means, job.width, made)
+                scene.add(splats)
+            assert scene is not None  # noqa: S101 - there is an object at least
+            scene.publish(job.target, overwrite=job.overwrite)
+        return len(job.files)
+
+    def finish(
+        self,
+        _context: bpy.types.Context,
+        _checked: SplatObject | None,
+        job: _LevelExport,
+        count: int,
+    ) -> Answer:
+        """Say what was written."""
+        for note in job.notes:
+            self.report({"WARNING"}, note)
+        self.report({"INFO"}, f"Wrote {count} levels, the finest as it is, to {job.target}")
         return {"FINISHED"}
 
 

@@ -15,7 +15,7 @@ from ..mesh import floaters, native
 from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import other_form
-from ..objects import demands, splat_group
+from ..objects import demands, level_objects, splat_group
 from ..viewport import draw as viewport_draw
 from . import (
     camera_list,
@@ -150,9 +150,12 @@ class REFINE_PT_floaters(_InSidebar, bpy.types.Panel):
         layout.operator("refine.find_floaters", icon="VIEWZOOM")
         obj = context.object
         counts = floaters.counts(obj.data) if mesh_layout.looks_like_splats(obj) else None
+        sure = {} if counts is None else floaters.surety(obj.data)
         column = layout.column(align=True)
         for name, text, _ in FLOATERS:
             shown = text if counts is None else f"{text}: {counts[name]:,}"
+            if sure.get(name) is not None:
+                shown += f" ({100.0 * sure[name]:.0f} %)"
             column.prop_enum(settings, "reasons", name, text=shown)
         if counts is not None:
             total = sum(counts[name] for name in settings.reasons)
@@ -295,7 +298,11 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
         column.prop(settings, "levels")
         column.prop(settings, "level_survivors")
         column.operator("refine.levels", icon="MOD_DECIM")
-        _draw_progress(layout, context, "refine.export_ply", "refine.levels")
+        if level_objects.has_levels(obj):
+            column.operator("refine.export_levels", icon="EXPORT")
+        _draw_progress(
+            layout, context, "refine.export_ply", "refine.levels", "refine.export_levels"
+        )
 
 
 def _draw_progress(layout: bpy.types.UILayout, context: bpy.types.Context, *names: str) -> None:

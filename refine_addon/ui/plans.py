@@ -21,9 +21,9 @@ from ..core import pipeline
 from ..core.errors import RefineError
 from ..core.estimate.alignment import Alignment
 from ..core.estimate.cost import expected_seconds
-from ..core.estimate.quality import in_words, out_of_reach
+from ..core.estimate.quality import in_views, in_words, out_of_reach, parted
 from ..core.pace import in_time
-from ..core.report import sizes_in_words
+from ..core.report import MANY_UNSEEN, sizes_in_words
 from ..core.selection import Tally, quality_of
 from ..core.survivor_choice import SURVIVORS
 from ..core.task import may_absorb
@@ -46,9 +46,6 @@ if TYPE_CHECKING:
 
 PLAN = "refine_plan"
 """Custom property of the mesh: the last plan, or why there is none, as JSON."""
-
-MANY_UNSEEN = 0.05
-"""Share of the splats above which it is said that no view has them in its image."""
 
 REST = 0.2
 """Seconds without a change after which a slider has come to rest."""
@@ -230,6 +227,8 @@ def sentence(plan: dict[str, Any]) -> str:
     >>> plan |= {"psnr": 38.2, "psnr_absorbed": 45.9, "psnr_refitted": 48.9, "becomes": "absorb"}
     >>> sentence(plan).removeprefix("Keeps 50 of 100, 2.5 of 5.0 MB, ")
     'about 46 dB in these views (Unchanged: about 38, Refit: about 49)'
+    >>> sentence(plan | {"psnr_between": 36.3}).removeprefix("Keeps 50 of 100, 2.5 of 5.0 MB, ")
+    'about 46 dB in these views, about 36 between them (Unchanged: about 38, Refit: about 49)'
     """
     text = (
         f"Keeps {'about ' if plan.get('about') else ''}{plan['kept']:,} of {plan['splats']:,}, "
@@ -239,13 +238,13 @@ def sentence(plan: dict[str, Any]) -> str:
         return text
     if "psnr_absorbed" not in plan:  # not foretold
         unless = " if survivors stay unchanged" if plan["becomes"] != "unchanged" else ""
-        return f"{text}, {in_words(plan['psnr'])} in these views{unless}"
+        return f"{text}, {in_views(plan['psnr'], plan.get('psnr_between'))}{unless}"
     ways = dict(zip(SURVIVORS, ("psnr", "psnr_absorbed", "psnr_refitted"), strict=True))
     # Deleting is done at once.
     taken = dict(plan.get("seconds", ()), unchanged=None)
     times = {name: f" in {in_time(taken[name])}" if taken.get(name) else "" for name in SURVIVORS}
     way = plan["becomes"]
-    here = f"{in_words(plan[ways.pop(way)])} in these views{times[way]}"
+    here = in_views(plan[ways.pop(way)], plan.get("psnr_between")) + times[way]
     others = ", ".join(
         f"{name.capitalize()}: {in_words(plan[told]).removesuffix(' dB')}{times[name]}"
         for name, told in ways.items()
@@ -300,6 +299,9 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[Warned]:
         warned.append(Warned(text, "refine.add_ring"))
     some_useful = len(camera_list.useless(record)) < len(record.get("cameras") or ())
     remedy = "refine.leave_out" if some_useful else "refine.add_ring"
+    if plan.get("parted"):
+        text = f"Views between these lose more: {in_words(plan['psnr_between'])}"
+        warned.append(Warned(text, "refine.add_between"))
     texts = (camera_list.warning(record), _sentence(alignment.distant()))
     warned += [Warned(text, remedy) for text in texts if text]
     unseen = plan.get("unseen", 0)
@@ -461,6 +463,11 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
     if curve is None:
         return plan
     plan["psnr"] = curve.at(removed / rest)
+    told: Became = becomes if curve.foretold else "unchanged"
+    between = curve.at_between(removed / rest, told)
+    if between is not None:
+        plan["psnr_between"] = between
+        plan["parted"] = parted(curve.at(removed / rest, told), between)
     if known.scored_s is not None:
         plan["seconds"] = expected_seconds(known.scored_s, removed / rest, once=False)
     if curve.foretold:

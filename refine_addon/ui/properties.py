@@ -165,6 +165,8 @@ FLOATERS = (
     ("giant", "Giant", "Is a huge veil across the pictures"),
     ("needle", "Needle", "Is long and thin, and crosses the pictures"),
     ("transparent", "Transparent", "Floats, but no picture changes visibly without it"),
+    ("haze", "Haze", "Floats near a camera, faint; no picture changes visibly without one of it"),
+    ("outside", "Outside", "Lies outside all views: none of the cameras can judge it"),
 )
 """Reasons why a splat floats, by the names that core gives them."""
 

@@ -12,8 +12,10 @@ import numpy as np
 from bpy.props import EnumProperty, IntProperty
 
 from ..cameras.objects import UPRIGHT, WEIGHT, world_matrix
-from ..cameras.sets import CameraChoice
+from ..cameras.sets import CameraChoice, create_cameras
 from ..core.errors import RefineError
+from ..core.views import ViewSet
+from ..core.views_between import with_views_between
 from ..mesh import attributes as mesh_attributes
 from ..mesh import edit as mesh_edit
 from ..mesh import layout as mesh_layout
@@ -103,6 +105,36 @@ class REFINE_OT_add_ring(AtOnce, OnSplats, bpy.types.Operator):
             collection.objects.link(_camera(context.scene, bounds, number, self.count))
         _join(context, collection)
         self.report({"INFO"}, f"Added {self.count} cameras in '{collection.name}'; score again")
+        return {"FINISHED"}
+
+
+class REFINE_OT_add_between(AtOnce, OnSplats, bpy.types.Operator):
+    """Add cameras halfway between neighbouring ones; they decide together with the others"""
+
+    bl_idname = "refine.add_between"
+    bl_label = "Add Views Between"
+    bl_options = {"REGISTER", "UNDO"}
+
+    count: IntProperty(name="Cameras", description="At most so many", default=32, min=1, max=1000)
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Add them."""
+        choice = CameraChoice.of_scene(context.scene)
+        if choice.source == "FRAMES":
+            msg = "a shot decides: add cameras between its frames by more frames, not as objects"
+            raise RefineError(msg)
+        views = choice.views(context)
+        more = with_views_between(views, self.count).views[len(views) :]
+        if not more:
+            msg = "no two cameras that decide stand apart and look alike: nothing is between them"
+            raise RefineError(msg)
+        collection = bpy.data.collections.new("Views Between")
+        create_cameras(ViewSet(more), collection)
+        _join(context, collection)
+        if context.scene.refine.views:
+            context.scene.refine.views += len(more)  # or they would take the place of others
+        added = counted(len(more), "camera")
+        self.report({"INFO"}, f"Added {added} in '{collection.name}'; score again")
         return {"FINISHED"}
 
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import sys
 import time
+from typing import TYPE_CHECKING
 
 import bpy
 from bpy.app.handlers import persistent
 
 from ..render import copies, out_of_sight
 from ..render.meshes import drawn_by_us
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
 
 NOTICE = "Splats are not in this render: use Render > Render Image with Splats"
 """What is said."""
@@ -26,15 +30,20 @@ _until: list[float] = []
 def register() -> None:
     """Say it from now on."""
     bpy.app.handlers.render_init.append(_began)
-    for listening in (bpy.app.handlers.undo_post, bpy.app.handlers.load_post):
+    for listening in _listened():
         listening.append(_returned)
 
 
 def unregister() -> None:
     """Undo `register`."""
-    for listening in (bpy.app.handlers.load_post, bpy.app.handlers.undo_post):
+    for listening in _listened():
         listening.remove(_returned)
     bpy.app.handlers.render_init.remove(_began)
+
+
+def _listened() -> tuple[list[Callable[..., None]], ...]:
+    handlers = bpy.app.handlers
+    return handlers.undo_post, handlers.redo_post, handlers.load_post
 
 
 @persistent

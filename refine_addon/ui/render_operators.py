@@ -157,6 +157,8 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         what = counted(len(shared.frames), "frame") if self.animation else "Rendered"
         among = f" among what {shared.engine} rendered" if shared.engine else ""
         self.report({"INFO"}, f"{what}: {shared.splats:,} splats{among}, {seconds:.1f} s")
+        for sentence in frames.left_out(context.scene):
+            self.report({"WARNING"}, sentence)
         return {"FINISHED"}
 
     def _stopped(self, context: bpy.types.Context, error: Exception | None = None) -> Answer:

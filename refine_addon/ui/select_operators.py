@@ -21,6 +21,7 @@ from ..mesh import scores as mesh_scores
 from ..objects import splat_object
 from ..objects.demands import Demands
 from . import plans
+from .deleting import Deleting
 from .on_thread import OnThread
 from .operator_bases import Answer, AtOnce, OnSplats
 from .select_tools import MODES
@@ -211,23 +212,18 @@ class REFINE_OT_grow_selection(OnThread, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_delete_selected(AtOnce, OnSplats, bpy.types.Operator):
+class REFINE_OT_delete_selected(Deleting, bpy.types.Operator):
     """Delete the selected splats, but for those that must stay"""
 
     bl_idname = "refine.delete_selected"
     bl_label = "Delete Selected"
     bl_options = {"REGISTER", "UNDO"}
 
-    def act(self, context: bpy.types.Context) -> Answer:
-        """Delete them."""
-        checked = mesh_layout.check(context.object)
+    def going(self, context: bpy.types.Context, checked: SplatObject) -> NDArray[np.bool_]:
+        """Return the selected splats that need not stay."""
         going = _some(checked.obj, selection.selected(checked.obj))
         protected = Demands.of_scene(context.scene).forced(checked).protected
-        going &= True if protected is None else ~protected
-        outcome = splat_object.delete_splats(checked, ~going)
-        _forget(context, checked)
-        self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, {outcome.kept:,} stay")
-        return {"FINISHED"}
+        return going & (True if protected is None else ~protected)
 
 
 class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
@@ -257,7 +253,8 @@ class REFINE_OT_separate_selected(AtOnce, OnSplats, bpy.types.Operator):
             raise
         selection.select(apart, np.zeros(mesh_layout.splat_count(apart.data), np.bool_))
         apart.select_set(True)
-        _forget(context, checked)
+        plans.forget(checked.mesh)
+        plans.refresh(context)
         self.report({"INFO"}, f"'{apart.name}' has {mesh_layout.splat_count(apart.data):,} splats")
         return {"FINISHED"}
 
@@ -268,9 +265,3 @@ def _some(obj: bpy.types.Object, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]
         msg = f"object '{obj.name}': no splat is selected"
         raise RefineError(msg)
     return chosen
-
-
-def _forget(context: bpy.types.Context, checked: SplatObject) -> None:
-    """Drop the plan of an object that has other splats now."""
-    plans.forget(checked.mesh)
-    plans.refresh(context)

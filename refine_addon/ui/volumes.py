@@ -3,15 +3,23 @@
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import bpy
 import numpy as np
 from bpy.props import EnumProperty, IntProperty, PointerProperty
 
 from ..core.errors import RefineError
 from ..mesh import layout as mesh_layout
-from ..objects import demands, splat_object
-from . import demand_changes, plans
-from .operator_bases import Answer, AtOnce, Needing, OnSplats, idle, on_splats
+from ..objects import demands
+from . import demand_changes
+from .deleting import Deleting
+from .operator_bases import Answer, AtOnce, Needing, idle, on_splats
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from ..mesh.layout import SplatObject
 
 ROLES = (
     ("PROTECT", "Protect Inside", "Splats in it stay, whatever else is said", "LOCKED", 0),
@@ -154,22 +162,17 @@ class REFINE_OT_drop_volume(Needing, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_crop(AtOnce, OnSplats, bpy.types.Operator):
+class REFINE_OT_crop(Deleting, bpy.types.Operator):
     """Delete now what the volumes say must go, without scores; nothing else is deleted"""
 
     bl_idname = "refine.crop"
     bl_label = "Delete Now"
     bl_options = {"REGISTER", "UNDO"}
 
-    def act(self, context: bpy.types.Context) -> Answer:
-        """Delete it."""
-        checked = mesh_layout.check(context.object)
+    def going(self, context: bpy.types.Context, checked: SplatObject) -> NDArray[np.bool_]:
+        """Return the splats that must go."""
         forced_out = demands.Demands.of_scene(context.scene).forced(checked).out
         if forced_out is None or not forced_out.any():
             msg = f"object '{checked.obj.name}': no volume says of any splat that it must go"
             raise RefineError(msg)
-        outcome = splat_object.delete_splats(checked, ~forced_out)
-        plans.forget(checked.mesh)
-        plans.refresh(context)
-        self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, {outcome.kept:,} stay")
-        return {"FINISHED"}
+        return forced_out

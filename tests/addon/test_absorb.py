@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import bpy
 import numpy as np
@@ -143,6 +144,34 @@ def test_saving_leaves_in_the_blend_what_apply_leaves(addon, few, room_views, tm
     np.testing.assert_array_equal(means, expected.splats.means.astype(np.float32))
     assert "refine_score" in obj.data.attributes
     assert addon.mesh.scores.record(obj.data) is None
+
+
+def test_nothing_is_saved_over_where_refitting_was_stopped(
+    addon, few, room_views, tmp_path, monkeypatch
+):
+    """A .blend is not taken back by Ctrl+Z: object and file stay, and no file is written either."""
+    room, budget = few
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
+    before, count = (tmp_path / "scene.blend").read_bytes(), len(room.data.vertices)
+    decide = addon.core.pipeline.decide
+
+    def stopped(task, **options):
+        result = decide(task, **options)
+        return replace(result, stopped=addon.core.Cancelled())
+
+    monkeypatch.setattr(addon.core.operation.requests, "decide", stopped)
+    request = addon.core.PruneRequest(room_views, budget, addon.core.Settings("closed-form"))
+    out = tmp_path / "out.ply"
+
+    with pytest.raises(addon.core.Cancelled):
+        addon.objects.operation.prune_object(room.name, request, output=out, save=True)
+
+    assert not out.exists()
+    assert (tmp_path / "scene.blend").read_bytes() == before
+    assert len(room.data.vertices) == count
+    with pytest.raises(addon.core.Cancelled):
+        addon.objects.operation.prune_object(room.name, request, output=out)
+    assert out.exists()
 
 
 def test_protected_splats_neither_vanish_nor_change(addon, few):

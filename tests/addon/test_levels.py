@@ -136,3 +136,75 @@ def test_another_mode_than_object_mode_is_refused(few):
     assert few.mode == "VERTEX_PAINT"
 
     assert not bpy.ops.refine.levels.poll()
+
+
+def test_levels_are_exported_as_a_streamed_sog(addon, few, tmp_path):
+    """3976, 1988 and 398 splats, from the object or a level of it; replaced only when told."""
+    few.matrix_world = Matrix.Scale(2.0, 4)
+    bpy.context.view_layer.update()
+    assert bpy.ops.refine.levels() == {"FINISHED"}
+    before = {
+        obj.name: splats_of(addon, obj).means for obj in bpy.data.objects if obj.type == "MESH"
+    }
+
+    assert bpy.ops.refine.export_levels(filepath=str(tmp_path / "web")) == {"FINISHED"}
+
+    path = tmp_path / "web/lod-meta.json"
+    for level, (name, count) in enumerate(
+        {"room": 3976, "room_lod1": 1988, "room_lod2": 398}.items()
+    ):
+        means = addon.core.read_splats(path, level=level).splats().means
+        wanted = before[name]
+        assert len(means) == len(wanted) == count
+        np.testing.assert_allclose(np.sort(means, axis=0), np.sort(wanted, axis=0), atol=3e-4)
+    bpy.context.view_layer.objects.active = bpy.data.objects["room_lod2"]
+    with pytest.raises(RuntimeError, match="exists already"):
+        bpy.ops.refine.export_levels(filepath=str(path))
+    bpy.ops.refine.export_levels(filepath=str(path), overwrite=True, apply_transform=True)
+    means = addon.core.read_splats(path, level=2).splats().means
+    wanted = before["room_lod2"] * 2.0
+    np.testing.assert_allclose(np.sort(means, axis=0), np.sort(wanted, axis=0), atol=6e-4)
+
+
+def test_the_button_stands_where_there_are_levels(addon, few):
+    """On the object and on each level; on another there is none."""
+    has = addon.objects.level_objects.has_levels
+    assert not has(few)
+    assert not has(None)
+
+    bpy.ops.refine.levels()
+
+    assert has(few)
+    assert has(bpy.data.objects["room_lod2"])
+    for name in ("room_lod1", "room_lod2"):
+        bpy.data.objects.remove(bpy.data.objects[name])
+    assert not has(few)
+
+
+def test_an_object_without_levels_is_not_exported_as_some(few, tmp_path):
+    """It says what to do."""
+    with pytest.raises(RuntimeError, match="'room': has no levels; make them first"):
+        bpy.ops.refine.export_levels(filepath=str(tmp_path / "web"))
+    assert not (tmp_path / "web").exists()
+    assert few.name == "room"
+
+
+def test_a_chunk_is_as_wide_as_the_views_are_away(addon, few, tmp_path, monkeypatch):
+    """In the unit of the object, which is twice as large in the world; else that of the world."""
+    few.matrix_world = Matrix.Scale(2.0, 4)
+    bpy.context.view_layer.update()
+    bpy.ops.refine.levels()
+    module, widths = addon.ui.export_operators, []
+    made = module.StreamedSog
+    monkeypatch.setattr(
+        module,
+        "StreamedSog",
+        lambda means, width, folder: widths.append(width) or made(means, width, folder),
+    )
+
+    for apply in (False, True):
+        bpy.ops.refine.export_levels(filepath=str(tmp_path / str(apply)), apply_transform=apply)
+
+    far = bpy.data.objects["room_lod1"]["refine_lod"]["distance"]
+    assert widths == pytest.approx([far / 2.0, far])
+    assert 0.5 < far < 20.0

@@ -225,6 +225,51 @@ def test_a_ring_sees_all_and_joins_the_collection_that_decides(room, room_camera
     assert "refine.keep_unseen" not in remedies(found)
 
 
+@pytest.mark.usefixtures("room")
+def test_views_between_join_the_cameras_that_decide(room_cameras):
+    """Each stands halfway between two cameras, and the panel's limit leaves room for all."""
+    settings = bpy.context.scene.refine
+    settings.views = 64
+    where = [np.array(camera.location) for camera in room_cameras.objects]
+    bpy.ops.refine.add_between(count=10)
+
+    added = bpy.data.collections["Views Between"].objects
+    halves = [(one + other) / 2 for one in where for other in where]
+    assert len(added) == 10
+    assert len(room_cameras.all_objects) == 82
+    assert settings.views == 74
+    for camera in added:
+        place = np.array(camera.location)
+        assert min(np.abs(half - place).max() for half in halves) < 1e-5
+
+
+@pytest.mark.usefixtures("room")
+def test_where_nothing_is_between_no_camera_is_added(room_cameras, unchanged):
+    """One camera has no neighbour; a shot has frames, not cameras."""
+    for camera in list(room_cameras.objects)[1:]:
+        room_cameras.objects.unlink(camera)
+    bpy.context.view_layer.update()
+    unchanged.start()
+    with pytest.raises(RuntimeError, match="nothing is between them"):
+        bpy.ops.refine.add_between()
+    bpy.context.scene.refine.source = "FRAMES"
+    with pytest.raises(RuntimeError, match="a shot decides"):
+        bpy.ops.refine.add_between()
+    bpy.context.scene.refine.source = "COLLECTION"
+    unchanged()
+
+
+def test_where_views_between_lose_more_they_are_offered(addon):
+    """The plan's sentence says both, and the warning's button adds them."""
+    plans = addon.ui.plans
+    plan = {"splats": 100, "unseen": 0, "psnr_between": 36.2, "parted": True}
+
+    found = plans.warnings(plan, {"views_used": 8, "cameras": []})
+
+    assert remedies(found) == ["refine.add_between"]
+    assert "about 36 dB" in found[0].text
+
+
 @pytest.mark.parametrize("size", [(1920, 1080), (600, 900)])
 def test_a_ring_frames_wide_and_tall_pictures(room, size, warned):
     """The ball fits into the shorter side."""

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from mathutils import Matrix, Vector
 
+from benchmarks.renderer.rasterizer import render
+
 IMAGE = "Render with Splats"
 
 
@@ -174,6 +176,55 @@ def test_splats_between_glass_and_a_wall_are_seen(addon, shot, quarter):
     assert settings(shot) == before
 
 
+@pytest.mark.slow
+def test_splats_among_glass_and_walls_are_those_of_the_reference_renderer(addon, shot, quarter):
+    """At least 40 dB: green glass, a red wall amid the splats, a blue one behind most of them.
+
+    By hand, front to back: the splats before each, seen through what is in front, then its colour.
+    Where splats let all through, it is what the three make as light.
+    """
+    shot.render.resolution_percentage, shot.cycles.samples = 100, 64
+    shot.view_settings.view_transform = "Standard"
+    view = addon.cameras.objects.view_from_camera(
+        shot.camera, shot, bpy.context.evaluated_depsgraph_get()
+    )
+    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(quarter), whole=True)
+    depths = (splats.means - view.center) @ view.rotation[2]
+    expected, light = np.zeros((2, 80, 120, 3))
+    left, passed, near = np.ones((80, 120, 1)), np.ones((80, 120, 1)), 0.0
+    compared = np.ones((80, 120), np.bool_)
+    for share, alpha, color, (columns, rows) in (
+        (0.1, 0.4, (0.0, 1.0, 0.0), ((0, 60), (0, 80))),
+        (0.3, 1.0, (1.0, 0.0, 0.0), ((40, 100), (30, 50))),
+        (0.8, 1.0, (0.0, 0.0, 1.0), ((-60, 180), (-40, 120))),
+    ):
+        far = float(np.quantile(depths[depths > 0.2], share))
+        obj = plane(shot, far, color, alpha, width=1.0)
+        edges = np.array([columns, rows]) - [[view.cx], [view.cy]]
+        (x, y), (wide, high) = edges.mean(axis=1) / view.fx, np.ptp(edges, axis=1) / view.fx
+        obj.matrix_world @= Matrix.Translation((x * far, -y * far, 0.0))
+        obj.matrix_world @= Matrix.Diagonal((wide * far, high * far, 1.0, 1.0))
+        mask = np.zeros((80, 120, 1))
+        mask[max(rows[0], 0) : rows[1], max(columns[0], 0) : columns[1]] = alpha
+        for column, row in zip(columns, rows, strict=True):
+            compared[:, max(column - 3, 0) : max(column + 3, 0)] = False
+            compared[max(row - 3, 0) : max(row + 3, 0)] = False
+        some = splats.take((depths >= near) & (depths < far))
+        black, white = (render(some, view, near=0.1, background=(b,) * 3) for b in (0.0, 1.0))
+        expected += left * passed * black
+        passed = passed * np.where(left > 0.0, (white - black).mean(axis=2, keepdims=True), 1.0)
+        expected += left * passed * mask * color
+        light += left * mask * color
+        left, near = left * (1.0 - mask), far
+    shown = np.where(light > 0.0, 1.055 * np.maximum(light, 1e-9) ** (1 / 2.4) - 0.055, 0.0)
+    expected += passed * (shown - light)
+
+    apart = (rendered()[..., :3] - expected.clip(0.0, 1.0))[compared]
+
+    assert compared.mean() > 0.5
+    assert -10.0 * np.log10(np.mean(apart**2)) > 40.0
+
+
 def test_what_an_undo_brings_back_of_a_render_is_put_right(addon, shot):
     """A step that was noted while a mesh was left out, or a file saved then."""
     shown, gone = (plane(shot, 1.0, (1.0, 1.0, 1.0), 1.0) for _ in range(2))
@@ -231,6 +282,17 @@ def test_a_border_is_cut_out_of_the_picture(shot):
     assert cut.shape == (20, 30, 4)
     solid = whole[:20, :30, 3] > 0.995
     assert np.abs(cut[..., :3] - whole[:20, :30, :3])[solid].max() < 0.02
+
+
+@pytest.mark.parametrize("share", [0.7, 0.55, 0.9, 0.3])
+def test_a_border_ends_at_the_column_that_blender_ends_it_at(shot, share):
+    """.7 is a little less in 32 bits, and .7 times 60 columns 42 again, rounded to these."""
+    render = shot.render
+    render.use_border = render.use_crop_to_border = True
+    render.border_max_x = render.border_max_y = share
+    plane(shot, 50.0, (0.0, 0.0, 0.0), 1.0, width=200.0)
+
+    assert rendered().shape == (round(40 * share), round(60 * share), 4)
 
 
 def test_an_orthographic_camera_sees_splats_at_one_scale(shot):
@@ -340,6 +402,29 @@ def test_f12_says_that_splats_are_not_in_it(addon, shot, quarter, capfd):
     assert shot.name in bpy.data.scenes
 
 
+def test_splats_that_blender_draws_are_left_to_it(
+    addon, shot, quarter, monkeypatch, capfd, tmp_path
+):
+    """In 5.3 point clouds of a type of their own; where there is none, all others stand in.
+
+    F12 shows them and says nothing, and among others they are rendered with the meshes.
+    """
+    other = bpy.data.objects.new("other", quarter.data.copy())
+    cloud, _ = addon.mesh.convert.converted(addon.mesh.layout.check(quarter))
+    monkeypatch.setattr(addon.mesh.native, "TYPE", getattr(cloud.data, "type", ""))
+    bpy.ops.render.render()
+    said = capfd.readouterr().err
+    with pytest.raises(RuntimeError, match="has no splats to draw; import some, or use Render Im"):
+        bpy.ops.refine.render()
+    shot.collection.objects.link(other)
+    meshes = addon.render.meshes.Meshes(shot, tmp_path)
+    addon.render.copies.remove_all()
+
+    assert addon.ui.render_notice.IN_BACKGROUND not in said
+    assert meshes.engine == "CYCLES"
+    assert cloud not in meshes._hidden
+
+
 def test_the_command_writes_the_frames_it_is_told(addon, shot, tmp_path, capsys):
     """By default the current frame; files are named by the frame, as Blender's own ``-f`` does."""
     shot.render.filepath = str(tmp_path / "f_##")
@@ -355,6 +440,23 @@ def test_the_command_writes_the_frames_it_is_told(addon, shot, tmp_path, capsys)
     told = capsys.readouterr()
     assert f"frame 7: {tmp_path / 'f_07.png'}" in told.out
     assert "has no camera" in told.err
+
+
+def test_what_splats_are_rendered_without_is_said(addon, shot, tmp_path, capsys):
+    """A camera with depth of field, a scene with motion blur and compositing nodes."""
+    shot.render.filepath = str(tmp_path / "f_##")
+    quiet = addon.render.frames.left_out(shot)
+    shot.camera.data.dof.use_dof = shot.render.use_motion_blur = True
+    if not hasattr(shot, "compositing_node_group"):
+        shot.use_nodes = True
+    else:
+        shot.compositing_node_group = bpy.data.node_groups.new("nodes", "CompositorNodeTree")
+
+    assert quiet == []
+    assert addon.command.main(["render"], scene=True) == 0
+    said = capsys.readouterr().out
+    assert "note: Splats are drawn without depth of field and motion blur" in said
+    assert "note: Compositing nodes are left out" in said
 
 
 def test_the_command_names_the_frames_that_it_leaves(addon, shot, tmp_path, capsys):

@@ -358,6 +358,7 @@ def test_the_summary_says_what_went_and_where_it_is(capsys):
     pattern = (
         r"in\.ply: kept 9 of 60 splats \(85\.0% removed\), 6\.1 -> 1\.4 kB, by 5 of 5 views, "
         r"\d+\.\d\d s -> out\.ply\n  \d+ of 60 splats lie in no view\n"
+        r"  \d+% of these go: add views if others can see them\n"
     )
     assert re.fullmatch(pattern, said.out)
     assert said.err == ""
@@ -369,13 +370,16 @@ def test_the_summary_says_how_close_the_pictures_stay(capsys):
     for options, pattern in (
         (
             ["--method", "occlusion"],
-            r"  quality: about \d+ dB in these views; what absorbing and refitting reach is not ",
+            r"  quality: about \d+ dB in these views, about \d+ between them; what absorbing ",
         ),
         (
             ["--absorb"],
-            r"  quality: about \d+ dB in these views \(--survivors unchanged about \d+ dB or more ",
+            r"quality: about \d+ dB in these views, about \d+ between them \(--survivors unch",
         ),
-        (["--method", "occlusion", "--ratio", "0"], r"  quality: more than 60 dB in these views$"),
+        (
+            ["--method", "occlusion", "--ratio", "0"],
+            r"  quality: more than 60 dB in these views and between them$",
+        ),
     ):
         assert command.main([*PRUNE, "-o", "out.ply", "--overwrite", *options]) == 0
 

@@ -48,10 +48,11 @@ def test_clean_says_why_and_writes_the_rest(files, capsys):
 
     assert call(files, "clean", "-o", str(out), "--report", str(told)) == 0
     assert len(read_ply(out)) == SIDE**2
-    assert "1 in front of surfaces in 3+ views; 576 of 577 splats stay" in capsys.readouterr().out
+    assert "1 in front of surfaces (88 %); 576 of 577 splats stay" in capsys.readouterr().out
     facts = json.loads(told.read_text())["results"][0]["cleaned"]
     assert facts["front"] == 1
     assert facts["giant"] == 0
+    assert facts["sure"] == {"front": 7 / 8, "isolated": None, "giant": None, "needle": None}
 
 
 def test_without_an_output_nothing_is_written(files):

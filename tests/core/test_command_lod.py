@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 
 import numpy as np
@@ -275,6 +276,21 @@ def test_a_streamed_sog_that_is_stopped_leaves_nothing(files, streamed, monkeypa
 
     after = {entry: entry.read_bytes() for entry in path.parent.rglob("*") if entry.is_file()}
     assert after == before
+
+
+def test_a_library_that_is_missing_is_told_before_the_work(streamed, monkeypatch, capsys):
+    """Nothing is scored for a streamed SOG that could not be written."""
+    path, run = streamed
+
+    def missing(name):
+        raise ImportError(name)
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+    monkeypatch.setattr(levels_files, "each_level", None)
+
+    assert call(path.parents[1], *run) == 1
+    assert "WebP images need a library" in capsys.readouterr().err
+    assert not path.parent.exists()
 
 
 @pytest.mark.parametrize(

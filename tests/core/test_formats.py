@@ -373,10 +373,14 @@ def test_the_command_does_not_write_a_ply_under_a_misleading_name(tmp_path, caps
     source, cameras = str(tmp_path / "in.ply"), ["--cameras", str(tmp_path / "cameras.json")]
 
     assert main(["convert", source, str(tmp_path / "a.ksplat")]) == 2
+    assert main(["convert", source, str(tmp_path / "meta.json")]) == 2
+    assert main(["convert", source, str(tmp_path / "lod-meta.json")]) == 2
     assert main(["score", source, *cameras, "-o", str(tmp_path / "a.splat")]) == 2
 
     said = capsys.readouterr().err
     assert f".ksplat is not written, expected one of {', '.join(SUFFIXES)}" in said
+    assert ".json is not written" in said
+    assert "lod-meta.json: holds levels, which lod makes; expected" in said
     assert "only a .ply holds scores" in said
 
 

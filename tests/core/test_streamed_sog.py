@@ -189,6 +189,15 @@ def interrupted(*_given, **_named):
     raise KeyboardInterrupt
 
 
+@pytest.mark.parametrize("model", ["default", "antialiased", "2dgs"])
+def test_the_model_is_kept(tmp_path, model):
+    """Each folder says it, and so does what is read."""
+    write(tmp_path / "lod-meta.json", replace(room(400), model=model))
+
+    assert read_splats(tmp_path / "lod-meta.json").model == model
+    assert read_splats(tmp_path / "0_0/meta.json").model == model
+
+
 def test_what_is_stopped_leaves_nothing(tmp_path, monkeypatch):
     """Once both levels are written, before they are moved: neither folders nor what is above."""
     path = tmp_path / "a/out/lod-meta.json"

@@ -165,19 +165,22 @@ class Binary(Blender):
         *,
         size: tuple[int, int] = (1600, 1000),
         simulate: bool = True,
+        factory: bool = True,
         **arguments: Any,
     ) -> Any:
         """Run a step in a window of some pixels, on an open file or the default scene.
 
         The step's `main` is a generator; each value it yields is how many seconds to leave
-        Blender to itself. Where it simulates events, Blender listens to no real ones. See `step`
-        for the other parameters, the result and the error.
+        Blender to itself. Where it simulates events, Blender listens to no real ones; where it is
+        not fresh from the factory, it reads and keeps preferences. See `step` for the other
+        parameters, the result and the error.
         """
 
         def window(*words: str) -> subprocess.CompletedProcess[str]:
             width, height = map(str, size)
             screen = f"--server-args=-screen 0 {width}x{height}x24"
-            blender = ["xvfb-run", "--auto-servernum", screen, "blender", "--factory-startup"]
+            blender = ["xvfb-run", "--auto-servernum", screen, "blender"]
+            blender += ["--factory-startup"] * factory
             place = ["--enable-event-simulate"] * simulate
             place += ["--window-geometry", "0", "0", width, height]
             file = [] if blend is None else [blend]

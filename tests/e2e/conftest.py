@@ -12,8 +12,12 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 # The harness and the tools it stands on are modules of the tests, not of the package.
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[2] / ".ci")]
@@ -29,6 +33,7 @@ from blenders import (  # noqa: E402
     without_blender,
 )
 
+PICTURES = PROJECT / "build" / "e2e"
 SCENE = PROJECT / "tests" / "data" / "room_small"
 
 
@@ -72,17 +77,28 @@ def installed(extension_zip: Path, tmp_path_factory: pytest.TempPathFactory):
 
 
 @pytest.fixture
-def fresh_binary(request: pytest.FixtureRequest, tmp_path: Path) -> Blender:
+def fresh_binary(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Blender]:
     """Give a real Blender without the extension."""
-    return have(request.param, tmp_path, tmp_path / "resources")
+    blender = have(request.param, tmp_path, tmp_path / "resources")
+    yield blender
+    keep_pictures(blender)
 
 
 @pytest.fixture
-def blender(request: pytest.FixtureRequest, tmp_path: Path, installed) -> Blender:
+def blender(request: pytest.FixtureRequest, tmp_path: Path, installed) -> Iterator[Blender]:
     """Give a Blender of either kind with the extension installed and enabled."""
     resources = tmp_path / "resources"
     shutil.copytree(installed(request.param), resources)
-    return have(request.param, tmp_path, resources)
+    blender = have(request.param, tmp_path, resources)
+    yield blender
+    keep_pictures(blender)
+
+
+def keep_pictures(blender: Blender) -> None:
+    """Copy the pictures that a test took, failed or not, to where a person looks at them."""
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    for picture in blender.work.glob("*.png"):
+        shutil.copy(picture, PICTURES / f"{blender.name}-{picture.name}")
 
 
 @pytest.fixture

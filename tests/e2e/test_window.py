@@ -9,15 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from blenders import PROJECT
-from PIL import Image
+from view_pictures import psnr, reference, view_in
 
-from benchmarks.renderer.rasterizer import render
 from benchmarks.tables.models import version
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.formats.ply_columns import columns_from_splats
 from refine_addon.core.formats.ply_header import new_header, with_model
-from refine_addon.core.views import View
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,8 +22,6 @@ if TYPE_CHECKING:
     from blenders import Binary
 
     from refine_addon.core.rendering import Model
-
-PICTURES = PROJECT / "build" / "e2e"
 
 
 def test_score_apply_and_undo_by_hand(binary: Binary, blend: Path):
@@ -37,12 +32,7 @@ def test_score_apply_and_undo_by_hand(binary: Binary, blend: Path):
 
     Pictures of the stages stay in build/e2e, for a person to look at.
     """
-    try:
-        found = binary.window_step("window", blend, name="Splats", pictures=binary.work)
-    finally:
-        PICTURES.mkdir(parents=True, exist_ok=True)
-        for picture in binary.work.glob("*.png"):
-            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+    found = binary.window_step("window", blend, name="Splats", pictures=binary.work)
 
     assert found["opened"] == {"vertices": 39_755, "scored": False}
     assert found["scored"] == {"vertices": 39_755, "scored": True}
@@ -70,23 +60,21 @@ def test_the_viewport_shows_splats_as_the_reference_renderer(
     saved object is shown as before, and without the extension it is so again, with its handler
     gone.
     """
-    try:
-        found = binary.window_step(
-            "view",
-            size=(800, 500),
-            cloud=cloud,
-            cameras=cameras,
-            picture=binary.work / "view-{}.png",
-            blend=binary.work / "saved.blend",
-        )
-    finally:
-        PICTURES.mkdir(parents=True, exist_ok=True)
-        for picture in binary.work.glob("*.png"):
-            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+    found = binary.window_step(
+        "view",
+        size=(800, 500),
+        cloud=cloud,
+        cameras=cameras,
+        picture=binary.work / "view-{}.png",
+        blend=binary.work / "saved.blend",
+    )
+
+    shown = view_in(found["camera"], binary.work / "view-SCENE.png")
+    expected = reference(found["camera"], cloud)
 
     assert found["after import"] == found["still on"] == "SCENE"
     assert found["failure"] == ""
-    assert _psnr(found["camera"], binary.work / "view-SCENE.png", cloud) > 28.0
+    assert psnr(shown, expected) > 28.0
     assert found["HEAT"] == found["SCENE"] == found["STAYS"] + found["GOES"] <= 39_755
     assert 0 < found["GOES"] <= 39_755 // 2
     assert found["two"] == 2 * found["one hidden"]
@@ -106,22 +94,19 @@ def test_the_viewport_shows_every_model_as_the_reference_renderer(
     tagged = tmp_path / "point_cloud.ply"
     rows = np.column_stack([*columns.values()])
     tagged.write_bytes(with_model(header, model) + rows.tobytes())
-    try:
-        found = same_binary.window_step(
-            "view",
-            size=(800, 500),
-            cloud=tagged,
-            cameras=cameras,
-            picture=same_binary.work / "view-{}.png",
-            blend=same_binary.work / "saved.blend",
-        )
-    finally:
-        PICTURES.mkdir(parents=True, exist_ok=True)
-        for picture in same_binary.work.glob("*.png"):
-            shutil.copy(picture, PICTURES / f"{same_binary.name}-{model}-{picture.name}")
+    picture = f"view-{model}-{{}}.png"
+    found = same_binary.window_step(
+        "view",
+        size=(800, 500),
+        cloud=tagged,
+        cameras=cameras,
+        picture=same_binary.work / picture,
+        blend=same_binary.work / "saved.blend",
+    )
 
+    shown = view_in(found["camera"], same_binary.work / picture.format("SCENE"))
     assert found["failure"] == ""
-    assert _psnr(found["camera"], same_binary.work / "view-SCENE.png", tagged) > 28.0
+    assert psnr(shown, reference(found["camera"], tagged)) > 28.0
 
 
 def test_apply_is_adjusted_as_the_last_operation(binary: Binary, blend: Path):
@@ -130,12 +115,7 @@ def test_apply_is_adjusted_as_the_last_operation(binary: Binary, blend: Path):
     The panel says what was done. The next click goes by the panel, and remembers nothing: 60 % of
     39,755 are 23,853.
     """
-    try:
-        found = binary.window_step("adjust", blend, name="Splats", pictures=binary.work)
-    finally:
-        PICTURES.mkdir(parents=True, exist_ok=True)
-        for picture in binary.work.glob("*.png"):
-            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+    found = binary.window_step("adjust", blend, name="Splats", pictures=binary.work)
 
     left = {stage: told["vertices"] for stage, told in found.items()}
     assert left == {
@@ -157,12 +137,7 @@ def test_compare_shows_before_after_and_difference_in_a_window_of_their_own(
 
     The images are 240 x 160, the render size. Nothing asks to be saved on leaving.
     """
-    try:
-        found = binary.window_step("compare", blend, pictures=binary.work)
-    finally:
-        PICTURES.mkdir(parents=True, exist_ok=True)
-        for picture in binary.work.glob("*.png"):
-            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+    found = binary.window_step("compare", blend, pictures=binary.work)
 
     names = ["Compare: before", "Compare: after", "Compare: difference"]
     for shown in (found["first"], found["again"]):
@@ -181,14 +156,9 @@ def test_what_must_stay_and_go_is_shown_in_every_mode(binary: Binary, cloud: Pat
     All modes draw the same splats, and those that stay or go are parted between two of them. What
     is marked in edit mode is counted when that is left.
     """
-    try:
-        found = binary.window_step(
-            "volumes", cloud=cloud, cameras=cameras, picture=binary.work / "volumes-{}.png"
-        )
-    finally:
-        PICTURES.mkdir(parents=True, exist_ok=True)
-        for picture in binary.work.glob("*.png"):
-            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+    found = binary.window_step(
+        "volumes", cloud=cloud, cameras=cameras, picture=binary.work / "volumes-{}.png"
+    )
 
     unscored = found["unscored"]
     assert 1000 < unscored["protected"] < 30_000
@@ -208,14 +178,9 @@ def test_the_window_lives_while_splats_are_scored(binary: Binary, blend: Path, c
     keeps them. Loading a file, closing the window, switching the extension off and quitting end
     the thread; a file is imported by a thread that a dialog starts.
     """
-    try:
-        found = binary.window_step(
-            "alive", blend, size=(1200, 900), blend=blend, cloud=cloud, pictures=binary.work
-        )
-    finally:
-        PICTURES.mkdir(parents=True, exist_ok=True)
-        for picture in binary.work.glob("*.png"):
-            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+    found = binary.window_step(
+        "alive", blend, size=(1200, 900), blend=blend, cloud=cloud, pictures=binary.work
+    )
 
     assert found["before"] is None
     assert found["shown"] == ["closed-form", True]
@@ -233,59 +198,34 @@ def test_the_window_lives_while_splats_are_scored(binary: Binary, blend: Path, c
 def test_the_first_minutes_hold_no_trap(binary: Binary, cloud: Path, cameras: Path):
     """Dropped splats bring the 72 cameras beside them to Blender's own one, and their image size.
 
-    Dropped cameras are the last operation, which F9 adjusts: adjusting the splats would undo them.
+    Ticking *Upright* in the box of the last operation turns both and loses neither. Dropped cameras
+    are the last operation then: adjusting the splats would undo them.
     After undo all 39,755 are drawn, without an event. The file is shown as it was saved, its plain
     points hidden.
     """
     for path in (cloud, cameras):
         shutil.copy(path, binary.work)
-    try:
-        found = binary.window_step(
-            "first_minutes",
-            cloud=binary.work / cloud.name,
-            cameras=binary.work / cameras.name,
-            pictures=binary.work,
-            blend=binary.work / "saved.blend",
-            asset=binary.work / "asset.spz",
-        )
-    finally:
-        PICTURES.mkdir(parents=True, exist_ok=True)
-        for picture in binary.work.glob("*.png"):
-            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+    found = binary.window_step(
+        "first_minutes",
+        cloud=binary.work / cloud.name,
+        cameras=binary.work / cameras.name,
+        pictures=binary.work,
+        blend=binary.work / "saved.blend",
+        asset=binary.work / "asset.spz",
+    )
 
     imported, dropped = found["imported"], found["dropped"]
     assert (imported["splats"], imported["cameras"]) == (39_755, 1 + 72)
     assert imported["size"] == [240, 160]
+    assert found["upright True"] == {**imported, "turned": True}
+    assert found["upright False"] == imported
     assert (dropped["cameras"], dropped["last"]) == (1 + 2 * 72, "REFINE_OT_import_cameras")
+    assert found["adjusted"] == dropped
     assert found["applied"]["splats"] == 19_878
     assert found["drawn"] == [19_878, 39_755]
     assert found["undone"]["splats"] == 39_755
     assert found["reopened"] == ["HEAT", 39_755, "BOUNDS"]
     assert found["exported"] < 39_755 * 30
-
-
-def _psnr(seen: dict, picture: Path, cloud: Path) -> float:
-    """Return how close a view in a picture of the screen is to the reference renderer, dB."""
-    view, window = np.array(seen["view"]), np.array(seen["window"])
-    width, height = seen["size"]
-    rotation = np.diag([1.0, -1.0, -1.0]) @ view[:3, :3]
-    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)  # float32
-    camera = View(
-        rotation=rotation,
-        center=-rotation.T @ np.diag([1.0, -1.0, -1.0]) @ view[:3, 3],
-        fx=window[0, 0] * width / 2,
-        fy=window[1, 1] * height / 2,
-        cx=(1.0 - window[0, 2]) * width / 2,
-        cy=(1.0 + window[1, 2]) * height / 2,
-        width=width,
-        height=height,
-    )
-    near = window[2, 3] / (window[2, 2] - 1.0)
-    expected = render(read_ply(cloud).splats(), camera, near=near).clip(0.0, 1.0)
-    left, top = seen["left"], seen["top"]
-    with Image.open(picture) as screen:
-        shown = np.asarray(screen.convert("RGB"))[top : top + height, left : left + width] / 255.0
-    return float(-10.0 * np.log10(np.mean((shown - expected) ** 2)))
 
 
 def test_splats_are_selected_as_they_are_seen(binary: Binary, cloud: Path, cameras: Path):
@@ -294,19 +234,14 @@ def test_splats_are_selected_as_they_are_seen(binary: Binary, cloud: Path, camer
     A lasso along the edges of the box takes what the box takes, but for a pixel at its edges. The
     selection is undone, and it is in the file.
     """
-    try:
-        found = binary.window_step(
-            "selecting",
-            size=(800, 500),
-            cloud=cloud,
-            cameras=cameras,
-            blend=binary.work / "saved.blend",
-            pictures=binary.work,
-        )
-    finally:
-        PICTURES.mkdir(parents=True, exist_ok=True)
-        for picture in binary.work.glob("*.png"):
-            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
+    found = binary.window_step(
+        "selecting",
+        size=(800, 500),
+        cloud=cloud,
+        cameras=cameras,
+        blend=binary.work / "saved.blend",
+        pictures=binary.work,
+    )
 
     assert found["imported"] == found["undone"] == found["none"] == 0
     assert 0 < found["box"] < found["through"]
@@ -333,21 +268,16 @@ def test_splats_stand_among_other_objects(binary: Binary, cloud: Path):
     lies behind them in every version. An instance of a collection looks as the splats themselves,
     linked or not, and is made real to be scored.
     """
-    try:
-        found = binary.window_step(
-            "among",
-            size=(800, 500),
-            cloud=cloud,
-            blend=binary.work / "set.blend",
-            picture=binary.work / "among-{}.png",
-        )
-    finally:
-        PICTURES.mkdir(parents=True, exist_ok=True)
-        for picture in binary.work.glob("*.png"):
-            shutil.copy(picture, PICTURES / f"{binary.name}-{picture.name}")
-    plain = _view_of(found, binary.work / "among-plain.png")
+    found = binary.window_step(
+        "among",
+        size=(800, 500),
+        cloud=cloud,
+        blend=binary.work / "set.blend",
+        picture=binary.work / "among-{}.png",
+    )
+    plain = view_in(found, binary.work / "among-plain.png")
     shown = {
-        name: _view_of(found, binary.work / f"among-{name}.png")
+        name: view_in(found, binary.work / f"among-{name}.png")
         for name in (
             "grid",
             "xray-front",
@@ -373,10 +303,3 @@ def test_splats_stand_among_other_objects(binary: Binary, cloud: Path):
     for name in ("instance", "linked"):
         assert np.sqrt(np.mean((shown[name] - plain) ** 2)) < 0.005  # 46 dB
     assert found["real"] == 9_939
-
-
-def _view_of(seen: dict, picture: Path) -> np.ndarray:
-    """Return what a picture of the screen shows of a view, (H, W, 3) in 0..1."""
-    (width, height), left, top = seen["size"], seen["left"], seen["top"]
-    with Image.open(picture) as screen:
-        return np.asarray(screen.convert("RGB"))[top : top + height, left : left + width] / 255.0

@@ -1,10 +1,11 @@
 """Which splats float: they stand where the cameras see that nothing is.
 
 1. Suspects are found: splats that have little support by others (`support.own_support`), small
-   clusters that touch nothing else, giants and needles.
+   clusters that touch nothing else, giants and needles (`search.Search`).
 2. All suspects are taken away, and it is measured what the views see at the place of each: how much
    of the light that reaches it stops near it, and how much goes on to a surface behind. So floaters
-   are no support for each other, and a surface supports all that belongs to it.
+   are no support for each other, and a surface supports all that belongs to it. What has lost its
+   support by that is suspect, too, and both steps are done again.
 
 Only the second step decides. A splat with nothing behind it, such as one of a sky, stays.
 """
@@ -18,23 +19,16 @@ import numpy as np
 
 from ..errors import RefineError
 from ..seeing import projection
-from ..seeing.measuring import VIEW_GROUPS
 from ..splats import among_all, refuse_undrawable
 from ..volumes import refuse_all
-from ..work import Progress, for_chunks, part, silent
-from .clusters import cluster_sizes
-from .support import Evidence, Support, hits_of_view
+from ..work import Progress, part, silent
+from .search import Search
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
-    from ..seeing.projection import Footprints, Gaussians
-    from ..seeing.scene import Scene
     from ..splats import Splats
     from ..views import ViewSet
-    from .support import Hits
 
 Sums = TypeVar("Sums")
 
@@ -44,52 +38,13 @@ REASONS = {
     "giant": "giant",
     "needle": "needle-like",
     "transparent": "nearly transparent",
+    "haze": "haze near cameras",
+    "outside": "outside all views",
 }
 """Why a splat may go, and how that is said after a number."""
 
 DEFAULT_REASONS = ("front", "isolated", "giant", "needle")
-"""All but the nearly transparent, which no picture shows."""
-
-DOUBTED = 0.3
-"""A splat is suspect, and may turn out to be in front of surfaces, if others support less than this
-share of its light."""
-
-SMALL = 100
-"""A cluster of fewer splats is suspect."""
-
-SOLID = 0.1
-"""Splats of lower opacity do not hold clusters together."""
-
-HUGE, GIANT = 0.15, 0.25
-"""A giant is longer than this many scene sizes, and its standard deviation reaches across this
-share of a picture's longer side."""
-
-SLENDER, LONG = 10.0, 0.05
-"""A needle is this many times as long as wide, and its standard deviation reaches across this share
-of a picture's longer side."""
-
-SUPPORT, GIANT_SUPPORT, VEIL_SUPPORT = 0.2, 0.3, 0.5
-"""A suspect floats if less than this share of the light stops near it. Giants cross surfaces, so
-they may have more near them, and giants that are veils up to a half."""
-
-VEIL = 0.15
-"""A giant of lower opacity is a veil."""
-
-VIEWS = 3
-"""At least so many views must see past a splat; all of them where fewer see it."""
-
-AGREE = 0.6
-"""At least this share of the views that see it must see past it."""
-
-LOUD, LOUD_VIEWS, LOUD_AGREE = 10 / 255, 6, 0.3
-"""Where a splat changes a pixel by at least this much, so many views that see past it are enough,
-if they are this share of all: the others may see it against a surface just behind."""
-
-VISIBLE, WIDE = 4 / 255, 0.05
-"""By how much a splat must change a pixel, as its opacity times its contrast to what lies behind.
-One whose standard deviation reaches across more than this share of a picture's longer side changes
-more pixels, and must change each by so much less: the root mean square of the picture's change is
-the same."""
+"""All but what no picture shows, and what no view can judge."""
 
 
 @dataclass(frozen=True)
@@ -141,6 +96,9 @@ class Cleaned:
         How many views see past each splat.
     seen : (N,) int32
         In how many of the views used each splat's centre lies; 0 of those that had to go.
+    sure : (N,) float32
+        Of those that have a reason, the share of further views that is expected to see past each,
+        (p + 1) / (n + 2) where p of n do (Laplace's rule of succession).
     undrawable : int
         How many splats cannot be drawn. They stay.
     views_given, views_used : int
@@ -152,6 +110,7 @@ class Cleaned:
     by_reason: dict[str, NDArray[np.bool_]]
     past: NDArray[np.int32]
     seen: NDArray[np.int32]
+    sure: NDArray[np.float32]
     undrawable: int
     views_given: int
     views_used: int
@@ -169,28 +128,37 @@ class Cleaned:
             by_reason={name: among_all(mask, rest) for name, mask in self.by_reason.items()},
             past=among_all(self.past, rest),
             seen=among_all(self.seen, rest),
+            sure=among_all(self.sure, rest),
         )
+
+    def surety(self) -> dict[str, float | None]:
+        """Return the mean of `sure` for each of `REASONS`; None where no view tells."""
+        return {
+            name: float(self.sure[mask].mean(dtype=np.float64))
+            if name != "outside" and mask.any()
+            else None
+            for name, mask in self.by_reason.items()
+        }
 
     def facts(self) -> dict[str, Any]:
         """Return what a report says of it."""
-        return {**self.counts(), "words": self.in_words()}
+        surety = self.surety()
+        sure = {name: surety[name] for name in self.settings.reasons}
+        return {**self.counts(), "sure": sure, "words": self.in_words()}
 
     def in_words(self) -> str:
-        """Return what goes and why, such as "2,114 in front of surfaces in 3+ views, 301 isolated".
+        """Return what goes, why, and how sure that is, such as "2,114 in front of surfaces (96 %)".
 
-        Those that only one or two views see, all of them past it, are counted by themselves.
+        The percentage is the mean of `sure`.
         """
-        words = []
-        for name, text in REASONS.items():
-            if name not in self.settings.reasons:
-                continue
-            many = self.past >= VIEWS if name == "front" else np.ones(len(self.keep), np.bool_)
-            views = f" in {VIEWS}+ views" if name == "front" else ""
-            words.append((int(np.count_nonzero(self.by_reason[name] & many)), f"{text}{views}"))
-            few = int(np.count_nonzero(self.by_reason[name] & ~many))
-            words.append((few, f"{text} in all of the 1 or 2 views that see them"))
-        counted = [f"{count:,} {text}" for count, text in words if count]
-        return ", ".join(counted) or "nothing to clean away"
+        counts, surety = self.counts(), self.surety()
+        words = [
+            f"{counts[name]:,} {text}"
+            + ("" if (sure := surety[name]) is None else f" ({100.0 * sure:.0f} %)")
+            for name, text in REASONS.items()
+            if counts.get(name)
+        ]
+        return ", ".join(words) or "nothing to clean away"
 
     def notes(self) -> list[str]:
         """Return what else the user should know, in sentences."""
@@ -248,7 +216,10 @@ def clean(  # noqa: PLR0913 - as `pipeline.prune`
         )
         if len(splats):
             refuse_undrawable(int(np.count_nonzero(good)), len(good))
-        search = _Search(gaussians, scene, splats, views.spread(settings.views), threads)
+        used = views.spread(settings.views)
+        names = {id(view) for view in used}
+        unused = tuple(view for view in views if id(view) not in names)
+        search = Search(gaussians, scene, splats, (used, unused), threads)
         reasons = search.reasons(part(progress, 0.05, 1.0))
     may_go = np.ones(len(splats), np.bool_) if protected is None else ~protected
     by_reason = {name: search.of_all(mask) & may_go for name, mask in reasons.items()}
@@ -258,132 +229,6 @@ def clean(  # noqa: PLR0913 - as `pipeline.prune`
         raise RefineError(msg)
     return Cleaned(
         keep, by_reason, search.of_all(search.evidence.past.astype(np.int32)),
-        search.of_all(search.support.views.astype(np.int32)), int(np.count_nonzero(~good)),
-        len(views), len(search.views), settings,
+        search.of_all(search.seen.astype(np.int32)), search.of_all(search.sure.astype(np.float32)),
+        int(np.count_nonzero(~good)), len(views), len(search.views), settings,
     )  # fmt: skip
-
-
-class _Search:
-    """The work of one `clean`, on M Gaussians."""
-
-    def __init__(
-        self,
-        gaussians: Gaussians,
-        scene: Scene,
-        splats: Splats,
-        views: ViewSet,
-        threads: int | None,
-    ) -> None:
-        self.gaussians, self.scene, self.threads = gaussians, scene, threads
-        self.views, self.count = views.by_distance(), len(splats)
-        self.support, self.evidence = Support.zero(len(gaussians)), Evidence.zero(len(gaussians))
-        with np.errstate(invalid="ignore"):
-            scales = np.sort(splats.log_scales[gaussians.index].astype(np.float64), axis=1)
-        self.slender = scales[:, 2] - scales[:, 1] >= np.log(SLENDER)
-
-    def of_all(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values of the M Gaussians, (M,), for all N splats, (N,); 0 for the others."""
-        whole = np.zeros(self.count, values.dtype)
-        whole[self.gaussians.index] = values
-        return whole
-
-    def reasons(self, progress: Progress) -> dict[str, NDArray[np.bool_]]:
-        """Return for each reason which Gaussians it is true of, (M,) each; one each at most."""
-        self._measure_support(part(progress, 0.0, 0.5))
-        doubted, width = self.support.shares() < DOUBTED, self.support.width
-        giant = (self.gaussians.largest >= HUGE) & (width >= GIANT)
-        needle = self.slender & (width >= LONG) & ~giant
-        small = self._clusters(~doubted & ~giant, part(progress, 0.5, 0.6))
-        self._find_evidence(doubted | giant | needle | small, part(progress, 0.6, 1.0))
-        effect = self._effect()
-        floats = ~giant & self._floats(SUPPORT) & agreed(self.evidence, effect)
-        most = np.where(self.gaussians.alphas < VEIL, VEIL_SUPPORT, GIANT_SUPPORT)
-        shows = effect >= VISIBLE * (WIDE / np.maximum(width, WIDE))
-        visible = floats & shows
-        return {
-            "front": visible & doubted & ~needle,
-            "isolated": visible & small & ~needle,
-            "giant": giant & self._floats(most) & shows,
-            "needle": visible & needle,
-            "transparent": floats & doubted & ~visible,
-        }
-
-    def _measure_support(self, progress: Progress) -> None:
-        """Let all views see all Gaussians."""
-        count = len(self.gaussians)
-        nobody = np.zeros(count, np.bool_)
-
-        def of_group(numbers: range) -> Support:
-            total = Support.zero(count)
-            for number in numbers:
-                total.add(*self._seen(number, nobody))
-            return total
-
-        for support in self._in_groups(of_group, progress, "casting rays"):
-            self.support.merge(support)
-        if self.count and not self.support.weight.any():
-            msg = (
-                f"no camera sees the splats: none of {count} that show is hit by a ray of "
-                f"any of {len(self.views)} views; check that cameras and splats share "
-                "their frame and unit"
-            )
-            raise RefineError(msg)
-
-    def _clusters(self, solid: NDArray[np.bool_], progress: Progress) -> NDArray[np.bool_]:
-        """Return which Gaussians are of a small cluster, (M,), of those that are solid."""
-        rows = np.flatnonzero(solid & (self.gaussians.alphas >= SOLID))
-        small = np.zeros(len(solid), np.bool_)
-        sizes = cluster_sizes(self.gaussians.take(rows), progress=progress, threads=self.threads)
-        small[rows] = sizes < SMALL
-        return small
-
-    def _find_evidence(self, suspects: NDArray[np.bool_], progress: Progress) -> None:
-        """Let all views see what is left without the suspects, (M,)."""
-
-        def of_group(numbers: range) -> Evidence:
-            total = Evidence.zero(len(suspects))
-            for number in numbers:
-                _, hits = self._seen(number, suspects)
-                if hits is not None:
-                    total.add(hits, suspects, self.gaussians.colors)
-            return total
-
-        for evidence in self._in_groups(of_group, progress, "casting rays"):
-            self.evidence.merge(evidence)
-
-    def _seen(self, number: int, absent: NDArray[np.bool_]) -> tuple[Footprints, Hits | None]:
-        """Return the footprints of all Gaussians in a view, and what its rays hit."""
-        view = self.views[number][0]
-        footprints = projection.project(self.gaussians, self.scene, view)
-        return footprints, hits_of_view(
-            self.gaussians, footprints, self.scene, view, number, absent
-        )
-
-    def _in_groups(
-        self, work: Callable[[range], Sums], progress: Progress, what: str
-    ) -> list[Sums]:
-        """Return what `work` makes of the numbers of the views in each of some groups."""
-        count = min(VIEW_GROUPS, len(self.views))
-        return for_chunks(
-            lambda piece: work(range(piece.start, len(self.views), count)),
-            count, 1, progress=progress, what=what, threads=self.threads,
-        )  # fmt: skip
-
-    def _floats(self, most: float | NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which suspects have a surface behind them and less than `most` support, (M,)."""
-        views, near, behind = self.evidence.views, self.evidence.near, self.evidence.behind
-        return (views > 0) & (near < most * (near + behind))
-
-    def _effect(self) -> NDArray[np.float64]:
-        """Return by how much each suspect changes a pixel that it covers, (M,)."""
-        behind = self.evidence.behind
-        contrast = self.evidence.contrast / np.where(behind > 0.0, behind, 1.0)
-        return np.asarray(self.gaussians.alphas * contrast, np.float64)
-
-
-def agreed(evidence: Evidence, effect: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return past which suspects enough views see, given by how much each changes a pixel, (M,)."""
-    views, past = evidence.views, evidence.past
-    most = (past >= np.minimum(VIEWS, views)) & (past >= AGREE * views)
-    fewer = (past >= LOUD_VIEWS) & (past >= LOUD_AGREE * views)
-    return most | (fewer & (effect >= LOUD))

@@ -37,14 +37,49 @@ def cluster_sizes(
     near = nearest(points, NEIGHBOURS, progress=progress, threads=threads)
     one = np.repeat(np.arange(len(points)), near.shape[1])
     other = near.ravel().astype(np.int64)
+    touch = _touch(gaussians, points, one, other)
+    labels = connected(len(points), one[touch], other[touch])
+    return np.bincount(labels, minlength=len(points))[labels]
+
+
+def touching(
+    gaussians: Gaussians,
+    rows: NDArray[np.int64],
+    solid: NDArray[np.bool_],
+    *,
+    progress: Progress = silent,
+    threads: int | None = None,
+) -> NDArray[np.int64]:
+    """Return how many of their near neighbours that are solid some splats touch, (r,).
+
+    Parameters
+    ----------
+    gaussians : Gaussians
+    rows : (r,) int64
+        Which splats.
+    solid : (M,) bool
+        Which of all count as neighbours.
+    """
+    points = gaussians.means.T.astype(np.float64)  # (M, 3)
+    near = nearest(points, NEIGHBOURS, progress=progress, threads=threads)[rows]
+    one, other = np.repeat(rows, near.shape[1]), near.ravel().astype(np.int64)
+    touch = solid[other] & _touch(gaussians, points, one, other)
+    return np.asarray(touch.reshape(near.shape).sum(axis=1), np.int64)
+
+
+def _touch(
+    gaussians: Gaussians,
+    points: NDArray[np.float64],
+    one: NDArray[np.int64],
+    other: NDArray[np.int64],
+) -> NDArray[np.bool_]:
+    """Return which pairs of splats touch, (E,); points are their means, (M, 3)."""
     step = points[other] - points[one]
     length = np.sqrt(np.einsum("ij,ij->i", step, step))
     unit = (step / np.maximum(length, np.finfo(np.float64).tiny)[:, None]).T
     reach = sum(_deviation(gaussians.covariances[:, rows], unit) for rows in (one, other)) * REACH
     reach += APART * (1.0 + np.sqrt(np.einsum("ij,ij->i", points, points)))[one]
-    touch = length <= reach
-    labels = connected(len(points), one[touch], other[touch])
-    return np.bincount(labels, minlength=len(points))[labels]
+    return np.asarray(length <= reach)
 
 
 def _deviation(covariances: NDArray[np.float32], unit: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -221,22 +221,25 @@ def _depths(
     return np.asarray(np.maximum(depth, _NEAREST * z[owner]), np.float64)
 
 
-def own_support(hits: Hits) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def own_support(
+    hits: Hits, wanted: NDArray[np.bool_]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the light that each of `hit` takes, and that times its support by others, (u,) each.
 
     Others support it as they would if it were gone: then ``1 / (1 - alpha)`` times as much light
-    reaches what lies behind it.
+    reaches what lies behind it. Both are 0 of those that are not wanted, (u,) bool.
     """
-    every = np.arange(len(hits.key))
+    rows = np.flatnonzero(wanted.take(hits.owner) & (hits.weight > 0.0))
     before = _running(hits.weight)
-    around = hits.around(every)
-    more = 1.0 / (1.0 - hits.alpha)
-    near = before[every] - before[around.first]
-    near += (before[around.last] - before[every + 1]) * more
+    around = hits.around(rows)
+    more = 1.0 / (1.0 - hits.alpha[rows])
+    near = before[rows] - before[around.first]
+    near += (before[around.last] - before[rows + 1]) * more
     behind = (before[around.end] - before[around.last]) * more
     support = near / np.maximum(near + behind, _TINY)
-    support = np.where(behind > NOTHING * hits.transmittance, support, 1.0)
-    return hits.sums(every, hits.weight), hits.sums(every, hits.weight * support)
+    support = np.where(behind > NOTHING * hits.transmittance[rows], support, 1.0)
+    weight = hits.weight[rows]
+    return hits.sums(rows, weight), hits.sums(rows, weight * support)
 
 
 @dataclass(frozen=True, eq=False)
@@ -273,11 +276,11 @@ class Support(_Sums):
     views: NDArray[np.float64]
     width: NDArray[np.float64]
 
-    def add(self, footprints: Footprints, hits: Hits | None) -> None:
-        """Add what one view sees."""
+    def add(self, footprints: Footprints, hits: Hits | None, wanted: NDArray[np.bool_]) -> None:
+        """Add what one view sees; light and support of the Gaussians that are wanted, (M,) bool."""
         self.views[footprints.index[footprints.inside]] += 1.0
         if hits is not None:
-            weight, supported = own_support(hits)
+            weight, supported = own_support(hits, wanted[hits.hit])
             self.weight[hits.hit] += weight
             self.supported[hits.hit] += supported
             self.width[hits.hit] = np.maximum(self.width[hits.hit], hits.width)
@@ -313,6 +316,11 @@ class Evidence(_Sums):
     contrast: NDArray[np.float64]
     views: NDArray[np.float64]
     past: NDArray[np.float64]
+
+    def support(self) -> NDArray[np.float64]:
+        """Return the share of the light that stops near each, (M,); 1 where no view sees it."""
+        total = self.near + self.behind
+        return np.where(total > 0.0, self.near / np.where(total > 0.0, total, 1.0), 1.0)
 
     def add(self, hits: Hits, suspects: NDArray[np.bool_], colors: NDArray[np.float32]) -> None:
         """Add what one view sees.

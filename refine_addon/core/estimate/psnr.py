@@ -45,9 +45,32 @@ def psnr_kept(
     keep : (N,) bool
     threads : int, optional
     """
-    place, views = keep[sample.splat_rows].astype(np.int64), sample.seeing()
-    psnr = _of_each_view(sample, _removing(sample, place, [1]), views, silent, threads)
-    return None if psnr is None else float(_mean(sample, psnr, views)[0])
+    psnr = _mean_after(sample, keep.astype(np.int64), [1], threads)
+    return None if psnr is None else float(psnr[0])
+
+
+def psnr_after(
+    sample: RaySample,
+    values: NDArray[np.float32],
+    shares: Sequence[float] | NDArray[np.float64],
+    *,
+    protected: NDArray[np.bool_] | None = None,
+    threads: int | None = None,
+) -> NDArray[np.float64] | None:
+    """Return the mean PSNR of all views with some shares removed, (L,), dB; None if little is seen.
+
+    Parameters
+    ----------
+    sample : RaySample
+        Of all N splats.
+    values, protected
+        See `quality_curve`.
+    shares : (L,) float
+        Ascending.
+    threads : int, optional
+    """
+    counts = [math.floor(share * len(values)) for share in shares]
+    return _mean_after(sample, _places(values, protected), counts, threads)
 
 
 def quality_curve(
@@ -208,6 +231,20 @@ def mean_psnr(
     numbers = sample.validating()
     psnr = _of_each_view(sample, compare, numbers, progress, threads)
     return None if psnr is None else float(_mean(sample, psnr, numbers)[0])
+
+
+def _mean_after(
+    sample: RaySample, places: NDArray[np.int64], counts: Sequence[int], threads: int | None
+) -> NDArray[np.float64] | None:
+    """Return the mean PSNR of all views after each of L removals, (L,), dB.
+
+    None if too little is seen. `places`, (N,), is that of each splat in the order of removal; see
+    `_removing`.
+    """
+    views = sample.seeing()
+    compare = _removing(sample, places[sample.splat_rows], counts)
+    psnr = _of_each_view(sample, compare, views, silent, threads)
+    return None if psnr is None else np.minimum.accumulate(_mean(sample, psnr, views))
 
 
 def _removing(sample: RaySample, place: NDArray[np.int64], counts: Sequence[int]) -> Compare:

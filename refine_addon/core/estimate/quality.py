@@ -15,7 +15,7 @@ import numpy as np
 from ..survivor_choice import SURVIVORS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
@@ -47,7 +47,7 @@ FEWEST = 20_000
 PLAIN = 0.1
 """Share removed up to which absorbing is plain deletion."""
 
-REFIT_GAIN, REFIT_HITS, FEWER_RAYS = (4.0, 4.8, 4.9, 4.2), 78.0, 1.2
+REFIT_GAIN, REFIT_HITS, FEWER_RAYS = (3.0, 3.7, 3.7, 3.1), 78.0, 1.5
 """What refitting gains over absorbing in the views that decide, dB: at `ABSORBED_SHARES`, where a
 ray hits `REFIT_HITS` splats, and so much less for each doubling of that. Rounds learn from a number
 of hits, so that of a scene in which rays hit more they see fewer rays."""
@@ -58,6 +58,12 @@ UNSEEN = 60.0
 AS_GOOD = 0.5
 """By so much more, dB, absorbing has to reach than plain deletion, or deletion is as good: nobody
 sees a difference so small, and rows that stay to the bit can be compared with the original's."""
+
+PARTED = 3.0
+"""By so much less, dB, views in between are said to lose more than those that decided."""
+
+NOTICED = 50.0
+"""What decided counts as no more than that, dB: between views at 70 and at 55 nobody sees more."""
 
 _LEAST_SHARE = 1e-6  # the place of "nothing removed" on the curve's axis, where that is infinite
 
@@ -80,6 +86,8 @@ class Quality:
         As `psnr`, of single views by their names; those that no ray tells of are missing.
     hits : float
         How many splats a ray hits on average.
+    between : (L,) float64 or None
+        As `psnr`, in views between these; None where nothing tells it.
 
     Examples
     --------
@@ -94,6 +102,7 @@ class Quality:
     foretold: bool = True
     views: dict[str, NDArray[np.float64]] = field(default_factory=dict)
     hits: float = REFIT_HITS
+    between: NDArray[np.float64] | None = None
 
     def at(self, share: float, survivors: Became = "unchanged") -> float:
         """Return the PSNR with a share of the splats removed, dB; if survivors may change, about.
@@ -121,6 +130,23 @@ class Quality:
             name: min(float(np.interp(place, odds, _with_start(psnr))) + gain, PSNR_CAP)
             for name, psnr in self.views.items()
         }
+
+    def at_between(self, share: float, survivors: Became = "unchanged") -> float | None:
+        """Return the PSNR in views between these with a share of the splats removed, dB.
+
+        Absorbing and refitting are taken to gain as much there. None where nothing tells it.
+
+        Examples
+        --------
+        >>> between = np.array([48.0, 36.0])
+        >>> curve = Quality(np.array([0.2, 0.5]), between + 2.0, between + 9.0, between=between)
+        >>> curve.at_between(0.5), curve.at_between(0.5, "absorb")
+        (36.0, 43.0)
+        """
+        if self.between is None:
+            return None
+        deleted = float(np.interp(_log_odds(share), self._odds(), _with_start(self.between)))
+        return min(deleted + self.at(share, survivors) - self.at(share), PSNR_CAP)
 
     def share(self, psnr: float, survivors: Became = "unchanged") -> float:
         """Return the largest share that can go while the PSNR is at least `psnr`, dB; or 0.
@@ -162,6 +188,7 @@ class Quality:
             "foretold": self.foretold,
             "hits": round(self.hits, 2),
             "views": {name: psnr.round(2).tolist() for name, psnr in self.views.items()},
+            "between": None if self.between is None else self.between.round(2).tolist(),
         }
 
     @classmethod
@@ -173,12 +200,15 @@ class Quality:
             single = dict((facts or {}).get("views") or {})  # files of older versions have none
             views = {str(name): np.array(values, np.float64) for name, values in single.items()}
             hits = float((facts or {}).get("hits", REFIT_HITS))
+            told = (facts or {}).get("between")  # nor this
+            between = None if told is None else np.array(told, np.float64)
         except (AttributeError, KeyError, TypeError, ValueError):
             return None
-        curves: Sequence[NDArray[np.float64]] = (shares, psnr, absorbed, *views.values())
+        curves: list[NDArray[np.float64]] = [shares, psnr, absorbed, *views.values()]
+        curves += [] if between is None else [between]
         whole = len(shares) and all(curve.shape == (len(shares),) for curve in curves)
         foretold = bool((facts or {}).get("foretold", True))
-        return cls(shares, psnr, absorbed, foretold, views, hits) if whole else None
+        return cls(shares, psnr, absorbed, foretold, views, hits, between) if whole else None
 
 
 def refit_gain(share: NDArray[np.float64] | float, hits: float) -> NDArray[np.float64]:
@@ -194,7 +224,7 @@ def refit_gain(share: NDArray[np.float64] | float, hits: float) -> NDArray[np.fl
     Examples
     --------
     >>> [round(float(refit_gain(0.5, hits)), 2) for hits in (39.0, 78.0, 156.0)]
-    [6.0, 4.8, 3.6]
+    [5.2, 3.7, 2.2]
     """
     fewer = FEWER_RAYS * math.log2(max(hits, 1.0) / REFIT_HITS)
     gain = np.interp(share, ABSORBED_SHARES, REFIT_GAIN) - fewer
@@ -223,7 +253,7 @@ def expected(
     Examples
     --------
     >>> expected(None, 0.5, {"absorb": 46.0}, 78.0)
-    {'unchanged': None, 'absorb': 46.0, 'refit': 50.8}
+    {'unchanged': None, 'absorb': 46.0, 'refit': 49.7}
     """
     told: dict[Became, float | None] = {}
     for way in SURVIVORS:
@@ -356,6 +386,31 @@ def in_words(psnr: float) -> str:
     ('about 38 dB', 'more than 60 dB')
     """
     return f"more than {UNSEEN:.0f} dB" if psnr > UNSEEN else f"about {psnr:.0f} dB"
+
+
+def parted(psnr: float | None, between: float | None) -> bool:
+    """Return whether views in between lose more than those that decided, so that it can be seen.
+
+    >>> parted(50.0, 36.0), parted(50.0, 48.0), parted(80.0, 48.0), parted(50.0, None)
+    (True, False, False, False)
+    """
+    return psnr is not None and between is not None and min(psnr, NOTICED) - between > PARTED
+
+
+def in_views(psnr: float, between: float | None) -> str:
+    """Return an estimate in the views that decided and in those between them, as a user needs it.
+
+    >>> in_views(50.2, 36.1), in_views(50.2, None)
+    ('about 50 dB in these views, about 36 between them', 'about 50 dB in these views')
+    >>> in_views(72.0, 70.0)
+    'more than 60 dB in these views and between them'
+    """
+    here = f"{in_words(psnr)} in these views"
+    if between is None:
+        return here
+    if in_words(psnr) == in_words(between):
+        return f"{here} and between them"
+    return f"{here}, {in_words(between).removesuffix(' dB')} between them"
 
 
 def _with_start(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ import numpy as np
 from ..splats import LOG_ZERO, Splats, above_constant
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -66,6 +66,12 @@ def _flat_scales(columns: Mapping[str, NDArray[Any]] | NDArray[Any]) -> NDArray[
     """Return the log scales of discs, (N, 3), the third of which is 0."""
     scales = _stack(columns, REQUIRED[7:9])
     return np.column_stack([scales, np.full(len(scales), LOG_ZERO, scales.dtype)])
+
+
+def other_properties(names: Iterable[str]) -> list[str]:
+    """Return which of the names of a file's properties say nothing of splats, nor are normals."""
+    known = ("nx", "ny", "nz", *REQUIRED)
+    return [name for name in names if name not in known and not name.startswith("f_rest_")]
 
 
 def empty_rows(count: int, degree: int) -> tuple[NDArray[Any], Splats]:

@@ -16,7 +16,7 @@ from ..splats import drawable, with_model
 from ..whole_file import expanded, whole_file
 from . import compressed_ply, dot_splat, glb, ksplat, sog, spz, streamed_sog
 from .ply import SplatFile, read_ply
-from .ply_columns import REQUIRED, splats_from_columns
+from .ply_columns import other_properties, splats_from_columns
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -168,6 +168,8 @@ def format_named(path: Path | Url) -> Format | None:
     form = next((form for form in FORMATS if name.endswith(form.suffix)), None)
     if form is None and name.endswith(NOT_WRITTEN):
         msg = f"{path}: {path.suffix} is not written, expected one of {', '.join(SUFFIXES)}"
+        if name.endswith(streamed_sog.INDEX):
+            msg = f"{path}: holds levels, which lod makes; expected one of {', '.join(SUFFIXES)}"
         raise RefineError(msg)
     return form
 
@@ -279,9 +281,7 @@ class Packed:
                 f"{self.form.suffix} does not say that splats are {self.file.model}: read it with "
                 f"--model {self.file.model}"
             )
-        names = self.file.rows.dtype.names or ()
-        known = ("nx", "ny", "nz", *REQUIRED)
-        extra = [n for n in names if n not in known and not n.startswith("f_rest_")]
+        extra = other_properties(self.file.rows.dtype.names or ())
         if extra:
             notes.append(f"{self.form.suffix} does not hold {', '.join(extra)}: left out")
         lost = self.left_out(keep)

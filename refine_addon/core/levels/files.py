@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import RefineError
 from ..estimate.quality import PSNR_CAP
 from ..formats import sog
+from ..formats.images import codec_for
 from ..formats.registry import Packed, as_written, scene_name
 from ..formats.streamed_sog import INDEX
 from ..formats.streamed_sog_write import StreamedSog, folder_for
@@ -283,7 +284,11 @@ class StreamedSink(LevelSink):
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[None]:
-        """Refuse what cannot be written; see `streamed_sog_write.folder_for`."""
+        """Refuse what cannot be written, also for want of a library for images.
+
+        See `streamed_sog_write.folder_for`.
+        """
+        codec_for(self.target)
         with folder_for(self.target, overwrite=self.request.overwrite) as made:
             self.made.append(made)
             yield

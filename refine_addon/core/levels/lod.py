@@ -335,7 +335,7 @@ def _absorbing(
     scene: Task, budgets: Sequence[Budget], progress: Progress, threads: int | None
 ) -> Iterator[_Made]:
     """Make levels each from the one before."""
-    original, ray_sample, whole = scene.scene()[0], None, None
+    original, scores, whole = scene.scene()[0], None, None
     task = scene
     for number, budget in enumerate(budgets):
         of_level = part(progress, number / len(budgets), (number + 1) / len(budgets))
@@ -345,13 +345,13 @@ def _absorbing(
         assert result.absorbed is not None  # noqa: S101 - the task says so
         whole = result.absorbed if whole is None else _both(whole, result.absorbed)
         yield _Made(whole.keep, whole.splats, result, whole)
-        if number == 0:
-            ray_sample = result.scores.ray_sample
+        scores = result.scores if scores is None else scores
+        left = result.report["estimated_psnr"]
         task = replace(
             task,
             splats=whole.splats,
             protected=None if scene.protected is None else scene.protected[whole.keep],
-            origin=Origin(original, ray_sample, result.report["estimated_psnr"]),
+            origin=Origin(original, scores.ray_sample, scores.between, left),
         )
 
 

@@ -5,6 +5,7 @@ A request says what is to be done, a source where the splats are, a sink where t
 | | source | request | sink | in |
 |---|---|---|---|---|
 | `prune_file` | `FileSource` | `PruneRequest` | `FileSink` | `core/operation/files.py` |
+| `convert_files` | `ArrangedSource` | `ConvertRequest` | `FileSink` | `operation/arranged.py` |
 | `file_to_file` | `FileSource` | any of `requests.py` | `FileSink` | `core/operation/files.py` |
 | `lod_file` | `FileSource` | `LevelsRequest` | a `LevelSink` | `core/levels/files.py` |
 | `prune_object` | `ObjectSource` | `PruneRequest` | `ObjectSink` | `objects/operation.py` |

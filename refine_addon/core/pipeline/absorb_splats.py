@@ -83,9 +83,19 @@ def absorb_task(
             curve=goal is not None,
         )  # fmt: skip
     progress = part(progress, start, 1.0)
+    deciding = part(progress, 0.0, 0.97)
     if goal is None:
-        return _absorb_to_count(task, keep, known, progress, threads)
-    return _absorb_to_psnr(task, goal, known, progress, threads)
+        made = _absorb_to_count(task, keep, known, deciding, threads)
+    else:
+        made = _absorb_to_psnr(task, goal, known, deciding, threads)
+    between = (known[0] if task.origin is None else task.origin).between
+    if between is None or made.stopped is not None:
+        return made
+    psnr = psnr_against(
+        between, made.survivors.splats, task.scene()[1],
+        progress=part(progress, 0.97, 1.0), threads=threads,
+    )  # fmt: skip
+    return replace(made, psnr_between=psnr)
 
 
 def _absorb_to_count(

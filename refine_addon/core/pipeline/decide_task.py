@@ -16,7 +16,16 @@ from .. import selection
 from ..estimate.cost import expected_seconds
 from ..estimate.psnr import psnr_kept
 from ..estimate.quality import AS_GOOD, PLAIN, deletion_will_do, in_words, needed
-from ..report import MEASURES, Clock, conclude, expected_psnr, in_tenths, make_report, remark
+from ..report import (
+    MEASURES,
+    Clock,
+    conclude,
+    conclude_between,
+    expected_psnr,
+    in_tenths,
+    make_report,
+    remark,
+)
 from ..task import DEFAULTS, Result, Settings, Task
 from ..work import Progress, part, report, silent
 from .absorb_splats import CLOSE, absorb_task
@@ -172,6 +181,7 @@ def _delete(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     keep, psnr = _deleting(task, scores, threads)
     clock.lap("select_s")
     facts = _facts(task, scores, keep, psnr, clock)
+    conclude_between(facts, _estimated_between(scores, keep, threads))
     gone = facts["splats"]["removed"] / len(keep)
     facts["survivors"] = {
         "asked": task.survivors,
@@ -197,6 +207,7 @@ def _absorbed(task: Task, scores: Scores, plain: float | None, made: Made, clock
     """
     absorbed = made.absorbed
     facts = _facts(task, scores, absorbed.keep, made.psnr, clock, absorbed)
+    conclude_between(facts, made.psnr_between)
     gone = facts["splats"]["removed"] / len(absorbed.keep)
     measured = made.measured()
     if task.budget.psnr is None:  # else deletion keeps another number of splats
@@ -231,6 +242,7 @@ def _facts(
     size = int(np.broadcast_to(task.row_bytes, len(keep)).sum() + task.fixed_bytes)
     why = remark(task.budget, facts["splats"]["removed"], len(keep), psnr, size)
     conclude(facts, scores, keep, psnr, absorbed, why)
+    facts["splats"]["unseen_removed"] = int(np.count_nonzero((scores.seen == 0) & ~keep))
     return facts
 
 
@@ -310,6 +322,17 @@ def _estimated(scores: Scores, keep: NDArray[np.bool_], threads: int | None) -> 
         return psnr_kept(scores.ray_sample, keep, threads=threads)
     if scores.quality is not None:
         return scores.quality.at(1.0 - float(np.mean(keep)))
+    return None
+
+
+def _estimated_between(
+    scores: Scores, keep: NDArray[np.bool_], threads: int | None
+) -> float | None:
+    """Return the same in views between those that scored, dB."""
+    if scores.between is not None:
+        return psnr_kept(scores.between, keep, threads=threads)
+    if scores.quality is not None:
+        return scores.quality.at_between(1.0 - float(np.mean(keep)))
     return None
 
 

@@ -32,6 +32,8 @@ class Made:
         Before refitting: by absorbing, or by deletion where that is better to begin with.
     psnr : float or None
         The estimated PSNR of what they became in the end, dB; None if too little is seen.
+    psnr_between : float or None
+        The same in views between those that decided, dB.
     refitted : Refitted or None
         By refitting; None where they were not refitted.
     seconds : float
@@ -46,6 +48,7 @@ class Made:
 
     absorbed: Absorbed
     psnr: float | None = None
+    psnr_between: float | None = None
     refitted: Refitted | None = None
     seconds: float = 0.0
     before: dict[Became, float | None] = field(default_factory=dict)

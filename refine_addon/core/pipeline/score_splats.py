@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..estimate.alignment import alignment
-from ..estimate.psnr import quality_curve
+from ..estimate.psnr import psnr_after, quality_curve
 from ..scoring import auto, closed_form, occlusion
 from ..seeing.ray_sample import validation_rays
 from ..task import DEFAULTS, Settings
@@ -133,6 +133,11 @@ def with_quality(
         scores.ray_sample, scores.values, protected=protected, settled=scores.settled,
         progress=progress, threads=threads,
     )  # fmt: skip
+    if curve is not None and scores.between is not None:
+        between = psnr_after(
+            scores.between, scores.values, curve.shares, protected=protected, threads=threads
+        )
+        curve = replace(curve, between=between)
     return replace(scores, quality=curve)
 
 

@@ -17,7 +17,7 @@ of it is added to that of the next round.
 k is `DAMPING` over how many rays there are for each survivor: the more rays, the less damping.
 
 Validation rays, which nothing is learned from, compare survivors before and after a round. One that
-loses is undone, and the next is damped more. Rounds end where little is gained.
+loses is undone, and the next is damped more. Rounds end where little is gained, or after many rays.
 """
 
 from __future__ import annotations

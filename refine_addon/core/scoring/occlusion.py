@@ -31,6 +31,8 @@ from ..seeing import projection
 from ..seeing.measuring import SECONDS, Measured, Measuring, Sampling
 from ..seeing.ray_sample import RaySample
 from ..splats import refuse_undrawable
+from ..views import ViewSet
+from ..views_between import views_between
 from ..work import Progress, part, report, silent
 from . import closed_form, coverage
 from .closed_form_settings import ClosedForm
@@ -43,7 +45,6 @@ if TYPE_CHECKING:
 
     from ..seeing.projection import Gaussians
     from ..splats import Splats
-    from ..views import ViewSet
 
 LEAST = 0.1
 """Share of the splats that is left when scores are computed for the last time."""
@@ -59,6 +60,12 @@ ROUNDS_BEGIN = 0.3
 
 ROUND_COST = 0.3
 """Share of the time that is still ahead that a round takes, to show progress."""
+
+BETWEEN = 12
+"""So many views at most tell what lies between those that score."""
+
+BETWEEN_RAYS = 0.375
+"""How many rays they have together, as a part of `VALIDATION_RAYS`."""
 
 PRIOR = ClosedForm("distance", frustum=False, local=False)
 """Model of the floor. It has no frustum test, since splats that no view shows also need a floor."""
@@ -244,6 +251,8 @@ class OcclusionScoring:
     scoring_rays : RaySample or None
         The rays that order splats after the first round; None if there is but one, and once `rank`
         has taken them.
+    between : RaySample or None
+        Rays of views between those that score; `rank` casts them.
     prior : (N,) float32
         Orders the splats that are not among the Gaussians, and is the floor of all others.
     undrawable : (N,) bool
@@ -263,6 +272,7 @@ class OcclusionScoring:
         self.prior, self.undrawable = prior, undrawable
         self.validation_rays = validation_rays
         self.scoring_rays: RaySample | None = None
+        self.between: RaySample | None = None
         self._sample = coverage.sample(gaussians)  # (m,)
         self._sums: dict[int, Mapping[int, Measured]] = {}  # group -> what holds its sums
         self._errors: dict[int, NDArray[np.float64]] = {}  # of the sample, by groups
@@ -331,6 +341,11 @@ class OcclusionScoring:
         seen = np.zeros(len(self.prior), np.int32)
         seen[self.gaussians.index] = measured.seen
         weights = self._floor_weights(measured, list(self._sums), part(progress, 0.0, 0.0))
+        if self.between is not None:
+            self.between.cast_all(
+                self.gaussians, self.measuring.scene, part(progress, 0.0, 0.0),
+                self.measuring.threads,
+            )  # fmt: skip
         left, done, rounds = np.arange(len(self.gaussians)), ROUNDS_BEGIN, None
         if self.scoring_rays is not None:
             rounds = RemovalRounds(
@@ -355,6 +370,7 @@ class OcclusionScoring:
             facts={"floor": weights},
             method="occlusion",
             ray_sample=self.validation_rays,
+            between=self.between,
             settled=settled,
         )
 
@@ -462,6 +478,25 @@ class MemoryScoring(OcclusionScoring):
         super().__init__(gaussians, measuring, settings.rounds, prior, ~good, rays)
         if settings.rounds > 1:
             self.scoring_rays = RaySample(measuring.views, gaussians, splats, scoring=True)
+        self.between = rays_between(views, gaussians, splats)
+
+
+def rays_between(views: ViewSet, gaussians: Gaussians, splats: Splats) -> RaySample | None:
+    """Return the rays of views between those that score, to be cast; None where nothing is between.
+
+    Parameters
+    ----------
+    views : ViewSet
+        Those that score.
+    gaussians, splats
+        See `RaySample`.
+    """
+    halfway = views_between(views, BETWEEN)
+    if not halfway:
+        return None
+    sample = RaySample(ViewSet(tuple(halfway)).by_distance(), gaussians, splats)
+    sample.share = BETWEEN_RAYS
+    return sample
 
 
 class _Removal:

@@ -39,13 +39,13 @@ _STEPS = (0.7548776662466927, 0.5698402909980532)
 square (the R2 sequence, Roberts 2018)."""
 
 
-def pixels(view: View, number: int, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def pixels(view: View, number: float, count: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the columns and rows of a view through which about `count` rays go, spread evenly.
 
     Parameters
     ----------
     view : View
-    number : int
+    number : float
         Different numbers give different pixels.
     count : float
 

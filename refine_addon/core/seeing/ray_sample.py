@@ -76,6 +76,8 @@ class RaySample:
         Which of all splats each Gaussian is.
     stored_rows : (M,) int64
         Which of `splats` it is: they need only hold those that are hit.
+    share : float
+        How many rays all views have together, as a part of what they usually have.
     rays : list of Rays or None
         Of each view; None where they have not been cast.
     """
@@ -89,7 +91,7 @@ class RaySample:
         few_views: bool = False,
         scoring: bool = False,
     ) -> None:
-        self.views, self.splats, self.scoring = views, splats, scoring
+        self.views, self.splats, self.scoring, self.share = views, splats, scoring, 1.0
         self._step = max(math.ceil(len(views) / VALIDATION_VIEWS), 1) if few_views else 1
         self.splat_rows = self.stored_rows = gaussians.index
         self.rays: list[Rays | None] = [None] * len(views)
@@ -121,12 +123,18 @@ class RaySample:
                 with np.errstate(under="ignore"):
                     footprints = projection.project(gaussians, scene, self.views[number][0])
                     self.rays[number] = cast_view(
-                        self.views, number, footprints, scoring=self.scoring
+                        self.views, number, footprints, scoring=self.scoring, share=self.share
                     )
 
         for_chunks(
             cast_one, len(numbers), 1, progress=progress, what="casting rays", threads=threads
         )
+
+    def cast_all(
+        self, gaussians: Gaussians, scene: Scene, progress: Progress, threads: int | None
+    ) -> None:
+        """Cast the rays of all views."""
+        self.cast(range(len(self.views)), gaussians, scene, progress, threads)
 
     def seeing(self) -> list[int]:
         """Return the numbers of the views whose rays hit a splat."""
@@ -169,8 +177,7 @@ def validation_rays(
         splats, views, progress=part(progress, 0.0, 0.2), threads=threads
     )
     sample = RaySample(views.by_distance(), gaussians, splats)
-    numbers = range(len(sample.views))
-    sample.cast(numbers, gaussians, scene, part(progress, 0.2, 1.0), threads)
+    sample.cast_all(gaussians, scene, part(progress, 0.2, 1.0), threads)
     return sample
 
 
@@ -180,6 +187,7 @@ def cast_view(
     footprints: Footprints,
     *,
     scoring: bool = False,
+    share: float = 1.0,
 ) -> Rays:
     """Return the rays of one of some views.
 
@@ -193,15 +201,18 @@ def cast_view(
         In that view.
     scoring : bool
         Whether these are scoring rays, which go through other pixels than the validation rays.
+    share : float
+        See `RaySample`.
     """
     view = views[number][0]
     rays_of_all, hits_of_all = VALIDATION_RAYS, MAX_VALIDATION_HITS
     if scoring:
         rays_of_all, hits_of_all = SCORING_RAYS, MAX_SCORING_HITS
-    most_rays = min(rays_of_all / len(views), MAX_RAYS_OF_VIEW)
-    most_hits = min(hits_of_all / len(views), MAX_HITS_OF_VIEW)
+    most_rays = min(share * rays_of_all / len(views), MAX_RAYS_OF_VIEW)
+    most_hits = min(share * hits_of_all / len(views), MAX_HITS_OF_VIEW)
     count = min(most_rays, most_hits / max(depth_complexity(footprints, view), 1.0))
-    return cast(footprints, *pixels(view, number + len(views) * scoring, count))
+    # Half a step of the sequence keeps the two samples apart in every view, however many there are.
+    return cast(footprints, *pixels(view, number + 0.5 * scoring, count))
 
 
 def cast_colored(

@@ -21,7 +21,15 @@ from ..formats.ply_header import with_count
 from ..operation.run import Request, Written, run
 from ..pipeline.absorb_splats import ABSORBED
 from ..refitting.refit import Refit
-from ..report import MEASURES, conclude, expected_psnr, files_facts, make_report, remark
+from ..report import (
+    MEASURES,
+    conclude,
+    conclude_between,
+    expected_psnr,
+    files_facts,
+    make_report,
+    remark,
+)
 from ..scoring.closed_form_block import ROWS
 from ..selection import refuse_none_left
 from ..urls import Url
@@ -267,6 +275,7 @@ class TilesRequest(Request[TileScene, TileDecision]):
         size, removed = sum(tile.size for tile in scene.tiles), scene.total - kept
         why = remark(asked.budget, removed, scene.total, psnr, size)
         conclude(facts, scores, keep, psnr, made.absorbed if made else None, why)
+        conclude_between(facts, None)
         facts["survivors"]["asked"] = asked.survivors
         if made is not None:
             if made.refitted is not None:

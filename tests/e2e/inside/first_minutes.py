@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 import extension
+from adjust import adjust
 from view import Show
 from window import Hand, at_work, picture, price, until
 
@@ -55,7 +56,7 @@ def main(
 def bring_in(
     show: Show, hand: Hand, found: dict[str, Any], files: tuple[str, str]
 ) -> Generator[float, None, None]:
-    """Drop splats, which bring the cameras beside them, then cameras; take these back."""
+    """Drop splats, which bring the cameras beside them, then cameras; adjust, take these back."""
     drop(show, files[0])
     yield 0.5
     yield from hand.press("S")  # of the two that import such files, ours
@@ -65,6 +66,9 @@ def bring_in(
     yield from show.settle()
     yield from picture(str(Path(show.pictures).parent), "first-2-imported", 1.0)
     found["imported"] = scene()
+    for upright in (True, False):
+        yield from adjust(hand, {"upright": upright})
+        found[f"upright {upright}"] = scene()
 
     yield from hand.move(500, 500)
     drop(show, files[1])
@@ -74,6 +78,8 @@ def bring_in(
     yield from until(lambda: not at_work() and scene()["cameras"] >= wanted, "they are imported")
     yield 0.5
     found["dropped"] = scene()
+    yield from adjust(hand, {"upright": True})
+    found["adjusted"] = scene()
     yield from hand.undo()
     yield 0.5
 
@@ -130,6 +136,7 @@ def scene() -> dict[str, Any]:
         "splats": len(mesh.vertices) if mesh else 0,
         "scored": bool(mesh) and "refine_score" in mesh.attributes,
         "cameras": sum(obj.type == "CAMERA" for obj in bpy.context.scene.objects),
+        "turned": bool(mesh) and round(bpy.data.objects[NAME].matrix_world[2][1]) == -1,
         "size": [render.resolution_x, render.resolution_y],
         "last": operators[-1].bl_idname if operators else "",
     }

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import importlib
+import os
+import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import bpy
 import extension
 import numpy as np
-import xkey
+import xserver
 from mathutils import Vector
 from window import picture, until
 
@@ -62,16 +65,19 @@ def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
     yield from until(lambda: not rendering(), "the animation is over")
     found["alike"].append(settings(scene) == before)
 
-    bpy.data.objects["Cube"].hide_render = True  # so it is the splats that are rendered
-    scene.render.resolution_percentage = 3200
-    before, shown = settings(scene), bpy.data.images[IMAGE].size[:]
-    yield 0.5
-    invoke()
-    yield 1.0
-    found["began"] = rendering()
-    xkey.tap(xkey.ESCAPE)
-    yield from until(lambda: not rendering(), "it has stopped")
-    found["alike"].append(settings(scene) == before)
+    for number in range(3):  # 160,000 splats
+        copy = bpy.data.objects["Splats"].copy()
+        copy.location.z += 0.01 * number
+        scene.collection.objects.link(copy)
+    found["busy"] = []
+    for animation in (True, False):  # which end by themselves in minutes alone
+        bpy.data.objects["Cube"].hide_render = not animation  # else it is the splats that are drawn
+        scene.render.resolution_percentage = 400 if animation else 3200
+        scene.frame_end, scene.render.filepath = 99, f"{pictures}/stopped_##"
+        yield 0.5
+        before, shown = settings(scene), bpy.data.images[IMAGE].size[:]
+        yield from escape(found, animation=animation)
+        found["alike"].append(settings(scene) == before)
     found["stopped"] = bpy.data.images[IMAGE].size[:] == shown
 
     scene.render.resolution_percentage = 100
@@ -83,6 +89,27 @@ def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
     notice = importlib.import_module(f"{extension.MODULE}.ui.render_notice")
     found["notice"] = bool(notice._until)
     return found
+
+
+def escape(found: dict[str, Any], *, animation: bool) -> Generator[float, None, None]:
+    """Begin a render, press Esc a second later, and note how busy Blender was until it ended."""
+    invoke(animation=animation)
+    yield 1.0
+    found["began"] = rendering()
+    busy = processor()
+    xserver.tap(xserver.ESCAPE)
+    yield from until(lambda: not rendering(), "it has stopped")
+    found["busy"].append(processor() - busy)
+
+
+def processor() -> float:
+    """Return the seconds of processor that Blender has taken, but for its software renderer's."""
+    ticks = 0
+    for task in Path("/proc/self/task").iterdir():
+        name, _, rest = (task / "stat").read_text(encoding="utf-8").rpartition(")")
+        if "llvmpipe" in name:
+            ticks += sum(map(int, rest.split()[11:13]))
+    return time.process_time() - ticks / os.sysconf("SC_CLK_TCK")
 
 
 def prepare(scene: bpy.types.Scene) -> None:

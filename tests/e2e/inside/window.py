@@ -148,10 +148,12 @@ class Hand:
         """The sidebar, as it is now."""
         return next(region for region in self.area.regions if region.type == "UI")
 
-    def press(self, key: str, **modifiers: bool) -> Generator[float, None, None]:
-        """Press and release a key or a button of the mouse."""
-        for value in ("PRESS", "RELEASE"):
-            self.window.event_simulate(type=key, value=value, **self.at, **modifiers)
+    def press(
+        self, key: str, *, unicode: str | None = None, **modifiers: bool
+    ) -> Generator[float, None, None]:
+        """Press and release a key or a button of the mouse; a key that types needs its text."""
+        for value, text in (("PRESS", unicode), ("RELEASE", None)):
+            self.window.event_simulate(type=key, value=value, unicode=text, **self.at, **modifiers)
             yield A_MOMENT
 
     def move(self, x: int, y: int) -> Generator[float, None, None]:

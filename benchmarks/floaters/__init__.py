@@ -1,0 +1,1 @@
+"""Recipes of floaters, by people who had not read what finds them."""

@@ -1,0 +1,34 @@
+"""Operators that delete splats at once, without scores."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..mesh import layout as mesh_layout
+from ..objects import splat_object
+from . import plans
+from .operator_bases import Answer, AtOnce, OnSplats
+
+if TYPE_CHECKING:
+    import bpy
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from ..mesh.layout import SplatObject
+
+
+class Deleting(AtOnce, OnSplats):
+    """An operator that deletes some splats of the active object."""
+
+    def going(self, context: bpy.types.Context, checked: SplatObject) -> NDArray[np.bool_]:
+        """Return which splats go, (N,), or raise `RefineError` if it is none."""
+        raise NotImplementedError
+
+    def act(self, context: bpy.types.Context) -> Answer:
+        """Delete them, drop the plan that was made with them, and say how many they were."""
+        checked = mesh_layout.check(context.object)
+        outcome = splat_object.delete_splats(checked, ~self.going(context, checked))
+        plans.forget(checked.mesh)
+        plans.refresh(context)
+        self.report({"INFO"}, f"Deleted {outcome.removed:,} splats, {outcome.kept:,} stay")
+        return {"FINISHED"}

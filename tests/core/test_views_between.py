@@ -1,0 +1,168 @@
+"""Views between neighbouring ones, and what the estimate tells of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from refine_addon.core import Budget, Settings, ViewSet, prune, with_views_between
+from refine_addon.core.estimate.psnr import psnr_kept
+from refine_addon.core.estimate.quality import Quality
+from refine_addon.core.views_between import views_between
+from tests.core.test_invariance import MOTIONS, moved
+from tests.core.test_occlusion import splats_of
+from tests.core.test_views import ring, view
+
+
+def line(*places: float) -> ViewSet:
+    """Return views side by side that look along z."""
+    return ViewSet(tuple(view([x, 0.0, 0.0], name=f"at {x}") for x in places))
+
+
+def test_a_view_between_two_stands_halfway_and_looks_halfway():
+    """Neighbours of a ring of eight are 45 degrees apart: theirs is at 22.5, and looks inwards."""
+    between = views_between(ring(8), 8)
+
+    first = min(between, key=lambda view: abs(np.degrees(np.arctan2(*view.center[1::-1])) - 22.5))
+    direction = -np.array([np.cos(np.pi / 8), np.sin(np.pi / 8), 0.0])
+    assert len(between) == 8
+    np.testing.assert_allclose(first.center, -3.0 * np.cos(np.pi / 8) * direction, atol=1e-12)
+    np.testing.assert_allclose(first.rotation[2], direction, atol=1e-12)
+
+
+def test_only_neighbours_have_a_view_between_them():
+    """Of views at 0, 1 and 3 those at 0 and 3 have another in the middle."""
+    places = sorted(view.center[0] for view in views_between(line(0.0, 1.0, 3.0), 9))
+
+    assert places == [0.5, 2.0]
+
+
+@pytest.mark.parametrize(
+    "views",
+    [
+        line(1.0),
+        line(1.0, 1.0, 1.0),
+        ViewSet(
+            (view(name="ahead"), view([1, 0, 0], rotation=np.diag([-1.0, 1, -1]), name="back"))
+        ),
+        ViewSet(
+            (view(name="plain"), view([1, 0, 0], rotation=np.diag([-1.0, 1, 1]), name="glass"))
+        ),
+    ],
+)
+def test_where_nothing_is_between_there_is_no_view(views):
+    """One view, views in one place, views that look away from each other, and a mirrored one."""
+    assert views_between(views, 9) == []
+    assert len(with_views_between(views, 9)) == len(views)
+
+
+def test_views_between_depend_on_nothing_but_the_scene():
+    """Neither the order of the views nor a motion of the world changes which there are."""
+    views = ring(9)
+    wanted = {view.name: view for view in views_between(views, 4)}
+
+    shuffled = views_between(views.take([4, 8, 0, 2, 7, 1, 3, 6, 5]), 4)
+    assert {view.name for view in shuffled} == set(wanted)
+    for motion in MOTIONS.values():
+        _, turned = moved(splats_of([(0.0, 0.0, 0.0)]), views, *motion)
+        assert {view.name for view in views_between(turned, 4)} == set(wanted)
+
+
+def test_more_views_than_pairs_go_between_those_between():
+    """Two views and five between: the middle, two quarters, then two of four eighths."""
+    views = with_views_between(line(0.0, 8.0), 5)
+
+    places = sorted(view.center[0] for view in views)
+    assert len(views) == 7
+    assert {0.0, 2.0, 4.0, 6.0, 8.0} < set(places) < set(np.arange(9.0))
+
+
+def hidden_from_the_sides() -> tuple:
+    """Return a red patch that posts hide from two cameras, and that one between them sees.
+
+    From x = -1 and 1 the rays to (0, 0, 4) pass z = 2 at x = -.5 and .5, where the posts are. The
+    first 225 splats are the wall behind all, then comes the patch, then the posts.
+    """
+    grid = np.stack(np.meshgrid(*[np.linspace(-1, 1, 15)] * 2), axis=-1).reshape(-1, 2)
+    parts = [(4.0 * grid, 6.0, 0.4), (0.3 * grid, 4.0, 0.03)]
+    parts += [(0.3 * grid + (x, 0.0), 2.0, 0.05) for x in (-0.55, 0.55)]
+    means = np.concatenate([np.column_stack([xy, np.full(len(xy), z)]) for xy, z, _ in parts])
+    scales = np.repeat([size for _, _, size in parts], len(grid))
+    splats = splats_of(means, 0.99, scales[:, None])
+    patch = slice(len(grid), 2 * len(grid))
+    colors = np.zeros((len(means), 3), np.float32)
+    colors[patch] = (1.5, -1.5, -1.5)
+    views = [view([x, 0.0, 0.0], fx=80.0, fy=80.0, name=str(x)) for x in (-1.0, 1.0)]
+    return replace(splats, sh_dc=colors), ViewSet(tuple(views)), patch
+
+
+@pytest.mark.parametrize("survivors", ["unchanged", "absorb"])
+def test_what_only_views_between_see_is_told_and_warned_of(survivors):
+    """A quarter of the splats is the patch and goes: the two cameras see no change.
+
+    At the middle the patch fills a seventh of the width and a fifth of the height: .03 of the
+    picture. Where it is gone gray stands for red, .4 off in each channel: -10 log(.03 .16) = 23 dB,
+    and more where a part of it stays.
+    """
+    splats, views, patch = hidden_from_the_sides()
+
+    result = prune(splats, views, Budget(ratio=0.25), Settings("occlusion"), survivors=survivors)
+
+    assert np.mean(result.keep[patch]) < 0.1
+    assert result.report["estimated_psnr"] > 80.0
+    assert 23.0 < result.report["estimated_psnr_between"] < 32.0
+    assert any("views between these lose more" in note for note in result.report["notes"])
+
+
+def test_views_between_that_decide_keep_what_they_see():
+    """With a third view in the middle most of the patch stays, and nothing is warned of."""
+    splats, views, patch = hidden_from_the_sides()
+
+    result = prune(
+        splats, with_views_between(views, 1), Budget(ratio=0.25), Settings("occlusion"),
+        survivors="unchanged",
+    )  # fmt: skip
+
+    assert np.mean(result.keep[patch]) > 0.5
+    assert result.report["estimated_psnr_between"] > 50.0
+    assert not any("between" in note for note in result.report["notes"])
+
+
+def test_the_estimate_between_is_that_of_rays_cast_there():
+    """By the rays of the view in the middle; the curve at a share it has is the result's."""
+    splats, views, _ = hidden_from_the_sides()
+    result = prune(splats, views, Budget(ratio=0.3), Settings("occlusion"), survivors="unchanged")
+
+    scores = result.scores
+    rays = scores.between
+    scored = scores.quality.at_between(0.3)
+    told = result.report["estimated_psnr_between"]
+    assert [view.center[0] for view, _ in rays.views] == [0.0]
+    assert told == pytest.approx(psnr_kept(rays, result.keep), abs=0.01)
+    assert told == pytest.approx(scored, abs=0.01)
+
+
+def test_what_is_stored_of_the_curve_is_read_again():
+    """A curve of a file that an older version wrote has nothing to tell of between."""
+    curve = Quality(
+        *np.array([[0.2, 0.5], [50.0, 40.0], [53.0, 46.0]]), between=np.array([48.0, 36.0])
+    )
+
+    again = Quality.from_facts(curve.facts())
+    old = Quality.from_facts({k: v for k, v in curve.facts().items() if k != "between"})
+
+    assert again.at_between(0.5) == 36.0
+    assert old.at_between(0.5) is None
+    assert Quality.from_facts(curve.facts() | {"between": [1.0]}) is None
+
+
+def test_of_one_view_nothing_is_told_of_between():
+    """There is no view between one and itself."""
+    splats, views, _ = hidden_from_the_sides()
+
+    result = prune(splats, views.take([0]), Budget(ratio=0.3))
+
+    assert result.report["estimated_psnr_between"] is None
+    assert not any("between" in note for note in result.report["notes"])

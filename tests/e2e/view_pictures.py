@@ -1,0 +1,58 @@
+"""What pictures of the screen show of a view, and how close they are to what they should be."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from benchmarks.renderer.rasterizer import render
+from refine_addon.core.formats.ply import read_ply
+from refine_addon.core.views import View
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def fewer(cloud: Path, folder: Path) -> Path:
+    """Write every fourth splat of a file to another; what is done to them takes less time."""
+    file = read_ply(cloud)
+    file.write(folder / "few.ply", np.arange(len(file)) % 4 == 0)
+    return folder / "few.ply"
+
+
+def view_in(seen: dict[str, Any], picture: Path) -> np.ndarray:
+    """Return what a picture of the screen shows of a view, (H, W, 3) in 0..1.
+
+    ``seen`` says where the view lies, as `inside/view.py` tells it.
+    """
+    (width, height), left, top = seen["size"], seen["left"], seen["top"]
+    with Image.open(picture) as screen:
+        return np.asarray(screen.convert("RGB"))[top : top + height, left : left + width] / 255.0
+
+
+def reference(seen: dict[str, Any], cloud: Path) -> np.ndarray:
+    """Return what the reference renderer shows of a file of splats there, on black."""
+    view, window = np.array(seen["view"]), np.array(seen["window"])
+    width, height = seen["size"]
+    rotation = np.diag([1.0, -1.0, -1.0]) @ view[:3, :3]
+    rotation /= np.linalg.norm(rotation, axis=1, keepdims=True)  # float32
+    camera = View(
+        rotation=rotation,
+        center=-rotation.T @ np.diag([1.0, -1.0, -1.0]) @ view[:3, 3],
+        fx=window[0, 0] * width / 2,
+        fy=window[1, 1] * height / 2,
+        cx=(1.0 - window[0, 2]) * width / 2,
+        cy=(1.0 + window[1, 2]) * height / 2,
+        width=width,
+        height=height,
+    )
+    near = window[2, 3] / (window[2, 2] - 1.0)
+    return render(read_ply(cloud).splats(), camera, near=near).clip(0.0, 1.0)
+
+
+def psnr(one: np.ndarray, other: np.ndarray) -> float:
+    """Return how close pictures are, dB; 99 if they are the same."""
+    error = np.mean((one - other) ** 2)
+    return float(-10.0 * np.log10(error)) if error else 99.0
