@@ -365,6 +365,18 @@ def test_the_summary_says_what_went_and_where_it_is(capsys):
 
 
 @pytest.mark.usefixtures("folder")
+def test_views_between_decide_besides_those_of_the_file(capsys):
+    """Five views and two between: seven are used, or those of a limit and two; -1 is refused."""
+    for options, used in (([], 7), (["--views", "3"], 5)):
+        asked = [*PRUNE, *CLOSED, "-o", "out.ply", "--overwrite", "--views-between", "2", *options]
+        assert command.main(asked) == 0
+        assert f"by {used} of {used} views" in capsys.readouterr().out
+
+    assert command.main([*PRUNE, "-o", "out.ply", "--overwrite", "--views-between", "-1"]) != 0
+    assert "--views-between is -1, expected 0 or more" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("folder")
 def test_the_summary_says_how_close_the_pictures_stay(capsys):
     """As the report does, in whole decibels; and why not what absorbing would reach."""
     for options, pattern in (
