@@ -58,11 +58,16 @@ def discs(splats: Splats) -> Splats:
 
 
 def measure(
-    splats: Splats, decided: Splats, views: ViewSet, evaluators: Sequence[Evaluator], ratio: float
+    splats: Splats,
+    decided: Splats,
+    views: ViewSet,
+    evaluators: Sequence[Evaluator],
+    ratio: float,
+    ways: Sequence[SurvivorChoice],
 ) -> list[str]:
     """Return for each way: PSNR in the views of both evaluators, and the estimate, dB."""
     cells = []
-    for way in WAYS:
+    for way in ways:
         result = prune(decided, views, Budget(ratio=ratio), survivors=way)
         left = result.survivors(decided)
         drawn = left if left.model == splats.model else version(left, splats.model)
@@ -77,19 +82,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("folder")
     parser.add_argument("--ratios", type=float, nargs="+", default=[0.5, 0.7])
     parser.add_argument("--models", nargs="+", choices=MODELS, default=MODELS)
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS)
+    parser.add_argument("--decided-as", nargs="+", choices=MODELS, help="default: both")
     options = parser.parse_args(arguments)
     scene = read_scene(options.folder)
-    print("| model | decided as | removed |", " | ".join(WAYS), "|")
-    print("|---|---|---|" + "---|" * len(WAYS))
+    print("| model | decided as | removed |", " | ".join(options.ways), "|")
+    print("|---|---|---|" + "---|" * len(options.ways))
     for model in options.models:
         splats = version(scene.splats, model)
         evaluators = [
             Evaluator(splats, views, metrics=("psnr",)) for views in (scene.train, scene.test)
         ]
-        for asked in dict.fromkeys((model, MODELS[0])):
+        for asked in options.decided_as or dict.fromkeys((model, MODELS[0])):
             decided = replace(splats, model=asked)
             for ratio in options.ratios:
-                cells = measure(splats, decided, scene.train, evaluators, ratio)
+                cells = measure(splats, decided, scene.train, evaluators, ratio, options.ways)
                 print(f"| {model} | {asked} | {100 * ratio:.0f} % |", " | ".join(cells), "|")
                 sys.stdout.flush()
     return 0

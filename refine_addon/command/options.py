@@ -168,8 +168,8 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "by what the cameras see of it, far better when much is removed (--method then only "
         "matters with --threshold and --min-seen); refit: they absorb and are then fitted to what "
         "all splats look like, some dB better still, in several times the time; auto, the "
-        "default: absorb, but unchanged where that is as good, and with --method, --threshold, "
-        "--min-seen or --together",
+        "default (no way to score, as --method auto is): absorb, but unchanged where that is as "
+        "good, and with --method, --threshold, --min-seen or --together",
     )
     becoming.add_argument(
         "--absorb",
@@ -280,8 +280,9 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
         "--survivors",
         choices=SURVIVORS,
         default=Levels.survivors,
-        help="what those that stay may become, see prune (default absorb); --method only matters "
-        "where they stay unchanged",
+        help="what those that stay may become, see prune (default absorb; no auto: either each "
+        "level is made from the one before, or all are parts of one another); --method only "
+        "matters where they stay unchanged",
     )
     becoming.add_argument(
         "--nested",
@@ -402,9 +403,9 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--method",
         choices=METHODS,
-        help="how splats are scored; default: auto, which knows what hides what, by no more views "
-        "than --tolerance asks for; occlusion uses all of them; closed-form takes nothing as "
-        "hidden: far faster, worse",
+        help="how splats are scored; default: auto (another than that of --survivors), which knows "
+        "what hides what, by no more views than --tolerance asks for; occlusion uses all of them; "
+        "closed-form takes nothing as hidden: far faster, worse",
     )
     parser.add_argument(
         "--tolerance",

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .absorbing.absorb import Counts
-    from .estimate.quality import Quality
     from .formats.ply import SplatFile
     from .formats.registry import Packed
     from .scores import Scores
@@ -230,7 +229,7 @@ def conclude(
     facts |= {
         "estimated_psnr": None if psnr is None else round(psnr, 2),
         "estimated_psnr_note": note,
-        "survivors": {"became": became, **expected_psnr(curve, gone, {became: psnr})},
+        "survivors": {"became": became, **expected_psnr(scores, gone, {became: psnr})},
         "quality": None if curve is None else curve.facts(),
     }
     if psnr is None and scores.ray_sample is not None:
@@ -263,7 +262,7 @@ def prices(scores: Scores, scored: float) -> list[dict[str, Any]]:
     return [
         {
             "removed": share,
-            **expected_psnr(curve, share, {"unchanged": curve.at(share)}),
+            **expected_psnr(scores, share, {"unchanged": curve.at(share)}),
             "seconds": in_tenths(expected_seconds(scored, share, once=False)),
         }
         for share in PRICED
@@ -276,19 +275,23 @@ def in_tenths(seconds: Mapping[Became, float]) -> dict[Became, float]:
 
 
 def expected_psnr(
-    curve: Quality | None, gone: float, measured: Mapping[Became, float | None]
+    scores: Scores, gone: float, measured: Mapping[Became, float | None]
 ) -> dict[str, Any]:
     """Return what a report says of how close the pictures stay by what survivors become.
 
     Parameters
     ----------
-    curve : Quality or None
+    scores : Scores
+        Their curve and their rays tell what was not measured.
     gone : float
         Share of the splats that goes.
     measured : mapping of str to (float or None)
         The estimates that were measured on rays, dB, by what survivors became.
     """
-    told = expected(curve, gone, measured)
+    rays, many = scores.ray_sample, len(scores.values) >= FEWEST
+    told = expected(
+        scores.quality, gone, measured, rays.hits_of_ray() if rays is not None and many else None
+    )
     some = [psnr for psnr in measured.values() if psnr is not None]
     foretold = told["absorb"] is not None or not some
     return {

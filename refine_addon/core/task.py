@@ -13,6 +13,7 @@ from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
 from .splats import among_all
 from .survivor_choice import refuse_unknown
+from .views import refuse_other
 from .volumes import refuse_all
 
 if TYPE_CHECKING:
@@ -174,14 +175,16 @@ class Task:
     reusable: bool = False
 
     def __post_init__(self) -> None:
-        """Check what survivors may become.
+        """Check what survivors may become, and that the views are such.
 
         Raises
         ------
         RefineError
-            If there is no such choice.
+            If there is no such choice, or the views are none.
         """
         refuse_unknown(self.survivors)
+        if self.views is not None:
+            refuse_other(self.views)
 
     @property
     def absorb(self) -> bool:

@@ -303,3 +303,10 @@ def _median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
     """Return the weighted median of values, (V,); the smaller one if two are in the middle."""
     order = np.argsort(values, kind="stable")
     return float(values[order[np.searchsorted(np.cumsum(weights[order]), 0.5 - 1e-9)]])
+
+
+def refuse_other(views: object) -> None:
+    """Raise `RefineError` if what is given as views is no `ViewSet`."""
+    if not isinstance(views, ViewSet):
+        msg = f"views is a {type(views).__name__}, expected a ViewSet: ViewSet((view, ...))"
+        raise RefineError(msg)

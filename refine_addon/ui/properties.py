@@ -61,7 +61,7 @@ SURVIVORS = (
     (
         "auto",
         "Auto",
-        "Absorb, but unchanged where that is as good, or another method than Auto scores",
+        "Absorb, but unchanged where that is as good, or where Method, how to score, is not Auto",
     ),
     ("unchanged", "Unchanged", "They stay what they are, to the bit"),
     (

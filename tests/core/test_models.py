@@ -8,13 +8,16 @@ import numpy as np
 import pytest
 
 from refine_addon.core import RefineError, Splats, View, ViewSet, read_splats
+from refine_addon.core.absorbing import merging
 from refine_addon.core.absorbing.absorb import absorb
 from refine_addon.core.absorbing.merge_field import ViewSums
 from refine_addon.core.formats import ply_header
 from refine_addon.core.formats.ply_columns import columns_from_splats
 from refine_addon.core.formats.registry import FORMATS
+from refine_addon.core.levels.files import LevelsRequest, lod_file
+from refine_addon.core.levels.lod import Levels
 from refine_addon.core.operation.files import file_to_file
-from refine_addon.core.operation.requests import ConvertRequest
+from refine_addon.core.operation.requests import ConvertRequest, ScoreRequest
 from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS, MODELS
 from refine_addon.core.seeing import projection
 from refine_addon.core.seeing.cast import hits
@@ -228,3 +231,35 @@ def seen_whole(left, _sums, _progress):
 def test_splats_of_different_models_are_no_scene():
     with pytest.raises(RefineError, match="different models"):
         joined([cloud(2), with_model(cloud(2), "2dgs")])
+
+
+def test_discs_are_without_the_shortest_axis_of_what_they_were():
+    """Against the eigenvectors that LAPACK finds; of a needle and a ball any axis will do."""
+    random = np.random.default_rng(5)
+    shapes = random.normal(size=(300, 3, 3)) * np.exp(random.normal(0.0, 2.0, (300, 1, 3)))
+    whole = shapes @ np.swapaxes(shapes, 1, 2)
+    whole[:2] = np.diag([4.0, 0.0, 0.0]), np.eye(3)
+    rows, columns = np.triu_indices(3)
+
+    found = merging.flat(whole[:, rows, columns])
+
+    values, axes = np.linalg.eigh(whole)
+    shortest = np.einsum("n,ni,nj->nij", values[:, 0], axes[:, :, 0], axes[:, :, 0])
+    sizes = np.trace(whole, axis1=1, axis2=2)[:, None]
+    expected = (whole - shortest)[:, rows, columns]
+    np.testing.assert_allclose((found / sizes)[2:], (expected / sizes)[2:], atol=1e-6)
+    np.testing.assert_allclose(found[:2, [0, 3, 5]].sum(axis=1), [4.0, 2.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_levels_and_scores_are_files_of_the_same_model(tmp_path, model):
+    """Of splats that the file calls ordinary and `model=` does not; discs stay discs."""
+    source = write(tmp_path / "in.ply", before_the_camera(60, -2.0, "default"))
+    views = ViewSet((VIEW,))
+    levels = Levels((0.5,), survivors="absorb")
+
+    lod_file(source, tmp_path / "levels", LevelsRequest(views, levels, model=model))
+    file_to_file(source, tmp_path / "scored.ply", ScoreRequest(views, model=model))
+
+    assert read_splats(tmp_path / "levels/in.lod1.ply").model == model
+    assert read_splats(tmp_path / "scored.ply").model == model

@@ -156,6 +156,19 @@ def test_refitted_survivors_are_nearer_to_what_the_views_see():
     assert every.splats.sh_rest is survivors.sh_rest
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["antialiased", "2dgs"])
+def test_splats_of_other_models_gain_and_discs_keep_their_shapes(model):
+    """Half of a cloud gains a dB at least, as Gaussians do; discs by colours and opacities."""
+    splats = replace(cloud(300), model=model)
+    survivors = splats.take(np.arange(0, 300, 2))
+
+    found = refit.refit(survivors, splats, ring(), refit.Refit(rounds=2))
+
+    assert found.psnr > found.psnr_before + 1.0
+    assert np.array_equal(found.splats.means, survivors.means) == (model == "2dgs")
+
+
 def test_a_round_that_loses_is_undone_and_the_next_damped_more(monkeypatch):
     """What the validation rays say is given: a gain, a loss, a gain, and a gain too small to go on.
 
@@ -268,6 +281,66 @@ def test_views_move_a_little_in_each_round_and_along_their_own_axes():
     moves = np.linalg.norm(places[0], axis=1)
     assert 0.7 * steps[0] < np.sqrt(np.mean(moves**2)) < 1.3 * steps[0]
     np.testing.assert_allclose(places[1], places[0] @ turn.T, atol=1e-9)
+
+
+def test_rays_see_the_same_without_their_hidden_hits():
+    """Behind two opaque splats of alpha .99 no more than 1e-4 is left, and a third hides the rest.
+
+    The splats that no ray sees are no longer among those that are hit.
+    """
+    splats, view = cloud(400), ring()[0]
+    splats = replace(
+        splats,
+        opacity_logits=np.full(400, 9.0, np.float32),
+        log_scales=splats.log_scales + np.float32(1.0),
+    )
+    gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)))
+    rays = cast(projection.project(gaussians, scene, view), COLUMNS, ROWS)
+
+    seen = rays.visible()
+
+    assert len(seen.hit) < len(rays.hit)
+    assert len(seen.ray) < 0.8 * len(rays.ray)
+    every, some = (colors_from(splats, gaussians.index[each.hit], view) for each in (rays, seen))
+    np.testing.assert_array_equal(seen.colors(some), rays.colors(every))
+    for one, other in zip(seen.contributions()[::2], rays.contributions()[::2], strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_numbers_are_kept_to_one_in_256():
+    """Half of the last of 8 bits, the first of which is not stored; infinity and 0 are exact."""
+    values = np.random.default_rng(3).normal(size=1000).astype(np.float32) * np.float32(1e-20)
+
+    kept = linear._floats(linear._halves(values))
+
+    assert np.abs(kept / values - 1.0).max() <= 1.0 / 256 + 1e-7
+    exact = np.array([0.0, 1.0, -2.5, np.inf], np.float32)
+    np.testing.assert_array_equal(linear._floats(linear._halves(exact)), exact)
+
+
+@pytest.mark.parametrize(
+    ("asked", "rays", "rounds"), [(None, 200_000, 2), (None, 10, 4), (5, 10**6, 5)]
+)
+def test_rounds_end_where_many_rays_were_cast_unless_so_many_are_asked_for(
+    monkeypatch, asked, rays, rounds
+):
+    """400,000 rays are two rounds of 200,000; with few rays there are four, and as many as asked.
+
+    The gains are more than the least.
+    """
+    said = iter(np.arange(30.0, 60.0))
+    monkeypatch.setattr(round_rays.RoundRays, "psnr", lambda *_: next(said))
+    errors = np.zeros((3, rays), np.float32)
+    none = np.zeros(0, np.int64)
+    view = linear.LinearView(none, errors, none, none, none, none, None, None)
+    monkeypatch.setattr(round_rays.RoundRays, "linear", lambda *_, **__: [view])
+    told = refit._Told(*np.zeros((2, linear.COUNT, 30), np.float32))
+    monkeypatch.setattr(refit._Solver, "solve", lambda *_: (told.left + 1e-3, told))
+    splats = cloud(60)
+
+    *_, last = refit.refit_rounds(splats.take(np.arange(30)), splats, ring(), refit.Refit(asked))
+
+    assert last.rounds == rounds
 
 
 def test_what_is_around_a_region_is_drawn_and_does_not_change():

@@ -26,7 +26,10 @@ RUNS = {
     "score": [["-o", "scored.ply", *CAMERAS]],
     "clean": [["--reasons", "front,isolated,giant,needle,transparent", *CAMERAS]],
     "convert": [["b.splat"]],
-    "lod": [["-o", "levels", "--nested", *CAMERAS]],
+    "lod": [
+        ["-o", "levels", "--nested", *CAMERAS],
+        ["-o", "refitted", "--survivors", "refit", "--levels", ".5", *CAMERAS],
+    ],
     "info": [[]],
 }
 

@@ -347,6 +347,20 @@ def counted_calls(folder, views, count):
     return calls[0]
 
 
+def test_tiles_of_different_models_are_refused(tiles):
+    """The message names both files and what each holds."""
+    tagged = tiles[1]
+    rest = tagged.read_bytes().removeprefix(b"ply\n")
+    tagged.write_bytes(b"ply\ncomment SplatRenderMode: mip\n" + rest)
+
+    with pytest.raises(RefineError) as caught:
+        units.tiles_at(tiles)
+
+    first = f"{tagged}: its splats are antialiased, those of {tiles[0]} default"
+    assert str(caught.value) == f"{first}; expected one model in all tiles"
+    assert {tile.model for tile in units.tiles_at(tiles[:1], "2dgs")} == {"2dgs"}
+
+
 def test_a_slice_of_a_unit_is_that_of_its_tiles(tmp_path):
     """Any slice of a unit, across its parts, in the types and the degree of all of them.
 
@@ -743,3 +757,23 @@ def test_a_link_to_another_disk_is_refused_before_the_work(tmp_path, tiles, view
 
     with pytest.raises(RefineError, match="is a link to another disk"):
         prune_tiles(tiles, out, PruneRequest(views, Budget(ratio=0.5), CLOSED))
+
+
+@pytest.mark.slow
+def test_over_tiles_survivors_stay_unchanged_by_default_and_a_note_says_so(tiles, views):
+    """As by name, where a file would absorb; where it would not, nobody is told."""
+    settings = Settings(views=4)
+    default, named = (
+        prune_tiles(tiles, None, PruneRequest(views, Budget(ratio=0.5), settings, survivors=way))
+        for way in ("auto", "unchanged")
+    )
+    scored = prune_tiles(tiles, None, PruneRequest(views, Budget(ratio=0.5), CLOSED))
+
+    words = "survivors stay unchanged: over tiles"
+    assert [note for note in default["notes"] if note not in named["notes"]] == [
+        note for note in default["notes"] if words in note
+    ]
+    assert any(words in note for note in default["notes"])
+    assert default["survivors"]["asked"] == scored["survivors"]["asked"] == "auto"
+    assert default["survivors"]["psnr"] == named["survivors"]["psnr"]
+    assert not any(words in note for note in scored["notes"])

@@ -99,6 +99,27 @@ def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budg
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("model", ["antialiased", "2dgs"])
+def test_tiles_of_every_model_are_pruned_as_one_file(tmp_path, tiles, views, model):
+    """Scored to the byte; absorbed region by region, written as the model that they are."""
+    request = PruneRequest(
+        views, Budget(ratio=0.5), replace(OCCLUSION, views=6), survivors="unchanged", model=model
+    )
+    prune_tiles(tiles, tmp_path / "out", request)
+    prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", request)
+
+    expected = read_ply(tmp_path / "pruned.ply").rows
+    assert read(tmp_path / "out", tiles).tobytes() == expected.tobytes()
+    assert {read_ply(tmp_path / "out" / tile.name).model for tile in tiles} == {model}
+
+    prune_tiles(tiles, tmp_path / "merged", replace(request, survivors="absorb"))
+
+    merged = [read_ply(tmp_path / "merged" / tile.name) for tile in tiles]
+    assert {file.model for file in merged} == {model}
+    assert sum(map(len, merged)) == COUNT - COUNT // 2
+
+
+@pytest.mark.slow
 def test_views_of_nothing_are_refused_as_of_one_file(tmp_path, tiles, views):
     """Near planes behind all splats: the message is that of one file, and nothing is left."""
     away = ViewSet(tuple(replace(view, near=1e6) for view in views))

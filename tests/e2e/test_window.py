@@ -8,12 +8,20 @@ from fractions import Fraction
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 from view_pictures import psnr, reference, view_in
+
+from benchmarks.tables.models import version
+from refine_addon.core.formats.ply import read_ply
+from refine_addon.core.formats.ply_columns import columns_from_splats
+from refine_addon.core.formats.ply_header import new_header, with_model
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from blenders import Binary
+
+    from refine_addon.core.rendering import Model
 
 
 def test_score_apply_and_undo_by_hand(binary: Binary, blend: Path):
@@ -73,6 +81,31 @@ def test_the_viewport_shows_splats_as_the_reference_renderer(
     assert found["undone"] == found["one hidden"]
     assert found["stored"] == found["shown as"] == "TEXTURED"
     assert found["handlers"] == [1, 0]
+
+
+@pytest.mark.parametrize("model", ["antialiased", "2dgs"])
+def test_the_viewport_shows_every_model_as_the_reference_renderer(
+    same_binary: Binary, cloud: Path, cameras: Path, tmp_path: Path, model: Model
+):
+    """At least 28 dB, as for ordinary splats."""
+    splats = version(read_ply(cloud).splats(), model)
+    columns = columns_from_splats(splats)
+    header = new_header(((name, "float") for name in columns), len(splats))
+    tagged = tmp_path / "point_cloud.ply"
+    rows = np.column_stack([*columns.values()])
+    tagged.write_bytes(with_model(header, model) + rows.tobytes())
+    found = same_binary.window_step(
+        "view",
+        size=(800, 500),
+        cloud=tagged,
+        cameras=cameras,
+        picture=same_binary.work / f"{model}-view-{{}}.png",
+        blend=same_binary.work / "saved.blend",
+    )
+    shown = view_in(found["camera"], same_binary.work / f"{model}-view-SCENE.png")
+
+    assert found["failure"] == ""
+    assert psnr(shown, reference(found["camera"], tagged)) > 28.0
 
 
 def test_apply_is_adjusted_as_the_last_operation(binary: Binary, blend: Path):

@@ -267,10 +267,14 @@ def _in_plane(ends: _Ends, tilt: float) -> _Plane:
     one, two = (_signal(splats, plane, blur) for splats in (ends.one, ends.two))
     position, other = _shares(one.mass, two.mass)
     overlap = one.times(two, x, y)
-    between = position * other
-    mixed = _mixed(
-        one.footprint, two.footprint, position, (between * x * x, between * x * y, between * y * y)
-    )
+    if ends.one.model == "2dgs":
+        mixed = footprint(_mixture(ends.one, ends.two, position), plane, blur)
+    else:
+        between = position * other
+        mixed = _mixed(
+            one.footprint, two.footprint, position,
+            (between * x * x, between * x * y, between * y * y),
+        )  # fmt: skip
     # The estimated overlap of nearly opaque splats can exceed the smaller mass; the true one never.
     mass = one.mass + two.mass - np.minimum(overlap, np.minimum(one.mass, two.mass))
     base = _base(mixed, blur, ends.one.model)
@@ -327,9 +331,7 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
     one, two = splats.take(first), splats.take(second)
     position, color = pairs.position[:, None], pairs.color[:, None]
     step = two.means - one.means
-    rows, columns = np.triu_indices(3)
-    between = step[:, rows] * step[:, columns] * (position * (1.0 - position))  # (M, 6)
-    covariances = position * one.covariances + (1.0 - position) * two.covariances + between
+    covariances = _mixture(one, two, pairs.position)
     direction = normalized(color * one.direction + (1.0 - color) * two.direction)
     lost = ~direction.any(axis=1)
     direction[lost] = one.direction[lost]
@@ -345,6 +347,64 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
         pairs.color * one.blur + (1.0 - pairs.color) * two.blur,
         one.model,
     )
+
+
+def _mixture(one: Field, two: Field, share: Array) -> Array:
+    """Return the covariances of mixtures of pairs, (M, 6); of discs without the shortest axis.
+
+    `share`, (M,), is that of the first.
+    """
+    position, step = share[:, None], two.means - one.means
+    rows, columns = np.triu_indices(3)
+    between = step[:, rows] * step[:, columns] * (position * (1.0 - position))  # (M, 6)
+    apart = position * one.covariances + (1.0 - position) * two.covariances
+    whole = np.asarray(apart + between, np.float64)
+    return flat(whole) if one.model == "2dgs" else whole
+
+
+def flat(covariances: Array) -> Array:
+    """Return covariances, (M, 6), without what they have along their shortest axis.
+
+    That axis n is the eigenvector of the least eigenvalue, which is
+    ``t / 3 + 2 p cos((acos(det(B / p) / 2) + 2 pi) / 3)`` with t the trace, ``B = C - t / 3 I`` and
+    ``p^2 = tr(B^2) / 6`` (Smith 1961); what is left is ``P C P``, ``P = I - n n'``.
+    """
+    total = np.maximum(covariances[:, [0, 3, 5]].sum(axis=1), _TINY)
+    full = covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3) / total[:, None, None]
+    centered = full - np.eye(3) / 3.0
+    p = np.sqrt(np.maximum(np.einsum("nij,nij->n", centered, centered) / 6.0, FLATTEST))
+    angle = np.arccos(np.clip(_triple(centered) / (2.0 * p**3), -1.0, 1.0)) / 3.0
+    least = 1.0 / 3.0 + 2.0 * p * np.cos(angle + 2.0 * np.pi / 3.0)
+    normal = _null(full - least[:, None, None] * np.eye(3))
+    along = np.einsum("nij,nj->ni", full, normal)
+    own = np.einsum("ni,ni->n", along, normal)
+    outer = normal[:, :, None] * along[:, None, :]
+    left = full - outer - np.swapaxes(outer, 1, 2)
+    left += own[:, None, None] * normal[:, :, None] * normal[:, None, :]
+    rows, columns = np.triu_indices(3)
+    result: Array = left[:, rows, columns] * total[:, None]
+    return result
+
+
+def _triple(matrices: Array) -> Array:
+    """Return the determinants of matrices, (M, 3, 3)."""
+    first, second, third = np.moveaxis(matrices, 1, 0)
+    determinant: Array = np.einsum("ni,ni->n", first, np.cross(second, third))
+    return determinant
+
+
+def _null(matrices: Array) -> Array:
+    """Return unit vectors, (M, 3), that symmetric matrices of rank 2 or less map to 0."""
+    rows = np.moveaxis(matrices, 1, 0)  # (3, M, 3)
+    crossed = np.stack([np.cross(rows[k], rows[(k + 1) % 3]) for k in range(3)], axis=1)
+    best = np.argmax(np.einsum("nki,nki->nk", crossed, crossed), axis=1)
+    normal = crossed[np.arange(len(best)), best]
+    # Of rank 1, a needle: any vector at right angles to its axis. Of rank 0: any vector.
+    lengths = np.einsum("nki,nki->nk", matrices, matrices)
+    axis = matrices[np.arange(len(best)), np.argmax(lengths, axis=1)]
+    beside = across(normalized(axis))[0].T
+    lost = np.einsum("ni,ni->n", normal, normal) <= FLATTEST * lengths.max(axis=1) ** 2
+    return normalized(np.where(lost[:, None], beside, normal))
 
 
 def axes(covariances: Array) -> tuple[Array, Array]:

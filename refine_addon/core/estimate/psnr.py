@@ -108,6 +108,7 @@ def quality_curve(
         absorbed_from(psnr, _mean(sample, gains, validating), len(values)),
         len(values) >= FEWEST,
         dict(zip(names, np.minimum.accumulate(of_views, axis=1), strict=True)),
+        sample.hits_of_ray(),
     )
 
 

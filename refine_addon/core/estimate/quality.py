@@ -47,9 +47,10 @@ FEWEST = 20_000
 PLAIN = 0.1
 """Share removed up to which absorbing is plain deletion."""
 
-REFITTED = 4.0
-"""About what refitting gains over absorbing in the views that decide, dB: 3.6, 5.0, 5.0, 4.4
-and 3.8 on `room_small` at 10, 30, 50, 70 and 90 % removed; less outdoors."""
+REFIT_GAIN, REFIT_HITS, FEWER_RAYS = (4.0, 4.8, 4.9, 4.2), 78.0, 1.2
+"""What refitting gains over absorbing in the views that decide, dB: at `ABSORBED_SHARES`, where a
+ray hits `REFIT_HITS` splats, and so much less for each doubling of that. Rounds learn from a number
+of hits, so that of a scene in which rays hit more they see fewer rays."""
 
 UNSEEN = 60.0
 """PSNR in dB above which pictures are the same to the eye: rounding to 8 bits alone makes 59."""
@@ -77,6 +78,8 @@ class Quality:
         Whether `absorbed` is accurate enough to be shown.
     views : dict of str to (L,) float64
         As `psnr`, of single views by their names; those that no ray tells of are missing.
+    hits : float
+        How many splats a ray hits on average.
 
     Examples
     --------
@@ -90,6 +93,7 @@ class Quality:
     absorbed: NDArray[np.float64]
     foretold: bool = True
     views: dict[str, NDArray[np.float64]] = field(default_factory=dict)
+    hits: float = REFIT_HITS
 
     def at(self, share: float, survivors: Became = "unchanged") -> float:
         """Return the PSNR with a share of the splats removed, dB; if survivors may change, about.
@@ -137,8 +141,9 @@ class Quality:
         """Return the PSNR with its beginning, where nothing is removed."""
         if survivors == "unchanged":
             return _with_start(self.psnr)
-        gain = REFITTED if survivors == "refit" else 0.0
-        return _with_start(np.minimum(self.absorbed + gain, PSNR_CAP))
+        gain = refit_gain(self.shares, self.hits) if survivors == "refit" else 0.0
+        told = np.minimum(self.absorbed + gain, PSNR_CAP)
+        return _with_start(np.minimum.accumulate(told))
 
     def _odds(self) -> NDArray[np.float64]:
         return np.array([_log_odds(share) for share in (0.0, *self.shares.tolist())])
@@ -155,6 +160,7 @@ class Quality:
             "psnr": self.psnr.tolist(),
             "absorbed": self.absorbed.tolist(),
             "foretold": self.foretold,
+            "hits": round(self.hits, 2),
             "views": {name: psnr.round(2).tolist() for name, psnr in self.views.items()},
         }
 
@@ -166,16 +172,40 @@ class Quality:
             shares, psnr, absorbed = (np.array((facts or {})[name], np.float64) for name in names)
             single = dict((facts or {}).get("views") or {})  # files of older versions have none
             views = {str(name): np.array(values, np.float64) for name, values in single.items()}
+            hits = float((facts or {}).get("hits", REFIT_HITS))
         except (AttributeError, KeyError, TypeError, ValueError):
             return None
         curves: Sequence[NDArray[np.float64]] = (shares, psnr, absorbed, *views.values())
         whole = len(shares) and all(curve.shape == (len(shares),) for curve in curves)
         foretold = bool((facts or {}).get("foretold", True))
-        return cls(shares, psnr, absorbed, foretold, views) if whole else None
+        return cls(shares, psnr, absorbed, foretold, views, hits) if whole else None
+
+
+def refit_gain(share: NDArray[np.float64] | float, hits: float) -> NDArray[np.float64]:
+    """Return about what refitting gains over absorbing, dB, at least 0.
+
+    Parameters
+    ----------
+    share : (L,) float64 or float
+        Of the splats that goes.
+    hits : float
+        How many splats a ray hits on average.
+
+    Examples
+    --------
+    >>> [round(float(refit_gain(0.5, hits)), 2) for hits in (39.0, 78.0, 156.0)]
+    [6.0, 4.8, 3.6]
+    """
+    fewer = FEWER_RAYS * math.log2(max(hits, 1.0) / REFIT_HITS)
+    gain = np.interp(share, ABSORBED_SHARES, REFIT_GAIN) - fewer
+    return np.asarray(gain.clip(0.0), np.float64)
 
 
 def expected(
-    curve: Quality | None, share: float, measured: Mapping[Became, float | None]
+    curve: Quality | None,
+    share: float,
+    measured: Mapping[Became, float | None],
+    hits: float | None = None,
 ) -> dict[Became, float | None]:
     """Return about which PSNR is reached by what survivors become, dB; None where nothing tells it.
 
@@ -186,20 +216,24 @@ def expected(
         Of the splats that goes.
     measured : mapping of str to (float or None)
         The estimates that were measured, dB: these are returned.
+    hits : float or None
+        How many splats a ray hits on average, to foretell what refitting gains over absorbing that
+        was measured; None where that is not foretold.
 
     Examples
     --------
-    >>> expected(None, 0.5, {"absorb": 46.0})
-    {'unchanged': None, 'absorb': 46.0, 'refit': 50.0}
+    >>> expected(None, 0.5, {"absorb": 46.0}, 78.0)
+    {'unchanged': None, 'absorb': 46.0, 'refit': 50.8}
     """
     told: dict[Became, float | None] = {}
     for way in SURVIVORS:
         told[way] = measured.get(way)
         if told[way] is None and curve is not None and (curve.foretold or way == "unchanged"):
             told[way] = curve.at(share, way)
-    absorbed = told["absorb"]
+    absorbed = measured.get("absorb")
     if measured.get("refit") is None and absorbed is not None:
-        told["refit"] = min(absorbed + REFITTED, PSNR_CAP)
+        gain = None if hits is None else float(refit_gain(share, hits))
+        told["refit"] = None if gain is None else min(absorbed + gain, PSNR_CAP)
     return told
 
 

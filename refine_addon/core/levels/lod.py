@@ -8,7 +8,7 @@ levels. Either way the rows of a level are among those of the level before.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
@@ -164,6 +164,9 @@ class Level:
         What all splats became by absorbing and refitting.
     remark : str
         Why the PSNR that was asked for is out of reach; "" if it is not.
+    made : dict
+        What the report of `pipeline.decide` says of what survivors became: ``became``, and where
+        they changed ``absorbed`` and ``refitted``, of those of the level before.
     """
 
     number: int
@@ -175,6 +178,7 @@ class Level:
     scores: Scores
     absorbed: Absorbed | None = None
     remark: str = ""
+    made: dict[str, Any] = field(default_factory=dict)
 
     def for_all(self, rest: NDArray[np.bool_]) -> Level:
         """Return a level of what was left of N splats, (N,) bool, as one of them all."""
@@ -198,6 +202,7 @@ class Level:
             "psnr": self.psnr,
             "distance_psnr": None if within is None else short(within),
             "psnr_from_distances": [round(psnr, 2) for _, psnr in self.reach.psnr],
+            **self.made,
         }
 
 
@@ -292,12 +297,18 @@ def each_level(
         level = Level(
             number, levels.asked[place], keep, splats, result.report["estimated_psnr"],
             original.reach(splats, progress=part(after, end, end)), scores,
-            absorbed, result.report["budget_remark"],
+            absorbed, result.report["budget_remark"], _made_of(result.report),
         )  # fmt: skip
         yield level if forced is None else level.for_all(~forced)
     if not number:
         msg = f"no level has fewer splats than the input, which has {total}"
         raise RefineError(msg)
+
+
+def _made_of(facts: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what a report says of what survivors became; see `Level.made`."""
+    changed = {key: facts[key] for key in ("absorbed", "refitted") if key in facts}
+    return {"became": facts["survivors"]["became"], **changed}
 
 
 class _Made(NamedTuple):

@@ -160,7 +160,7 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     if made is not None and task.budget.psnr is None:  # of as many survivors
         measured |= made.measured()
     gone = facts["splats"]["removed"] / len(result.keep)
-    facts["survivors"] |= {"asked": "auto", **expected_psnr(scores.quality, gone, measured)}
+    facts["survivors"] |= {"asked": "auto", **expected_psnr(scores, gone, measured)}
     if gone:
         facts["notes"].append(unchanged_note(psnr, made))
     return result
@@ -176,7 +176,7 @@ def _delete(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     facts["survivors"] = {
         "asked": task.survivors,
         "became": "unchanged",
-        **expected_psnr(scores.quality, gone, {"unchanged": psnr}),
+        **expected_psnr(scores, gone, {"unchanged": psnr}),
         "seconds": _seconds(task, clock, gone, once=False),
     }
     return Result(keep, scores, facts)
@@ -205,7 +205,7 @@ def _absorbed(task: Task, scores: Scores, plain: float | None, made: Made, clock
     facts["survivors"] = {
         "asked": task.survivors,
         "became": made.became,
-        **expected_psnr(scores.quality, gone, measured),
+        **expected_psnr(scores, gone, measured),
         "seconds": _seconds(task, clock, gone, once=once),
     }
     facts |= made.facts()

@@ -12,6 +12,7 @@ from ..estimate.psnr import quality_curve
 from ..scoring import auto, closed_form, occlusion
 from ..seeing.ray_sample import validation_rays
 from ..task import DEFAULTS, Settings
+from ..views import refuse_other
 from ..volumes import refuse_all
 from ..work import Progress, part, silent
 
@@ -67,10 +68,12 @@ def score(  # noqa: PLR0913 - as `pipeline.prune`
     Raises
     ------
     RefineError
-        If there are no splats, if none of them can be drawn, or if no view sees any.
+        If there are no splats, if none of them can be drawn, if no view sees any, or the views are
+        no `ViewSet`.
     Cancelled
         If `progress` answers ``False``.
     """
+    refuse_other(views)
     if forced_out is not None and forced_out.any():
         refuse_all(forced_out)
         rest = ~forced_out

@@ -324,7 +324,7 @@ def linear_view(
 
 
 def _halves(values: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Return the upper halves of the bits of some numbers, rounded: they keep them to 1 / 512."""
+    """Return the upper halves of the bits of some numbers, rounded: they keep them to 1 / 256."""
     return ((values.view(np.uint32) + np.uint32(1 << 15)) >> np.uint32(16)).astype(np.uint16)
 
 

@@ -77,7 +77,8 @@ class Refit:
     rounds : int, optional
         At most so many; by default see `MAX_ROUNDS`.
     geometry : bool
-        Whether means, scales and rotations are refitted too, or colours and opacities alone.
+        Whether means, scales and rotations are refitted too, or colours and opacities alone. Of
+        discs (2DGS), which `linear` does not know, it is always the latter.
     """
 
     rounds: int | None = None
@@ -225,8 +226,8 @@ def refit_on(
     threads: int | None = None,
 ) -> Iterator[Refitted]:
     """Yield what `refit_rounds` does, of some rays."""
-    moving = np.zeros(COUNT, np.bool_)
-    moving[: COUNT if settings.geometry else MEAN.start] = True
+    moving, geometry = np.zeros(COUNT, np.bool_), settings.geometry and survivors.model != "2dgs"
+    moving[: COUNT if geometry else MEAN.start] = True
     movable = moving[:, None] & ~(
         np.zeros(len(survivors), np.bool_) if protected is None else protected
     )
@@ -242,7 +243,7 @@ def refit_on(
         )
         linear = rays.linear(
             best.splats, number,
-            geometry=settings.geometry, progress=part(progress, begin, middle),
+            geometry=geometry, progress=part(progress, begin, middle),
         )  # fmt: skip
         solver = _Solver(linear, movable, threads)
         count = sum(view.errors.shape[1] for view in linear)

@@ -137,6 +137,11 @@ class RaySample:
         seeing = self.seeing()
         return seeing[:: max(math.ceil(len(seeing) / VALIDATION_VIEWS), 1)]
 
+    def hits_of_ray(self) -> float:
+        """Return how many splats a ray hits on average, hidden ones included."""
+        every = [rays for rays in self.rays if rays is not None]
+        return sum(len(rays.ray) for rays in every) / max(sum(rays.count for rays in every), 1)
+
     def hitting(self, numbers: Sequence[int]) -> int:
         """Return how many rays of some views hit a splat."""
         return sum(rays.hitting for rays in (self.rays[number] for number in numbers) if rays)

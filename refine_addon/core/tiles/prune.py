@@ -57,6 +57,12 @@ if TYPE_CHECKING:
 SCORED = 0.82
 """Part of the progress that scoring is, or scoring and absorbing; the rest is writing."""
 
+UNCHANGED = (
+    "survivors stay unchanged: over tiles they absorb or are refitted where that is asked for by "
+    "name, which takes longer, and room on the disk"
+)
+"""A note of the report, where the files of one scene would have absorbed by default."""
+
 
 def prune_tiles(
     sources: Sequence[Path | str],
@@ -105,7 +111,8 @@ def prune_tiles(
         If a disk is full, a storage or all workers fail, or a file appears in the place of an
         output. What is done is kept for the same call.
     """
-    if request.survivors == "auto":  # over tiles absorbing takes far longer, and room on the disk
+    absorbs_in_memory, by_default = request.absorb, request.survivors == "auto"
+    if by_default:  # over tiles absorbing takes far longer, and room on the disk
         request = replace(request, survivors="unchanged")
     asked = TilesRequest(request)
     tiles = tiles_at(sources, request.model)
@@ -118,7 +125,12 @@ def prune_tiles(
             place = near / f".refine-{_digest(tiles, asked)}"
         scene = TileScene(Folder(place), tiles, workers or InProcess(threads))
         sink = TileSink(scene, output, overwrite=request.overwrite)
-        return run(scene, asked, sink, progress=progress, threads=threads).report
+        told = run(scene, asked, sink, progress=progress, threads=threads).report
+    if by_default:
+        told["survivors"]["asked"] = "auto"
+        if absorbs_in_memory:
+            told["notes"].append(UNCHANGED)
+    return told
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,7 +275,7 @@ class TilesRequest(Request[TileScene, TileDecision]):
                     "refit": psnr,
                 }
                 share = removed / scene.total
-                facts["survivors"] |= expected_psnr(scores.quality, share, told)
+                facts["survivors"] |= expected_psnr(scores, share, told)
                 facts["survivors"]["became"] = "refit"
                 facts["refitted"] = {"began": "absorb", **made.refitted.facts(made.seconds)}
                 facts["notes"].append(made.refitted.note(made.seconds))

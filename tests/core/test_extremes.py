@@ -1,0 +1,87 @@
+"""Whatever survivors may become: scenes at the edge of what there is, with warnings as errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from refine_addon.core import CHOICES, Budget, ViewSet, prune
+
+from .test_absorb import around, cloud
+
+COUNT = 120
+
+
+def small(count=3, distance=6.0):
+    """Return views of 40 x 30 pixels, from a circle around the origin."""
+    return ViewSet(
+        tuple(
+            replace(view, fx=25.0, fy=25.0, cx=20.0, cy=15.0, width=40, height=30)
+            for view in around(count, distance)
+        )
+    )
+
+
+def scaled(splats, views, factor, offset=0.0):
+    """Return the same scene in another unit, and moved."""
+    return (
+        replace(
+            splats,
+            means=splats.means.astype(np.float64) * factor + offset,
+            log_scales=splats.log_scales + np.float32(np.log(factor)),
+        ),
+        ViewSet(tuple(replace(view, center=view.center * factor + offset) for view in views)),
+    )
+
+
+def with_logits(splats, value):
+    """Return splats of which every second has this opacity, as a logit."""
+    logits = splats.opacity_logits.copy()
+    logits[::2] = value
+    return replace(splats, opacity_logits=logits)
+
+
+def of_a_pixel(views):
+    """Return the views as images of one pixel."""
+    return ViewSet(
+        tuple(replace(view, width=1, height=1, cx=0.5, cy=0.5) for view in views),
+    )
+
+
+SCENES = {
+    "one view": lambda splats, _: (splats, small(1)),
+    "one splat": lambda splats, views: (splats.take(np.arange(1)), views),
+    "images of a pixel": lambda splats, views: (splats, of_a_pixel(views)),
+    "in one place": lambda splats, views: (replace(splats, means=np.zeros((COUNT, 3))), views),
+    "the same": lambda splats, views: (splats.take(np.zeros(COUNT, np.int64)), views),
+    "opacities of 0": lambda splats, views: (with_logits(splats, -np.inf), views),
+    "opacities of 1": lambda splats, views: (with_logits(splats, np.inf), views),
+    "millionths": lambda splats, views: scaled(splats, views, 1e-6),
+    "millions": lambda splats, views: scaled(splats, views, 1e6),
+    "moved": lambda splats, views: scaled(splats, views, 1.0, 1e6),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("survivors", CHOICES)
+@pytest.mark.parametrize("name", SCENES)
+def test_survivors_of_a_scene_at_an_edge_are_as_many_as_asked_for_and_numbers(name, survivors):
+    """Half stay; none is NaN that was a number; refitting ends no lower than it began."""
+    splats, views = SCENES[name](cloud(COUNT), small())
+
+    result = prune(splats, views, Budget(keep=max(len(splats) // 2, 1)), survivors=survivors)
+
+    left, told = result.survivors(splats), result.report
+    assert len(left) == max(len(splats) // 2, 1)
+    for array in ("means", "log_scales", "quaternions", "sh_dc", "sh_rest"):
+        assert np.isfinite(getattr(left, array)).all()
+    assert not np.isnan(left.opacity_logits).any()
+    refitted = told.get("refitted", {"psnr": 0.0, "psnr_before": 0.0})
+    assert refitted["psnr"] >= refitted["psnr_before"]
+    reached = told["survivors"]["psnr"]
+    assert all(psnr is None or 0.0 < psnr <= 100.0 for psnr in reached.values())
+    if name == "images of a pixel":  # too little is seen for a measurement
+        assert reached == {"unchanged": None, "absorb": None, "refit": None}
