@@ -94,17 +94,16 @@ def test_the_viewport_shows_every_model_as_the_reference_renderer(
     tagged = tmp_path / "point_cloud.ply"
     rows = np.column_stack([*columns.values()])
     tagged.write_bytes(with_model(header, model) + rows.tobytes())
-    picture = f"view-{model}-{{}}.png"
     found = same_binary.window_step(
         "view",
         size=(800, 500),
         cloud=tagged,
         cameras=cameras,
-        picture=same_binary.work / picture,
+        picture=same_binary.work / f"{model}-view-{{}}.png",
         blend=same_binary.work / "saved.blend",
     )
+    shown = view_in(found["camera"], same_binary.work / f"{model}-view-SCENE.png")
 
-    shown = view_in(found["camera"], same_binary.work / picture.format("SCENE"))
     assert found["failure"] == ""
     assert psnr(shown, reference(found["camera"], tagged)) > 28.0
 

@@ -183,7 +183,7 @@ class Walk:
         self.call(bpy.ops.refine.add_volume, role="KEEP", shape="BOX")
         yield from self.over()
         yield from self.hand.press("S")
-        for key, text in (("PERIOD", "."), ("NINE", "9")):
+        for key, text in (("ZERO", "0"), ("PERIOD", "."), ("NINE", "9")):
             yield from self.hand.press(key, unicode=text)
         yield from self.hand.press("RET")
         yield 1.0
@@ -196,9 +196,9 @@ class Walk:
         yield from self.hand.press("ESC")
         yield 0.5
         self.call(bpy.ops.refine.crop)
-        yield from self.seen("14-cropped")
-        for item in list(bpy.context.scene.refine.volumes):
+        for item in bpy.context.scene.refine.volumes:
             item.object.hide_set(True)
+        yield from self.seen("14-cropped")
 
     def apply(self) -> Generator[float, None, None]:
         """Score again, apply, undo and redo."""
@@ -224,7 +224,7 @@ class Walk:
         scene.render.engine = "CYCLES"  # without a graphics card EEVEE compiles for minutes
         scene.cycles.samples, scene.cycles.use_denoising = 1, False
         scene.render.film_transparent = True
-        yield from self.hand.scroll(down=False)
+        yield from self.hand.scroll(down=True)
         yield from self.hand.click("refine.render(")
         yield from until(lambda: IMAGE in bpy.data.images and not rendering(), "it is rendered")
         yield 1.0
