@@ -60,4 +60,9 @@ def run() -> None:
         answer_with(answer, value)
 
 
-run()
+try:
+    run()
+except Exception:  # noqa: BLE001 - a window would stay open
+    traceback.print_exc()
+    sys.stderr.flush()
+    os._exit(1)
