@@ -24,7 +24,7 @@ RUNS = {
         ["--together", "--dry-run", "--method", "closed-form", *CAMERAS],
     ],
     "score": [["-o", "scored.ply", *CAMERAS]],
-    "clean": [["--reasons", "front,isolated,giant,needle,transparent", *CAMERAS]],
+    "clean": [["--reasons", "front,isolated,giant,needle,transparent,haze,outside", *CAMERAS]],
     "convert": [["b.splat"]],
     "lod": [
         ["-o", "levels", "--nested", *CAMERAS],
