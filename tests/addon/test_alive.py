@@ -442,7 +442,7 @@ def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, few, 
     bpy.ops.refine.export_ply(filepath=str(at_once))
     options = {"overwrite": False, "apply_transform": False}
     ended = until_over(*start(export, filepath=str(later), **options)[:2])
-    options = {"files": [], "directory": "", "upright": False, "cameras": False}
+    options = {"files": [], "directory": "", "upright": False, "cameras": False, "level": 0}
     operator, context, said = start(read.REFINE_OT_import_ply, filepath=str(later), **options)
     imported = until_over(operator, context)
     obj = bpy.context.view_layer.objects.active
