@@ -55,7 +55,7 @@ from .ui.remedies import (
     REFINE_OT_leave_out,
     REFINE_OT_turn_cameras,
 )
-from .ui.render_operators import REFINE_OT_render
+from .ui.render_operators import REFINE_OT_render, REFINE_OT_watch_render
 from .ui.select_operators import (
     REFINE_OT_delete_selected,
     REFINE_OT_grow_selection,
@@ -102,6 +102,7 @@ CLASSES = (
     REFINE_OT_compare,
     REFINE_OT_view,
     REFINE_OT_render,
+    REFINE_OT_watch_render,
     REFINE_OT_convert,
     REFINE_OT_bake_transform,
     REFINE_OT_join,

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import bpy
@@ -28,9 +29,51 @@ _STEP = 0.05
 """Seconds between two looks at whether Blender's render is over."""
 
 
+@dataclass
+class _Watch:
+    """One render of Blender's during which Esc is watched for."""
+
+    escaped: bool = False
+    over: bool = False
+
+
+_watch = _Watch(over=True)
+"""The one under way."""
+
+
+def _watch_anew() -> None:
+    """Watch for Esc ahead of what waits for it so far."""
+    global _watch
+    _watch.over, _watch = True, _Watch()
+    bpy.ops.refine.watch_render("INVOKE_DEFAULT")
+
+
 def no_render(_context: bpy.types.Context) -> str:
     """Return that a render has to be over first, "" if none is under way."""
     return "A render is under way" if bpy.app.is_job_running("RENDER") else ""
+
+
+class REFINE_OT_watch_render(bpy.types.Operator):
+    """Notes Esc, and leaves it to Blender's render"""
+
+    # Of operators that wait, the last is told of an event first. Blender's render keeps Esc for
+    # itself, also where it has just ended by itself and so is not ended by that.
+    bl_idname = "refine.watch_render"
+    bl_label = "Watch a Render"
+    bl_options = {"INTERNAL"}
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
+        """Begin to watch."""
+        self._watch = _watch
+        context.window_manager.modal_handler_add(self)
+        return {"RUNNING_MODAL"}
+
+    def modal(self, _context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+        """Note Esc; end at the first event after the render."""
+        if self._watch.over:
+            return {"FINISHED", "PASS_THROUGH"}
+        self._watch.escaped |= event.type == "ESC" and event.value == "PRESS"
+        return {"PASS_THROUGH"}
 
 
 class REFINE_OT_render(Needing, bpy.types.Operator):
@@ -75,13 +118,12 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         manager = context.window_manager
         self._timer = manager.event_timer_add(_STEP, window=context.window)
         manager.modal_handler_add(self)
+        _watch_anew()
         return self._go_on(context)
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Start the next render when one is over."""
-        if event.type == "ESC" and event.value == "PRESS":
-            self._escaped = True  # Blender ends its render by itself
-        elif event.type == "TIMER":
+        if event.type == "TIMER":
             main_thread.serve()
             if not bpy.app.is_job_running("RENDER"):
                 return self._go_on(context)
@@ -98,13 +140,12 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
             chosen = [*range(scene.frame_start, scene.frame_end + 1, scene.frame_step)]
         self._shared, self._frames = Shared(card=card.available()), chosen
         self._steps = frames.steps(scene, chosen, self._shared, write=self.animation)
-        self._started, self._escaped, self._timer = time.monotonic(), False, None
-        self._opened = False
+        self._started, self._timer, self._opened = time.monotonic(), None, False
 
     def _go_on(self, context: bpy.types.Context) -> Answer:
         """Take what the last render came to, and start the next one."""
         try:
-            if self._escaped or self._steps is None:
+            if _watch.escaped or self._steps is None:
                 return self._stopped(context)
             step = next(self._steps)
             self._show()
@@ -135,6 +176,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         finally:
             view.render_display_type = display
         self._opened = True
+        _watch_anew()
 
     def _show(self) -> None:
         """Show the last frame wherever a render is shown."""
@@ -170,6 +212,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
 
     def _over(self, context: bpy.types.Context) -> None:
         """Remove all that was made for the render."""
+        _watch.over = True
         if self._steps is not None:
             self._steps.close()
             self._steps = None
