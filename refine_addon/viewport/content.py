@@ -193,6 +193,10 @@ class Content:
         mapping of (int, int) to (4, 4) float64
             Matrices to the world of those that can be drawn by now, by their place in `atlas`.
         """
+        for held in self._held.values():  # also of meshes that have gone since it began
+            if held.future and held.future.done():
+                held.packed, held.future, held.important = held.future.result(), None, None
+                self._mark(held)
         wanted = {}
         for key, obj, matrix in places:
             mesh = key[1]
@@ -208,11 +212,7 @@ class Content:
                 except RefineError:
                     self.refused.add(mesh)
                     continue
-            held = self._held[mesh]
-            if held.future and held.future.done():
-                held.packed, held.future, held.important = held.future.result(), None, None
-                self._mark(held)
-            if held.packed is not None:
+            if self._held[mesh].packed is not None:
                 wanted[key] = matrix
         self._place(set(wanted), existing)
         return wanted

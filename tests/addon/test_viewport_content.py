@@ -85,3 +85,14 @@ def test_new_ranks_of_the_same_splats_are_drawn_anew(addon, room, content, packi
     ranks[0].value = 1.0 - ranks[0].value
 
     assert drawn(addon, content, room).held.scored == before + 1
+
+
+def test_splats_that_went_while_they_were_packed_are_not_waited_for(addon, room, content, packing):
+    """As those of an import that is undone at once; a view would never be complete."""
+    drawn(addon, content, room)
+    assert content.pending()
+    packing.run()
+
+    content.update([], set)
+
+    assert not content.pending()
