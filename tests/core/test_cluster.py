@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -188,12 +189,14 @@ class FakeCluster:
     """Stands for a cluster that takes a moment to start, while Ctrl-C is pressed."""
 
     made: ClassVar[list[FakeCluster]] = []
+    pressed: ClassVar[threading.Event] = threading.Event()
 
     def __init__(self, **_options):
         self.made.append(self)
         self.started = self.closed = False
         time.sleep(0.1)  # until whoever started this waits
         os.kill(os.getpid(), signal.SIGINT)
+        self.pressed.wait(10.0)  # a busy machine takes its time
         time.sleep(0.1)
         self.started = True
 
@@ -209,8 +212,16 @@ def test_ctrl_c_while_workers_start_waits_for_them_and_closes_them(monkeypatch):
     distributed = pytest.importorskip("distributed")
     monkeypatch.setattr(distributed, "LocalCluster", FakeCluster)
 
-    with pytest.raises(KeyboardInterrupt), cluster.cluster(2):
-        pass
+    def press(*_called):
+        FakeCluster.pressed.set()
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, press)
+    try:
+        with pytest.raises(KeyboardInterrupt), cluster.cluster(2):
+            pass
+    finally:
+        signal.signal(signal.SIGINT, before)
 
     assert [one.closed for one in FakeCluster.made] == [True]
 
