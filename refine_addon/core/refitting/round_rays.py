@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
+from .. import costs
 from ..estimate.quality import PSNR_CAP
 from ..processes import for_each
 from ..seeing import projection
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..costs import Plan
     from ..seeing.projection import Footprints, Gaussians
     from ..seeing.scene import Scene
     from ..splats import Splats
@@ -201,7 +203,7 @@ class RoundRays:
     original : Target
         The unpruned splats.
     count : int
-        How many of these there are.
+        How many of these there are; also an attribute.
     threads : int, optional
     """
 
@@ -217,7 +219,7 @@ class RoundRays:
         threads: int | None,
     ) -> None:
         self.windows, self.scene = windows, scene
-        self._original, self._count, self._threads = original, count, threads
+        self._original, self.count, self._threads = original, count, threads
         self._validation: list[Truth] = []
 
     @classmethod
@@ -253,6 +255,12 @@ class RoundRays:
         ]
         return cls(windows, scene, InMemory(original, gaussians, scene), len(original), threads)
 
+    def costs(self, survivors: int) -> tuple[Plan, list[Plan]]:
+        """Return what checking so many survivors for the first time, and a round, cost."""
+        counts = self.count + self.around, survivors, len(self.windows)
+        rays = sum(window.rays for window in self.windows)
+        return costs.refitting(*counts, rays, 0)[1], costs.refit_round(*counts, rays)
+
     def linear(
         self, splats: Splats, number: int, *, geometry: bool, progress: Progress
     ) -> list[LinearView]:
@@ -274,7 +282,7 @@ class RoundRays:
         hits = [truth.hits for truth in self._validation]
         truth = CastTruth(self._original, windows, number, hits)
         work = _Linearize(truth, self.target(splats, gaussians), shapes)
-        count = self._count + len(splats)
+        count = self.count + len(splats)
         return self._each(work, windows, count, 1.0, part(progress, 0.05, 1.0))
 
     def psnr(self, splats: Splats, progress: Progress) -> float:
@@ -282,7 +290,7 @@ class RoundRays:
         share = 1.0 / _EVERY**2
         if not self._validation:
             self._validation = self._each(
-                CastTruth(self._original, self.windows, 0), self.windows, self._count, share,
+                CastTruth(self._original, self.windows, 0), self.windows, self.count, share,
                 part(progress, 0.0, 0.5),
             )  # fmt: skip
         gaussians = self._gaussians(splats, part(progress, 0.5, 0.6))
