@@ -36,11 +36,8 @@ check: $(DEV)         ## lint, format, types, and whether each mutant's line is 
 build: $(DEV)         ## the extension's zip, validated, into build/
 	$(PY) .ci/build_extension.py
 
-bench: $(BENCH)       ## speed and memory, with medians
-	$(PY) -m benchmarks.speed.scoring
-	$(PY) -m benchmarks.speed.file_to_file
-	$(PY) -m benchmarks.speed.file_to_file --absorb --splats 1900000 --runs 1
-	$(PY) -m benchmarks.speed.in_blender
+bench: $(BENCH)       ## seconds and memory of whole commands beside splat-transform; QUICK=1: 160,000 splats
+	$(PY) -m benchmarks.speed.whole $(if $(QUICK),--quick)
 
 bench-trade: $(BENCH) ## quality over time: docs/trade.md; SCENES="folder ..." measures others, RAP=FILE RAP too
 	-$(PY) -m benchmarks.baselines.splat_transform
