@@ -111,8 +111,9 @@ class LinearView:
     by_log_alpha : (3, h) uint16
         How the colour changes with the logarithm of alpha, ``T a (c - B)``; 0 where alpha is
         clipped, and does not change.
-    steepness : (2, h) uint16, optional
-        ``A d`` across and down, 1/px; none if geometry does not change.
+    steepness : (2, h) or (3, h) uint16, optional
+        ``A d`` across and down, 1/px; none if geometry does not change. Of discs also whether the
+        disc is hit, 1, or its low-pass, 0, which no scale and no turn changes.
     slopes : Slopes
         Of the splats that are hit.
     """
@@ -138,8 +139,9 @@ class LinearView:
         ray, owner = self.ray.astype(np.intp), self.owner.astype(np.intp)
         log_alpha = (self.slopes.opacity * mine[OPACITY][0]).take(owner)
         if self.steepness is not None:
-            x, y, xx, xy, yy = (each.take(owner) for each in self.slopes.polynomials(mine))
-            across, down = map(_floats, self.steepness)
+            x, y, *squares = (each.take(owner) for each in self.slopes.polynomials(mine))
+            across, down, *on_plane = map(_floats, self.steepness)
+            xx, xy, yy = (each * on_plane[0] for each in squares) if on_plane else squares
             log_alpha += across * (x + across * xx + down * xy)
             log_alpha += down * (y + down * yy)
         result, weight = np.empty_like(self.errors), _floats(self.weight)
@@ -167,9 +169,12 @@ class LinearView:
             result[channel] = self.slopes.light[channel] * self._sum(error, owner)
         result[OPACITY] = self.slopes.opacity * self._sum(value, owner)
         if self.steepness is not None:
-            across, down = map(_floats, self.steepness)
+            across, down, *on_plane = map(_floats, self.steepness)
             x, y = value * across, value * down
-            moments = [x, y, x * across, x * down, y * down]
+            moments = [x, y]
+            if on_plane:
+                x, y = x * on_plane[0], y * on_plane[0]
+            moments += [x * across, x * down, y * down]
             sums = np.stack([self._sum(each, owner).astype(np.float32) for each in moments])
             result[MEAN.start :] = self.slopes.gradients(sums)
         return result
@@ -185,10 +190,11 @@ class LinearView:
         result[OPACITY.start] = np.square(self.slopes.opacity) * self._sum(value, owner)
         if self.steepness is None:
             return result
-        x, y = map(_floats, self.steepness)
+        x, y, *on_plane = map(_floats, self.steepness)
         squares = (x * x, x * y, y * y)
         second = [value * each for each in squares]
-        fourth = [each * squares[0] for each in second[:2]] + [each * squares[2] for each in second]
+        curved = [each * on_plane[0] for each in second] if on_plane else second
+        fourth = [each * squares[0] for each in curved[:2]] + [each * squares[2] for each in curved]
         sums = [self._sum(each, owner) for each in (*second, *fourth)]
         result[MEAN] = self.slopes.squared_linear(sums[:3])
         result[SCALE.start :] = self.slopes.squared_quadratic(sums[3:])
@@ -373,8 +379,8 @@ def _steepness_on_discs(
 ) -> NDArray[np.float32]:
     """Return `_steepness` of hits on discs, (7, h), at a step from their centres, (h,) each.
 
-    With d scaled to the plane of the disc, ``d / (1 + g d)``, C of the disc is that of a Gaussian;
-    where its low-pass is what is drawn, only the mean matters.
+    With d scaled to the plane of the disc, ``d / (1 + g d)``, C of the disc is that of a Gaussian.
+    Where its low-pass is what is drawn, only the mean matters; see `LinearView.steepness`.
     """
     across, down = step
     depth = 1.0 + discs[4] * across + discs[5] * down
@@ -385,14 +391,15 @@ def _steepness_on_discs(
     low_pass = np.float32(1.0 / DISC_LOW_PASS)
     blob = (across * across + down * down) * low_pass
     plane = ahead & (first * first + second * second <= blob)
-    result = np.empty((2, len(across)), np.float32)
+    result = np.empty((3, len(across)), np.float32)
+    result[2] = plane
     for k, of_blob in enumerate((across, down)):
         result[k] = np.where(plane, discs[k] * first + discs[2 + k] * second, low_pass * of_blob)
     return result
 
 
 def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> NDArray[np.float32]:
-    """Return ``A d`` of some hits, across and down, (2, h), 1/px."""
+    """Return `LinearView.steepness` of some hits, (2, h) or (3, h), as numbers."""
     place = np.empty(int(footprints.index.max(initial=-1)) + 1, np.intp)
     place[footprints.index] = np.arange(len(footprints.index))
     mine = footprints.take(place[rays.hit])
@@ -402,9 +409,9 @@ def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> N
         (at + np.float32(0.5) - center.take(owner)).astype(np.float32)
         for at, center in zip(pixel, mine.centers, strict=True)
     ]
-    result = np.zeros((2, len(owner)), np.float32)
     if mine.discs is not None:
         return _steepness_on_discs(mine.discs.take(owner, axis=1), step)
+    result = np.zeros((2, len(owner)), np.float32)
     for axes, sigma in zip((mine.major, mine.minor), mine.sigmas, strict=True):
         inverse = (1.0 / np.square(np.square(sigma.astype(np.float64)))).astype(np.float32)
         along = step[0] * axes[0].take(owner) + step[1] * axes[1].take(owner)

@@ -77,8 +77,7 @@ class Refit:
     rounds : int, optional
         At most so many; by default see `MAX_ROUNDS`.
     geometry : bool
-        Whether means, scales and rotations are refitted too, or colours and opacities alone. Of
-        discs (2DGS), which `linear` does not know, it is always the latter.
+        Whether means, scales and rotations are refitted too, or colours and opacities alone.
     """
 
     rounds: int | None = None
@@ -226,8 +225,9 @@ def refit_on(
     threads: int | None = None,
 ) -> Iterator[Refitted]:
     """Yield what `refit_rounds` does, of some rays."""
-    moving, geometry = np.zeros(COUNT, np.bool_), settings.geometry and survivors.model != "2dgs"
+    moving, geometry = np.zeros(COUNT, np.bool_), settings.geometry
     moving[: COUNT if geometry else MEAN.start] = True
+    moving[SCALE.stop - 1] &= survivors.model != "2dgs"  # discs have no third scale
     movable = moving[:, None] & ~(
         np.zeros(len(survivors), np.bool_) if protected is None else protected
     )
