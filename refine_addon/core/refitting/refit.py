@@ -7,12 +7,12 @@ squared difference of colours is made small by damped least squares (Levenberg, 
 
     minimise over x   |J x - r|^2  +  sum over parameters p of  (k (D_p + m_p) + K_p) x_p^2
 
-r is the difference on all rays, large ones made small in it (`linear.HUBER`), D the diagonal of J'J, m_p the median of D over all splats that are
-hit, for each kind of parameter, and K the sum of D over the rounds before. So what few rays tell of
-a splat moves it little, and rounds together learn from the rays of all of them, not from the last
-alone: each has a share in what a parameter becomes. The sum is made small by a few steps of
-conjugate gradients, preconditioned by the diagonal. What these and the damping leave of J'r, half
-of it is added to that of the next round.
+r is the difference on all rays, in which large ones count less (`linear.HUBER`), D the diagonal of
+J'J, m_p the median of D over all splats that are hit, for each kind of parameter, and K the sum of
+D over the rounds before. So what few rays tell of a splat moves it little, and rounds together
+learn from the rays of all of them, not from the last alone: each has a share in what a parameter
+becomes. The sum is made small by a few steps of conjugate gradients, preconditioned by the
+diagonal. What these and the damping leave of J'r, half of it is added to that of the next round.
 
 k is `DAMPING` over how many rays there are for each survivor: the more rays, the less damping.
 
