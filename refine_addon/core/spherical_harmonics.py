@@ -119,26 +119,20 @@ def colors(
     return np.asarray(color)
 
 
-def single_colors(
-    directions: NDArray[Any], sh_dc: NDArray[Any], sh_rest: NDArray[Any]
-) -> NDArray[np.float32]:
+def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return what `colors` does, (3, N), in float32 throughout: a tenth of the time.
 
     Parameters
     ----------
-    directions : (N, 3) floating
-    sh_dc : (N, 3) floating
-    sh_rest : (N, K, 3) floating
+    directions : (3, N) floating
+    harmonics : (N, 3, K) float32
+        Coefficients of each channel, the constant first.
     """
-    degree = math.isqrt(sh_rest.shape[1] + 1) - 1
-    values = _values(np.ascontiguousarray(directions.T, np.float32), degree)
-    color = sh_dc.T.astype(np.float32) * values[0]
-    color += np.float32(0.5)
-    if degree:
-        # In one layout whatever that of the coefficients is: sums round alike.
-        rest = np.ascontiguousarray(sh_rest.transpose(0, 2, 1), np.float32)
-        color = color + np.einsum("nk,nck->nc", np.stack(values[1:], axis=1), rest).T
-    return np.asarray(color, np.float32)
+    degree = math.isqrt(harmonics.shape[2]) - 1
+    values = np.stack(_values(np.asarray(directions, np.float32), degree), axis=1)  # (N, K)
+    result = np.einsum("nk,nck->cn", values, harmonics)
+    result += np.float32(0.5)
+    return np.asarray(result, np.float32)
 
 
 def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -58,6 +58,10 @@ MAX_ROUNDS, ENOUGH_RAYS = 4, (5, 400_000)
 """By default there are so many rounds, and fewer where these have had so many rays for each
 survivor and so many in all: of large scenes each round takes as long as absorbing."""
 
+SIMPLER, ENOUGH_SIMPLER = 0.4, 0.25
+"""How many times as many rays a round has, and are enough, for colours and opacities alone: four of
+13 parameters, and colours change with most of these in straight lines."""
+
 LEAST_GAIN = 0.05
 """Rounds end where the PSNR of the validation rays rises by less, dB."""
 
@@ -209,7 +213,9 @@ def refit_rounds(  # noqa: PLR0913 - as `refit`
 
     Parameters and errors are those of `refit`.
     """
-    rays = RoundRays.of(original, views, len(survivors), part(progress, 0.0, 0.05), threads)
+    share = 1.0 if _with_geometry(settings, survivors) else SIMPLER
+    count = round(share * len(survivors))
+    rays = RoundRays.of(original, views, count, part(progress, 0.0, 0.05), threads)
     yield from refit_on(
         rays, survivors, settings,
         protected=protected, progress=part(progress, 0.05, 1.0), threads=threads,
@@ -226,7 +232,7 @@ def refit_on(
     threads: int | None = None,
 ) -> Iterator[Refitted]:
     """Yield what `refit_rounds` does, of some rays."""
-    moving, geometry = np.zeros(COUNT, np.bool_), settings.geometry and survivors.model != "2dgs"
+    moving, geometry = np.zeros(COUNT, np.bool_), _with_geometry(settings, survivors)
     moving[: COUNT if geometry else MEAN.start] = True
     movable = moving[:, None] & ~(
         np.zeros(len(survivors), np.bool_) if protected is None else protected
@@ -236,7 +242,10 @@ def refit_on(
     yield best
     rounds, cast = settings.rounds or MAX_ROUNDS, 0
     enough = np.inf if settings.rounds else max(ENOUGH_RAYS[0] * len(survivors), ENOUGH_RAYS[1])
-    before, more = _Told(*np.zeros((2, COUNT, len(survivors)), np.float32)), 1.0
+    enough *= 1.0 if geometry else ENOUGH_SIMPLER
+    before = _Told(*np.zeros((2, COUNT, len(survivors)), np.float32))
+    more = 1.0 if geometry else SIMPLER
+    undone = False
     for number in range(1, rounds + 1):
         begin, middle, near, end = (
             0.04 + 0.96 * (number - 1 + share) / rounds for share in (0.0, 0.4, 0.9, 1.0)
@@ -264,10 +273,15 @@ def refit_on(
             yield best
             if gain < LEAST_GAIN or cast >= enough:
                 return
-        elif more > 1.0:
+        elif undone:
             return
         else:
-            more *= MORE_DAMPING
+            more, undone = more * MORE_DAMPING, True
+
+
+def _with_geometry(settings: Refit, survivors: Splats) -> bool:
+    """Return whether means, scales and rotations are refitted."""
+    return settings.geometry and survivors.model != "2dgs"
 
 
 class _Told(NamedTuple):

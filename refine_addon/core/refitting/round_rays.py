@@ -150,15 +150,23 @@ class InMemory:
 
     Attributes
     ----------
-    splats : Splats
     gaussians : Gaussians
-        Made of these.
     scene : Scene
+    means : (M, 3) float64
+        Of these, in the world.
+    harmonics : (M, 3, K) float32
+        Of these, see `single_colors`.
     """
 
-    splats: Splats
     gaussians: Gaussians
     scene: Scene
+    means: NDArray[np.float64]
+    harmonics: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, splats: Splats, gaussians: Gaussians, scene: Scene) -> InMemory:
+        """Return the splats that some Gaussians were made of."""
+        return cls(gaussians, scene, *_colored(splats, gaussians.index))
 
     def footprints(self, window: Window) -> Footprints:
         """Return the footprints in a view that may reach into a window of it."""
@@ -169,16 +177,32 @@ class InMemory:
 
     def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float32]:
         """Return the colours in which a view sees some of the Gaussians, (3, u)."""
-        return colors_of(self.splats.take(self.gaussians.index[hit]), view)
+        return _seen_from(self.means.take(hit, axis=0), self.harmonics.take(hit, axis=0), view)
 
 
 def colors_of(splats: Splats, view: View) -> NDArray[np.float32]:
     """Return the colours in which a view sees splats, (3, u), as far as they can be drawn."""
-    direction = splats.means.astype(np.float64) - view.center
-    length = np.linalg.norm(direction, axis=1)
-    direction /= np.maximum(length, np.finfo(np.float64).tiny)[:, None]
-    colors = single_colors(direction, splats.sh_dc, splats.sh_rest)
-    return colors.clip(0.0, projection.BRIGHTEST)
+    return _seen_from(*_colored(splats, np.arange(len(splats))), view)
+
+
+def _colored(
+    splats: Splats, rows: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Return means and harmonics of some splats, see `InMemory`."""
+    harmonics = np.empty((len(rows), 3, 1 + splats.sh_rest.shape[1]), np.float32)
+    harmonics[:, :, 0] = splats.sh_dc[rows]
+    harmonics[:, :, 1:] = splats.sh_rest[rows].transpose(0, 2, 1)
+    return splats.means[rows].astype(np.float64), harmonics
+
+
+def _seen_from(
+    means: NDArray[np.float64], harmonics: NDArray[np.float32], view: View
+) -> NDArray[np.float32]:
+    """Return the colours that `colors_of` does, of means and harmonics; see `InMemory`."""
+    direction = np.ascontiguousarray((means - view.center).T, np.float32)
+    length = np.sqrt(np.square(direction).sum(axis=0))
+    direction /= np.maximum(length, np.finfo(np.float32).tiny)
+    return single_colors(direction, harmonics).clip(0.0, projection.BRIGHTEST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +275,7 @@ class RoundRays:
             The unpruned splats, in the frame of the views.
         views : ViewSet
         count : int
-            How many survivors there are.
+            For how many survivors there are to be rays, see `limits`.
         progress : callable
         threads : int, optional
         """
@@ -265,7 +289,8 @@ class RoundRays:
             Window(view, number, weight, rays, hits, step=steps[number])
             for number, (view, weight) in enumerate(chosen)
         ]
-        return cls(windows, scene, InMemory(original, gaussians, scene), len(original), threads)
+        target = InMemory.of(original, gaussians, scene)
+        return cls(windows, scene, target, len(original), threads)
 
     def linear(
         self, splats: Splats, number: int, *, geometry: bool, progress: Progress
@@ -307,7 +332,7 @@ class RoundRays:
 
     def target(self, splats: Splats, gaussians: Gaussians) -> Target:
         """Return what rays are cast into: survivors, given also as Gaussians, the first of all."""
-        return InMemory(splats, gaussians, self.scene)
+        return InMemory.of(splats, gaussians, self.scene)
 
     def _gaussians(self, splats: Splats, progress: Progress) -> Gaussians:
         views = ViewSet(tuple(window.view for window in self.windows))

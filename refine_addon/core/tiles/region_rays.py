@@ -137,7 +137,7 @@ class RegionRays(RoundRays):
 
     def target(self, splats: Splats, gaussians: Gaussians) -> _Amid:
         """Return what rays are cast into: the region's survivors amid all others."""
-        return _Amid(InMemory(splats, gaussians, self.scene), self._after, self._others)
+        return _Amid(InMemory.of(splats, gaussians, self.scene), self._after, self._others)
 
 
 def _windows(
