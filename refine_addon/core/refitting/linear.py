@@ -15,7 +15,7 @@ along the splat's axis j, whose scale is s_j and the longest of which is s::
     da / d turn_1        = a (s_2^2 - s_3^2) h_2 h_3    a small turn about axis 1; others in turn
 
 That J changes with the mean, the colour with the direction of view, and what antialiasing keeps of
-the opacity with the scales, is left out. Discs have no geometry to change here. Parameters are
+the opacity with the scales, is left out. Of discs, d is scaled to their plane first. Parameters are
 those of the splat's own axes, so results turn and grow with the scene.
 
 With ``e = A d``, ``g = W' J' e``. In the scene's frame all changes of a splat's mean are one vector
@@ -32,8 +32,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..rendering import ALPHA_CUT, ALPHA_MAX
+from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..seeing import projection
+from ..seeing.cast import BEHIND
 from ..seeing.rays import LEAST_LEFT
 from ..splats import SH_C0, rotation_matrices
 from ..work import Progress, each_chunk
@@ -199,8 +200,9 @@ class LinearView:
     by_log_alpha : (3, h) uint16
         How the colour changes with the logarithm of alpha, ``T a (c - B)``; 0 where alpha is
         clipped, and does not change.
-    steepness : (2, h) uint16
-        ``A d`` across and down, 1/px; (0, h) if geometry does not change.
+    steepness : (2, h) or (3, h) uint16
+        ``A d`` across and down, 1/px; (0, h) if geometry does not change. Of discs also whether the
+        disc is hit, 1, or its low-pass, 0, which no scale and no turn changes.
     unclipped : (3, u) bool
         Where the colour changes with the harmonics.
     jacobian : (2, 3, u) float32
@@ -258,8 +260,10 @@ class LinearView:
         mine = [row.take(self.hit) for row in change]
         log_alpha = mine[OPACITY.start].take(hits.owner)
         if hits.steepness:
-            across, down = hits.steepness
+            across, down, *on_plane = hits.steepness
             x, y, xx, xy, yy = (each.take(hits.owner) for each in self._polynomials(mine))
+            for where in on_plane:
+                xx, xy, yy = xx * where, xy * where, yy * where
             xx *= across
             x += xx
             xy *= down
@@ -294,9 +298,12 @@ class LinearView:
         result[COLOR] *= self.unclipped
         result[OPACITY] = self._sum(value, hits.owner)
         if hits.steepness:
-            across, down = hits.steepness
+            across, down, *on_plane = hits.steepness
             x, y = value * across, value * down
-            moments = (x, y, x * across, x * down, y * down)
+            moments = [x, y]
+            for where in on_plane:
+                x, y = x * where, y * where
+            moments += [x * across, x * down, y * down]
             sums = [self._sum(each, hits.owner).astype(np.float32) for each in moments]
             one, other = self.jacobian
             result[MEAN] = one * sums[0] + other * sums[1]
@@ -339,10 +346,12 @@ class LinearView:
         result[OPACITY] *= np.square(np.float32(1.0) - shapes.gaussians.alphas)
         if not hits.steepness:
             return result
-        x, y = hits.steepness
+        x, y, *on_plane = hits.steepness
         second = [value * x * x, value * x * y, value * y * y]
-        fourth = [second[0] * x * x, second[0] * x * y, second[0] * y * y]
-        fourth += [second[1] * y * y, second[2] * y * y]
+        curved = [each * on_plane[0] for each in second] if on_plane else second
+        squares = (x * x, x * y, y * y)
+        fourth = [curved[0] * each for each in squares]
+        fourth += [each * squares[2] for each in curved[1:]]
         of_second, of_fourth = (
             [self._sum(each, hits.owner) for each in powers] for powers in (second, fourth)
         )
@@ -543,8 +552,32 @@ def _floats(halves: NDArray[np.uint16]) -> NDArray[np.float32]:
     return (halves.astype(np.uint32) << np.uint32(16)).view(np.float32)
 
 
+def _steepness_on_discs(
+    discs: NDArray[np.float32], step: list[NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """Return `_steepness` of hits on discs, (7, h), at a step from their centres, (h,) each.
+
+    With d scaled to the plane of the disc, ``d / (1 + g d)``, C of the disc is that of a Gaussian.
+    Where its low-pass is what is drawn, only the mean matters; see `LinearView.steepness`.
+    """
+    across, down = step
+    depth = 1.0 + discs[4] * across + discs[5] * down
+    ahead = depth > BEHIND
+    first, second = (
+        (discs[k] * across + discs[k + 1] * down) / np.where(ahead, depth, 1.0) for k in (0, 2)
+    )
+    low_pass = np.float32(1.0 / DISC_LOW_PASS)
+    blob = (across * across + down * down) * low_pass
+    plane = ahead & (first * first + second * second <= blob)
+    result = np.empty((3, len(across)), np.float32)
+    result[2] = plane
+    for k, of_blob in enumerate((across, down)):
+        result[k] = np.where(plane, discs[k] * first + discs[2 + k] * second, low_pass * of_blob)
+    return result
+
+
 def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> NDArray[np.float32]:
-    """Return ``A d`` of some hits, across and down, (2, h), 1/px."""
+    """Return `LinearView.steepness` of some hits, (2, h) or (3, h), as numbers."""
     place = np.empty(int(footprints.index.max(initial=-1)) + 1, np.intp)
     place[footprints.index] = np.arange(len(footprints.index))
     mine = footprints.take(place[rays.hit])
@@ -554,6 +587,8 @@ def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> N
         (at + np.float32(0.5) - center.take(owner)).astype(np.float32)
         for at, center in zip(pixel, mine.centers, strict=True)
     ]
+    if mine.discs is not None:
+        return _steepness_on_discs(mine.discs.take(owner, axis=1), step)
     result = np.zeros((2, len(owner)), np.float32)
     for axes, sigma in zip((mine.major, mine.minor), mine.sigmas, strict=True):
         inverse = (1.0 / np.square(np.square(sigma.astype(np.float64)))).astype(np.float32)

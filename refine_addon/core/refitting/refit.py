@@ -81,8 +81,7 @@ class Refit:
     rounds : int, optional
         At most so many; by default see `MAX_ROUNDS`.
     geometry : bool
-        Whether means, scales and rotations are refitted too, or colours and opacities alone. Of
-        discs (2DGS), which `linear` does not know, it is always the latter.
+        Whether means, scales and rotations are refitted too, or colours and opacities alone.
     """
 
     rounds: int | None = None
@@ -213,7 +212,7 @@ def refit_rounds(  # noqa: PLR0913 - as `refit`
 
     Parameters and errors are those of `refit`.
     """
-    share = 1.0 if _with_geometry(settings, survivors) else SIMPLER
+    share = 1.0 if settings.geometry else SIMPLER
     count = round(share * len(survivors))
     rays = RoundRays.of(original, views, count, part(progress, 0.0, 0.05), threads)
     yield from refit_on(
@@ -232,8 +231,9 @@ def refit_on(
     threads: int | None = None,
 ) -> Iterator[Refitted]:
     """Yield what `refit_rounds` does, of some rays."""
-    moving, geometry = np.zeros(COUNT, np.bool_), _with_geometry(settings, survivors)
+    moving, geometry = np.zeros(COUNT, np.bool_), settings.geometry
     moving[: COUNT if geometry else MEAN.start] = True
+    moving[SCALE.stop - 1] &= survivors.model != "2dgs"  # discs have no third scale
     movable = moving[:, None] & ~(
         np.zeros(len(survivors), np.bool_) if protected is None else protected
     )
@@ -277,11 +277,6 @@ def refit_on(
             return
         else:
             more, undone = more * MORE_DAMPING, True
-
-
-def _with_geometry(settings: Refit, survivors: Splats) -> bool:
-    """Return whether means, scales and rotations are refitted."""
-    return settings.geometry and survivors.model != "2dgs"
 
 
 class _Told(NamedTuple):
