@@ -353,7 +353,8 @@ class LinearView:
         fourth = [curved[0] * each for each in squares]
         fourth += [each * squares[2] for each in curved[1:]]
         of_second, of_fourth = (
-            [self._sum(each, hits.owner) for each in powers] for powers in (second, fourth)
+            [self._sum(each, hits.owner).astype(np.float32) for each in powers]
+            for powers in (second, fourth)
         )
         in_image = [[_dot(row, axis) for axis in shapes.axes] for row in self.jacobian]
         longest, squared = np.square(shapes.scales.max(axis=0)), np.square(shapes.scales)
@@ -382,23 +383,21 @@ def _dot(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]]) -> NDArray[
 
 
 def _squared(
-    polynomial: NDArray[np.float32], sums: Sequence[NDArray[np.float64]]
-) -> NDArray[np.float64]:
+    polynomial: NDArray[np.float32], sums: Sequence[NDArray[np.float32]]
+) -> NDArray[np.float32]:
     """Return the sums over hits of squared polynomials, (u,).
 
     Parameters
     ----------
     polynomial : (3, u) float32
         Coefficients of x^2, x y and y^2.
-    sums : list of (u,) float64
+    sums : list of (u,) float32
         Of x^4, x^3 y, x^2 y^2, x y^3 and y^4 over the hits of each splat.
     """
-    a, b, c = polynomial.astype(np.float64)
-    weights = (a * a, 2.0 * a * b, b * b + 2.0 * a * c, 2.0 * b * c, c * c)
-    result = np.zeros(a.shape)
-    for weight, of_power in zip(weights, sums, strict=True):
-        result += weight * of_power
-    return np.maximum(result, 0.0)
+    a, b, c = polynomial
+    result = a * a * sums[0] + (b * b + 2.0 * a * c) * sums[2] + c * c * sums[4]
+    result += 2.0 * b * (a * sums[1] + c * sums[3])
+    return np.asarray(np.maximum(result, np.float32(0.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -581,11 +580,13 @@ def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> N
     place = np.empty(int(footprints.index.max(initial=-1)) + 1, np.intp)
     place[footprints.index] = np.arange(len(footprints.index))
     mine = footprints.take(place[rays.hit])
-    owner, ray = rays.owner[kept].astype(np.intp), rays.ray[kept]
-    pixel = (rays.columns[ray % len(rays.columns)], rays.rows[ray // len(rays.columns)])
+    owner, ray = rays.owner.take(kept).astype(np.intp), rays.ray.take(kept)
+    columns, rows = (
+        each.astype(np.float32) + np.float32(0.5) for each in (rays.columns, rays.rows)
+    )
+    pixels = np.tile(columns, len(rows)), np.repeat(rows, len(columns))  # of all rays
     step = [
-        (at + np.float32(0.5) - center.take(owner)).astype(np.float32)
-        for at, center in zip(pixel, mine.centers, strict=True)
+        at.take(ray) - center.take(owner) for at, center in zip(pixels, mine.centers, strict=True)
     ]
     if mine.discs is not None:
         return _steepness_on_discs(mine.discs.take(owner, axis=1), step)
