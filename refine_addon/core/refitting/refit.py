@@ -189,7 +189,7 @@ def refit(  # noqa: PLR0913 - all but three are optional
     Notes
     -----
     Memory: about 700 bytes a survivor, and 14 bytes for each hit of a round, see
-    `round_rays.MAX_HITS`.
+    `round_rays.limits`.
     """
     *_, last = refit_rounds(
         survivors, original, views, settings,
