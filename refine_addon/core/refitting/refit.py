@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from ..splats import Splats
     from ..views import ViewSet
 
-STEPS = 6
+STEPS = 8
 """Steps of conjugate gradients in a round."""
 
 DAMPING, LEAST_DAMPING = 4.0, 0.1
