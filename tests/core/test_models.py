@@ -16,6 +16,7 @@ from refine_addon.core.formats.ply_columns import columns_from_splats
 from refine_addon.core.formats.registry import FORMATS
 from refine_addon.core.levels.files import LevelsRequest, lod_file
 from refine_addon.core.levels.lod import Levels
+from refine_addon.core.operation.arranged import convert_files
 from refine_addon.core.operation.files import file_to_file
 from refine_addon.core.operation.requests import ConvertRequest, ScoreRequest
 from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS, MODELS
@@ -98,6 +99,21 @@ def test_a_format_tells_the_model_or_its_notes_do(tmp_path, form, model):
     held = model in form.models
     assert read_splats(back).model == (model if held else "default")
     assert any(f"--model {model}" in note for note in report["notes"]) != held
+    assert (b"scale_2" in back.read_bytes()) == (read_splats(back).model != "2dgs")
+
+
+def test_discs_of_several_files_are_written_without_a_third_scale(tmp_path):
+    """Whether the files have it or not; what is read from them is the same."""
+    one = write(tmp_path / "one.ply", cloud(3), [b"SplatRenderMode: 2dgs"])
+    other = write(tmp_path / "other.ply", with_model(cloud(4), "2dgs"))
+
+    convert_files([one, other], tmp_path / "both.ply", ConvertRequest())
+
+    both = read_splats(tmp_path / "both.ply")
+    assert b"scale_2" not in both.header
+    expected = joined([read_splats(one).splats(), read_splats(other).splats()])
+    np.testing.assert_array_equal(both.splats().log_scales, expected.log_scales)
+    np.testing.assert_array_equal(both.splats().quaternions, expected.quaternions)
 
 
 def test_what_is_asked_for_replaces_what_the_file_says(tmp_path):
