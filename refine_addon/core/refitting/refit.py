@@ -248,7 +248,7 @@ def refit_on(
     undone = False
     for number in range(1, rounds + 1):
         begin, middle, near, end = (
-            0.04 + 0.96 * (number - 1 + share) / rounds for share in (0.0, 0.4, 0.9, 1.0)
+            0.04 + 0.96 * (number - 1 + share) / rounds for share in (0.0, 0.6, 0.95, 1.0)
         )
         linear = rays.linear(
             best.splats, number,
