@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from ..splats import Splats
     from ..views import ViewSet
 
-STEPS = 6
+STEPS = 8
 """Steps of conjugate gradients in a round."""
 
 DAMPING, LEAST_DAMPING = 4.0, 0.1
@@ -192,7 +192,7 @@ def refit(  # noqa: PLR0913 - all but three are optional
     Notes
     -----
     Memory: about 700 bytes a survivor, and 14 bytes for each hit of a round, see
-    `round_rays.MAX_HITS`.
+    `round_rays.limits`.
     """
     *_, last = refit_rounds(
         survivors, original, views, settings,
