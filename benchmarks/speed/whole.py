@@ -75,6 +75,7 @@ def measured(count: int) -> dict[str, Figure]:
         for name, command in commands(folder, count).items():
             _, busy, megabytes = run(command)
             figures[name] = Figure(round(busy, 2), round(megabytes))
+            print(f"{count:,}, {name}: {busy:.1f} s, {megabytes:.0f} MB", flush=True)
             (folder / "out.ply").unlink()
     return figures
 
