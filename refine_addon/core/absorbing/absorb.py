@@ -171,9 +171,9 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     count = len(splats)
     spared = np.zeros(count, np.bool_) if protected is None else np.array(protected, np.bool_)
     lineage = _Lineage(splats, np.arange(count) if deleted is None else np.flatnonzero(~deleted))
-    began = began or len(lineage.origin)
     goal = max(keep_count, int(np.count_nonzero(spared[lineage.origin])), 0)
     left_after = stages(len(lineage.origin), goal)
+    factor = patience(1.0 - goal / max(began or len(lineage.origin), 1))
     bare = lineage.without_harmonics(progress)
     scene = scene_of(bare.means, drawable(bare), views)
     sums: ViewSums | None = None
@@ -182,7 +182,7 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
         sums = measure(bare, sums, part(of_stage, 0.0, 0.5))
         stage = absorb_once(
             bare, views, scene, sums, left, protected=spared[lineage.origin],
-            factor=patience(1.0 - goal / max(began, 1)), color_of=lineage.color_of,
+            factor=factor, color_of=lineage.color_of,
             progress=part(of_stage, 0.5, 1.0), threads=threads,
         )  # fmt: skip
         bare, sums = stage.splats, stage.expected
@@ -216,8 +216,7 @@ class _Lineage:
     def without_harmonics(self, progress: Progress) -> Splats:
         """Return the splats with their base colour alone, in float64; undrawable ones stay so."""
         drawn = drawable(self.splats)[self.rows]
-        bare = replace(self.splats, sh_rest=self.splats.sh_rest[:, :0]).take(self.rows)
-        bare = in_float64(bare, progress)
+        bare = in_float64(self.splats.up_to_degree(0).take(self.rows), progress)
         bare.sh_dc[~drawn] = np.nan
         return bare
 
