@@ -211,7 +211,7 @@ class _Lineage:
         self.rows = self.origin = rows
         # Of each of the M: which of those left it is or went into, and its share of the colour.
         self._owner, self._share = np.arange(len(rows), dtype=np.int32), np.ones(len(rows))
-        self._colors: NDArray[np.float32] | None = None  # (K, 3), from the first stage on
+        self._colors: Array | None = None  # (K, 3), from the first stage on
 
     def without_harmonics(self, progress: Progress) -> Splats:
         """Return the splats with their base colour alone, in float64; undrawable ones stay so."""
@@ -226,7 +226,7 @@ class _Lineage:
         Those that splats had before the first stage, or got by merging.
         """
         if self._colors is not None:
-            return np.asarray(self._colors[rows], np.float64)
+            return self._colors[rows]
         own = self.origin[rows]
         return spherical_harmonics.colors(
             direction, self.splats.sh_dc[own], self.splats.sh_rest[own]
@@ -306,7 +306,7 @@ class Stage(NamedTuple):
         Of each splat in the colour of its survivor.
     expected : ViewSums
         Of the K survivors, predicted from the sums before the stage and the merges' own errors.
-    color : (K, 3) float32 or None
+    color : (K, 3) float64 or None
         Of those that may merge, as the views see them; None where none did.
     """
 
@@ -315,7 +315,7 @@ class Stage(NamedTuple):
     survivor: Index
     share: Array
     expected: ViewSums
-    color: NDArray[np.float32] | None
+    color: Array | None
 
 
 def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
@@ -432,7 +432,7 @@ def _with_merged(
     survivor[rows] = np.where(graph.alive[owner], new_row[rows[owner]], -1)
     members = np.flatnonzero(changed[owner])  # all that went into one of them, themselves included
     harmonics = _Blend(rows[members], survivor[rows[members]], share[members])
-    color = np.zeros((np.count_nonzero(keep), 3), np.float32)
+    color = np.zeros((np.count_nonzero(keep), 3))
     color[new_row[rows[graph.alive]]] = graph.field.color[graph.alive]
     shares = np.ones(len(keep))
     shares[rows] = share
