@@ -221,7 +221,7 @@ def _delete(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     keep, psnr = _deleting(task, scores, threads)
     clock.lap("select_s")
     facts = _facts(task, scores, keep, psnr, clock)
-    conclude_between(facts, _estimated_between(scores, keep, threads))
+    conclude_between(facts, _estimated_between(scores, keep, threads), scores.seen)
     gone = facts["splats"]["removed"] / len(keep)
     facts["survivors"] = {
         "asked": task.survivors,
@@ -247,7 +247,7 @@ def _absorbed(task: Task, scores: Scores, plain: float | None, made: Made, clock
     """
     absorbed = made.absorbed
     facts = _facts(task, scores, absorbed.keep, made.psnr, clock, absorbed)
-    conclude_between(facts, made.psnr_between)
+    conclude_between(facts, made.psnr_between, scores.seen)
     gone = facts["splats"]["removed"] / len(absorbed.keep)
     measured = made.measured()
     if task.budget.psnr is None:  # else deletion keeps another number of splats
