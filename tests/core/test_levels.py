@@ -140,7 +140,9 @@ def test_what_absorbed_before_is_not_thinned_by_a_tenth_again(monkeypatch):
     monkeypatch.setattr(
         absorb_splats.absorbing,
         "absorb",
-        lambda splats, *rest, **named: given.append(len(splats)) or whole(splats, *rest, **named),
+        lambda *rest, **named: (
+            given.append(len(rest[0]) - named["deleted"].sum()) or whole(*rest, **named)
+        ),
     )
     monkeypatch.setattr(absorbing, "patience", lambda share: shares.append(share) or plain(share))
 

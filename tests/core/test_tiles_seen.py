@@ -283,7 +283,7 @@ def test_absorbing_a_single_region_is_absorbing_one_file(
 
 def test_a_stage_leaves_enough_to_choose_from():
     """Merges count half a splat each, so no stage may ask for more than half of the splats."""
-    assert absorbing.STAGE >= 0.5
+    assert absorbing.ALONE >= 0.5
 
 
 def test_stored_rays_know_which_are_wanted(tmp_path, views):

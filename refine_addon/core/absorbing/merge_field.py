@@ -14,6 +14,8 @@ from ..splats import opacity, rotation_matrices
 from ..work import Progress, for_chunks, part, silent
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from ..rendering import Model
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
     Index = NDArray[np.int64] | NDArray[np.int32]
     Footprint = tuple[Array, Array, Array]
+    ColorOf = Callable[[Index, Array], Array]
 
 DIRECTION_VIEWS = 32
 """At most so many views, spread evenly, decide from which directions splats are viewed."""
@@ -228,6 +231,7 @@ def measured_field(  # noqa: PLR0913 - which splats, seen by what, in which scen
     views: ViewSet,
     scene: Scene,
     sums: ViewSums,
+    color_of: ColorOf | None = None,
     *,
     progress: Progress = silent,
     threads: int | None = None,
@@ -245,6 +249,9 @@ def measured_field(  # noqa: PLR0913 - which splats, seen by what, in which scen
         Of splats and views.
     sums : ViewSums
         Of all splats.
+    color_of : callable, optional
+        ``color_of(rows, directions)`` returns the colours of some splats, seen along directions; by
+        default those of their harmonics.
     progress : callable, optional
         See `refine_addon.core.work.Progress`.
     threads : int, optional
@@ -262,8 +269,11 @@ def measured_field(  # noqa: PLR0913 - which splats, seen by what, in which scen
     def fill(piece: slice) -> None:
         chunk = splats.take(rows[piece])
         covariances[piece] = _covariances(chunk)
-        color[piece] = spherical_harmonics.colors(
-            viewed.direction[piece], chunk.sh_dc, chunk.sh_rest
+        direction = viewed.direction[piece]
+        color[piece] = (
+            spherical_harmonics.colors(direction, chunk.sh_dc, chunk.sh_rest)
+            if color_of is None
+            else color_of(rows[piece], direction)
         )
 
     for_chunks(

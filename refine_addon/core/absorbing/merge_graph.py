@@ -22,12 +22,17 @@ if TYPE_CHECKING:
 NEIGHBOURS = 8
 """How many nearest neighbours each splat may be merged with."""
 
-BATCH = 0.03
-"""Share of the splats that one round removes at most; then costs are computed again."""
+BATCH = 0.1
+"""Share of the splats that one round removes at most; then costs are computed again. Rounds of a
+third of that leave pictures as close, and take longer."""
+
+LOOKED_AT = 0.03
+"""A round looks at the cheapest operations of at least twice this share of the splats, however few
+it may remove: else the last few splats of a stage would take as many rounds as all before."""
 
 FILLED = 0.25
-"""A round that removes less than this share of its quota also merges pairs that are not the
-cheapest operation for both of their splats. Ordinary scenes fill .64 of it or more. Of copies of a
+"""A round that removes less than this share of its quota, or of `LOOKED_AT`, also merges pairs that
+are not the cheapest operation for both of their splats. Ordinary scenes remove more. Of copies of a
 splat, each costs less than the one before it, so that only one pair would merge in a round."""
 
 DISC_PATIENCE = 0.5
@@ -172,10 +177,11 @@ class MergeGraph:
         if that is cheaper than all of its pairs. If these are few, see `FILLED`.
         """
         error = self._errors()  # (N,)
-        limit = self._limit(error, quota)
+        least = max(int(LOOKED_AT * np.count_nonzero(self.alive)), 1)
+        limit = self._limit(error, max(quota, least))
         edges = np.flatnonzero(self.cost <= limit)  # (e,)
         alone, chosen = self._cheapest(error, edges, limit)
-        if np.count_nonzero(alone) + len(chosen) < FILLED * quota:
+        if np.count_nonzero(alone) + len(chosen) < FILLED * min(quota, least):
             chosen = self._completed(chosen, edges)
         alone[self.first[chosen]] = alone[self.second[chosen]] = False
         doomed = np.flatnonzero(alone)  # (d,)
@@ -185,13 +191,13 @@ class MergeGraph:
         self._carry_out(doomed[order[~is_merge]], chosen[order[is_merge] - len(doomed)], progress)
         return len(order)
 
-    def _limit(self, error: Array, quota: int) -> float:
+    def _limit(self, error: Array, count: int) -> float:
         """Return the cost of the most expensive operation that a round looks at.
 
-        These are twice the quota, since operations that share a splat exclude each other.
+        These are twice `count`, since operations that share a splat exclude each other.
         """
         costs = np.concatenate([error[self.alive], self.cost[np.isfinite(self.cost)]])
-        last = min(2 * quota, len(costs)) - 1
+        last = min(2 * count, len(costs)) - 1
         return float(np.partition(costs, last)[last])
 
     def _cheapest(

@@ -320,12 +320,8 @@ def absorb_removed(  # noqa: PLR0913 - as `pipeline.prune`
         )
 
     with np.errstate(under="ignore"):  # as in `score_splats.score`
-        absorbed = absorbing.absorb(
-            splats.take(rest), used, measure, count,
-            began=began - deleted, protected=None if protected is None else protected[rest],
+        return absorbing.absorb(
+            splats, used, measure, count,
+            began=began - deleted, deleted=~rest, protected=protected,
             progress=absorbing_progress, threads=threads,
         )  # fmt: skip
-    keep = np.zeros(total, np.bool_)
-    keep[np.flatnonzero(rest)[absorbed.keep]] = True
-    gone = total - int(np.count_nonzero(rest))
-    return replace(absorbed, keep=keep, deleted=absorbed.deleted + gone)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..absorbing.absorb import STAGE, Counts, patience, stages
+from ..absorbing.absorb import Counts, patience, stages
 from ..pipeline.absorb_splats import FIRST, PARTS
 from ..seeing.measuring import Measured
 from ..selection import Budget, select
@@ -47,6 +47,10 @@ if TYPE_CHECKING:
 
 REGION = 1 << 20
 """Splats of a region at most; absorbing takes about 900 bytes of each."""
+
+ALONE = 0.6
+"""Least share that a stage of several regions leaves where one is enough; see `absorb.ALONE`. Half
+goes in two stages: four regions in one stage lost .5 dB."""
 
 _SAMPLE = 1 << 14  # splats that decide along which axis a box is divided
 _ASKEW = np.array([[2, -1, 2], [2, 2, -1], [-1, 2, 2]], np.float32) / np.float32(3.0)
@@ -113,7 +117,7 @@ def absorb(tiles: MeasuredTiles, goal: int, settings: Settings, runner: Runner) 
     if len(rows) <= REGION:
         return _at_once(tiles.context, left, AbsorbAtOnce(goal, total, settings), runner)
     factor = patience(1.0 - goal / len(rows))
-    counts = stages(len(rows), goal, STAGE)
+    counts = stages(len(rows), goal, ALONE)
     for number, count in enumerate(counts):
         stage_runner = runner.part(number / len(counts), (number + 1) / len(counts))
         regions, left = _stage(tiles.context, number, left, count, factor, stage_runner)
@@ -215,7 +219,7 @@ def _staying(stage: StageContext, sizes: Sequence[int], left: int, runner: Runne
 
     As many go as a region has among the cheapest merges and deletions of all. A merge counts half,
     since of two splats that merge one goes; so all of them together may count half of the splats,
-    and `STAGE` has to be .5 or more, or there would not be enough to go.
+    and a stage has to leave half of them, or there would not be enough to go.
     """
     numbers = range(len(sizes))
     gather = [GatherRegion(index) for index in numbers]

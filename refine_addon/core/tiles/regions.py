@@ -199,7 +199,7 @@ class AbsorbRegion:
         graph = partial(self._graph, context, runtime.threads)
         protected = np.zeros(len(arrays["gathered"]), np.bool_)
         with np.errstate(under="ignore"):
-            left, keep, taken, expected = reduced(
+            left, keep, taken, _, expected, _ = reduced(
                 unpacked(arrays["gathered"]), ViewSums(*arrays["sums"]), arrays["mergeable"], graph,
                 self.count, protected=protected, progress=runtime.progress,
             )  # fmt: skip
