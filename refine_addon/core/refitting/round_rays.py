@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
+from .. import costs
 from ..estimate.quality import PSNR_CAP
 from ..processes import for_each
 from ..seeing import projection
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..costs import Plan
     from ..seeing.projection import Footprints, Gaussians
     from ..seeing.scene import Scene
     from ..splats import Splats
@@ -295,6 +297,12 @@ class RoundRays:
         ]
         target = InMemory.of(original, gaussians, scene)
         return cls(windows, scene, target, len(original), threads)
+
+    def costs(self, survivors: int) -> tuple[Plan, list[Plan]]:
+        """Return what checking so many survivors for the first time, and a round, cost."""
+        counts = self._count + self.around, survivors, len(self.windows)
+        rays = sum(window.rays for window in self.windows)
+        return costs.refitting(*counts, rays, 0)[1], costs.refit_round(*counts, rays)
 
     def linear(
         self, splats: Splats, number: int, *, geometry: bool, progress: Progress
