@@ -20,7 +20,7 @@ ABSORBING = (0.1, 0.5, 0.65, 1.4, 1.8, 2.4)
 
 These and the next are processor times of `room_small`, of one thread."""
 
-REFITTING = (23.0, 20.0, 14.0, 14.0, 10.0, 7.0)
+REFITTING = (20.0, 17.0, 8.5, 10.5, 7.5, 5.0)
 """The same of refitting."""
 
 
@@ -39,7 +39,7 @@ def expected_seconds(scored: float, share: float, *, once: bool) -> dict[Became,
     Examples
     --------
     >>> expected_seconds(1.0, 0.5, once=True)
-    {'unchanged': 2.5, 'absorb': 1.65, 'refit': 15.65}
+    {'unchanged': 2.5, 'absorb': 1.65, 'refit': 10.15}
     """
     measured = scored if once else scored / ROUNDS
     absorbing, refitting = (
