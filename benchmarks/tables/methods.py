@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 
@@ -197,15 +198,25 @@ def _core() -> list[Method]:
         about = CORE_ABOUT.get(name, f"method '{name}'")
         methods.append(_scoring(name, OURS, about, Settings(views=0, method=name)))
     about = "`--survivors absorb`: survivors absorb what goes, by what the views see of each"
-    return [*methods, Method("occlusion+absorb", OURS, about, reduce=_absorb)]
+    methods.append(Method("occlusion+absorb", OURS, about, reduce=partial(_made, "absorb")))
+    about = "`--survivors refit`: then they learn on rays what the unpruned splats look like"
+    methods.append(Method("occlusion+refit", OURS, about, reduce=partial(_made, "refit")))
+    about = "auto deletes, and the survivors are refitted: `core.refit`"
+    return [*methods, Method("auto+refit", OURS, about, reduce=_deleted_and_refitted)]
 
 
-def _absorb(task: Task, keep_count: int, ratio: float) -> Splats:
+def _made(survivors: str, task: Task, keep_count: int, ratio: float) -> Splats:
     del ratio
     budget = Budget(keep=keep_count)
     settings = Settings(views=0, method="occlusion")
-    result = core.prune(task.splats, task.views, budget, settings, survivors="absorb")
-    return task.splats.take(result.keep) if result.absorbed is None else result.absorbed.splats
+    result = core.prune(task.splats, task.views, budget, settings, survivors=survivors)
+    return result.survivors(task.splats)
+
+
+def _deleted_and_refitted(task: Task, keep_count: int, ratio: float) -> Splats:
+    del ratio
+    result = core.prune(task.splats, task.views, Budget(keep=keep_count), Settings(views=0))
+    return core.refit(task.splats.take(result.keep), task.splats, task.views).splats
 
 
 def _scoring(name: str, group: str, about: str, settings: Settings) -> Method:

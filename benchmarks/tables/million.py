@@ -181,7 +181,9 @@ def commands(folder: Path, left: int) -> Mapping[str, Sequence[str | Path]]:
     ours: list[str | Path] = [sys.executable, "-m", "refine_addon", "prune", source, "-o", output]
     ours += ["--keep", str(left), "--cameras", folder / "cameras.json", "--views", "0"]
     found: dict[str, Any] = {name: [*ours, "--method", name] for name in METHODS}
-    found["occlusion+absorb"] = [*ours, "--method", "occlusion", "--absorb"]
+    for survivors in ("absorb", "refit"):
+        made = ["--method", "occlusion", "--survivors", survivors]
+        found[f"occlusion+{survivors}"] = [*ours, *made]
     if splat_transform.find() is not None:
         for flag in splat_transform.FLAGS:
             name = f"splat-transform{flag.removeprefix('--decimate')}"

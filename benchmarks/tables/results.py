@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .hessian import Energies
     from .methods import Method
     from .million import Million
+    from .refits import Curve
     from .sizes import Timed
     from .variants import Line
 
@@ -49,6 +50,7 @@ class Measured:
     estimate: list[Estimated] = field(default_factory=list)
     iterations: int = 0
     finetune: list[Tuned] = field(default_factory=list)
+    refits: list[Curve] = field(default_factory=list)
     million: Million | None = None
     cheaper: list[Line] = field(default_factory=list)
     ablation: list[Line] = field(default_factory=list)

@@ -41,6 +41,7 @@ from . import (
     hessian,
     methods,
     million,
+    refits,
     sizes,
     trade_report,
     variants,
@@ -72,7 +73,7 @@ FAILURES = (
 )
 ONCE = ("finetune", "million")
 """Parts that take long and are measured for the first scene only."""
-PARTS = ("methods", "sizes", "estimate", *ONCE, "cheaper", "ablation", "flops", "hessian")
+PARTS = ("methods", "sizes", "estimate", "refits", *ONCE, "cheaper", "ablation", "flops", "hessian")
 HALF = 0.5
 """Share removed where methods are timed only."""
 
@@ -232,6 +233,7 @@ def _parts(
     return {
         "sizes": lambda: sizes.measure(ours, task, timed),
         "estimate": lambda: list(estimate.measure(splats, scoring, budgets)),
+        "refits": lambda: refits.measure(task, held_out, ratios),
         "finetune": tuned,
         "million": lambda: million.measure(splats, scoring, scene.test, options.million),
         "cheaper": lambda: variants.measure(variants.CHEAPER, task, held_out, ratios),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .methods import EXTERNAL, LITERATURE, OURS
+from .refits import STARTS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,12 +36,17 @@ def draw(file: Path, scene: Measured) -> None:
             x, y = max(row.cost.seconds, 1e-3), row.quality["held-out", "renders"]["psnr"]
             group = row.method.group
             frame.scatter(x, y, color=COLORS[group], marker=MARKERS[group], s=28, zorder=3)
+        for curve in scene.refits:
+            if curve.ratio == ratio and curve.name in STARTS:
+                seconds, psnr = zip(*curve.rounds, strict=True)
+                times = np.maximum(curve.start + np.array(seconds), 1e-3)
+                frame.plot(times, psnr, color=COLORS[OURS], lw=0.8, marker=".", ms=3)
         _labels(frame, rows)
         frame.set(xscale="log", xlabel="seconds", title=f"{ratio:.0%} removed")
         frame.grid(alpha=0.3)
         frame.margins(x=0.25)
     frames[0][0].set_ylabel("PSNR on held-out views, dB")
-    figure.suptitle(f"{scene.name}: quality over time (circles: ours)")
+    figure.suptitle(f"{scene.name}: quality over time (circles: ours, lines: refitting's rounds)")
     # Without the date and version that would change the file at every run.
     figure.savefig(file, dpi=100, metadata={"Software": None})
     plt.close(figure)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from . import finetune, flops, million
+from . import finetune, flops, million, refits
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -27,6 +27,7 @@ def sections(scene: Measured, ratios: Sequence[float]) -> list[str]:
     return [
         *_sizes_table(scene),
         *_estimate_table(scene, ratios),
+        *_refit_tables(scene, ratios),
         *_finetune_table(scene),
         *_million_table(scene),
         *_cheaper_table(scene, ratios),
@@ -77,6 +78,32 @@ def _estimate_table(scene: Measured, ratios: Sequence[float]) -> list[str]:
 
 def _signed(value: float) -> str:
     return f"{round(value, 1) + 0.0:+.1f}"  # no minus before a zero
+
+
+def _refit_tables(scene: Measured, ratios: Sequence[float]) -> list[str]:
+    if not scene.refits:
+        return []
+    heads, rounds, ways = [f"{ratio:.0%}" for ratio in ratios], [], []
+    for name in dict.fromkeys(curve.name for curve in scene.refits):
+        curves = [curve for curve in scene.refits if curve.name == name]
+        if name in refits.STARTS:
+            rounds.append([name, *(" ".join(f"{psnr:.1f}" for _, psnr in curve.rounds)
+                                   for curve in curves)])  # fmt: skip
+            rounds.append(["seconds", *(" ".join(f"{curve.start + seconds:.1f}"
+                                                 for seconds, _ in curve.rounds)
+                                        for curve in curves)])  # fmt: skip
+        if name == "absorbed" or name not in refits.STARTS:
+            label = "as it is" if name == "absorbed" else name
+            ways.append([label, *(f"{curve.rounds[-1][1]:.1f} ({curve.rounds[-1][0]:.1f})"
+                                  for curve in curves)])  # fmt: skip
+    how = ("PSNR on held-out views against renders of the unpruned splats, dB. Seconds are the "
+           "processor's with one thread, what comparing takes left out")  # fmt: skip
+    return ["", f"### {scene.name}: refitting, round after round", "",
+            f"{how}, and count from the scores. The first number is before any round.", "",
+            *table(["refitted", *heads], rounds), "",
+            f"### {scene.name}: refitting made cheaper", "",
+            f"After absorbing. {how}, and of refitting alone.", "",
+            *table(["refitting", *heads], ways)]  # fmt: skip
 
 
 def _finetune_table(scene: Measured) -> list[str]:

@@ -43,41 +43,46 @@ def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
     >>> basis(np.array([0.0, 0.0, 1.0]), 1).round(4).tolist()
     [0.2821, -0.0, 0.4886, -0.0]
     """
-    x, y, z = np.moveaxis(np.asarray(directions, np.float64), -1, 0)
+    return np.stack(_values(np.moveaxis(np.asarray(directions, np.float64), -1, 0), degree), -1)
+
+
+def _values(directions: NDArray[Any], degree: int) -> list[NDArray[Any]]:
+    """Return the values of `basis`, (...) each, along directions, (3, ...), in their type."""
+    x, y, z = directions
     xx, yy, zz = x * x, y * y, z * z
-    root = np.sqrt(1.0 / np.pi)
+    root = math.sqrt(1.0 / math.pi)
     bands = [[np.full_like(x, 0.5 * root)]]
     if degree >= 1:
-        c = np.sqrt(3.0) / 2 * root
+        c = math.sqrt(3.0) / 2 * root
         bands.append([-c * y, c * z, -c * x])
     if degree >= 2:  # noqa: PLR2004
-        c = np.sqrt(15.0) / 2 * root
+        c = math.sqrt(15.0) / 2 * root
         bands.append(
             [
                 c * x * y,
                 -c * y * z,
-                np.sqrt(5.0) / 4 * root * (2 * zz - xx - yy),
+                math.sqrt(5.0) / 4 * root * (2 * zz - xx - yy),
                 -c * x * z,
                 c / 2 * (xx - yy),
             ]
         )
     if degree >= 3:  # noqa: PLR2004
-        a, b = np.sqrt(35.0 / 2) / 4 * root, np.sqrt(21.0 / 2) / 4 * root
-        c = np.sqrt(105.0) / 2 * root
+        a, b = math.sqrt(35.0 / 2) / 4 * root, math.sqrt(21.0 / 2) / 4 * root
+        c = math.sqrt(105.0) / 2 * root
         bands.append(
             [
                 -a * y * (3 * xx - yy),
                 c * x * y * z,
                 -b * y * (4 * zz - xx - yy),
-                np.sqrt(7.0) / 4 * root * z * (2 * zz - 3 * xx - 3 * yy),
+                math.sqrt(7.0) / 4 * root * z * (2 * zz - 3 * xx - 3 * yy),
                 -b * x * (4 * zz - xx - yy),
                 c / 2 * z * (xx - yy),
                 -a * x * (xx - 3 * yy),
             ]
         )
     if degree >= 4:  # noqa: PLR2004
-        a, b = np.sqrt(35.0) * 3 / 4 * root, np.sqrt(35.0 / 2) * 3 / 4 * root
-        c, d = np.sqrt(5.0) * 3 / 4 * root, np.sqrt(5.0 / 2) * 3 / 4 * root
+        a, b = math.sqrt(35.0) * 3 / 4 * root, math.sqrt(35.0 / 2) * 3 / 4 * root
+        c, d = math.sqrt(5.0) * 3 / 4 * root, math.sqrt(5.0 / 2) * 3 / 4 * root
         bands.append(
             [
                 a * x * y * (xx - yy),
@@ -91,7 +96,7 @@ def basis(directions: NDArray[Any], degree: int) -> NDArray[np.float64]:
                 a / 4 * (xx * (xx - 3 * yy) - yy * (3 * xx - yy)),
             ]
         )
-    return np.stack([value for band in bands for value in band], axis=-1)
+    return [value for band in bands for value in band]
 
 
 def colors(
@@ -112,6 +117,22 @@ def colors(
     if sh_rest.shape[1]:
         color += np.einsum("nk,nkc->nc", values[:, 1:], np.asarray(sh_rest, np.float64))
     return np.asarray(color)
+
+
+def single_colors(directions: NDArray[Any], harmonics: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return what `colors` does, (3, N), in float32 throughout: a tenth of the time.
+
+    Parameters
+    ----------
+    directions : (3, N) floating
+    harmonics : (N, 3, K) float32
+        Coefficients of each channel, the constant first.
+    """
+    degree = math.isqrt(harmonics.shape[2]) - 1
+    values = np.stack(_values(np.asarray(directions, np.float32), degree), axis=1)  # (N, K)
+    result = np.einsum("nk,nck->cn", values, harmonics)
+    result += np.float32(0.5)
+    return np.asarray(result, np.float32)
 
 
 def rotate(sh_rest: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[np.float64]:

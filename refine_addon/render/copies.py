@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 MARK = "refine_render"
-"""Custom property of such a copy."""
+"""Custom property of such a copy: the scene that it is of."""
 
 
 def copied(scene: bpy.types.Scene, name: str) -> bpy.types.Scene:
@@ -20,7 +20,7 @@ def copied(scene: bpy.types.Scene, name: str) -> bpy.types.Scene:
     """
     copy = scene.copy()
     copy.name = name
-    copy[MARK] = True
+    copy[MARK] = scene
     render = copy.render
     render.use_compositing = render.use_sequencer = render.use_multiview = False
     rendered = next((layer for layer in copy.view_layers if layer.use), copy.view_layers[0])
@@ -30,7 +30,10 @@ def copied(scene: bpy.types.Scene, name: str) -> bpy.types.Scene:
 
 
 def remove_all() -> None:
-    """Remove all copies."""
+    """Remove all copies; a window that shows one shows its scene again."""
+    for window in bpy.context.window_manager.windows:
+        if MARK in window.scene:
+            window.scene = window.scene[MARK]
     found = [scene for scene in bpy.data.scenes if MARK in scene]
     if bpy.context.window is None:  # as in a command: `remove` of 4.3 crashes without a window
         bpy.data.batch_remove(found)

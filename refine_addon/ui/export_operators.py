@@ -47,7 +47,47 @@ class _Export:
     notes: list[str]
 
 
-class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelper):
+class Exporting(AskedFirst, OnSplats, ExportHelper):
+    """An operator that writes what the active object holds, and only reads it."""
+
+    apply_transform: BoolProperty(
+        name="Apply Transform",
+        description="Write the splats as they stand in the world: positions, rotations, scales "
+        "and view-dependent colour follow the object",
+    )
+    overwrite: BoolProperty(
+        name="Overwrite",
+        description="Replace what is there of that name",
+        options={"SKIP_SAVE"},
+    )
+
+    @staticmethod
+    def new_name(obj: bpy.types.Object) -> str:
+        """Return the name that the file browser proposes."""
+        raise NotImplementedError
+
+    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
+        """Ask where; whoever picks what exists in the browser means to replace it."""
+        if not self.filepath:
+            self.filepath = self.new_name(context.object)
+        self.overwrite = True
+        return ExportHelper.invoke(self, context, event)
+
+    def written(
+        self, _context: bpy.types.Context, _checked: SplatObject | None
+    ) -> list[SplatObject]:
+        """Return none: the objects are only read."""
+        return []
+
+    def say(self, notes: list[str], what: str) -> Answer:
+        """Say what was written, and what of it to mind."""
+        for note in notes:
+            self.report({"WARNING"}, note)
+        self.report({"INFO"}, what)
+        return {"FINISHED"}
+
+
+class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
     """Write the active object's splats to a file, in the format that its suffix names"""
 
     bl_idname = "refine.export_ply"
@@ -64,23 +104,16 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
         options={"SKIP_SAVE"},
     )
     settled: StringProperty(default=_FORMATS[0][0], options={"HIDDEN", "SKIP_SAVE"})
-    apply_transform: BoolProperty(
-        name="Apply Transform",
-        description="Write the splats as they stand in the world: positions, rotations, scales "
-        "and view-dependent colour follow the object",
-    )
-    overwrite: BoolProperty(
-        name="Overwrite",
-        description="Replace the file if it exists",
-        options={"SKIP_SAVE"},
-    )
 
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
-        """Ask for the file; whoever picks an existing one in the browser means to replace it."""
-        if not self.filepath:
-            self.filepath = _new_name(context.object)
-        self.overwrite = True
-        return ExportHelper.invoke(self, context, event)
+    @staticmethod
+    def new_name(obj: bpy.types.Object) -> str:
+        """Return a name that no file beside the .blend has yet."""
+        mesh = obj.data
+        pruned = mesh_scores.RANK in mesh.attributes and mesh_scores.record(mesh) is None
+        name = f"{obj.name}_{'pruned' if pruned else 'copy'}"
+        names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
+        folder = Path(bpy.path.abspath("//"))  # where the file browser starts
+        return next(f"{new}.ply" for new in names if not (folder / f"{new}.ply").exists())
 
     def check(self, _context: bpy.types.Context) -> bool:
         """Bring name and format together, whichever was changed; return whether either changed."""
@@ -92,12 +125,6 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
         self.filepath = name + self.suffix
         self.settled = self.suffix
         return before != (self.filepath, self.suffix)
-
-    def written(
-        self, _context: bpy.types.Context, _checked: SplatObject | None
-    ) -> list[SplatObject]:
-        """Return none: the object is only read."""
-        return []
 
     def prepare(self, _context: bpy.types.Context, checked: SplatObject) -> _Export:
         """Refuse what cannot be written, and gather what is."""
@@ -125,10 +152,7 @@ class REFINE_OT_export_ply(AskedFirst, OnSplats, bpy.types.Operator, ExportHelpe
         """Say what was written."""
         if isinstance(file, Packed):
             self.report({"INFO"}, "; ".join(file.notes(np.ones(len(file.file), np.bool_))))
-        for note in job.notes:
-            self.report({"WARNING"}, note)
-        self.report({"INFO"}, f"Wrote the splats to {self.filepath}")
-        return {"FINISHED"}
+        return self.say(job.notes, f"Wrote the splats to {self.filepath}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +166,7 @@ class _LevelExport:
     notes: list[str]
 
 
-class REFINE_OT_export_levels(AskedFirst, OnSplats, bpy.types.Operator, ExportHelper):
+class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
     """Write the active object and its levels as a streamed SOG: a folder that web viewers load"""
 
     bl_idname = "refine.export_levels"
@@ -153,28 +177,11 @@ class REFINE_OT_export_levels(AskedFirst, OnSplats, bpy.types.Operator, ExportHe
     filename_ext = ""
     check_extension = None
     filter_glob: StringProperty(default=INDEX, options={"HIDDEN"})
-    apply_transform: BoolProperty(
-        name="Apply Transform",
-        description="Write the splats as they stand in the world",
-    )
-    overwrite: BoolProperty(
-        name="Overwrite",
-        description="Replace the levels that are in the folder",
-        options={"SKIP_SAVE"},
-    )
 
-    def ask(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
-        """Ask for the folder; it is made."""
-        if not self.filepath:
-            self.filepath = f"{level_objects.levels_of(context.object)[0].name}_levels"
-        self.overwrite = True
-        return ExportHelper.invoke(self, context, event)
-
-    def written(
-        self, _context: bpy.types.Context, _checked: SplatObject | None
-    ) -> list[SplatObject]:
-        """Return none: the objects are only read."""
-        return []
+    @staticmethod
+    def new_name(obj: bpy.types.Object) -> str:
+        """Return the name of a folder; it is made."""
+        return f"{level_objects.levels_of(obj)[0].name}_levels"
 
     def prepare(self, _context: bpy.types.Context, checked: SplatObject) -> _LevelExport:
         """Gather what is written."""
@@ -214,17 +221,5 @@ class REFINE_OT_export_levels(AskedFirst, OnSplats, bpy.types.Operator, ExportHe
         count: int,
     ) -> Answer:
         """Say what was written."""
-        for note in job.notes:
-            self.report({"WARNING"}, note)
-        self.report({"INFO"}, f"Wrote {count} levels, the finest as it is, to {job.target}")
-        return {"FINISHED"}
-
-
-def _new_name(obj: bpy.types.Object) -> str:
-    """Return a name for an export that no file beside the .blend has yet."""
-    mesh = obj.data
-    pruned = mesh_scores.RANK in mesh.attributes and mesh_scores.record(mesh) is None
-    name = f"{obj.name}_{'pruned' if pruned else 'copy'}"
-    names = itertools.chain([name], (f"{name}_{number}" for number in itertools.count(2)))
-    folder = Path(bpy.path.abspath("//"))  # where the file browser starts
-    return next(f"{new}.ply" for new in names if not (folder / f"{new}.ply").exists())
+        what = f"Wrote {count} levels, the finest as it is, to {job.target}"
+        return self.say(job.notes, what)

@@ -28,6 +28,12 @@ IMAGE = "Render with Splats"
 _STEP = 0.05
 """Seconds between two looks at whether Blender's render is over."""
 
+_ENDS_UNSEEN = bpy.app.version < (5, 0, 0)
+"""Whether Blender frees what a render draws with while it goes on, unless a window shows its scene.
+
+See `RE_FreeUnusedGPUResources` in its source; one frame of sixty ended Blender 4.3 on X11.
+"""
+
 
 @dataclass
 class _Watch:
@@ -171,6 +177,8 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         display = view.render_display_type
         if self._opened:
             view.render_display_type = "NONE"
+        if _ENDS_UNSEEN and step.what == "meshes":
+            context.window.scene = bpy.data.scenes[step.scene]
         try:
             bpy.ops.render.render("INVOKE_DEFAULT", scene=step.scene, animation=step.animation)
         finally:

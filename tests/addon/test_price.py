@@ -376,7 +376,7 @@ def test_success_is_no_warning(room, room_cameras, capfd, survivors):  # noqa: A
 def test_an_export_suggests_a_name_that_no_file_has(addon, room, room_cameras, tmp_path):  # noqa: ARG001
     """Beside the .blend; "pruned" once splats were removed, else a copy."""
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "scene.blend"))
-    name = addon.ui.export_operators._new_name
+    name = addon.ui.export_operators.REFINE_OT_export_ply.new_name
     room = bpy.data.objects["room"]
     before = name(room)
     bpy.ops.refine.score()

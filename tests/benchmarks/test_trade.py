@@ -93,7 +93,7 @@ def test_the_report_says_what_was_measured(small: Path, tmp_path: Path) -> None:
     arguments = "--methods opacity closed-form ghap-moments --ratios 0.5 --runs 1 --compared 2"
 
     code = trade.main([str(small), *arguments.split(), "--metrics", "psnr", "ssim",
-                       "--parts", "methods", "cheaper", "ablation",
+                       "--parts", "methods", "cheaper", "ablation", "refits",
                        "--output", str(output)])  # fmt: skip
 
     text = output.read_text()
@@ -106,6 +106,8 @@ def test_the_report_says_what_was_measured(small: Path, tmp_path: Path) -> None:
     assert "views against pictures" not in text
     assert "published, z: without visibility" in text
     assert "| cells of 8 px, 3 rounds |" in text
+    for row in ("| absorbed |", "| deleted by the closed form |", "| twice the rays |"):
+        assert f"{row} " in text
     assert str(small.parent) not in text
     rows = [line for line in text.splitlines() if line.startswith("| opacity |")]
     assert len(rows) == 3
@@ -123,7 +125,7 @@ def test_the_report_has_sizes_estimates_and_a_larger_scene(small: Path, tmp_path
     assert code == 0
     assert "corner: 3,500 splats" in "\n".join(lines)
     assert any("60 x 40 | 480 x 320 | 1920 x 1280 |" in line for line in lines)
-    for name in (*METHODS, "occlusion+absorb"):
+    for name in (*METHODS, "occlusion+absorb", "occlusion+refit"):
         assert sum(line.startswith(f"| {name} |") for line in lines) == 2, name
     for way in ("delete", "absorb"):
         assert sum(line.startswith(f"| {way} |") for line in lines) == 1, way

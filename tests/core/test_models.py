@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import RefineError, Splats, View, ViewSet, read_splats
-from refine_addon.core.absorbing import merging
+from refine_addon.core.absorbing import merge_field, merging
 from refine_addon.core.absorbing.absorb import absorb
 from refine_addon.core.absorbing.merge_field import ViewSums
 from refine_addon.core.formats import ply_header
@@ -16,6 +16,7 @@ from refine_addon.core.formats.ply_columns import columns_from_splats
 from refine_addon.core.formats.registry import FORMATS
 from refine_addon.core.levels.files import LevelsRequest, lod_file
 from refine_addon.core.levels.lod import Levels
+from refine_addon.core.operation.arranged import convert_files
 from refine_addon.core.operation.files import file_to_file
 from refine_addon.core.operation.requests import ConvertRequest, ScoreRequest
 from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS, MODELS
@@ -98,6 +99,21 @@ def test_a_format_tells_the_model_or_its_notes_do(tmp_path, form, model):
     held = model in form.models
     assert read_splats(back).model == (model if held else "default")
     assert any(f"--model {model}" in note for note in report["notes"]) != held
+    assert (b"scale_2" in back.read_bytes()) == (read_splats(back).model != "2dgs")
+
+
+def test_discs_of_several_files_are_written_without_a_third_scale(tmp_path):
+    """Whether the files have it or not; what is read from them is the same."""
+    one = write(tmp_path / "one.ply", cloud(3), [b"SplatRenderMode: 2dgs"])
+    other = write(tmp_path / "other.ply", with_model(cloud(4), "2dgs"))
+
+    convert_files([one, other], tmp_path / "both.ply", ConvertRequest())
+
+    both = read_splats(tmp_path / "both.ply")
+    assert b"scale_2" not in both.header
+    expected = joined([read_splats(one).splats(), read_splats(other).splats()])
+    np.testing.assert_array_equal(both.splats().log_scales, expected.log_scales)
+    np.testing.assert_array_equal(both.splats().quaternions, expected.quaternions)
 
 
 def test_what_is_asked_for_replaces_what_the_file_says(tmp_path):
@@ -251,6 +267,52 @@ def test_discs_are_without_the_shortest_axis_of_what_they_were():
     expected = (whole - shortest)[:, rows, columns]
     np.testing.assert_allclose((found / sizes)[2:], (expected / sizes)[2:], atol=1e-6)
     np.testing.assert_allclose(found[:2, [0, 3, 5]].sum(axis=1), [4.0, 2.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.4])
+def test_what_merges_into_a_disc_looks_like_it_from_where_it_is_viewed(spread):
+    """Of any covariance: thin, the same footprint along the direction, and a disc is itself.
+
+    A camera sees the projection along its direction, so there nothing may be missing, but for what
+    `ASIDE` leaves of it, whose square is .01: views from aside count that much.
+    """
+    random = np.random.default_rng(6)
+    shapes = random.normal(size=(200, 3, 3))
+    shapes[:100, :, 2] = 0.0  # discs
+    rows, columns = np.triu_indices(3)
+    whole = (shapes @ np.swapaxes(shapes, 1, 2))[:, rows, columns]
+    direction = random.normal(size=(200, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    beside = np.cross(direction, random.normal(size=3))
+    deviation = spread * beside / np.linalg.norm(beside, axis=1)[:, None]
+
+    found = merging.flat_as_viewed(whole, direction, deviation)
+
+    values = np.linalg.eigvalsh(found[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3))
+    np.testing.assert_allclose(values[:, 0], 0.0, atol=1e-9)
+    np.testing.assert_allclose(found[:100], whole[:100], atol=1e-9)
+    plane, none = merge_field.across(direction), np.zeros(200)
+    seen, expected = (merge_field.footprint(each, plane, none) for each in (found, whole))
+    lost = (expected[0] + expected[2] - seen[0] - seen[2]) / (expected[0] + expected[2])
+    assert lost.min() > -1e-9
+    assert np.median(lost[100:]) < (0.03 if spread else 0.01)
+
+
+def test_of_discs_one_behind_the_other_comes_one_that_faces_the_camera():
+    """The shortest axis of both lies across: without it the disc would be seen from its edge."""
+    discs = replace(
+        cloud(2),
+        means=np.array([[0.0, 0.0, 1.95], [0.0, 0.0, 2.05]]),
+        log_scales=np.log(np.tile([0.02, 0.01, 1.0], (2, 1))),
+        quaternions=np.tile([1.0, 0.0, 0.0, 0.0], (2, 1)),
+        opacity_logits=np.full(2, -1.0),
+        sh_dc=np.ones((2, 3)),
+    )
+
+    merged = absorb(with_model(discs, "2dgs"), ViewSet((VIEW,)), seen_whole, 1).splats
+
+    assert abs(rotation_matrices(merged.quaternions)[0, 2, 2]) > 0.99
+    np.testing.assert_allclose(np.sort(np.exp(merged.log_scales[0, :2])), [0.01, 0.02], rtol=0.02)
 
 
 @pytest.mark.parametrize("model", MODELS)

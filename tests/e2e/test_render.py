@@ -43,6 +43,8 @@ def test_renders_show_splats_among_meshes(binary: Binary, blend: Path, cloud: Pa
     assert found["stopped"]
     assert max(found["busy"]) < 1.0
     assert found["notice"]
+    # Else Blender before 5.0 may free, as it goes on, what a render draws with.
+    assert binary.name != "trixie" or (found["in_windows"] and all(found["in_windows"]))
     assert {path.name for path in binary.work.glob("frame_*")} == {"frame_01.png", "frame_02.png"}
     picture = np.load(binary.work / "rendered.npy")[..., :3]
     assert _psnr(picture, cloud, cameras) > 40.0

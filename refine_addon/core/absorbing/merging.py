@@ -45,6 +45,10 @@ if TYPE_CHECKING:
 FLATTEST = 1e-14
 """Least eigenvalue of a covariance over the sum of the three; rounding hides smaller ones."""
 
+ASIDE = 0.1
+"""Least standard deviation of viewing directions that discs are made for, about radians: other
+views than those given look from aside, too. Results hardly depend on it between .03 and .3."""
+
 CHANNELS = 3
 """Red, green and blue."""
 
@@ -208,10 +212,10 @@ class _Signal(NamedTuple):
     Attributes
     ----------
     footprint : Footprint
-        Covariances in the plane, low-pass included.
+        Covariances in the plane, low-pass included; of discs see `_disc_as_drawn`.
     area, base : (M,) float64
         See `_area`, with the low-pass; and of what the opacity is meant for: of antialiased splats
-        without the low-pass, of discs with their own.
+        without the low-pass.
     mass : (M,) float64
         Opacity times `base`.
     """
@@ -267,8 +271,11 @@ def _in_plane(ends: _Ends, tilt: float) -> _Plane:
     one, two = (_signal(splats, plane, blur) for splats in (ends.one, ends.two))
     position, other = _shares(one.mass, two.mass)
     overlap = one.times(two, x, y)
-    if ends.one.model == "2dgs":
-        mixed = footprint(_mixture(ends.one, ends.two, position), plane, blur)
+    discs = ends.one.model == "2dgs"
+    if discs:
+        disc = _mixture(ends.one, ends.two, position, ends[4:6])
+        sharp = footprint(disc, plane, np.zeros(len(blur)))
+        mixed = _disc_as_drawn(sharp, blur)
     else:
         between = position * other
         mixed = _mixed(
@@ -279,7 +286,10 @@ def _in_plane(ends: _Ends, tilt: float) -> _Plane:
     mass = one.mass + two.mass - np.minimum(overlap, np.minimum(one.mass, two.mass))
     base = _base(mixed, blur, ends.one.model)
     growth = np.maximum(mass / (base * ALPHA_MAX), 1.0)
-    mixed = (mixed[0] * growth, mixed[1] * growth, mixed[2] * growth)
+    grown = sharp if discs else mixed
+    mixed = (grown[0] * growth, grown[1] * growth, grown[2] * growth)
+    if discs:
+        mixed = _disc_as_drawn(mixed, blur)
     area = _area(mixed)
     merged = _Signal(mixed, area, _base(mixed, blur * growth, ends.one.model), mass)
     return _Plane(one, two, merged, x, y, position, other, growth, overlap)
@@ -287,28 +297,38 @@ def _in_plane(ends: _Ends, tilt: float) -> _Plane:
 
 def _signal(splats: Field, plane: tuple[Array, Array], blur: Array) -> _Signal:
     """Return splats in a plane, spanned by unit vectors, with a low-pass of variance `blur`."""
-    ellipse = footprint(splats.covariances, plane, blur)
+    if splats.model == "2dgs":
+        sharp = footprint(splats.covariances, plane, np.zeros(len(blur)))
+        ellipse = _disc_as_drawn(sharp, blur)
+    else:
+        ellipse = footprint(splats.covariances, plane, blur)
     base = _base(ellipse, blur, splats.model)
     return _Signal(ellipse, _area(ellipse), base, splats.opacity * base)
 
 
 def _base(footprint: Footprint, blur: Array, model: Model) -> Array:
     """Return the area that opacity is meant for, (M,): see `_Signal`."""
-    if model == "default":
+    if model != "antialiased":
         return _area(footprint)
     xx, xy, yy = footprint
-    sharp = (np.maximum(xx - blur, _TINY), xy, np.maximum(yy - blur, _TINY))
-    return _area(sharp) if model == "antialiased" else _disc_area(sharp, blur / LOW_PASS)
+    return _area((np.maximum(xx - blur, _TINY), xy, np.maximum(yy - blur, _TINY)))
 
 
-def _disc_area(footprint: Footprint, pixel: Array) -> Array:
-    """Return what discs cover with their low-pass, over 2 pi, (M,); `pixel` is a pixel's area."""
-    xx, xy, yy = footprint
-    mean = 0.5 * (xx + yy)
-    first = mean + np.hypot(0.5 * (xx - yy), xy)
-    axes_of = disc_axes(np.stack([first, _determinant(footprint) / first]) / pixel)
-    covered: Array = axes_of[0] * axes_of[1] * pixel
-    return covered
+def _disc_as_drawn(sharp: Footprint, blur: Array) -> Footprint:
+    """Return ellipses that cover as much as discs with their low-pass, along the same axes.
+
+    `sharp` is without the low-pass, whose variance in `blur` is that of other splats; see
+    `disc_axes`.
+    """
+    xx, xy, yy = sharp
+    pixel = blur / LOW_PASS
+    mean, half = 0.5 * (xx + yy), 0.5 * (xx - yy)
+    root = np.hypot(half, xy)
+    first = np.maximum(mean + root, _TINY)
+    drawn = np.square(disc_axes(np.stack([first, _determinant(sharp) / first]) / pixel)) * pixel
+    middle = 0.5 * (drawn[0] + drawn[1])
+    stretch = 0.5 * (drawn[0] - drawn[1]) / np.maximum(root, _TINY)
+    return middle + stretch * half, stretch * xy, middle - stretch * half
 
 
 def _contrasts(ends: _Ends, one: Array, two: Array) -> tuple[Array, Array, Array]:
@@ -331,10 +351,11 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
     one, two = splats.take(first), splats.take(second)
     position, color = pairs.position[:, None], pairs.color[:, None]
     step = two.means - one.means
-    covariances = _mixture(one, two, pairs.position)
     direction = normalized(color * one.direction + (1.0 - color) * two.direction)
     lost = ~direction.any(axis=1)
     direction[lost] = one.direction[lost]
+    deviation = _mean_deviation(one.deviation, two.deviation, pairs.color)
+    covariances = _mixture(one, two, pairs.position, (direction, deviation))
     return Field(
         one.means + (1.0 - position) * step,
         covariances * pairs.growth[:, None],
@@ -342,24 +363,64 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
         one.contribution + two.contribution,
         pairs.error,
         direction,
-        _mean_deviation(one.deviation, two.deviation, pairs.color),
+        deviation,
         color * one.color + (1.0 - color) * two.color,
         pairs.color * one.blur + (1.0 - pairs.color) * two.blur,
         one.model,
     )
 
 
-def _mixture(one: Field, two: Field, share: Array) -> Array:
-    """Return the covariances of mixtures of pairs, (M, 6); of discs without the shortest axis.
+def _mixture(one: Field, two: Field, share: Array, viewed: tuple[Array, Array]) -> Array:
+    """Return the covariances of mixtures of pairs, (M, 6); of discs as a disc can have it.
 
-    `share`, (M,), is that of the first.
+    `share`, (M,), is that of the first; `viewed` is the direction and the deviation of the pairs,
+    see `merge_field.Viewing`.
     """
     position, step = share[:, None], two.means - one.means
     rows, columns = np.triu_indices(3)
     between = step[:, rows] * step[:, columns] * (position * (1.0 - position))  # (M, 6)
     apart = position * one.covariances + (1.0 - position) * two.covariances
     whole = np.asarray(apart + between, np.float64)
-    return flat(whole) if one.model == "2dgs" else whole
+    return flat_as_viewed(whole, *viewed) if one.model == "2dgs" else whole
+
+
+def flat_as_viewed(covariances: Array, direction: Array, deviation: Array) -> Array:
+    """Return covariances, (M, 6), of discs that look like given ones from where they are viewed.
+
+    A disc with the normal n that a covariance C is projected to along a, ``E C E'`` with
+    ``E = I - a n' / (n' a)``, looks like C along a, however thick C is. With M the mean of
+    ``v v'`` over viewing directions v, ``n' C n`` is least for ``n' M n = 1`` where
+    ``C n = l M n``, and projected along ``a = M n`` it leaves ``C - l a a'``. That is `flat` in
+    coordinates in which M is I; where C is viewed from all sides alike it is `flat` itself.
+
+    Parameters
+    ----------
+    covariances : (M, 6) float64
+    direction, deviation : (M, 3) float64
+        See `merge_field.Viewing`; `ASIDE` is the least standard deviation.
+    """
+    beside = deviation - np.einsum("ij,ij->i", deviation, direction)[:, None] * direction
+    size = np.maximum(np.sqrt(np.einsum("ij,ij->i", beside, beside)), ASIDE)
+    lengths = (np.ones(len(size)), size)
+    units = (direction, normalized(beside))
+    scaled, back = (
+        sum(
+            ((length**power - ASIDE**power)[:, None] * unit)[:, :, None] * unit[:, None, :]
+            for length, unit in zip(lengths, units, strict=True)
+        )
+        + ASIDE**power * np.eye(3)
+        for power in (-1, 1)
+    )
+    rows, columns = np.triu_indices(3)
+    left = flat((scaled @ _full(covariances) @ scaled)[:, rows, columns])
+    seen: Array = (back @ _full(left) @ back)[:, rows, columns]
+    return seen
+
+
+def _full(covariances: Array) -> Array:
+    """Return symmetric matrices, (M, 3, 3), of their upper halves, (M, 6)."""
+    full: Array = covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    return full
 
 
 def flat(covariances: Array) -> Array:
@@ -370,7 +431,7 @@ def flat(covariances: Array) -> Array:
     ``p^2 = tr(B^2) / 6`` (Smith 1961); what is left is ``P C P``, ``P = I - n n'``.
     """
     total = np.maximum(covariances[:, [0, 3, 5]].sum(axis=1), _TINY)
-    full = covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3) / total[:, None, None]
+    full = _full(covariances) / total[:, None, None]
     centered = full - np.eye(3) / 3.0
     p = np.sqrt(np.maximum(np.einsum("nij,nij->n", centered, centered) / 6.0, FLATTEST))
     angle = np.arccos(np.clip(_triple(centered) / (2.0 * p**3), -1.0, 1.0)) / 3.0
@@ -409,7 +470,7 @@ def _null(matrices: Array) -> Array:
 
 def axes(covariances: Array) -> tuple[Array, Array]:
     """Return log scales, (M, 3), and quaternions, (M, 4), of covariances, (M, 6)."""
-    full = covariances[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    full = _full(covariances)
     total = np.maximum(np.trace(full, axis1=1, axis2=2), _TINY)
     values, vectors = np.linalg.eigh(full / total[:, None, None])
     logs = 0.5 * (np.log(np.maximum(values, FLATTEST)) + np.log(total)[:, None])
@@ -439,8 +500,9 @@ def flattened(merged: Field, logs: Array, quaternions: Array) -> tuple[Array, Ar
     rows, columns = np.triu_indices(3)
     covariances = (vectors @ np.swapaxes(vectors, 1, 2))[:, rows, columns]
     plane = across(merged.direction)
+    none = np.zeros(len(flat))
     thick, thin = (
-        _base(footprint(each, plane, merged.blur), merged.blur, "2dgs")
+        _area(_disc_as_drawn(footprint(each, plane, none), merged.blur))
         for each in (merged.covariances, covariances)
     )
     return flat, turned, np.minimum(merged.opacity * thick / thin, ALPHA_MAX)

@@ -201,6 +201,21 @@ class SplatFile:
             raise RefineError(msg)
         return replace(self, header=with_model(self.header, model))
 
+    def without_third_scale(self) -> SplatFile:
+        """Return discs of another format without the third scale that it has a place for.
+
+        Rows of a plain PLY stay as they are, and so do splats that are no discs.
+        """
+        names = self.rows.dtype.names or ()
+        if self.origin is None or self.model != "2dgs" or THIRD_SCALE not in names:
+            return self
+        left = [name for name in names if name != THIRD_SCALE]
+        rows = np.empty(len(self), [(name, self.rows.dtype[name]) for name in left])
+        for name in left:
+            rows[name] = self.rows[name]
+        third = f"property float {THIRD_SCALE}\n".encode()  # as `new_file` writes it
+        return replace(self, rows=rows, header=self.header.replace(third, b""))
+
     def splats(self) -> Splats:
         """Return the rows as splats; the arrays are views of the file if its layout permits."""
         return drawn_as(splats_from_columns(self.rows), self.model)

@@ -97,7 +97,7 @@ def read_splats(path: Path | str, model: Model | None = None, level: int = 0) ->
         If the file does not exist, is of no known format, or is damaged; the message names the
         file, the place, what was found and what was expected. See also `SplatFile.drawn_as`.
     """
-    return _read(expanded(path), level).drawn_as(model)
+    return _read(expanded(path), level).drawn_as(model).without_third_scale()
 
 
 def _read(path: Path, level: int) -> SplatFile:

@@ -156,6 +156,7 @@ class ArrangedSource:
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # doubles to float32
             for name in ARRAYS:
                 getattr(copied, name)[:] = getattr(splats, name)
+        file = file.without_third_scale()
         return Loaded(
             name=" + ".join(str(file.path) for file in files),
             bytes=stored_bytes,

@@ -18,30 +18,34 @@ That J changes with the mean, the colour with the direction of view, and what an
 the opacity with the scales, is left out. Of discs, d is scaled to their plane first. Parameters are
 those of the splat's own axes, so results turn and grow with the scene.
 
-With ``e = A d``, h_j is ``r_j e``, r_j the splat's axis in the image, in pixels. So the ten
-derivatives of alpha are alpha times polynomials of degree 2 in the two numbers of e: a hit keeps
-alpha and e, a splat the coefficients.
+With ``e = A d``, ``g = W' J' e``. In the scene's frame all changes of a splat's mean are one vector
+m, and those of its scales and turns one symmetric matrix S: the logarithm of alpha changes by
+``g' m + g' S g``. In a view that is a polynomial of degree 2 in the two numbers of e, whose five
+coefficients are ``J W m`` and ``J W S W' J'``. So a hit keeps e and how its ray changes with alpha,
+and a splat of a view keeps J W.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..seeing import projection
 from ..seeing.cast import BEHIND
-from ..seeing.ray_sums import in_front
-from ..seeing.rays import LEAST_LEFT, LOG_OPAQUE
+from ..seeing.rays import LEAST_LEFT
 from ..splats import SH_C0, rotation_matrices
+from ..work import Progress, each_chunk
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
     from numpy.typing import NDArray
 
     from ..seeing.projection import Footprints, Gaussians
-    from ..seeing.rays import Rays
+    from ..seeing.rays import Rays, VisibleRays
     from ..seeing.scene import Scene
     from ..splats import Splats
     from ..views import View
@@ -54,9 +58,16 @@ the mean, the logarithms of the scales and a turn, the last three by its own axe
 
 COUNT = 13
 
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Rows and columns of the six numbers of a symmetric matrix."""
+
 LEAST_WEIGHT = ALPHA_CUT
 """Hits that make up less of their pixel are left out: a quarter less to do than with 1e-3, and the
 same results to .01 dB."""
+
+
+HUBER, VIEWS = 1.0, 1.0
+_LEAST_ERROR = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +78,9 @@ class Shapes:
     ----------
     gaussians : Gaussians
     scene : Scene
-    axes : (M, 3, 3) float64
-        Columns are the splat's axes in the scene's frame.
-    scales : (M, 3) float64
+    axes : (3, 3, M) float32
+        Of each of the splat's axes, its components in the scene's frame.
+    scales : (3, M) float32
         Standard deviations along these, scene sizes.
     geometry : bool
         Whether it is of interest how colours change with means, scales and turns.
@@ -77,8 +88,8 @@ class Shapes:
 
     gaussians: Gaussians
     scene: Scene
-    axes: NDArray[np.float64]
-    scales: NDArray[np.float64]
+    axes: NDArray[np.float32]
+    scales: NDArray[np.float32]
     geometry: bool
 
     @classmethod
@@ -86,11 +97,86 @@ class Shapes:
         cls, splats: Splats, gaussians: Gaussians, scene: Scene, *, geometry: bool = True
     ) -> Shapes:
         """Return the shapes of the splats that some Gaussians were made of."""
+        if not geometry:
+            none = np.empty((3, 3, 0), np.float32)
+            return cls(gaussians, scene, none, none[0], geometry)
         chosen = splats.take(gaussians.index)
-        axes = np.einsum("ij,njk->nik", scene.axes, rotation_matrices(chosen.quaternions))
-        logs = chosen.log_scales.astype(np.float64) - np.log(scene.size)
+        axes = np.einsum("ij,njk->kin", scene.axes, rotation_matrices(chosen.quaternions))
+        logs = chosen.log_scales.astype(np.float64).T - np.log(scene.size)
         scales = np.exp(logs.clip(*projection.LOG_SCALE_RANGE))
-        return cls(gaussians, scene, axes, scales, geometry)
+        return cls(
+            gaussians, scene, np.ascontiguousarray(axes, np.float32), scales.astype(np.float32),
+            geometry,
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        """Return the number of Gaussians."""
+        return len(self.gaussians)
+
+    def take(self, hit: NDArray[np.integer[Any]]) -> Shapes:
+        """Return some of them."""
+        axes, scales = self.axes, self.scales
+        if self.geometry:
+            axes, scales = axes.take(hit, axis=2), scales.take(hit, axis=1)
+        return Shapes(self.gaussians.take(hit), self.scene, axes, scales, self.geometry)
+
+    def in_scene(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return changed parameters, (13, M), as changes in the frame of the scene.
+
+        Returns
+        -------
+        (13, M) float32
+            Of the colour, of the logarithm of the opacity, m, and the six numbers of S (`PAIRS`);
+            without geometry the first four alone.
+        """
+        result = np.zeros((COUNT if self.geometry else MEAN.start, len(self)), np.float32)
+        result[COLOR] = np.float32(SH_C0) * change[COLOR]
+        result[OPACITY] = (np.float32(1.0) - self.gaussians.alphas) * change[OPACITY]
+        if self.geometry:
+            moved = self.scales.max(axis=0) * change[MEAN]
+            np.einsum("kin,kn->in", self.axes, moved, out=result[MEAN])
+            for parameter, strength, one, other in self._quadratic():
+                by = strength * change[parameter]
+                for row, (i, k) in enumerate(PAIRS, SCALE.start):
+                    result[row] += by * (one[i] * other[k] + one[k] * other[i])
+        return result
+
+    def by_parameter(self, sums: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the transpose of `in_scene`: of such sums, see `LinearView.backward`, (13, M)."""
+        result = np.zeros((COUNT, len(self)), np.float32)
+        result[COLOR] = np.float32(SH_C0) * sums[COLOR]
+        result[OPACITY] = (np.float32(1.0) - self.gaussians.alphas) * sums[OPACITY]
+        if self.geometry:
+            np.einsum("kin,in->kn", self.axes, sums[MEAN], out=result[MEAN])
+            result[MEAN] *= self.scales.max(axis=0)
+            for parameter, strength, one, other in self._quadratic():
+                for row, (i, k) in enumerate(PAIRS, SCALE.start):
+                    result[parameter] += sums[row] * (one[i] * other[k] + one[k] * other[i])
+                result[parameter] *= strength
+        return result
+
+    def _quadratic(
+        self,
+    ) -> Iterator[tuple[int, NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]]:
+        """Yield for scales and turns the number of the parameter, and half of its factor.
+
+        And the two axes, (3, M) each, of which S is the symmetric product.
+        """
+        squared, half = np.square(self.scales), np.float32(0.5)
+        for axis in range(3):
+            after, last = (axis + 1) % 3, (axis + 2) % 3
+            yield SCALE.start + axis, half * squared[axis], self.axes[axis], self.axes[axis]
+            turned = half * (squared[after] - squared[last])
+            yield TURN.start + axis, turned, self.axes[after], self.axes[last]
+
+
+class _Hits(NamedTuple):
+    """The hits of a view as numbers to compute with, (h,) each."""
+
+    owner: NDArray[np.intp]
+    weight: NDArray[np.float32]
+    by_log_alpha: list[NDArray[np.float32]]
+    steepness: list[NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,205 +185,316 @@ class LinearView:
 
     Attributes
     ----------
-    rows : (u,) int64
-        Rows of the splats that are hit, among all that are refitted.
+    hit : (u,) int64
+        The Gaussians that are hit, ascending.
     errors : (3, P) float32
         The colours that the rays should see, less those that they see now.
-    ray : (h,) uint16
-    owner : (h,) int32
-        Of each hit: its ray, and the splat as a place in `rows`.
+    hitting : (p,) int64
+        The rays that have hits.
+    counts : (p,) int64
+        How many hits each of these has.
+    owner : (h,) uint16 or int32
+        Of each hit, ray by ray: the splat as a place in `hit`.
     weight : (h,) uint16
         T a, see `_halves`.
     by_log_alpha : (3, h) uint16
         How the colour changes with the logarithm of alpha, ``T a (c - B)``; 0 where alpha is
         clipped, and does not change.
-    steepness : (2, h) uint16, optional
-        ``A d`` across and down, 1/px; none if geometry does not change.
-    slopes : Slopes
-        Of the splats that are hit.
+    steepness : (2, h) or (3, h) uint16
+        ``A d`` across and down, 1/px; (0, h) if geometry does not change. Of discs also whether the
+        disc is hit, 1, or its low-pass, 0, which no scale and no turn changes.
+    unclipped : (3, u) bool
+        Where the colour changes with the harmonics.
+    jacobian : (2, 3, u) float32
+        Rows of J W: pixels for a step of one scene size; none if geometry does not change.
     """
 
-    rows: NDArray[np.int64]
+    hit: NDArray[np.int64]
     errors: NDArray[np.float32]
-    ray: NDArray[np.uint16]
-    owner: NDArray[np.int32]
+    hitting: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    owner: NDArray[Any]
     weight: NDArray[np.uint16]
     by_log_alpha: NDArray[np.uint16]
-    steepness: NDArray[np.uint16] | None
-    slopes: Slopes
+    steepness: NDArray[np.uint16]
+    unclipped: NDArray[np.bool_]
+    jacobian: NDArray[np.float32]
 
     def forward(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return by how much the colours change, (3, P), to first order.
 
         Parameters
         ----------
-        change : (13, N) float32
-            Of the parameters of all splats.
+        change : (13, M) or (4, M) float32
+            Of all Gaussians, in the frame of the scene: see `Shapes.in_scene`.
         """
-        mine = change.take(self.rows, axis=1)
-        ray, owner = self.ray.astype(np.intp), self.owner.astype(np.intp)
-        log_alpha = (self.slopes.opacity * mine[OPACITY][0]).take(owner)
-        if self.steepness is not None:
-            x, y, xx, xy, yy = (each.take(owner) for each in self.slopes.polynomials(mine))
-            across, down = map(_floats, self.steepness)
-            log_alpha += across * (x + across * xx + down * xy)
-            log_alpha += down * (y + down * yy)
-        result, weight = np.empty_like(self.errors), _floats(self.weight)
-        for channel in range(3):
-            light = (self.slopes.light[channel] * mine[channel]).take(owner)
-            light *= weight
-            light += _floats(self.by_log_alpha[channel]) * log_alpha
-            result[channel] = np.bincount(ray, light, self.errors.shape[1])
-        return result
+        return self._forward(change, self._hits())
 
-    def backward(self, errors: NDArray[np.float32]) -> NDArray[np.float64]:
-        """Return the transpose of `forward` times some errors of the colours, (13, u).
+    def backward(self, errors: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the transpose of `forward` times some errors of the colours.
 
         Parameters
         ----------
         errors : (3, P) float32
+
+        Returns
+        -------
+        (13, u) or (4, u) float32
+            Off the diagonal of S, half of it.
         """
-        result = np.zeros((COUNT, len(self.rows)))
-        ray, owner = self.ray.astype(np.intp), self.owner.astype(np.intp)
-        value, weight = np.zeros(len(owner), np.float32), _floats(self.weight)
-        for channel in range(3):
-            error = errors[channel].take(ray)
-            value += _floats(self.by_log_alpha[channel]) * error
-            error *= weight
-            result[channel] = self.slopes.light[channel] * self._sum(error, owner)
-        result[OPACITY] = self.slopes.opacity * self._sum(value, owner)
-        if self.steepness is not None:
-            across, down = map(_floats, self.steepness)
-            x, y = value * across, value * down
-            moments = [x, y, x * across, x * down, y * down]
-            sums = np.stack([self._sum(each, owner).astype(np.float32) for each in moments])
-            result[MEAN.start :] = self.slopes.gradients(sums)
+        return self._backward(errors, self._hits())
+
+    def normal(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return `backward` of `forward`."""
+        hits = self._hits()
+        return self._backward(self._forward(change, hits), hits)
+
+    def _hits(self) -> _Hits:
+        halves = self.by_log_alpha, self.steepness
+        return _Hits(
+            self.owner.astype(np.intp), _floats(self.weight),
+            *([_floats(row) for row in rows] for rows in halves),
+        )  # fmt: skip
+
+    def _forward(self, change: NDArray[np.float32], hits: _Hits) -> NDArray[np.float32]:
+        mine = [row.take(self.hit) for row in change]
+        log_alpha = mine[OPACITY.start].take(hits.owner)
+        if hits.steepness:
+            across, down, *on_plane = hits.steepness
+            x, y, xx, xy, yy = (each.take(hits.owner) for each in self._polynomials(mine))
+            for where in on_plane:
+                xx, xy, yy = xx * where, xy * where, yy * where
+            xx *= across
+            x += xx
+            xy *= down
+            x += xy
+            x *= across
+            log_alpha += x
+            yy *= down
+            y += yy
+            y *= down
+            log_alpha += y
+        result = np.zeros_like(self.errors)
+        if not len(self.counts):
+            return result
+        first = np.cumsum(self.counts) - self.counts
+        for row, unclipped, seen, slope in zip(
+            result, self.unclipped, mine[COLOR], hits.by_log_alpha, strict=True
+        ):
+            light = (seen * unclipped).take(hits.owner)
+            light *= hits.weight
+            light += slope * log_alpha
+            row[self.hitting] = np.add.reduceat(light, first)
         return result
 
-    def diagonal(self) -> NDArray[np.float64]:
-        """Return the squared length of each column, that is of each parameter, (13, u)."""
-        result = np.zeros((COUNT, len(self.rows)))
-        owner = self.owner.astype(np.intp)
-        result[COLOR] = np.square(self.slopes.light) * self._sum(
-            np.square(_floats(self.weight)), owner
-        )
-        value = np.square(_floats(self.by_log_alpha)).sum(axis=0)
-        result[OPACITY.start] = np.square(self.slopes.opacity) * self._sum(value, owner)
-        if self.steepness is None:
+    def _backward(self, errors: NDArray[np.float32], hits: _Hits) -> NDArray[np.float32]:
+        result = np.zeros((COUNT if hits.steepness else MEAN.start, len(self.hit)), np.float32)
+        value = np.zeros(len(hits.owner), np.float32)
+        for channel, slope in enumerate(hits.by_log_alpha):
+            error = np.repeat(errors[channel].take(self.hitting), self.counts)
+            value += slope * error
+            error *= hits.weight
+            result[channel] = self._sum(error, hits.owner)
+        result[COLOR] *= self.unclipped
+        result[OPACITY] = self._sum(value, hits.owner)
+        if hits.steepness:
+            across, down, *on_plane = hits.steepness
+            x, y = value * across, value * down
+            moments = [x, y]
+            for where in on_plane:
+                x, y = x * where, y * where
+            moments += [x * across, x * down, y * down]
+            sums = [self._sum(each, hits.owner).astype(np.float32) for each in moments]
+            one, other = self.jacobian
+            result[MEAN] = one * sums[0] + other * sums[1]
+            for row, (i, k) in enumerate(PAIRS, SCALE.start):
+                result[row] = (
+                    one[i] * one[k] * sums[2]
+                    + (one[i] * other[k] + one[k] * other[i]) * sums[3]
+                    + other[i] * other[k] * sums[4]
+                )
+                if i != k:
+                    result[row] *= np.float32(2.0)
+        return result
+
+    def _polynomials(self, change: list[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
+        """Return the coefficients of x, y, x^2, x y, y^2 of changed geometry, (u,) each."""
+        xx, xy, xz, yy, yz, zz = change[SCALE.start :]
+        one, other = self.jacobian
+        rows = (xx, xy, xz), (xy, yy, yz), (xz, yz, zz)
+        turned = [[_dot(each, row) for row in rows] for each in (one, other)]  # S W' J'
+        return [
+            _dot(one, change[MEAN]), _dot(other, change[MEAN]),
+            _dot(one, turned[0]), np.float32(2.0) * _dot(other, turned[0]), _dot(other, turned[1]),
+        ]  # fmt: skip
+
+    def diagonal(self, shapes: Shapes) -> NDArray[np.float32]:
+        """Return the squared length of each column, that is of each parameter, (13, u).
+
+        Parameters
+        ----------
+        shapes : Shapes
+            Of the Gaussians that are hit.
+        """
+        result, hits = np.zeros((COUNT, len(self.hit)), np.float32), self._hits()
+        result[COLOR] = np.float32(SH_C0**2) * self._sum(np.square(hits.weight), hits.owner)
+        result[COLOR] *= self.unclipped
+        value = np.square(hits.by_log_alpha[0])
+        for slope in hits.by_log_alpha[1:]:
+            value += np.square(slope)
+        result[OPACITY] = self._sum(value, hits.owner)
+        result[OPACITY] *= np.square(np.float32(1.0) - shapes.gaussians.alphas)
+        if not hits.steepness:
             return result
-        x, y = map(_floats, self.steepness)
+        x, y, *on_plane = hits.steepness
+        second = [value * x * x, value * x * y, value * y * y]
+        curved = [each * on_plane[0] for each in second] if on_plane else second
         squares = (x * x, x * y, y * y)
-        second = [value * each for each in squares]
-        fourth = [each * squares[0] for each in second[:2]] + [each * squares[2] for each in second]
-        sums = [self._sum(each, owner) for each in (*second, *fourth)]
-        result[MEAN] = self.slopes.squared_linear(sums[:3])
-        result[SCALE.start :] = self.slopes.squared_quadratic(sums[3:])
+        fourth = [curved[0] * each for each in squares]
+        fourth += [each * squares[2] for each in curved[1:]]
+        of_second, of_fourth = (
+            [self._sum(each, hits.owner).astype(np.float32) for each in powers]
+            for powers in (second, fourth)
+        )
+        in_image = [[_dot(row, axis) for axis in shapes.axes] for row in self.jacobian]
+        longest, squared = np.square(shapes.scales.max(axis=0)), np.square(shapes.scales)
+        for axis in range(3):
+            after, last = (axis + 1) % 3, (axis + 2) % 3
+            (a, c, e), (b, d, f) = ([row[k] for k in (axis, after, last)] for row in in_image)
+            linear = a * a * of_second[0] + 2.0 * a * b * of_second[1] + b * b * of_second[2]
+            result[MEAN.start + axis] = np.maximum(longest * linear, 0.0)
+            scaled = squared[axis] * np.stack([a * a, 2.0 * a * b, b * b])
+            result[SCALE.start + axis] = _squared(scaled, of_fourth)
+            turned = (squared[after] - squared[last]) * np.stack([c * e, c * f + d * e, d * f])
+            result[TURN.start + axis] = _squared(turned, of_fourth)
         return result
 
     def _sum(self, values: NDArray[np.float32], owner: NDArray[np.intp]) -> NDArray[np.float64]:
         """Return the sum of values of hits over the hits of each splat, (u,)."""
-        return np.asarray(np.bincount(owner, values, len(self.rows)), np.float64)
+        return np.asarray(np.bincount(owner, values, len(self.hit)), np.float64)
+
+
+def _dot(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Return the inner products of vectors, three components each, (u,)."""
+    result = one[0] * other[0]
+    for k in (1, 2):
+        result += one[k] * other[k]
+    return np.asarray(result)
+
+
+def _squared(
+    polynomial: NDArray[np.float32], sums: Sequence[NDArray[np.float32]]
+) -> NDArray[np.float32]:
+    """Return the sums over hits of squared polynomials, (u,).
+
+    Parameters
+    ----------
+    polynomial : (3, u) float32
+        Coefficients of x^2, x y and y^2.
+    sums : list of (u,) float32
+        Of x^4, x^3 y, x^2 y^2, x y^3 and y^4 over the hits of each splat.
+    """
+    a, b, c = polynomial
+    result = a * a * sums[0] + (b * b + 2.0 * a * c) * sums[2] + c * c * sums[4]
+    result += 2.0 * b * (a * sums[1] + c * sums[3])
+    return np.asarray(np.maximum(result, np.float32(0.0)))
 
 
 @dataclass(frozen=True, eq=False)
-class Slopes:
-    """How alpha of the hits of u splats changes with their parameters, as polynomials of ``A d``.
+class LinearRays:
+    """The colours of the rays of all views, as a linear function of what M Gaussians change.
 
     Attributes
     ----------
-    light : (3, u) float32
-        How the colour changes with the constant of the harmonics; 0 where it is clipped.
-    opacity : (u,) float32
-        ``1 - o``.
-    linear : (3, 2, u) float32
-        Of the mean along each axis: coefficients of x and y.
-    quadratic : (6, 3, u) float32
-        Of scales and turns: coefficients of x^2, x y and y^2.
+    shapes : Shapes
+    views : list of LinearView
+    residual, diagonal : (13, M) float32
+        J'r and the diagonal of J'J, see `refit`.
     """
 
-    light: NDArray[np.float32]
-    opacity: NDArray[np.float32]
-    linear: NDArray[np.float32]
-    quadratic: NDArray[np.float32]
+    shapes: Shapes
+    views: list[LinearView]
+    residual: NDArray[np.float32]
+    diagonal: NDArray[np.float32]
 
-    def polynomials(self, change: NDArray[np.float32]) -> list[NDArray[np.float32]]:
-        """Return the coefficients of x, y, x^2, x y, y^2 of changed geometry, (u,) each.
+    @classmethod
+    def of(cls, shapes: Shapes, seen: Iterable[SeenView]) -> LinearRays:
+        """Put views together, each as soon as it is there."""
+        views = []
+        residual = np.zeros((COUNT if shapes.geometry else MEAN.start, len(shapes)), np.float32)
+        diagonal = np.zeros((COUNT, len(shapes)), np.float32)
+        for each in seen:
+            views.append(each.linear)
+            _add(residual, each.linear.hit, each.residual)
+            _add(diagonal, each.linear.hit, each.diagonal)
+        return cls(shapes, views, shapes.by_parameter(residual), diagonal)
 
-        Parameters
-        ----------
-        change : (13, u) float32
-        """
-        return [
-            *np.einsum("kiu,ku->iu", self.linear, change[MEAN]),
-            *np.einsum("kiu,ku->iu", self.quadratic, change[SCALE.start :]),
-        ]
+    @property
+    def count(self) -> int:
+        """How many rays there are."""
+        return sum(view.errors.shape[1] for view in self.views)
 
-    def gradients(self, moments: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the transpose of `polynomials`: nine parameters, (9, u), of five sums, (5, u)."""
-        return np.concatenate(
-            [
-                np.einsum("kiu,iu->ku", self.linear, moments[:2]),
-                np.einsum("kiu,iu->ku", self.quadratic, moments[2:]),
-            ]
+    def normal(
+        self, change: NDArray[np.float32], progress: Progress, threads: int | None
+    ) -> NDArray[np.float32]:
+        """Return J'J times some change of the parameters, (13, M)."""
+        in_scene = self.shapes.in_scene(change)
+        total = np.zeros_like(in_scene)
+
+        def of_view(piece: slice) -> NDArray[np.float32]:
+            with np.errstate(under="ignore"):
+                values: NDArray[np.float32] = self.views[piece.start].normal(in_scene)
+            return values
+
+        of_views = each_chunk(
+            of_view, len(self.views), 1, progress=progress, what="refitting", threads=threads
         )
+        for view, values in zip(self.views, of_views, strict=True):
+            _add(total, view.hit, values)
+        return self.shapes.by_parameter(total)
 
-    def squared_linear(self, sums: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the sums over hits of squared polynomials of the mean, (3, u).
 
-        Parameters
-        ----------
-        sums : list of (u,) float64
-            Of x^2, x y and y^2 over the hits of each splat.
-        """
-        a, b = np.moveaxis(self.linear.astype(np.float64), 1, 0)  # (3, u) each
-        result = a * a * sums[0] + 2.0 * a * b * sums[1] + b * b * sums[2]
-        return np.asarray(np.maximum(result, 0.0), np.float64)
+class SeenView(NamedTuple):
+    """A view, with what it adds to `LinearRays`."""
 
-    def squared_quadratic(self, sums: list[NDArray[np.float64]]) -> NDArray[np.float64]:
-        """Return the sums over hits of squared polynomials of scales and turns, (6, u).
+    linear: LinearView
+    residual: NDArray[np.float32]
+    diagonal: NDArray[np.float32]
 
-        Parameters
-        ----------
-        sums : list of (u,) float64
-            Of x^4, x^3 y, x^2 y^2, x y^3 and y^4 over the hits of each splat.
-        """
-        a, b, c = np.moveaxis(self.quadratic.astype(np.float64), 1, 0)  # (6, u) each
-        weights = (a * a, 2.0 * a * b, b * b + 2.0 * a * c, 2.0 * b * c, c * c)
-        result = np.zeros(a.shape)
-        for weight, of_power in zip(weights, sums, strict=True):
-            result += weight * of_power
-        return np.maximum(result, 0.0)
+
+def _add(total: NDArray[np.float32], hit: NDArray[np.int64], values: NDArray[np.float32]) -> None:
+    """Add the values of the u Gaussians of a view, (k, u), to a sum over views, (k, M)."""
+    for row, of_row in zip(total, values, strict=True):  # four times as fast as all at once
+        row[hit] += of_row
 
 
 def linear_view(
-    rays: Rays,
+    visible: VisibleRays,
     footprints: Footprints,
     truth: NDArray[np.float32],
-    colors: NDArray[np.float64],
+    colors: NDArray[np.float32],
     shapes: Shapes,
     view: View,
-) -> LinearView:
+) -> SeenView:
     """Return how the colours of the rays of a view change with the splats that they hit.
 
     Parameters
     ----------
-    rays : Rays
-        At most 2^16 of them.
+    visible : VisibleRays
+        At most 2^16 rays.
     footprints : Footprints
         In the view.
     truth : (3, P) float32
         The colours that the rays should see.
-    colors : (3, u) float64
+    colors : (3, u) float32
         Of the splats that are hit.
     shapes : Shapes
         Of the first Gaussians; what else is hit does not change.
     view : View
     """
-    movable = int(np.searchsorted(rays.hit, len(shapes.gaussians)))  # of those that are hit
-    counts = rays.counts()
-    log_front = in_front(rays.log_passed.astype(np.float64), counts)
-    transmittance = np.exp(np.where(log_front > LOG_OPAQUE, log_front, -np.inf)).astype(np.float32)
-    weight = transmittance * rays.alpha
+    rays, transmittance = visible
+    movable = int(np.searchsorted(rays.hit, len(shapes)))  # of those that are hit
+    weight, counts = transmittance * rays.alpha, rays.counts()
     kept = np.flatnonzero((weight > LEAST_WEIGHT) & (rays.owner < movable))
     owner = rays.owner.take(kept)
     left = np.maximum((transmittance - weight)[kept], np.float32(LEAST_LEFT))
@@ -307,20 +504,41 @@ def linear_view(
     alpha = rays.alpha[kept]
     changing = np.where(alpha < ALPHA_MAX, alpha, np.float32(0.0)) * transmittance[kept]
     seen, by_log_alpha = np.zeros((3, rays.count)), np.empty((3, len(kept)), np.float32)
-    for channel, of_splats in enumerate(colors.astype(np.float32)):
+    for channel, of_splats in enumerate(colors):
         sums = np.zeros(len(weight) + 1)  # of what all hits in front have of the colours of rays
         np.cumsum(weight * of_splats.take(rays.owner), dtype=np.float64, out=sums[1:])
         seen[channel, hitting] = sums.take(ends) - sums.take(ends - counts)
         background = (sums.take(last) - sums.take(kept + 1)).astype(np.float32) / left
         by_log_alpha[channel] = changing * (of_splats.take(owner) - background)
-    unclipped = (colors > 0.0) & (colors < projection.BRIGHTEST)
-    hit = rays.hit[:movable]
-    return LinearView(
-        shapes.gaussians.index[hit], (truth - seen.clip(0.0, 1.0)).astype(np.float32),
-        rays.ray.take(kept).astype(np.uint16), owner, _halves(weight[kept]), _halves(by_log_alpha),
-        _halves(_steepness(replace(rays, hit=hit), kept, footprints)) if shapes.geometry else None,
-        _slopes(hit, unclipped[:, :movable], shapes, view),
+    errors, ray = (truth - seen.clip(0.0, 1.0)).astype(np.float32), rays.ray.take(kept)
+    trust = _trust(errors)
+    of_hits = trust.take(ray)
+    hit, shapes = rays.hit[:movable], shapes.take(rays.hit[:movable])
+    first = np.flatnonzero(np.diff(ray, prepend=-1))
+    steepness, jacobian = np.empty((2, len(kept)), np.float32)[:0], np.empty((2, 3, 0), np.float32)
+    if shapes.geometry:
+        steepness = _steepness(replace(rays, hit=hit), kept, footprints)
+        rows = np.stack(projection.jacobian(shapes.gaussians, shapes.scene, view))
+        jacobian = np.ascontiguousarray(rows.transpose(0, 2, 1), np.float32)
+    linear = LinearView(
+        hit, trust * errors, ray.take(first).astype(np.int64), np.diff(first, append=len(ray)),
+        owner.astype(np.uint16 if movable < 1 << 16 else np.int32),
+        _halves(of_hits * weight[kept]), _halves(of_hits * by_log_alpha), _halves(steepness),
+        ((colors > 0.0) & (colors < projection.BRIGHTEST))[:, :movable], jacobian,
     )  # fmt: skip
+    return SeenView(linear, linear.backward(linear.errors), linear.diagonal(shapes))
+
+
+def _trust(errors: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return how much the rays of a view count, of their errors, (3, P): roots of weights, (P,).
+
+    Errors of more than `HUBER` times their root mean square count in proportion, not squared
+    (Huber's loss, by one step of reweighted least squares).
+    """
+    squared = np.mean(np.square(errors), axis=0)
+    mean = max(float(squared.mean(dtype=np.float64)), _LEAST_ERROR)
+    most = np.float32(HUBER * np.sqrt(mean))
+    return np.asarray(np.sqrt(most / np.maximum(np.sqrt(squared), most)), np.float32)
 
 
 def _halves(values: NDArray[np.float32]) -> NDArray[np.uint16]:
@@ -333,48 +551,13 @@ def _floats(halves: NDArray[np.uint16]) -> NDArray[np.float32]:
     return (halves.astype(np.uint32) << np.uint32(16)).view(np.float32)
 
 
-def _slopes(
-    hit: NDArray[np.int64], unclipped: NDArray[np.bool_], shapes: Shapes, view: View
-) -> Slopes:
-    """Return how alpha changes with the parameters of the Gaussians hit; see the top of this file.
-
-    `unclipped`, (3, u), is where their colours are not clipped.
-    """
-    gaussians, scales = shapes.gaussians.take(hit), shapes.scales[hit]  # (u, 3)
-    light, opacity = unclipped * np.float32(SH_C0), np.float32(1.0) - gaussians.alphas
-    if not shapes.geometry:
-        return Slopes(
-            light, opacity, np.empty((3, 2, 0), np.float32), np.empty((6, 3, 0), np.float32)
-        )
-    in_image = projection.jacobian(gaussians, shapes.scene, view)  # rows of J W, (u, 3) each
-    x, y = (np.einsum("ui,uij->ju", each, shapes.axes[hit]) for each in in_image)  # (3, u) each
-    longest, squared = scales.max(axis=1), np.square(scales).T  # (u,), (3, u)
-    after, last = [1, 2, 0], [2, 0, 1]
-    turned = squared[after] - squared[last]
-    scaled = np.stack([squared * x * x, 2.0 * squared * x * y, squared * y * y], axis=1)
-    turns = np.stack(
-        [
-            turned * x[after] * x[last],
-            turned * (x[after] * y[last] + y[after] * x[last]),
-            turned * y[after] * y[last],
-        ],
-        axis=1,
-    )
-    return Slopes(
-        light,
-        opacity,
-        (longest * np.stack([x, y], axis=1)).astype(np.float32),
-        np.concatenate([scaled, turns]).astype(np.float32),
-    )
-
-
 def _steepness_on_discs(
     discs: NDArray[np.float32], step: list[NDArray[np.float32]]
 ) -> NDArray[np.float32]:
     """Return `_steepness` of hits on discs, (7, h), at a step from their centres, (h,) each.
 
-    With d scaled to the plane of the disc, ``d / (1 + g d)``, C of the disc is that of a Gaussian;
-    where its low-pass is what is drawn, only the mean matters.
+    With d scaled to the plane of the disc, ``d / (1 + g d)``, C of the disc is that of a Gaussian.
+    Where its low-pass is what is drawn, only the mean matters; see `LinearView.steepness`.
     """
     across, down = step
     depth = 1.0 + discs[4] * across + discs[5] * down
@@ -385,26 +568,29 @@ def _steepness_on_discs(
     low_pass = np.float32(1.0 / DISC_LOW_PASS)
     blob = (across * across + down * down) * low_pass
     plane = ahead & (first * first + second * second <= blob)
-    result = np.empty((2, len(across)), np.float32)
+    result = np.empty((3, len(across)), np.float32)
+    result[2] = plane
     for k, of_blob in enumerate((across, down)):
         result[k] = np.where(plane, discs[k] * first + discs[2 + k] * second, low_pass * of_blob)
     return result
 
 
 def _steepness(rays: Rays, kept: NDArray[np.int64], footprints: Footprints) -> NDArray[np.float32]:
-    """Return ``A d`` of some hits, across and down, (2, h), 1/px."""
+    """Return `LinearView.steepness` of some hits, (2, h) or (3, h), as numbers."""
     place = np.empty(int(footprints.index.max(initial=-1)) + 1, np.intp)
     place[footprints.index] = np.arange(len(footprints.index))
     mine = footprints.take(place[rays.hit])
-    owner, ray = rays.owner[kept].astype(np.intp), rays.ray[kept]
-    pixel = (rays.columns[ray % len(rays.columns)], rays.rows[ray // len(rays.columns)])
+    owner, ray = rays.owner.take(kept).astype(np.intp), rays.ray.take(kept)
+    columns, rows = (
+        each.astype(np.float32) + np.float32(0.5) for each in (rays.columns, rays.rows)
+    )
+    pixels = np.tile(columns, len(rows)), np.repeat(rows, len(columns))  # of all rays
     step = [
-        (at + np.float32(0.5) - center.take(owner)).astype(np.float32)
-        for at, center in zip(pixel, mine.centers, strict=True)
+        at.take(ray) - center.take(owner) for at, center in zip(pixels, mine.centers, strict=True)
     ]
-    result = np.zeros((2, len(owner)), np.float32)
     if mine.discs is not None:
         return _steepness_on_discs(mine.discs.take(owner, axis=1), step)
+    result = np.zeros((2, len(owner)), np.float32)
     for axes, sigma in zip((mine.major, mine.minor), mine.sigmas, strict=True):
         inverse = (1.0 / np.square(np.square(sigma.astype(np.float64)))).astype(np.float32)
         along = step[0] * axes[0].take(owner) + step[1] * axes[1].take(owner)

@@ -7,12 +7,12 @@ squared difference of colours is made small by damped least squares (Levenberg, 
 
     minimise over x   |J x - r|^2  +  sum over parameters p of  (k (D_p + m_p) + K_p) x_p^2
 
-r is the difference on all rays, D the diagonal of J'J, m_p the median of D over all splats that are
-hit, for each kind of parameter, and K the sum of D over the rounds before. So what few rays tell of
-a splat moves it little, and rounds together learn from the rays of all of them, not from the last
-alone: each has a share in what a parameter becomes. The sum is made small by a few steps of
-conjugate gradients, preconditioned by the diagonal. What these and the damping leave of J'r, half
-of it is added to that of the next round.
+r is the difference on all rays, in which large ones count less (`linear.HUBER`), D the diagonal of
+J'J, m_p the median of D over all splats that are hit, for each kind of parameter, and K the sum of
+D over the rounds before. So what few rays tell of a splat moves it little, and rounds together
+learn from the rays of all of them, not from the last alone: each has a share in what a parameter
+becomes. The sum is made small by a few steps of conjugate gradients, preconditioned by the
+diagonal. What these and the damping leave of J'r, half of it is added to that of the next round.
 
 k is `DAMPING` over how many rays there are for each survivor: the more rays, the less damping.
 
@@ -29,8 +29,8 @@ import numpy as np
 
 from ..errors import RefineError
 from ..splats import rotation_matrices, unit_quaternions
-from ..work import Progress, each_chunk, part, silent
-from .linear import COLOR, COUNT, MEAN, OPACITY, SCALE, TURN, LinearView
+from ..work import Progress, part, silent
+from .linear import COLOR, COUNT, MEAN, OPACITY, SCALE, TURN, LinearRays
 from .round_rays import RoundRays
 
 if TYPE_CHECKING:
@@ -58,6 +58,10 @@ MAX_ROUNDS, ENOUGH_RAYS = 4, (5, 400_000)
 """By default there are so many rounds, and fewer where these have had so many rays for each
 survivor and so many in all: of large scenes each round takes as long as absorbing."""
 
+SIMPLER, ENOUGH_SIMPLER = 0.4, 0.25
+"""How many times as many rays a round has, and are enough, for colours and opacities alone: four of
+13 parameters, and colours change with most of these in straight lines."""
+
 LEAST_GAIN = 0.05
 """Rounds end where the PSNR of the validation rays rises by less, dB."""
 
@@ -77,8 +81,7 @@ class Refit:
     rounds : int, optional
         At most so many; by default see `MAX_ROUNDS`.
     geometry : bool
-        Whether means, scales and rotations are refitted too, or colours and opacities alone. Of
-        discs (2DGS), which `linear` does not know, it is always the latter.
+        Whether means, scales and rotations are refitted too, or colours and opacities alone.
     """
 
     rounds: int | None = None
@@ -185,7 +188,7 @@ def refit(  # noqa: PLR0913 - all but three are optional
 
     Notes
     -----
-    Memory: about 700 bytes a survivor, and 18 bytes for each hit of a round, see
+    Memory: about 700 bytes a survivor, and 14 bytes for each hit of a round, see
     `round_rays.MAX_HITS`.
     """
     *_, last = refit_rounds(
@@ -209,7 +212,9 @@ def refit_rounds(  # noqa: PLR0913 - as `refit`
 
     Parameters and errors are those of `refit`.
     """
-    rays = RoundRays.of(original, views, len(survivors), part(progress, 0.0, 0.05), threads)
+    share = 1.0 if settings.geometry else SIMPLER
+    count = round(share * len(survivors))
+    rays = RoundRays.of(original, views, count, part(progress, 0.0, 0.05), threads)
     yield from refit_on(
         rays, survivors, settings,
         protected=protected, progress=part(progress, 0.05, 1.0), threads=threads,
@@ -226,8 +231,9 @@ def refit_on(
     threads: int | None = None,
 ) -> Iterator[Refitted]:
     """Yield what `refit_rounds` does, of some rays."""
-    moving, geometry = np.zeros(COUNT, np.bool_), settings.geometry and survivors.model != "2dgs"
+    moving, geometry = np.zeros(COUNT, np.bool_), settings.geometry
     moving[: COUNT if geometry else MEAN.start] = True
+    moving[SCALE.stop - 1] &= survivors.model != "2dgs"  # discs have no third scale
     movable = moving[:, None] & ~(
         np.zeros(len(survivors), np.bool_) if protected is None else protected
     )
@@ -236,7 +242,10 @@ def refit_on(
     yield best
     rounds, cast = settings.rounds or MAX_ROUNDS, 0
     enough = np.inf if settings.rounds else max(ENOUGH_RAYS[0] * len(survivors), ENOUGH_RAYS[1])
-    before, more = _Told(*np.zeros((2, COUNT, len(survivors)), np.float32)), 1.0
+    enough *= 1.0 if geometry else ENOUGH_SIMPLER
+    before = _Told(*np.zeros((2, COUNT, len(survivors)), np.float32))
+    more = 1.0 if geometry else SIMPLER
+    undone = False
     for number in range(1, rounds + 1):
         begin, middle, near, end = (
             0.04 + 0.96 * (number - 1 + share) / rounds for share in (0.0, 0.4, 0.9, 1.0)
@@ -245,12 +254,13 @@ def refit_on(
             best.splats, number,
             geometry=geometry, progress=part(progress, begin, middle),
         )  # fmt: skip
-        solver = _Solver(linear, movable, threads)
-        count = sum(view.errors.shape[1] for view in linear)
-        cast += count
-        damping = more * max(DAMPING * len(survivors) / count, LEAST_DAMPING)
-        change, told = solver.solve(damping, before, part(progress, middle, near))
-        del linear, solver  # the hits, before those of the next round
+        cast += linear.count
+        damping = more * max(DAMPING * len(survivors) / linear.count, LEAST_DAMPING)
+        change, told = _solve(
+            linear, movable, damping, before,
+            progress=part(progress, middle, near), threads=threads,
+        )  # fmt: skip
+        del linear  # the hits, before those of the next round
         if not change.any():
             return
         trial = _moved(best.splats, change)
@@ -263,10 +273,10 @@ def refit_on(
             yield best
             if gain < LEAST_GAIN or cast >= enough:
                 return
-        elif more > 1.0:
+        elif undone:
             return
         else:
-            more *= MORE_DAMPING
+            more, undone = more * MORE_DAMPING, True
 
 
 class _Told(NamedTuple):
@@ -284,79 +294,57 @@ class _Told(NamedTuple):
     left: NDArray[np.float32]
 
 
-class _Solver:
-    """Solves the least squares of a round, of N survivors.
+def _solve(
+    linear: LinearRays,
+    movable: NDArray[np.bool_],
+    damping: float,
+    before: _Told,
+    *,
+    progress: Progress,
+    threads: int | None,
+) -> tuple[NDArray[np.float32], _Told]:
+    """Return by how much to change the parameters of N survivors, (13, N), and what rays told.
 
     Parameters
     ----------
-    linear : list of LinearView
+    linear : LinearRays
     movable : (13, N) bool
         Which parameters may change.
+    damping : float
+        k; see the top of this file.
+    before : _Told
+        By the rounds before.
+    progress : callable
     threads : int, optional
     """
+    index = linear.shapes.gaussians.index
+    moving = movable[:, index]
+    steps = [part(progress, k / STEPS, (k + 1) / STEPS) for k in range(STEPS)]
+    residual = linear.residual + np.float32(CARRIED) * before.left[:, index]
+    residual *= moving
+    diagonal = linear.diagonal * moving
+    prior = np.float32(damping) * (diagonal + _medians(diagonal)[:, None])
+    damped = prior + before.diagonal[:, index]
+    inverse = np.divide(
+        1.0, diagonal + damped, out=np.zeros_like(damped), where=diagonal > _NOTHING
+    )
 
-    def __init__(
-        self,
-        linear: list[LinearView],
-        movable: NDArray[np.bool_],
-        threads: int | None,
-    ) -> None:
-        self._linear, self._movable, self._threads = linear, movable, threads
-        self._kinds = np.flatnonzero(movable.any(axis=1)).tolist()
+    def product(direction: NDArray[np.float32], step: Progress) -> NDArray[np.float32]:
+        result = linear.normal(direction, step, threads)
+        result *= moving
+        result += damped * direction
+        return result
 
-    def solve(
-        self, damping: float, before: _Told, progress: Progress
-    ) -> tuple[NDArray[np.float32], _Told]:
-        """Return by how much to change the parameters of survivors, (13, N), and what rays told.
-
-        Parameters
-        ----------
-        damping : float
-            k; see the top of this file.
-        before : _Told
-            By the rounds before.
-        progress : callable
-        """
-        steps = [part(progress, k / (STEPS + 2), (k + 1) / (STEPS + 2)) for k in range(STEPS + 2)]
-        residual = self._sum(lambda view: view.backward(view.errors), steps[0])
-        residual += np.float32(CARRIED) * before.left
-        diagonal = self._sum(lambda view: view.diagonal(), steps[1])
-        prior = np.float32(damping) * (diagonal + _medians(diagonal)[:, None])
-        damped = prior + before.diagonal
-        inverse = np.divide(
-            1.0, diagonal + damped, out=np.zeros_like(damped), where=diagonal > _NOTHING
-        )
-        diagonal += before.diagonal
-
-        def product(direction: NDArray[np.float32], step: Progress) -> NDArray[np.float32]:
-            result = self._sum(lambda view: view.backward(view.forward(direction)), step)
-            result += damped * direction
-            return result
-
-        change, residual = _conjugate_gradients(product, residual, inverse, steps[2:])
-        prior *= change
-        residual += prior
-        return change, _Told(diagonal, residual)
-
-    def _sum(
-        self, work: Callable[[LinearView], NDArray[np.float64]], progress: Progress
-    ) -> NDArray[np.float32]:
-        """Return the sum over views, one after the other, of values of the splats hit, (13, N)."""
-        total = np.zeros(self._movable.shape)
-
-        def of_view(piece: slice) -> NDArray[np.float64]:
-            with np.errstate(under="ignore"):
-                return work(self._linear[piece.start])
-
-        of_views = each_chunk(
-            of_view, len(self._linear), 1,
-            progress=progress, what="refitting", threads=self._threads,
-        )  # fmt: skip
-        for view, values in zip(self._linear, of_views, strict=True):
-            for kind in self._kinds:  # one after the other: four times as fast as all at once
-                total[kind][view.rows] += values[kind]
-        total *= self._movable
-        return total.astype(np.float32)
+    change, residual = _conjugate_gradients(product, residual, inverse, steps)
+    prior *= change
+    residual += prior
+    result = np.zeros(movable.shape, np.float32)
+    told = _Told(before.diagonal.copy(), np.float32(CARRIED) * before.left)
+    for row, values in enumerate(zip(change, diagonal, residual, strict=True)):
+        result[row, index] = values[0]
+        told.diagonal[row, index] += values[1]
+        told.left[row, index] = values[2]
+    return result, told
 
 
 def _medians(diagonal: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,8 +1,8 @@
 """The rays of all rounds of refitting: what the unpruned splats look like on them, and survivors.
 
 Each round learns from rays through other pixels, of views that stand a little beside the given ones
-(`SHIFT`): what the given ones alone tell does not hold between them. Validation rays, which no
-round learns from, go through the given views, and tell what a round has gained.
+(`SHIFT`): what the given ones alone tell does not hold between them. So do validation rays, which
+no round learns from: they tell what a round has gained.
 
 Views are cast in processes of their own, as they are measured (`processes`).
 """
@@ -19,13 +19,14 @@ from ..estimate.quality import PSNR_CAP
 from ..processes import for_each
 from ..seeing import projection
 from ..seeing.cast import cast, depth_complexity, pixels
-from ..seeing.ray_sample import MAX_HITS_OF_VIEW, MAX_RAYS_OF_VIEW, colors_from
+from ..seeing.ray_sample import MAX_HITS_OF_VIEW, MAX_RAYS_OF_VIEW, VALIDATION_VIEWS
+from ..spherical_harmonics import single_colors
 from ..views import ViewSet
 from ..work import Progress, part
-from .linear import LEAST_WEIGHT, LinearView, Shapes, linear_view
+from .linear import LEAST_WEIGHT, LinearRays, SeenView, Shapes, linear_view
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -44,7 +45,7 @@ MIN_RAYS = 1 << 17
 
 HITS_OF_SPLAT, MIN_HITS = 64, 3 << 21
 """About how many hits of a round may show in the unpruned splats (`linear.LEAST_WEIGHT`), for each
-survivor, and where that would be fewer. Each takes 18 bytes."""
+survivor, and where that would be fewer. Each takes 14 bytes."""
 
 SHIFT, MAX_SHIFT = 0.7, 0.1
 """About how far a view is moved in a round: so many times as far as the view next to it is, at most
@@ -55,7 +56,8 @@ SECONDS, SECONDS_OF_RAY = 2.5e-7, 4e-6
 worth a process."""
 
 _SAME = 1e-6  # scene sizes; views nearer to each other stand in one place
-_EVERY = 2  # validation rays go through every second column and row of a round's rays
+_EVERY = 2  # validation rays go through every second row of a round's rays
+_NOTHING = 1e-30  # hits of a ray; keeps a division finite
 _LEAST_ERROR = 10.0 ** (-PSNR_CAP / 10.0)
 
 
@@ -123,7 +125,7 @@ class Window:
         count = min(self.rays, self.hits / max(hits, 1.0), MAX_RAYS_OF_VIEW)
         columns, rows = pixels(self.part, self.number + 1 + number, count)
         if not number:
-            columns, rows = columns[::_EVERY], rows[::_EVERY]
+            rows = rows[::_EVERY]
         return columns + self.left, rows + self.top
 
 
@@ -137,7 +139,7 @@ class Target(Protocol):
         """
         ...
 
-    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float64]:
+    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float32]:
         """Return the colours in which a view sees some of the splats, (3, u)."""
         ...
 
@@ -148,15 +150,23 @@ class InMemory:
 
     Attributes
     ----------
-    splats : Splats
     gaussians : Gaussians
-        Made of these.
     scene : Scene
+    means : (M, 3) float64
+        Of these, in the world.
+    harmonics : (M, 3, K) float32
+        Of these, see `single_colors`.
     """
 
-    splats: Splats
     gaussians: Gaussians
     scene: Scene
+    means: NDArray[np.float64]
+    harmonics: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, splats: Splats, gaussians: Gaussians, scene: Scene) -> InMemory:
+        """Return the splats that some Gaussians were made of."""
+        return cls(gaussians, scene, *_colored(splats, gaussians.index))
 
     def footprints(self, window: Window) -> Footprints:
         """Return the footprints in a view that may reach into a window of it."""
@@ -165,9 +175,34 @@ class InMemory:
         )
         return projection.front_to_back([reaching])
 
-    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float64]:
+    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float32]:
         """Return the colours in which a view sees some of the Gaussians, (3, u)."""
-        return colors_from(self.splats, self.gaussians.index[hit], view)
+        return _seen_from(self.means.take(hit, axis=0), self.harmonics.take(hit, axis=0), view)
+
+
+def colors_of(splats: Splats, view: View) -> NDArray[np.float32]:
+    """Return the colours in which a view sees splats, (3, u), as far as they can be drawn."""
+    return _seen_from(*_colored(splats, np.arange(len(splats))), view)
+
+
+def _colored(
+    splats: Splats, rows: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Return means and harmonics of some splats, see `InMemory`."""
+    harmonics = np.empty((len(rows), 3, 1 + splats.sh_rest.shape[1]), np.float32)
+    harmonics[:, :, 0] = splats.sh_dc[rows]
+    harmonics[:, :, 1:] = splats.sh_rest[rows].transpose(0, 2, 1)
+    return splats.means[rows].astype(np.float64), harmonics
+
+
+def _seen_from(
+    means: NDArray[np.float64], harmonics: NDArray[np.float32], view: View
+) -> NDArray[np.float32]:
+    """Return the colours that `colors_of` does, of means and harmonics; see `InMemory`."""
+    direction = np.ascontiguousarray((means - view.center).T, np.float32)
+    length = np.sqrt(np.square(direction).sum(axis=0))
+    direction /= np.maximum(length, np.finfo(np.float32).tiny)
+    return single_colors(direction, harmonics).clip(0.0, projection.BRIGHTEST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,14 +214,15 @@ class Truth:
     columns, rows : (C,), (R,) int64
         See `Rays`.
     colors : (3, P) float32
-    hits : float
-        How many hits each ray has, of those that count for `Window.hits`.
+    shown : float
+        How many hits a ray has that count for `Window.hits`, for each that the sizes of footprints
+        foretell.
     """
 
     columns: NDArray[np.int64]
     rows: NDArray[np.int64]
     colors: NDArray[np.float32]
-    hits: float
+    shown: float
 
 
 class RoundRays:
@@ -218,6 +254,8 @@ class RoundRays:
     ) -> None:
         self.windows, self.scene = windows, scene
         self._original, self._count, self._threads = original, count, threads
+        step = -(-len(windows) // VALIDATION_VIEWS)
+        self._validating = [window.moved(0) for window in windows[::step]] if step else []
         self._validation: list[Truth] = []
 
     @classmethod
@@ -237,7 +275,7 @@ class RoundRays:
             The unpruned splats, in the frame of the views.
         views : ViewSet
         count : int
-            How many survivors there are.
+            For how many survivors there are to be rays, see `limits`.
         progress : callable
         threads : int, optional
         """
@@ -251,12 +289,13 @@ class RoundRays:
             Window(view, number, weight, rays, hits, step=steps[number])
             for number, (view, weight) in enumerate(chosen)
         ]
-        return cls(windows, scene, InMemory(original, gaussians, scene), len(original), threads)
+        target = InMemory.of(original, gaussians, scene)
+        return cls(windows, scene, target, len(original), threads)
 
     def linear(
         self, splats: Splats, number: int, *, geometry: bool, progress: Progress
-    ) -> list[LinearView]:
-        """Return how the colours of each view's rays change with survivors as they are now.
+    ) -> LinearRays:
+        """Return how the colours of rays change with survivors as they are now.
 
         Parameters
         ----------
@@ -271,29 +310,29 @@ class RoundRays:
         gaussians = self._gaussians(splats, part(progress, 0.0, 0.05))
         shapes = Shapes.of(splats, gaussians, self.scene, geometry=geometry)
         windows = [window.moved(number) for window in self.windows]
-        hits = [truth.hits for truth in self._validation]
-        truth = CastTruth(self._original, windows, number, hits)
+        told = [truth.shown for truth in self._validation]
+        shown = float(np.mean(told)) if told else None
+        truth = CastTruth(self._original, windows, number, shown)
         work = _Linearize(truth, self.target(splats, gaussians), shapes)
         count = self._count + len(splats)
-        return self._each(work, windows, count, 1.0, part(progress, 0.05, 1.0))
+        return LinearRays.of(shapes, self._each(work, windows, count, part(progress, 0.05, 1.0)))
 
     def psnr(self, splats: Splats, progress: Progress) -> float:
         """Return the mean PSNR of survivors on validation rays, weighted as the views are, dB."""
-        share = 1.0 / _EVERY**2
+        windows = self._validating
         if not self._validation:
-            self._validation = self._each(
-                CastTruth(self._original, self.windows, 0), self.windows, self._count, share,
-                part(progress, 0.0, 0.5),
-            )  # fmt: skip
+            truth = CastTruth(self._original, windows, 0)
+            told = self._each(truth, windows, self._count, part(progress, 0.0, 0.5))
+            self._validation = list(told)
         gaussians = self._gaussians(splats, part(progress, 0.5, 0.6))
-        work = _CastErrors(self.target(splats, gaussians), self.windows, self._validation)
-        errors = self._each(work, self.windows, len(splats), share, part(progress, 0.6, 1.0))
-        weights = [window.weight for window in self.windows]
+        work = _CastErrors(self.target(splats, gaussians), windows, self._validation)
+        errors = [*self._each(work, windows, len(splats), part(progress, 0.6, 1.0))]
+        weights = [window.weight for window in windows]
         return float(np.average(-10.0 * np.log10(errors), weights=weights))
 
     def target(self, splats: Splats, gaussians: Gaussians) -> Target:
         """Return what rays are cast into: survivors, given also as Gaussians, the first of all."""
-        return InMemory(splats, gaussians, self.scene)
+        return InMemory.of(splats, gaussians, self.scene)
 
     def _gaussians(self, splats: Splats, progress: Progress) -> Gaussians:
         views = ViewSet(tuple(window.view for window in self.windows))
@@ -307,18 +346,15 @@ class RoundRays:
         work: Callable[[int], Result],
         windows: Sequence[Window],
         count: int,
-        share: float,
         progress: Progress,
-    ) -> list[Result]:
-        """Return what is found on a share of the rays of windows, cast into `count` splats."""
-        rays = share * sum(window.rays for window in windows)
-        seconds = SECONDS * (count + self.around) * len(windows) + SECONDS_OF_RAY * rays
-        return [
-            *for_each(
-                work, len(windows), seconds,
-                progress=progress, what="refitting", threads=self._threads,
-            )
-        ]  # fmt: skip
+    ) -> Iterator[Result]:
+        """Yield what is found on the rays of windows, cast into `count` splats."""
+        seconds = SECONDS * (count + self.around) * len(windows)
+        seconds += SECONDS_OF_RAY * sum(window.rays for window in windows)
+        return for_each(
+            work, len(windows), seconds,
+            progress=progress, what="refitting", threads=self._threads,
+        )  # fmt: skip
 
 
 def limits(count: int) -> tuple[float, float]:
@@ -349,14 +385,14 @@ class CastTruth:
     windows : sequence of Window
     round : int
         Its number; 0 for the validation rays.
-    hits : sequence of float
-        Of the validation rays, see `Truth`; none before these are cast.
+    shown : float or None
+        Of the validation rays, see `Truth`; None before these are cast.
     """
 
     target: Target
     windows: Sequence[Window]
     round: int
-    hits: Sequence[float] = ()
+    shown: float | None = None
 
     def __call__(self, place: int) -> Truth:
         """Return the rays of a view."""
@@ -365,18 +401,16 @@ class CastTruth:
             footprints = self.target.footprints(window)
             # Casting takes memory for all hits, also hidden ones, but for one view at a time.
             share = window.hits / MAX_HITS_OF_VIEW
-            if self.hits:
-                hits = self.hits[place]
-            else:
-                hits = share * depth_complexity(footprints, window.part)
-            columns, rows = window.pixels(hits, self.round)
+            foretold = depth_complexity(footprints, window.part)
+            each = (share if self.shown is None else self.shown) * foretold
+            columns, rows = window.pixels(each, self.round)
             rays = cast(footprints, columns, rows)
             most = share * len(rays.ray)
-            rays = rays.visible()
-            shown = np.count_nonzero(rays.contributions()[2] > LEAST_WEIGHT)
-            colors = rays.colors(self.target.colors(rays.hit, window.view))
-        each = max(shown, most) / max(rays.count, 1)
-        return Truth(columns, rows, colors.astype(np.float32), each)
+            rays, transmittance = rays.visible()
+            weight = transmittance * rays.alpha
+            colors = rays.composited(weight, self.target.colors(rays.hit, window.view))
+        each = max(np.count_nonzero(weight > LEAST_WEIGHT), most) / max(rays.count, 1)
+        return Truth(columns, rows, colors, each / max(foretold, _NOTHING))
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,9 +425,12 @@ class _CastErrors:
         """Return the mean squared error of the colours that the rays of a view see."""
         window, truth = self.windows[number], self.truths[number]
         with np.errstate(under="ignore"):
-            rays = cast(self.target.footprints(window), truth.columns, truth.rows).visible()
-            seen = rays.colors(self.target.colors(rays.hit, window.view))
-        return float(max(np.mean(np.square(truth.colors - seen)), _LEAST_ERROR))
+            footprints = self.target.footprints(window)
+            rays, transmittance = cast(footprints, truth.columns, truth.rows).visible()
+            colors = self.target.colors(rays.hit, window.view)
+            seen = rays.composited(transmittance * rays.alpha, colors)
+        error = np.mean(np.square(truth.colors - seen), dtype=np.float64)
+        return float(max(error, _LEAST_ERROR))
 
 
 @dataclass(frozen=True, eq=False)
@@ -404,11 +441,11 @@ class _Linearize:
     target: Target
     shapes: Shapes
 
-    def __call__(self, number: int) -> LinearView:
+    def __call__(self, number: int) -> SeenView:
         """Return how the colours of a view's rays change with the survivors."""
         window, truth = self.truth.windows[number], self.truth(number)
         with np.errstate(under="ignore"):
             footprints = self.target.footprints(window)
-            rays = cast(footprints, truth.columns, truth.rows).visible()
-            colors = self.target.colors(rays.hit, window.view)
-            return linear_view(rays, footprints, truth.colors, colors, self.shapes, window.view)
+            seen = cast(footprints, truth.columns, truth.rows).visible()
+            colors = self.target.colors(seen.rays.hit, window.view)
+            return linear_view(seen, footprints, truth.colors, colors, self.shapes, window.view)

@@ -28,7 +28,7 @@ BEHIND = 1e-4
 """Of a disc: a plane that a ray hits behind the camera, or at 1 / this times the centre's depth, is
 not hit."""
 
-_PAIRS = 1 << 17  # pairs of footprint and pixel at a time, which limits temporary memory
+_PAIRS = 1 << 15  # pairs of footprint and pixel at a time: what the second-level cache holds
 _MAX_TABLE = 1 << 14  # pixels; images up to this size are looked up in a table, see `_before`
 
 _CROSSING = 1e-3  # a disc of which this much is left of a plane through the camera crosses it

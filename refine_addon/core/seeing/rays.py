@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -32,6 +32,20 @@ LEAST_LEFT = 1e-8
 hidden is left out before (`LOG_OPAQUE`), so it only guards against a division by 0."""
 
 _PIECE = 1 << 15  # hits processed at a time: what stays in the second-level cache
+
+
+class VisibleRays(NamedTuple):
+    """Rays with the hits that are not hidden alone.
+
+    Attributes
+    ----------
+    rays : Rays
+    transmittance : (h,) float32
+        In front of each hit.
+    """
+
+    rays: Rays
+    transmittance: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +112,7 @@ class Rays:
             log_passed=self.log_passed.take(kept),
         )
 
-    def visible(self) -> Rays:
+    def visible(self) -> VisibleRays:
         """Return the rays with the hits that are not hidden alone: they see the same."""
         log_front = in_front(self.log_passed.astype(np.float64), self.counts())
         kept = np.flatnonzero(log_front > LOG_OPAQUE)
@@ -106,7 +120,7 @@ class Rays:
         used = np.zeros(len(self.hit), np.bool_)
         used[owner] = True
         place = np.cumsum(used, dtype=np.int32) - np.int32(1)
-        return replace(
+        seen = replace(
             self,
             ray=self.ray.take(kept),
             owner=place.take(owner),
@@ -114,6 +128,25 @@ class Rays:
             log_passed=self.log_passed.take(kept),
             hit=self.hit[used],
         )
+        return VisibleRays(seen, np.exp(log_front.take(kept).astype(np.float32)))
+
+    def composited(
+        self, weight: NDArray[np.float32], colors: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return the colour of each ray over black, (3, P), 0..1; see `colors`.
+
+        Parameters
+        ----------
+        weight : (h,) float32
+            Transmittance times alpha.
+        colors : (3, u) float32
+        """
+        first, result = self._first_hits(), np.zeros((3, self.count), np.float32)
+        if len(first):
+            hitting = self.ray.take(first)
+            for row, channel in zip(result, colors, strict=True):
+                row[hitting] = np.add.reduceat(weight * channel.take(self.owner), first)
+        return result.clip(0.0, 1.0)
 
     def contributions(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.float32]]:
         """Return what the rays see: the r hits that are not hidden.

@@ -14,11 +14,11 @@ from ..refitting.round_rays import (
     InMemory,
     RoundRays,
     Window,
+    colors_of,
     limits,
     steps_of,
 )
 from ..seeing import projection
-from ..seeing.ray_sample import colors_from
 from ..views import ViewSet
 from .regions import taken
 
@@ -67,9 +67,9 @@ class StoredSplats:
         """Return the rows of the splats that the Gaussians are, (M,), without reading them yet."""
         return self.context.folder.mapped("index")
 
-    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float64]:
+    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float32]:
         """Return the colours in which a view sees some of the Gaussians, (3, u)."""
-        return colors_from(self.take(self.index()[hit]), np.arange(len(hit)), view)
+        return colors_of(self.take(self.index()[hit]), view)
 
     def take(self, rows: NDArray[np.int64]) -> Splats:
         """Return some splats by their rows, (n,)."""
@@ -94,7 +94,7 @@ class _Amid:
             pieces.append((replace(others, index=others.index + len(gaussians)), depth[rows]))
         return projection.front_to_back(pieces)
 
-    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float64]:
+    def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float32]:
         """Return the colours in which a view sees some of the Gaussians, ascending, (3, u)."""
         count = len(self.region.gaussians)
         mine = int(np.searchsorted(hit, count))
@@ -137,7 +137,7 @@ class RegionRays(RoundRays):
 
     def target(self, splats: Splats, gaussians: Gaussians) -> _Amid:
         """Return what rays are cast into: the region's survivors amid all others."""
-        return _Amid(InMemory(splats, gaussians, self.scene), self._after, self._others)
+        return _Amid(InMemory.of(splats, gaussians, self.scene), self._after, self._others)
 
 
 def _windows(

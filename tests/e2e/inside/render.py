@@ -39,7 +39,8 @@ def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
     scene = bpy.context.scene
     prepare(scene)
     scene.render.filepath = f"{pictures}/frame_##"
-    found: dict[str, Any] = {}
+    found: dict[str, Any] = {"in_windows": []}
+    bpy.app.handlers.render_init.append(lambda scene, *_: note_windows(found, scene))
     before = settings(scene)
 
     invoke()
@@ -136,6 +137,13 @@ def invoke(*, animation: bool = False) -> None:
         bpy.ops.refine.render("INVOKE_DEFAULT", animation=animation)
 
 
+def note_windows(found: dict[str, Any], scene: bpy.types.Scene) -> None:
+    """Note whether a window shows what Cycles renders; called on the thread that does."""
+    if scene.render.engine == "CYCLES":
+        windows = bpy.context.window_manager.windows
+        found["in_windows"].append(any(window.scene == scene for window in windows))
+
+
 def rendering() -> bool:
     """Tell whether a render is under way."""
     return bpy.app.is_job_running("RENDER") or any("refine_render" in s for s in bpy.data.scenes)
@@ -152,6 +160,7 @@ def settings(scene: bpy.types.Scene) -> list[str]:
         if kind.type in {"BOOLEAN", "INT", "FLOAT", "STRING", "ENUM"} and not kind.is_readonly
     ]
     told += [f"{obj.name} {obj.hide_render} {obj.is_holdout}" for obj in bpy.data.objects]
+    told += {window.scene.name for window in bpy.context.window_manager.windows}
     return told + [scene.name for scene in bpy.data.scenes]
 
 
