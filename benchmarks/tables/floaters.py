@@ -6,8 +6,8 @@
 
 The recipes of `benchmarks.floaters` put in 1,000 floaters: 45 % single ones, 25 % in dense
 clusters, 26 % needles and 4 % giant veils. Nothing of the cleaner was chosen by them, nor were they
-written with it in view. `chosen` and `mixed` are what constants were chosen with; `none` puts in
-nothing.
+written with it in view. `copies`, `chosen` and `mixed` are what constants were chosen with; `none`
+puts in nothing. Those of `copies` are true splats, moved, turned, deformed and faded.
 
 Of the 2,000 floaters of `mixed`, 1,100 stand in front of a camera, each by itself; 800 form blobs
 of 5 to 59 in free space; 100 are huge veils. Size, opacity, colour and place vary. Free space is
@@ -31,7 +31,7 @@ from refine_addon.core.cleaning.clean import clean
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.seeing import projection
 from refine_addon.core.seeing.ray_sample import validation_rays
-from refine_addon.core.splats import SH_C0, Splats, joined
+from refine_addon.core.splats import SH_C0, Splats, joined, opacity
 
 from .evaluate import Evaluator, read_scene
 
@@ -44,6 +44,7 @@ COUNTS = {"front": 1100, "blob": 800, "veil": 100}
 KINDS = ("single", "cluster", "needle", "veil")
 RECIPES = ("volume", "photos", "motion")
 COUNT = 1000
+FAINTEST = 0.1  # opacity of the splats that `copies` copies
 
 
 class Places:
@@ -177,6 +178,51 @@ def _chosen(splats: Splats, views: ViewSet, seed: int) -> tuple[Splats, NDArray[
     return _as_splats(random, splats, rows), np.repeat(np.arange(4), counts)
 
 
+def _copies(splats: Splats, views: ViewSet, seed: int) -> tuple[Splats, NDArray[np.int64]]:
+    """Return floaters of all four kinds in the colours of the scene: true splats put elsewhere."""
+    random = np.random.default_rng(seed)
+    free = Places(splats, views)
+    alphas = opacity(splats.opacity_logits).astype(np.float64)
+    solid = np.flatnonzero(alphas > FAINTEST)
+    kinds = np.repeat(np.arange(4), (450, 250, 260, 40))
+    source = random.choice(solid, len(kinds))
+    means, scales = np.empty((len(kinds), 3)), np.exp(splats.log_scales[source].astype(np.float64))
+    faded = alphas[source] * random.beta(1.5, 2.5, len(kinds))
+    single, cluster, needle, veil = (np.flatnonzero(kinds == kind) for kind in range(4))
+    for part, low, high in ((single, 0.1, 0.95), (needle, 0.1, 0.9), (veil, 0.2, 0.8)):
+        means[part], _ = free.draw(random, len(part), low, high)
+    larger = random.uniform(0.5, 2.0, (len(single), 1))
+    scales[single] = np.clip(scales[single] * larger, 0.001 * free.size, 0.04 * free.size)
+    for part in np.split(cluster, 10):
+        center, depth = free.draw(random, 1, 0.2, 0.8)
+        radius = depth * _log_uniform(random, 0.008, 0.06, (1,))
+        step = splats.means[solid] - splats.means[random.choice(solid)]
+        source[part] = random.choice(solid[np.argsort((step**2).sum(axis=1))[:60]], len(part))
+        means[part] = center + random.normal(size=(len(part), 3)) * radius
+        scales[part] = radius * _log_uniform(random, 0.1, 0.6, (len(part), 1))
+        scales[part] *= _log_uniform(random, 0.3, 1.0, (len(part), 3))
+        dense = random.binomial(1, 0.6)
+        some = random.uniform(0.3, 0.95, len(part)), random.beta(2.0, 3.0, len(part))
+        faded[part] = some[0] if dense else some[1]
+    scales[needle] = free.size * _log_uniform(random, 0.015, 0.15, (len(needle), 1))
+    scales[needle, 1:] *= _log_uniform(random, 0.01, 0.1, (len(needle), 2))
+    scales[veil] = free.size * _log_uniform(random, 0.15, 0.6, (len(veil), 1))
+    scales[veil] *= _log_uniform(random, 0.1, 1.0, (len(veil), 3))
+    faded[veil] = random.uniform(0.02, 0.2, len(veil))
+    faded = faded.clip(0.01, 0.99)
+    copies = splats.take(source)
+    other = random.binomial(1, 0.5, (len(kinds), 1))
+    floaters = replace(
+        copies,
+        means=means.astype(np.float32),
+        log_scales=np.log(scales).astype(np.float32),
+        quaternions=random.normal(size=(len(kinds), 4)).astype(np.float32),
+        opacity_logits=np.log(faded / (1.0 - faded)).astype(np.float32),
+        sh_dc=copies.sh_dc + other * random.normal(0.0, 0.2, (len(kinds), 3)).astype(np.float32),
+    )
+    return floaters, kinds
+
+
 def _dense(
     random: np.random.Generator, free: Places, count: int
 ) -> tuple[NDArray[np.float64], ...]:
@@ -199,9 +245,9 @@ def dirtied(
     folder : Path
         Of the scene.
     splats, views
-        What it holds, and the views that place the floaters of `mixed` and `chosen`.
+        What it holds, and the views that place the floaters of `mixed`, `chosen` and `copies`.
     recipe : str
-        "none", "mixed", "chosen", or one of `RECIPES`.
+        "none", "mixed", "chosen", "copies", or one of `RECIPES`.
     seed : int
     """
     if recipe == "none":
@@ -214,16 +260,20 @@ def dirtied(
         added = replace(plain, rows=rows.astype(plain.rows.dtype)).splats()
         kinds = np.array([KINDS.index(kind) for kind in kinds])
         return joined([splats, added]), kinds, KINDS
-    make, names = (_chosen, KINDS) if recipe == "chosen" else (floaters, tuple(COUNTS))
-    added, kinds = make(splats, views, seed)
-    return joined([splats, added]), kinds, names
+    if recipe == "mixed":
+        added, kinds = floaters(splats, views, seed)
+        return joined([splats, added]), kinds, tuple(COUNTS)
+    added, kinds = (_copies if recipe == "copies" else _chosen)(splats, views, seed)
+    return joined([splats, added]), kinds, KINDS
 
 
 def main() -> int:
     """Print a line for each scene."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("scenes", nargs="+", type=Path, metavar="SCENE_DIR")
-    parser.add_argument("--recipe", choices=(*RECIPES, "chosen", "mixed", "none"), default="volume")
+    parser.add_argument(
+        "--recipe", choices=(*RECIPES, "copies", "chosen", "mixed", "none"), default="volume"
+    )
     parser.add_argument("--seed", type=int, default=7)
     options = parser.parse_args()
     print("scene: found (by kind), true splats taken, seconds, PSNR: before, dirty, cleaned")

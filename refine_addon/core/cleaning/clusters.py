@@ -45,26 +45,22 @@ def cluster_sizes(
 def touching(
     gaussians: Gaussians,
     rows: NDArray[np.int64],
-    solid: NDArray[np.bool_],
     *,
     progress: Progress = silent,
     threads: int | None = None,
-) -> NDArray[np.int64]:
-    """Return how many of their near neighbours that are solid some splats touch, (r,).
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Return near neighbours of some splats, and which of them each touches, (r, k) each.
 
     Parameters
     ----------
     gaussians : Gaussians
     rows : (r,) int64
         Which splats.
-    solid : (M,) bool
-        Which of all count as neighbours.
     """
     points = gaussians.means.T.astype(np.float64)  # (M, 3)
-    near = nearest(points, NEIGHBOURS, progress=progress, threads=threads)[rows]
-    one, other = np.repeat(rows, near.shape[1]), near.ravel().astype(np.int64)
-    touch = solid[other] & _touch(gaussians, points, one, other)
-    return np.asarray(touch.reshape(near.shape).sum(axis=1), np.int64)
+    near = nearest(points, NEIGHBOURS, progress=progress, threads=threads)[rows].astype(np.int64)
+    touch = _touch(gaussians, points, np.repeat(rows, near.shape[1]), near.ravel())
+    return near, touch.reshape(near.shape)
 
 
 def _touch(

@@ -1,9 +1,10 @@
 """Which splats float: suspects are taken away round by round, and the views judge their places.
 
-A round casts the rays of all views with the suspects so far absent. It tells two things: what the
-views see at the places of the suspects, which is evidence, and how much the others support each
-other without them. Who has lost support joins the suspects of the next round, since a veil that
-reaches through a scene stops light near everything in it, and a cluster vouches for itself.
+A round asks the rays of all views, some aimed at suspects, with the suspects so far absent. It
+tells two things: what the views see at the places of the suspects, which is evidence, and how much
+the others support each other without them. Who has lost support joins the suspects of the next
+round, since a veil that reaches through a scene stops light near everything in it, and a cluster
+vouches for itself.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..seeing.projection import Footprints, Gaussians
+    from ..seeing.projection import Gaussians
     from ..seeing.scene import Scene
     from ..splats import Splats
     from ..views import View, ViewSet
-    from .support import Hits
+    from .support import ViewHits
 
 Sums = TypeVar("Sums")
 
@@ -56,42 +57,40 @@ ROUNDS = 3
 FEW_NEW = 0.02
 """Rounds end where this share of the suspects, or less, joins them."""
 
-SUPPORT, LARGE_SUPPORT = 0.2, 0.3
-"""A suspect floats if less than this share of the light stops near it; giants and needles cross
-surfaces, so they may have more near them."""
+SUPPORT = 0.5
+"""A suspect floats only if less than this share of the light stops near it."""
 
-LOUD_SUPPORT, CROSSING_SUPPORT, MANY = 0.35, 0.6, 16.0
-"""What changes a pixel by `LOUD`, and what is a giant or a needle, may have this much near it if
-at least so many views are clear about it."""
+ISOLATED_SUPPORT = 0.05
+"""The same of what only belongs to a small cluster."""
 
-FAINT = 0.15
-"""Haze is of lower opacity."""
+AGREE = 0.2
+"""At least this share of the views that see it must see past it, but for giants and needles."""
 
 FEW = 2.0
 """What fewer views see past stays: no view could be left out, and the others still tell."""
 
-CLEAR, HELD = 1.6, 1.3
-"""So many views have to be clear about a splat, times the second for each neighbour that touches it
-and stays, at most half of all views: what hangs together with content needs more evidence."""
+POWER = 1.5
+"""The evidence is by how much a splat changes a pixel, times this power of one more than the views
+that see past it."""
 
-LARGE_CLEAR = (8.0, 1.1)
-"""The same of giants and needles, which lie in more pictures and touch more."""
+NEEDED = 11 / 255
+"""So much evidence is needed against a splat that touches nothing."""
 
-AGREE = 0.6
-"""At least this share of the views that see it must see past it."""
+HELD = 7.0
+"""That is multiplied by this to the power of the square root of how many neighbours touch the splat
+and stay."""
 
-LOUD, LOUD_VIEWS, LOUD_AGREE = 10 / 255, 6, 0.3
-"""Where a splat changes a pixel by at least this much, so many views that see past it are enough,
-if they are this share of all: the others may see it against a surface just behind."""
+GIANT_NEEDED, NEEDLE_NEEDED = 3.0, 1 / 3
+"""It is multiplied by these, too, for giants and needles."""
 
-NEEDLE_VIEWS = 4
-"""So many views must see past a needle that has more near it than `LARGE_SUPPORT`."""
+FAINT = 0.15
+"""Haze is of lower opacity."""
 
-VISIBLE, WIDE = 4 / 255, 0.05
-"""By how much a splat must change a pixel, as its opacity times its contrast to what lies behind.
-One whose standard deviation reaches across more than this share of a picture's longer side changes
-more pixels, and must change each by so much less: the root mean square of the picture's change is
-the same. Half is enough of what `MANY` views see past."""
+VISIBLE, GLARING, WIDE = 4 / 255, 40 / 255, 0.05
+"""A change of a pixel is opacity times contrast to what lies behind, at most the second of these.
+Where the standard deviation reaches across more than the third share of a picture's longer side it
+counts by so much more: the root mean square of the picture's change is the same. What stays, but
+would go if it changed a pixel by the first, is nearly transparent."""
 
 NEAR = 0.3
 """Haze is at most so far from a camera, scene sizes."""
@@ -156,6 +155,7 @@ class Search:
         self.seen, self.width, self.sure = np.zeros((3, len(gaussians)))
         self.shown = np.zeros(len(gaussians), np.bool_)
         self.evidence = Evidence.zero(len(gaussians))
+        self.hits: list[ViewHits | None] = [None] * len(self.views)
         with np.errstate(invalid="ignore"):
             scales = np.sort(splats.log_scales[gaussians.index].astype(np.float64), axis=1)
         self.slender = scales[:, 2] - scales[:, 1] >= np.log(SLENDER)
@@ -176,11 +176,8 @@ class Search:
         """
         suspects = self._suspects(progress)
         large = suspects.giant | suspects.needle
-        effect = self._effect()
-        least = np.where(self.evidence.past >= MANY, VISIBLE / 2.0, VISIBLE)
-        shows = effect >= least * (WIDE / np.maximum(self.width, WIDE))
-        floats = self._floats(suspects, effect, shows)
-        visible, faint = floats & shows, floats & ~shows & suspects.doubted & ~large
+        visible, faint = self._floats(suspects)
+        faint &= suspects.doubted & ~large
         haze = faint & (self.gaussians.alphas < FAINT) & self._near_cameras(faint)
         return {
             "front": visible & suspects.doubted & ~large,
@@ -194,8 +191,9 @@ class Search:
 
     def _suspects(self, progress: Progress) -> _Suspects:
         """Let the views look until few suspects join."""
-        nobody = np.zeros(len(self.gaussians), np.bool_)
-        support = self._look(nobody, ~nobody, part(progress, 0.0, 0.25), first=True).support
+        count = len(self.gaussians)
+        nobody = np.zeros(count, np.bool_)
+        support = self._first_look(part(progress, 0.0, 0.3))
         self.seen, self.width = support.views, support.width
         giant = (self.gaussians.largest >= HUGE) & (self.width >= GIANT)
         needle = self.slender & (self.width >= LONG) & ~giant
@@ -203,49 +201,45 @@ class Search:
         suspects = _Suspects(nobody, giant, needle, nobody)
         new, open_ = shares < DOUBTED, shares < _DECIDED
         for number in range(ROUNDS):
-            start = 0.25 * (number + 1)
+            start = (0.3, 0.8, 0.9)[number]
             doubted = suspects.doubted | new
             small = self._clusters(~doubted & ~giant, part(progress, start, start + 0.02))
             suspects = _Suspects(doubted, giant, needle, suspects.small | small)
             absent = suspects.mask
             wanted = open_ & ~absent
-            sight = self._look(absent, wanted, part(progress, start + 0.02, start + 0.25))
+            if not number:
+                self._aim(absent, absent | open_, part(progress, 0.32, 0.7))
+            sight = self._look(absent, wanted, part(progress, start + 0.02, start + 0.1))
             self.evidence = sight.evidence
             new = wanted & (sight.support.shares() < DOUBTED)
             if np.count_nonzero(new) <= FEW_NEW * np.count_nonzero(absent):
                 break
         return suspects
 
-    def _look(
-        self,
-        absent: NDArray[np.bool_],
-        wanted: NDArray[np.bool_],
-        progress: Progress,
-        *,
-        first: bool = False,
-    ) -> _Sight:
-        """Let all views look without suspects, (M,); `wanted`, (M,), says whose support counts.
-
-        In the first look the giants are absent where they are wide, and there are no suspects.
-        """
+    def _first_look(self, progress: Progress) -> Support:
+        """Let all views look with all present but giants, which are absent where they are wide."""
         count = len(self.gaussians)
+        all_ = np.ones(count, np.bool_)
 
-        def of_group(numbers: range) -> _Sight:
-            total = _Sight(Support.zero(count), Evidence.zero(count))
+        def of_group(numbers: range) -> Support:
+            total = Support.zero(count)
             for number in numbers:
-                footprints, hits = self._seen(number, absent, first=first)
-                total.support.add(footprints, hits, wanted)
-                if first:
-                    self.shown[footprints.index] = True
-                elif hits is not None:
-                    total.evidence.add(hits, absent, self.gaussians.colors)
+                view = self.views[number][0]
+                footprints = projection.project(self.gaussians, self.scene, view)
+                self.shown[footprints.index] = True
+                total.views[footprints.index[footprints.inside]] += 1.0
+                wide = footprints.sigmas[0] >= GIANT * max(view.width, view.height)
+                absent = np.zeros(count, np.bool_)
+                absent[footprints.index] = wide & (self.gaussians.largest[footprints.index] >= HUGE)
+                hits = hits_of_view(self.gaussians, footprints, self.scene, (view, number), absent)
+                if hits is not None:
+                    total.add(hits.without(absent), all_)
             return total
 
-        total = _Sight(Support.zero(count), Evidence.zero(count))
-        for sight in self._in_groups(of_group, progress, "casting rays"):
-            total.support.merge(sight.support)
-            total.evidence.merge(sight.evidence)
-        if first and self.count and not total.support.width.any():
+        total = Support.zero(count)
+        for support in self._in_groups(of_group, progress, "casting rays"):
+            total.merge(support)
+        if count and not total.width.any():
             msg = (
                 f"no camera sees the splats: none of {count} that show is hit by a ray of "
                 f"any of {len(self.views)} views; check that cameras and splats share "
@@ -254,19 +248,45 @@ class Search:
             raise RefineError(msg)
         return total
 
-    def _seen(
-        self, number: int, absent: NDArray[np.bool_], *, first: bool
-    ) -> tuple[Footprints, Hits | None]:
-        """Return the footprints of all Gaussians in a view, and what its rays hit."""
-        view = self.views[number][0]
-        footprints = projection.project(self.gaussians, self.scene, view)
-        if first:
-            wide = footprints.sigmas[0] >= GIANT * max(view.width, view.height)
-            absent = absent.copy()
-            absent[footprints.index] = wide & (self.gaussians.largest[footprints.index] >= HUGE)
-        return footprints, hits_of_view(
-            self.gaussians, footprints, self.scene, view, number, absent
-        )
+    def _aim(
+        self, suspects: NDArray[np.bool_], absent: NDArray[np.bool_], progress: Progress
+    ) -> None:
+        """Cast the rays of all rounds, aimed at suspects, (M,).
+
+        What lies behind Gaussians that may become suspects, `absent`, (M,), is kept, too.
+        """
+
+        def of_group(numbers: range) -> None:
+            for number in numbers:
+                view = self.views[number][0]
+                footprints = projection.project(self.gaussians, self.scene, view)
+                self.hits[number] = hits_of_view(
+                    self.gaussians, footprints, self.scene, (view, number), absent, suspects
+                )
+
+        self._in_groups(of_group, progress, "aiming rays")
+
+    def _look(
+        self, absent: NDArray[np.bool_], wanted: NDArray[np.bool_], progress: Progress
+    ) -> _Sight:
+        """Let all views look without suspects, (M,); `wanted`, (M,), says whose support counts."""
+        count = len(self.gaussians)
+
+        def of_group(numbers: range) -> _Sight:
+            total = _Sight(Support.zero(count), Evidence.zero(count))
+            for number in numbers:
+                cast = self.hits[number]
+                if cast is not None:
+                    hits = cast.without(absent)
+                    total.support.add(hits, wanted)
+                    total.evidence.add(hits, absent, self.gaussians.colors)
+            return total
+
+        total = _Sight(Support.zero(count), Evidence.zero(count))
+        for sight in self._in_groups(of_group, progress, "looking past suspects"):
+            total.support.merge(sight.support)
+            total.evidence.merge(sight.evidence)
+        return total
 
     def _clusters(self, solid: NDArray[np.bool_], progress: Progress) -> NDArray[np.bool_]:
         """Return which Gaussians are of a small cluster, (M,), of those that are solid."""
@@ -286,29 +306,31 @@ class Search:
             count, 1, progress=progress, what=what, threads=self.threads,
         )  # fmt: skip
 
-    def _floats(
-        self, suspects: _Suspects, effect: NDArray[np.float64], shows: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
-        """Return which suspects float, (M,), given by how much each changes a pixel, (M,)."""
-        seen, past = self.evidence.views, self.evidence.past
-        large = suspects.giant | suspects.needle
-        support = self.evidence.support()
-        passed = np.where(large, seen * (1.0 - support), past)
+    def _floats(self, suspects: _Suspects) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return which suspects float and show, and which float but do not show, (M,) each."""
+        seen, past, support = self.evidence.views, self.evidence.past, self.evidence.support()
+        giant, needle, large = suspects.giant, suspects.needle, suspects.giant | suspects.needle
+        passed = np.where(large, np.maximum(past, seen * (1.0 - support)), past)
         self.sure = (passed + 1.0) / (seen + 2.0)
-        clear = np.where(large, passed, past * past / np.maximum(np.maximum(self.seen, past), 1.0))
-        floats = large | agreed(self.evidence, effect)
-        floats &= (past >= FEW) | (suspects.giant & (passed >= FEW))
-        most = np.where(large, LARGE_SUPPORT, SUPPORT)
-        crossing = np.where(large, CROSSING_SUPPORT, np.where(effect >= LOUD, LOUD_SUPPORT, 0.0))
-        crossing[suspects.needle & (past < NEEDLE_VIEWS)] = 0.0
-        floats &= (support < most) | ((clear >= MANY) & (support < crossing))
-        rows = np.flatnonzero(floats)
-        stays = ~(floats & shows)
-        held = touching(self.gaussians, rows, stays, threads=self.threads)
-        few, more = LARGE_CLEAR
-        needed = np.where(large[rows], few * more**held, CLEAR * HELD**held)
-        floats[rows] = clear[rows] >= np.minimum(needed, len(self.views) / 2.0)
-        return floats
+        most = np.where(large | suspects.doubted, SUPPORT, ISOLATED_SUPPORT)
+        may = suspects.mask & (support < most) & (large | (past >= AGREE * seen))
+        may &= (past >= FEW) | (giant & (passed >= FEW))
+        rows = np.flatnonzero(may)
+        needed = np.select([giant, needle], [GIANT_NEEDED, NEEDLE_NEEDED], 1.0)
+        needed = NEEDED * needed[rows] / (1.0 + passed[rows]) ** POWER
+        wide = np.maximum(self.width[rows], WIDE) / WIDE
+        change = np.minimum(self._effect()[rows], GLARING) * wide
+        near, touch = touching(self.gaussians, rows, threads=self.threads)
+        shows = may.copy()
+        while True:  # what stays holds its neighbours: fewer go each time
+            held = HELD ** np.sqrt(np.count_nonzero(touch & ~shows[near], axis=1))
+            goes = change >= needed * held
+            if np.array_equal(goes, shows[rows]):
+                break
+            shows[rows] = goes
+        faint = may & ~shows
+        faint[rows] &= VISIBLE * wide >= needed * held
+        return shows, faint
 
     def _effect(self) -> NDArray[np.float64]:
         """Return by how much each suspect changes a pixel that it covers, (M,)."""
@@ -338,10 +360,3 @@ class Search:
         result = np.zeros(len(self.gaussians), np.bool_)
         result[rows] = True
         return result
-
-
-def agreed(evidence: Evidence, effect: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return past which suspects enough views see, given by how much each changes a pixel, (M,)."""
-    views, past = evidence.views, evidence.past
-    fewer = (past >= LOUD_VIEWS) & (past >= LOUD_AGREE * views)
-    return (past >= AGREE * views) | (fewer & (effect >= LOUD))

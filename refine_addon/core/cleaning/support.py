@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..seeing import projection
-from ..seeing.cast import cast, depth_complexity, pixels
+from ..seeing.cast import aimed, cast, depth_complexity, pixels
 from ..seeing.ray_sums import in_front
 
 if TYPE_CHECKING:
@@ -46,6 +46,10 @@ WINDOW = 0.1
 PARALLAX = 0.05
 """They are as well if it differs by less than this, per scene size."""
 
+TARGET = 0.2
+"""Rays are aimed at suspects whose standard deviations, multiplied, are less than this share of the
+area that a ray stands for."""
+
 REACHED = 1e-3
 """Hits that less of the light reaches tell nothing."""
 
@@ -58,6 +62,7 @@ SEEN = 0.1
 PAST = 0.15
 """A view sees past a splat if a lower share of the light stops near it."""
 
+_TURNS = (0.6180339887498949, 0.7548776662466927)  # spread multiples modulo 1 evenly
 _NEAREST = 0.2  # of the depth of its centre: as near as a ray may hit a splat
 _FRACTION = 0.999  # how much of the numbers from one ray to the next the places on a ray take
 _TINY = 1e-30  # replaces 0 as a divisor
@@ -122,28 +127,80 @@ class Hits:
         return np.asarray(np.bincount(self.owner[rows], values, len(self.hit)), np.float64)
 
 
+@dataclass(frozen=True, eq=False)
+class ViewHits:
+    """What the rays of one view hit that may show once suspects are absent: h hits, near to far.
+
+    Attributes
+    ----------
+    hit : (u,) int64
+        The Gaussians that any ray hits.
+    width : (u,) float32
+        See `Hits`.
+    owner : (h,) int32
+        Which of them each hit is on.
+    alpha : (h,) float32
+    key : (h,) float64
+        See `Hits`.
+    scale : float
+        How much of a key is one unit of nearness, 1 / scene size.
+    """
+
+    hit: NDArray[np.int64]
+    width: NDArray[np.float32]
+    owner: NDArray[np.int32]
+    alpha: NDArray[np.float32]
+    key: NDArray[np.float64]
+    scale: float
+
+    def without(self, absent: NDArray[np.bool_]) -> Hits:
+        """Return the hits that light reaches if some Gaussians, (M,) bool, take none."""
+        ray = np.floor(self.key)
+        present = (~absent[self.hit]).take(self.owner).astype(np.float64)
+        alpha = self.alpha.astype(np.float64)
+        _, counts = np.unique(ray, return_counts=True)
+        log_front = in_front(np.log1p(-alpha) * present, counts)
+        reached = np.flatnonzero(log_front > math.log(REACHED))  # (h,)
+        ray, key, alpha = ray[reached], self.key[reached], alpha[reached]
+        transmittance = np.exp(log_front[reached])
+        nearness = (ray + _FRACTION - key) / self.scale
+        return Hits(
+            self.hit, self.width, self.owner[reached], alpha, transmittance,
+            transmittance * alpha * present[reached], ray, key,
+            self.scale * np.maximum(WINDOW * nearness, PARALLAX),
+        )  # fmt: skip
+
+
 def hits_of_view(
     gaussians: Gaussians,
     footprints: Footprints,
     scene: Scene,
-    view: View,
-    number: int,
+    numbered: tuple[View, int],
     absent: NDArray[np.bool_],
-) -> Hits | None:
+    targets: NDArray[np.bool_] | None = None,
+) -> ViewHits | None:
     """Return what the rays of one view hit; None if nothing.
 
     Parameters
     ----------
     gaussians, footprints
         The latter are those of the former in the view.
-    scene, view
-    number : int
-        Of the view: each has its rays in other pixels.
+    scene
+    numbered : View, int
+        The view, and its number: each has its rays in other pixels.
     absent : (M,) bool
-        Gaussians that take no light, though they are hit.
+        Gaussians that may take no light, though they are hit.
+    targets : (M,) bool, optional
+        Rays are aimed at these if they are small.
     """
+    view, number = numbered
     count = min(RAYS, MAX_HITS / max(depth_complexity(footprints, view), 1.0))
-    rays = cast(footprints, *pixels(view, number, count))
+    columns, rows = pixels(view, number, count)
+    aims = None
+    if targets is not None:
+        cell = view.width * view.height / (len(columns) * len(rows))
+        aims = aimed(view, columns, rows, _centers(footprints, targets, number, TARGET * cell))
+    rays = cast(footprints, columns, rows, aims)
     if not len(rays.ray):
         return None
     present = ~absent[rays.hit].take(rays.owner)  # (hits of the rays,)
@@ -154,30 +211,26 @@ def hits_of_view(
     place[footprints.index] = np.arange(len(footprints.index))
     footprints = footprints.take(place[rays.hit])  # of the u that are hit
     depth = _depths(gaussians.take(rays.hit), footprints, scene, view, rays, reached)
-    key, window = _keys(rays.ray[reached], 1.0 / depth)
+    nearness = 1.0 / depth
+    scale = _FRACTION / float(nearness.max())
+    key = rays.ray[reached] + np.maximum(_FRACTION - scale * nearness, 0.0)
     order = np.argsort(key, kind="stable")
     reached = reached[order]
-    alpha, transmittance = rays.alpha[reached].astype(np.float64), np.exp(log_front[reached])
-    return Hits(
-        rays.hit,
-        footprints.sigmas[0] / np.float32(max(view.width, view.height)),
-        rays.owner[reached],
-        alpha,
-        transmittance,
-        transmittance * alpha * present[reached],
-        rays.ray[reached].astype(np.float64),
-        key[order],
-        window[order],
-    )
+    width = footprints.sigmas[0] / np.float32(max(view.width, view.height))
+    return ViewHits(rays.hit, width, rays.owner[reached], rays.alpha[reached], key[order], scale)
 
 
-def _keys(
-    ray: NDArray[np.int32], nearness: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return `key` and `window` of hits, (h,) each, by their nearness, 1 / depth in scene sizes."""
-    scale = _FRACTION / float(nearness.max())
-    key = ray.astype(np.float64) + _FRACTION - scale * nearness
-    return key, scale * np.maximum(WINDOW * nearness, PARALLAX)
+def _centers(
+    footprints: Footprints, targets: NDArray[np.bool_], number: int, area: float
+) -> NDArray[np.float32]:
+    """Return the centres of those targets that rays spread evenly would miss, (2, t), pixels.
+
+    They are smaller than an area, px^2, and in another order in each view.
+    """
+    small = footprints.sigmas[0] * footprints.sigmas[1] < area
+    rows = np.flatnonzero(small & targets[footprints.index])
+    turn = (footprints.index[rows] * _TURNS[0] + number * _TURNS[1]) % 1.0
+    return footprints.centers[:, rows[np.argsort(turn)]]
 
 
 def _depths(
@@ -206,10 +259,10 @@ def _depths(
         view.fy / z * (covariances[4] - y / z * covariances[5]),
     )
     owner, ray = rays.owner[reached], rays.ray[reached]
-    step = (  # (h,) each: from the splat's centre, pixels
-        rays.columns[ray % len(rays.columns)] + 0.5 - footprints.centers[0, owner],
-        rays.rows[ray // len(rays.columns)] + 0.5 - footprints.centers[1, owner],
-    )
+    step = [  # (h,) each: from the splat's centre, pixels
+        pixel + 0.5 - center.take(owner)
+        for pixel, center in zip(rays.pixels_of(ray), footprints.centers, strict=True)
+    ]
     longest = gaussians.largest.astype(np.float64)
     depth = z[owner]
     for axes, sigmas in zip((footprints.major, footprints.minor), footprints.sigmas, strict=True):
@@ -276,14 +329,12 @@ class Support(_Sums):
     views: NDArray[np.float64]
     width: NDArray[np.float64]
 
-    def add(self, footprints: Footprints, hits: Hits | None, wanted: NDArray[np.bool_]) -> None:
-        """Add what one view sees; light and support of the Gaussians that are wanted, (M,) bool."""
-        self.views[footprints.index[footprints.inside]] += 1.0
-        if hits is not None:
-            weight, supported = own_support(hits, wanted[hits.hit])
-            self.weight[hits.hit] += weight
-            self.supported[hits.hit] += supported
-            self.width[hits.hit] = np.maximum(self.width[hits.hit], hits.width)
+    def add(self, hits: Hits, wanted: NDArray[np.bool_]) -> None:
+        """Add light and support, in one view, of the Gaussians that are wanted, (M,) bool."""
+        weight, supported = own_support(hits, wanted[hits.hit])
+        self.weight[hits.hit] += weight
+        self.supported[hits.hit] += supported
+        self.width[hits.hit] = np.maximum(self.width[hits.hit], hits.width)
 
     def merge(self, other: Self) -> None:
         """Add what other views see."""

@@ -78,7 +78,50 @@ def depth_complexity(footprints: Footprints, view: View) -> float:
     return float(np.minimum(area, np.float32(size)).sum(dtype=np.float64)) / size
 
 
-def cast(footprints: Footprints, columns: NDArray[np.int64], rows: NDArray[np.int64]) -> Rays:
+def aimed(
+    view: View,
+    columns: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    targets: NDArray[np.float32],
+) -> NDArray[np.int64]:
+    """Return which pixel each ray goes through so that rays pass through targets, (2, P).
+
+    The columns and rows divide the image into cells of one ray each. A ray goes through the first
+    of the targets that lie in its cell, or where its column and row cross if none does.
+
+    Parameters
+    ----------
+    view : View
+    columns, rows : (C,), (R,) int64
+        See `Rays`; ascending.
+    targets : (2, t) float32
+        Column and row in the image, pixels; what lies outside it is no target.
+
+    Returns
+    -------
+    aims : (2, P) int64
+        Column and row of the pixel of each ray; see `Rays`.
+    """
+    row, column = np.divmod(np.arange(len(columns) * len(rows)), len(columns))
+    aims = np.stack([columns[column], rows[row]])
+    pixel = np.floor(targets).astype(np.int64)
+    inside = (pixel >= [[columns[0]], [rows[0]]]) & (pixel < [[view.width], [view.height]])
+    pixel = pixel[:, inside.all(axis=0)]
+    across, down = (
+        np.searchsorted(places, of_targets, side="right") - 1
+        for places, of_targets in zip((columns, rows), pixel, strict=True)
+    )
+    ray, first = np.unique(down * len(columns) + across, return_index=True)
+    aims[:, ray] = pixel[:, first]
+    return np.asarray(aims, np.int64)
+
+
+def cast(
+    footprints: Footprints,
+    columns: NDArray[np.int64],
+    rows: NDArray[np.int64],
+    aims: NDArray[np.int64] | None = None,
+) -> Rays:
     """Return the rays through some pixels with all that they hit.
 
     A ray hits a footprint where its alpha there is at least `ALPHA_CUT`. Discs are hit where the
@@ -90,15 +133,17 @@ def cast(footprints: Footprints, columns: NDArray[np.int64], rows: NDArray[np.in
         In the view of the pixels, front to back.
     columns, rows : (C,), (R,) int64
         See `Rays`; ascending.
+    aims : (2, P) int64, optional
+        See `aimed`.
     """
     pieces = [_compact(np.empty(0), np.empty(0), np.empty(0))]
-    pieces += [_compact(*piece) for piece in hits(footprints, columns, rows, _PAIRS)]
+    pieces += [_compact(*piece) for piece in hits(footprints, columns, rows, _PAIRS, aims=aims)]
     footprint, ray, alpha = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
     order = np.argsort(ray, kind="stable")  # footprints are front to back, and so stay hits
     hit, owner = _members(footprints.index, footprint.take(order))
     alpha = alpha.take(order)
     return Rays(
-        columns, rows, ray.take(order).astype(np.int32), owner, alpha, np.log1p(-alpha), hit
+        columns, rows, ray.take(order).astype(np.int32), owner, alpha, np.log1p(-alpha), hit, aims
     )
 
 
@@ -108,6 +153,8 @@ def hits(
     rows: NDArray[np.int64],
     limit: int,
     wanted: Callable[[NDArray[np.int64], NDArray[np.int32]], NDArray[np.bool_]] | None = None,
+    *,
+    aims: NDArray[np.int64] | None = None,
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]]:
     """Yield which pixels footprints hit, some footprints at a time.
 
@@ -122,6 +169,8 @@ def hits(
         which limits temporary memory.
     wanted : callable, optional
         Which pairs of a footprint and a pixel are of interest, (p,) bool; by default all.
+    aims : (2, P) int64, optional
+        Pixels in the cells between the columns and rows that are looked at instead; see `aimed`.
 
     Yields
     ------
@@ -138,6 +187,8 @@ def hits(
         _bounding_boxes(footprints, squared_radius, axis, places)
         for axis, places in enumerate((columns, rows))
     )
+    if aims is not None:
+        across, down = _with_cell_before(across), _with_cell_before(down)
     boxed = np.flatnonzero(across[1] * down[1] > 0)  # (r,)
     for start, end in _slices((across[1] * down[1])[boxed], limit):
         checkpoint()
@@ -147,7 +198,11 @@ def hits(
             left = np.flatnonzero(wanted(owner, pixel))
             owner, pixel = owner[left], pixel[left]
             column, row = column[left], row[left]
-        squared = _squared_distances(footprints, owner, columns.take(column), rows.take(row))
+        if aims is None:
+            place = columns.take(column), rows.take(row)
+        else:
+            place = aims[0].take(pixel), aims[1].take(pixel)
+        squared = _squared_distances(footprints, owner, *place)
         inside = np.flatnonzero(squared < squared_radius.take(owner))
         owner = owner[inside]
         alpha = footprints.alphas.take(owner) * np.exp(squared[inside] / np.float32(-2.0))
@@ -237,6 +292,14 @@ def _bounding_boxes(
         low, high = (center + edge for edge in _disc_extent(footprints.discs, squared_radius, axis))
     first, end = (_before(places, np.ceil(edge)) for edge in (low, high))
     return first, end - first
+
+
+def _with_cell_before(
+    box: tuple[NDArray[np.int64], NDArray[np.int64]],
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return boxes, see `_bounding_boxes`, with the cell before: it may reach into the box."""
+    first = np.maximum(box[0] - 1, 0)
+    return first, box[0] + box[1] - first
 
 
 def _disc_extent(

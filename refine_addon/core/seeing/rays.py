@@ -20,6 +20,8 @@ from ..work import checkpoint
 from .ray_sums import behind, in_front, paired
 
 if TYPE_CHECKING:
+    from typing import Any
+
     from numpy.typing import NDArray
 
 LOG_OPAQUE = -9.3
@@ -62,6 +64,8 @@ class Rays:
         Alpha of the splat there, and the logarithm of 1 - alpha.
     hit : (u,) int64
         The Gaussians that any ray hits, ascending.
+    aims : (2, P) int64, optional
+        Column and row of the pixels that the rays go through instead; see `cast.aimed`.
     """
 
     columns: NDArray[np.int64]
@@ -71,11 +75,20 @@ class Rays:
     alpha: NDArray[np.float32]
     log_passed: NDArray[np.float32]
     hit: NDArray[np.int64]
+    aims: NDArray[np.int64] | None = None
 
     @property
     def count(self) -> int:
         """How many rays there are."""
         return len(self.columns) * len(self.rows)
+
+    def pixels_of(
+        self, ray: NDArray[np.integer[Any]]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return column and row of the pixels that some rays, (n,), go through, (n,) each."""
+        if self.aims is not None:
+            return self.aims[0].take(ray), self.aims[1].take(ray)
+        return self.columns.take(ray % len(self.columns)), self.rows.take(ray // len(self.columns))
 
     @property
     def hitting(self) -> int:
