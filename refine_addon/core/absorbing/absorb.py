@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from .. import costs
+from ..pace import phases
 from ..seeing.scene import scene_of, spatial_order, splat_fingerprint
 from ..splats import ARRAYS, Splats, drawable
 from ..work import Progress, for_chunks, part, report, silent
@@ -169,12 +171,13 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     factor = patience(1.0 - goal / max(began or count, 1))
     left_after = stages(count, goal)
     sums: ViewSums | None = None
-    for number, left in enumerate(left_after):
-        of_stage = part(progress, number / len(left_after), (number + 1) / len(left_after))
-        sums = measure(splats, sums, part(of_stage, 0.0, 0.5))
+    steps = iter(phases(progress, *costs.absorbing(count, left_after, costs.Images.of(views))))
+    for left in left_after:
+        measuring, merging_progress = next(steps), next(steps)
+        sums = measure(splats, sums, measuring)
         stage = absorb_once(
             splats, views, scene, sums, left, protected=spared[origin],
-            factor=factor, progress=part(of_stage, 0.5, 1.0), threads=threads,
+            factor=factor, progress=merging_progress, threads=threads,
         )  # fmt: skip
         splats, sums, origin = stage.splats, stage.expected, origin[stage.keep]
         members = stage.sums_of(members)
