@@ -139,7 +139,8 @@ def note_rays(
             rays = cast_view(context.views.by_distance(), number, footprints, scoring=scoring)
         else:
             rays = cast(footprints, *pixels)
-    context.folder.note(name, tuple(vars(rays).values()))
+    arrays = (values for values in vars(rays).values() if values is not None)  # not aimed
+    context.folder.note(name, tuple(arrays))
 
 
 class StoredSums(Mapping[int, Measured]):
