@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from refine_addon import core
 from refine_addon.core import Settings
-from refine_addon.core.refitting.refit import Refit, refit_on
+from refine_addon.core.refitting.refit import SIMPLER, Refit, refit_on
 from refine_addon.core.refitting.round_rays import RoundRays
 from refine_addon.core.selection import Budget
 from refine_addon.core.work import silent
@@ -47,7 +47,7 @@ class Cheaper(NamedTuple):
 
 CHEAPER = {
     "as it is": Cheaper(),
-    "colours and opacities alone": Cheaper(Refit(geometry=False)),
+    "colours and opacities alone": Cheaper(Refit(geometry=False), rays=SIMPLER),
     "1 round": Cheaper(Refit(rounds=1)),
     "2 rounds": Cheaper(Refit(rounds=2)),
     "half of the views": Cheaper(views=0.5),

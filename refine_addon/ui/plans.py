@@ -23,7 +23,7 @@ from ..core.estimate.alignment import Alignment
 from ..core.estimate.cost import expected_seconds
 from ..core.estimate.quality import in_views, in_words, out_of_reach, parted
 from ..core.pace import in_time
-from ..core.report import MANY_UNSEEN, sizes_in_words
+from ..core.report import MANY_UNSEEN, little_seen, sizes_in_words
 from ..core.selection import Tally, quality_of
 from ..core.survivor_choice import SURVIVORS
 from ..core.task import may_absorb
@@ -65,6 +65,8 @@ class _Known:
     kinds : Histogram
     unseen : int
         Splats whose centre lies in none of the views.
+    little_seen : str
+        See `report.little_seen`.
     forced : int
         Splats that go before all others, which all of the above leaves out.
     scored_s : float or None
@@ -77,6 +79,7 @@ class _Known:
     fixed_bytes: int
     kinds: Histogram
     unseen: int
+    little_seen: str
     forced: int
     scored_s: float | None = None
 
@@ -311,6 +314,8 @@ def warnings(plan: dict[str, Any], record: dict[str, Any]) -> list[Warned]:
             text += f"; {plan['unseen_gone'] / unseen:.0%} of these go"
         some_go = plan.get("unseen_gone") != 0
         warned.append(Warned(text, "refine.keep_unseen" if some_go else ""))
+    elif plan.get("little_seen"):
+        warned.append(Warned(_sentence(plan["little_seen"]), "refine.add_ring"))
     return warned
 
 
@@ -413,7 +418,15 @@ def _know(task: Task, state: tuple[Any, ...], scored_s: float | None) -> _Known:
     kinds = price.histogram(scores)
     tally, unseen = Tally(scores, task.protected), int(np.count_nonzero(scores.seen == 0))
     known = _Known(
-        state, tally, int(task.row_bytes), task.fixed_bytes, kinds, unseen, gone, scored_s
+        state,
+        tally,
+        int(task.row_bytes),
+        task.fixed_bytes,
+        kinds,
+        unseen,
+        little_seen(scores.seen),
+        gone,
+        scored_s,
     )
     _known[:] = [known]
     return known
@@ -468,6 +481,7 @@ def _noted(known: _Known, settings: Any) -> dict[str, Any]:  # noqa: ANN401
     if between is not None:
         plan["psnr_between"] = between
         plan["parted"] = parted(curve.at(removed / rest, told), between)
+        plan["little_seen"] = known.little_seen
     if known.scored_s is not None:
         plan["seconds"] = expected_seconds(known.scored_s, removed / rest, once=False)
     if curve.foretold:

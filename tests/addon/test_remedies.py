@@ -270,6 +270,21 @@ def test_where_views_between_lose_more_they_are_offered(addon):
     assert "about 36 dB" in found[0].text
 
 
+def test_where_few_splats_lie_in_two_views_a_ring_is_offered(addon):
+    """But not beside the warning that many lie in none, which says more."""
+    plan = {"splats": 100, "unseen": 4, "little_seen": "21% of the splats lie in one view or none"}
+
+    few, none = (
+        addon.ui.plans.warnings(plan | {"unseen": unseen}, {"views_used": 8, "cameras": []})
+        for unseen in (4, 5)
+    )
+
+    assert [warned.text for warned in few] == [plan["little_seen"]]
+    assert remedies(few) == ["refine.add_ring"]
+    assert "in no view" in none[0].text
+    assert len(none) == 1
+
+
 @pytest.mark.parametrize("size", [(1920, 1080), (600, 900)])
 def test_a_ring_frames_wide_and_tall_pictures(room, size, warned):
     """The ball fits into the shorter side."""

@@ -49,7 +49,10 @@ def pace(sizes, *, passed):
         (10.0, 0.25, "about 30 s left"),  # 10 / .25 - 10
         (9.9, 0.25, "about 30 s left"),  # 29.7, rounded up
         (20.0, 0.25, "about 60 s left"),
-        (20.4, 0.25, "about 2 min left"),  # 61.2 s
+        (20.4, 0.25, "about 1 min 10 s left"),  # 61.2 s
+        (40.0, 0.25, "about 2 min left"),  # 120 s
+        (100.0, 0.25, "about 5 min left"),  # 300 s
+        (101.0, 0.25, "about 6 min left"),  # 303 s
         (3000.0, 0.25, "about 2 h 30 min left"),  # 9000 s
         (1200.0, 0.25, "about 1 h 0 min left"),  # 3600 s
     ],
@@ -60,6 +63,19 @@ def test_the_time_left_is_that_of_the_pace_so_far(passed, fraction, expected):
     one.next()
 
     assert one.left(fraction) == expected
+
+
+def test_the_time_left_rises_only_where_it_is_far_more():
+    """10 s for half leave 10 s. Half at 12 s leaves 12, 1.2 of it; at 14 s 14, 1.4 of it."""
+    now = [0.0]
+    one = Pace([7], lambda: now[0])
+    one.next()
+
+    def left_at(seconds):
+        now[0] = seconds
+        return one.seconds_left(0.5)
+
+    assert [left_at(seconds) for seconds in (10.0, 12.0, 14.0, 8.0)] == [10.0, 10.0, 14.0, 8.0]
 
 
 def test_the_time_left_of_several_files_goes_by_their_bytes():

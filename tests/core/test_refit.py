@@ -355,6 +355,14 @@ def test_rays_of_one_round_are_not_next_to_those_of_another():
         assert distance.min() > 25
 
 
+def test_rays_grow_with_survivors_and_hits_less_where_there_are_many():
+    """7 rays a survivor, at least 131,072; 112 hits, at least 6.3 million; of many, 64."""
+    assert round_rays.limits(100) == (1 << 17, 3 << 21)
+    assert round_rays.limits(100_000) == (700_000, 11_200_000)
+    assert round_rays.limits(200_000) == (1_400_000, 1 << 24)
+    assert round_rays.limits(1_000_000) == (7_000_000, 64_000_000)
+
+
 def test_views_move_a_little_in_each_round_and_along_their_own_axes():
     """By at most a few times `SHIFT` of the distance to the next view, or of a share of the scene.
 

@@ -184,7 +184,7 @@ def test_progress_rises_and_can_end_while_refitting(small, views):
     shares = [share for share, _ in told]
     assert shares == sorted(shares)
     assert told[-1][1] == "refitting"
-    assert 0.2 < told[-1][0] < 0.95
+    assert 0.05 < told[-1][0] < 0.95  # by what absorbing 5,000 splats costs beside refitting
 
 
 class Round:

@@ -166,3 +166,33 @@ def test_of_one_view_nothing_is_told_of_between():
 
     assert result.report["estimated_psnr_between"] is None
     assert not any("between" in note for note in result.report["notes"])
+
+
+def test_views_that_share_little_are_told_to_know_little_of_others():
+    """Turned apart, each of two views holds its own half of a wall; twice each, all is held twice.
+
+    The wall of 15 x 15 splats reaches from -4 to 4, at z = 6; either view looks 30 degrees aside.
+    """
+    splats, views, _ = hidden_from_the_sides()
+    wall = splats.take(np.arange(225))
+    cosine, sine = np.cos(np.pi / 6.0), np.sin(np.pi / 6.0)
+    apart = [
+        replace(one, rotation=np.array([[cosine, 0.0, -way], [0.0, 1.0, 0.0], [way, 0.0, cosine]]))
+        for one, way in zip(views, (-sine, sine), strict=True)
+    ]
+    beside = [
+        replace(one, center=one.center + np.array([0.0, 0.1, 0.0]), name=one.name + "b")
+        for one in apart
+    ]
+    held = wall.take(prune(wall, ViewSet(tuple(apart)), Budget(ratio=0.3)).scores.seen > 0)
+    few, enough = (
+        prune(held, ViewSet(tuple(chosen)), Budget(ratio=0.3), Settings("occlusion"))
+        for chosen in (apart, apart + beside)
+    )
+
+    share = np.mean(few.scores.seen < 2)
+    assert share > 0.5
+    told = f"{share:.0%} of the splats lie in one view or none"
+    assert [note for note in few.report["notes"] if told in note]
+    assert np.mean(enough.scores.seen < 2) < 0.1
+    assert not [note for note in enough.report["notes"] if "one view or none" in note]

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from .. import spherical_harmonics
+from .. import costs, spherical_harmonics
+from ..pace import phases
 from ..seeing.scene import scene_of, spatial_order, splat_fingerprint
 from ..splats import ARRAYS, Splats, drawable
 from ..work import Progress, for_chunks, part, report, silent
@@ -177,13 +178,14 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     bare = lineage.without_harmonics(progress)
     scene = scene_of(bare.means, drawable(bare), views)
     sums: ViewSums | None = None
-    for number, left in enumerate(left_after):
-        of_stage = part(progress, number / len(left_after), (number + 1) / len(left_after))
-        sums = measure(bare, sums, part(of_stage, 0.0, 0.5))
+    there = len(lineage.origin)
+    steps = iter(phases(progress, *costs.absorbing(there, left_after, costs.Images.of(views))))
+    for left in left_after:
+        measuring, merging_progress = next(steps), next(steps)
+        sums = measure(bare, sums, measuring)
         stage = absorb_once(
             bare, views, scene, sums, left, protected=spared[lineage.origin],
-            factor=factor, color_of=lineage.color_of,
-            progress=part(of_stage, 0.5, 1.0), threads=threads,
+            factor=factor, color_of=lineage.color_of, progress=merging_progress, threads=threads,
         )  # fmt: skip
         bare, sums = stage.splats, stage.expected
         lineage.follow(stage)

@@ -15,7 +15,7 @@ from ..whole_file import expanded, refuse_existing, refuse_mapped
 from ..work import Progress, report, silent
 from .loaded import Loaded, RowSizes
 from .requests import Kept
-from .run import DECIDED, Written, run
+from .run import Written, run
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -188,7 +188,7 @@ class FileSink:
         RefineError, Cancelled
             See `SplatFile.write`.
         """
-        report(runtime.progress, DECIDED, "writing")
+        report(runtime.progress, 0.0, "writing")
         writer = as_written(loaded.file(), self.path)
         columns = choice.columns if isinstance(choice, Kept) else loaded.columns(choice.absorbed)
         path, size = self.written, writer.size(choice.keep, columns)

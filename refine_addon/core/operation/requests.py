@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..cleaning.clean import Cleaning, clean
+from ..costs import Cost, joined
 from ..formats.registry import refuse_unknown_size
-from ..pipeline import decide, score
+from ..pace import phases
+from ..picture_files import chosen
+from ..pipeline import decide, planned, score, scoring_plans
 from ..report import kept_and_removed, prices, scoring_notes, seen_by, what_was_seen
 from ..survivor_choice import refuse_unknown
 from ..task import DEFAULTS, Settings, Task, may_absorb
-from .run import DECIDED, Request
+from .run import Request
 from .written import written_facts, written_splats
 
 if TYPE_CHECKING:
@@ -24,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..cleaning.clean import Cleaned
+    from ..costs import Plan
     from ..formats.format import Format
     from ..picture_files import PictureFiles
     from ..rendering import Model
@@ -34,9 +38,6 @@ if TYPE_CHECKING:
     from ..volumes import Zone
     from .loaded import Loaded
     from .run import Runtime
-
-CLEANED, COMPARED = 0.4, 0.85
-"""Where in the progress of a prune cleaning ends, and where pictures begin."""
 
 PROPERTY = "refine_score"
 """The property of a PLY that holds the scores."""
@@ -116,6 +117,24 @@ class PruneRequest(Request["Loaded", "Result"]):
                 held.enter_context(self.pictures.opened(self.views))
             yield
 
+    def costs(self, loaded: Loaded) -> list[Plan]:
+        """Return what the steps are expected to cost; see `Request.costs`."""
+        cleaning, deciding = self._costs(loaded)
+        pictures = []
+        if self.pictures is not None:
+            drawn = 2 * len(chosen(self.views))
+            pictures = [Cost("drawing", len(loaded.splats), drawn)]
+        writing = Cost("rewriting" if self.absorb else "writing", loaded.bytes)
+        return [[*cleaning, *deciding], [writing], pictures]
+
+    def _costs(self, loaded: Loaded) -> tuple[Plan, Plan]:
+        """Return what cleaning and deciding are expected to cost."""
+        deciding = planned(self._task(loaded))
+        if self.cleaning is None:
+            return [], deciding
+        views = self.views.spread(self.cleaning.views)
+        return [Cost("cleaning", len(loaded.splats), len(views))], deciding
+
     def decide(self, loaded: Loaded, runtime: Runtime) -> Result:
         """Return which splats stay, and what they become: clean, then `pipeline.decide`.
 
@@ -126,18 +145,22 @@ class PruneRequest(Request["Loaded", "Result"]):
         """
         loaded = loaded.counted(self.budget, changed=self.absorb)
         if self.cleaning is None:
-            return self._decide(loaded, runtime.part(0.0, DECIDED))
+            return self._decide(loaded, runtime)
         forced = loaded.forced
-        cleaned = _cleaned(loaded, self.views, self.cleaning, runtime.part(0.0, CLEANED))
+        cleaning, deciding = (
+            replace(runtime, progress=phase)
+            for phase in phases(runtime.progress, *self._costs(loaded))
+        )
+        cleaned = _cleaned(loaded, self.views, self.cleaning, cleaning)
         # The budget counts what is forced out as removed, so that is not cleaned away.
         left = cleaned.keep if forced.out is None else cleaned.keep | forced.out
-        result = self._decide(loaded.take(left), runtime.part(CLEANED, DECIDED)).for_all(left)
+        result = self._decide(loaded.take(left), deciding).for_all(left)
         result.report["cleaned"] = cleaned.facts()
         return result
 
-    def _decide(self, loaded: Loaded, runtime: Runtime) -> Result:
-        """Decide on what cleaning left."""
-        task = Task(
+    def _task(self, loaded: Loaded) -> Task:
+        """Return what is to be decided of what was loaded."""
+        return Task(
             budget=self.budget,
             settings=self.settings,
             splats=loaded.splats,
@@ -149,8 +172,14 @@ class PruneRequest(Request["Loaded", "Result"]):
             fixed_bytes=loaded.sizes.fixed,
             reusable=loaded.reusable,
         )
+
+    def _decide(self, loaded: Loaded, runtime: Runtime) -> Result:
+        """Decide on what cleaning left."""
         result = decide(
-            task, clock=runtime.clock, progress=runtime.progress, threads=runtime.threads
+            self._task(loaded),
+            clock=runtime.clock,
+            progress=runtime.progress,
+            threads=runtime.threads,
         )
         result.report["volumes"] = loaded.volumes
         return result
@@ -185,7 +214,7 @@ class PruneRequest(Request["Loaded", "Result"]):
             after = result.survivors(loaded.splats) if after is None else after
             facts["pictures"] = self.pictures.write(
                 loaded.splats, after, self.views,
-                progress=runtime.part(COMPARED, 1.0).progress, threads=runtime.threads,
+                progress=runtime.progress, threads=runtime.threads,
             )  # fmt: skip
             runtime.clock.lap("pictures_s")
         return facts
@@ -239,6 +268,12 @@ class CleanRequest(Request["Loaded", Kept]):
     overwrite: bool = False
     model: Model | None = None
 
+    def costs(self, loaded: Loaded) -> list[Plan]:
+        """Return what the steps are expected to cost; see `Request.costs`."""
+        views = len(self.views.spread(self.cleaning.views))
+        cleaning = Cost("cleaning", len(loaded.splats), views)
+        return [[cleaning], [Cost("writing", loaded.bytes)], []]
+
     def decide(self, loaded: Loaded, runtime: Runtime) -> Kept:
         """Return what `clean` leaves.
 
@@ -248,7 +283,7 @@ class CleanRequest(Request["Loaded", Kept]):
             See `clean`.
         """
         forced = loaded.forced
-        cleaned = _cleaned(loaded, self.views, self.cleaning, runtime.part(0.0, DECIDED))
+        cleaned = _cleaned(loaded, self.views, self.cleaning, runtime)
         facts: dict[str, Any] = what_was_seen(
             cleaned.seen, cleaned.undrawable, cleaned.views_given, cleaned.views_used
         )
@@ -283,6 +318,11 @@ class ScoreRequest(Request["Loaded", Kept]):
     overwrite: bool = False
     model: Model | None = None
 
+    def costs(self, loaded: Loaded) -> list[Plan]:
+        """Return what the steps are expected to cost; see `Request.costs`."""
+        plans = scoring_plans(loaded.splats, self.views, self.settings, None, quality=False)
+        return [joined(plans), [Cost("writing", loaded.bytes)], []]
+
     def decide(self, loaded: Loaded, runtime: Runtime) -> Kept:
         """Return all splats, with their scores as a property.
 
@@ -295,7 +335,7 @@ class ScoreRequest(Request["Loaded", Kept]):
         scores = score(
             loaded.splats, self.views, self.settings,
             protected=forced.protected, forced_out=forced.out,
-            progress=runtime.part(0.0, DECIDED).progress, threads=runtime.threads,
+            progress=runtime.progress, threads=runtime.threads,
         )  # fmt: skip
         runtime.clock.lap("score_s")
         facts: dict[str, Any] = seen_by(scores)
@@ -324,6 +364,10 @@ class ConvertRequest(Request["Loaded", Kept]):
 
     overwrite: bool = False
     model: Model | None = None
+
+    def costs(self, loaded: Loaded) -> list[Plan]:
+        """Return what the steps are expected to cost; see `Request.costs`."""
+        return [[], [Cost("writing", loaded.bytes)], []]
 
     def decide(self, loaded: Loaded, _runtime: Runtime) -> Kept:
         """Return all splats."""

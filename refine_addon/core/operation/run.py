@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
+from ..pace import phases
 from ..report import Clock
 from ..work import Cancelled, Progress, part, silent
 
@@ -28,13 +29,10 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
     from pathlib import Path
 
+    from ..costs import Plan
     from ..formats.format import Format
     from ..rendering import Model
     from ..volumes import Zone
-
-
-DECIDED = 0.8
-"""The share of its progress that a run has made when it begins to write a file."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +131,13 @@ class Request(ABC, Generic[LoadedT_contra, DecisionT]):
         """Refuse, before splats are read, what none can give in the format of the output."""
         yield
 
+    def costs(self, _loaded: LoadedT_contra) -> Sequence[Plan] | None:
+        """Return what deciding, writing and comparing are expected to cost.
+
+        None where deciding and writing share one progress callback.
+        """
+        return None
+
     @abstractmethod
     def decide(self, loaded: LoadedT_contra, runtime: Runtime) -> DecisionT:
         """Decide; nothing is changed or written."""
@@ -203,18 +208,27 @@ def run(
     with request.opened(sink.form), sink.opened():
         loaded = source.read(sink.form)
         runtime.clock.lap("read_s")
-        decision = request.decide(loaded, runtime)
+        costs = request.costs(loaded)
+        deciding, writing, comparing = (
+            [runtime] * 3
+            if costs is None
+            else [
+                replace(runtime, progress=phase)
+                for phase in phases(progress, *costs, threads=threads)
+            ]
+        )
+        decision = request.decide(loaded, deciding)
         stopped = getattr(decision, "stopped", None)
         if stopped is not None:  # what was reached is written
-            runtime = replace(runtime, progress=silent)
-        written = sink.write(loaded, decision, runtime)
+            writing = replace(writing, progress=silent)
+        written = sink.write(loaded, decision, writing)
         runtime.clock.lap(sink.timing)
         if stopped is not None:
             if written.path is not None:
                 stopped.add_note(f"{written.path} is written with what that had reached")
             raise stopped
         try:
-            compared = request.compare(loaded, decision, written.path, runtime)
+            compared = request.compare(loaded, decision, written.path, comparing)
         except (Cancelled, KeyboardInterrupt) as stop:
             if written.path is not None:
                 stop.add_note(f"{written.path} is written, its pictures and report are not")

@@ -9,11 +9,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from .. import costs
 from ..absorbing import absorb as absorbing
 from ..absorbing.merge_field import ViewSums
 from ..estimate.psnr import psnr_against
 from ..estimate.quality import left_to_lose
+from ..pace import phases
+from ..refitting.refit import expected_rounds
+from ..refitting.round_rays import limits
 from ..scoring import occlusion
+from ..seeing.ray_sample import VALIDATION_VIEWS
 from ..selection import Budget, quality_of, select
 from ..task import DEFAULTS, Settings
 from ..work import Progress, part, silent
@@ -26,6 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..absorbing.absorb import Absorbed
+    from ..costs import Plan
     from ..scores import Scores
     from ..seeing.measuring import Measured
     from ..splats import Splats
@@ -46,9 +52,6 @@ deletion changes the pictures less than any merge."""
 PARTS = 2
 """While splats are merged, they are measured again in one of so many parts of the views, which take
 turns; what the other views see is carried over."""
-
-ABSORBED = 0.3
-"""Share of the work that absorbing is where refitting follows, for a progress bar."""
 
 
 def absorb_task(
@@ -75,15 +78,11 @@ def absorb_task(
     -------
     Made
     """
-    goal, start = task.budget.psnr, 0.0 if known else 0.2
+    goal, (splats, views) = task.budget.psnr, task.scene()
+    left = len(splats) // 2 if goal is not None else int(np.count_nonzero(keep))
+    scoring, deciding, comparing = phases(progress, *absorbing_plans(task, left, scored=known))
     if known is None:
-        splats, views = task.scene()
-        known = score_once(
-            splats, views, task.settings, part(progress, 0.0, start), threads,
-            curve=goal is not None,
-        )  # fmt: skip
-    progress = part(progress, start, 1.0)
-    deciding = part(progress, 0.0, 0.97)
+        known = score_once(splats, views, task.settings, scoring, threads, curve=goal is not None)
     if goal is None:
         made = _absorb_to_count(task, keep, known, deciding, threads)
     else:
@@ -93,9 +92,50 @@ def absorb_task(
         return made
     psnr = psnr_against(
         between, made.survivors.splats, task.scene()[1],
-        progress=part(progress, 0.97, 1.0), threads=threads,
+        progress=comparing, threads=threads,
     )  # fmt: skip
     return replace(made, psnr_between=psnr)
+
+
+def absorbing_plans(task: Task, left: int, *, scored: object) -> list[Plan]:
+    """Return the costs of scoring once, unless that is done, of what follows, of what lies between.
+
+    Parameters
+    ----------
+    task : Task
+    left : int
+        How many splats survive.
+    scored : object
+        Whether the scores are there.
+    """
+    splats, views = task.scene()
+    count, used = len(splats), views.spread(task.settings.views)
+    return [
+        [] if scored else costs.joined(costs.scoring_once(count, costs.Images.of(used))),
+        costs.joined(_to_count(task, left)),
+        costs.comparing(left, min(len(used), costs.BETWEEN)),
+    ]
+
+
+def _to_count(task: Task, left: int) -> list[Plan]:
+    """Return the costs of absorbing down to a number of splats.
+
+    These are absorbing, comparing, refitting, and comparing again.
+    """
+    splats, views = task.scene()
+    count, used = len(splats), views.spread(task.settings.views)
+    compared = costs.comparing(left, min(len(used), VALIDATION_VIEWS))
+    absorbed = _stages(count, left, costs.Images.of(used))
+    if task.survivors != "refit":
+        return [absorbed, compared, [], []]
+    refitted = costs.refitting(count, left, len(used), limits(left)[0], expected_rounds(left))
+    return [absorbed, 2 * compared, costs.joined(refitted), compared]
+
+
+def _stages(count: int, left: int, images: costs.Images) -> Plan:
+    """Return the costs of the stages of absorbing; the first tenth is deleted before."""
+    begin = max(count - math.floor(FIRST * count), left)
+    return costs.joined(costs.absorbing(begin, absorbing.stages(begin, left), images))
 
 
 def _absorb_to_count(
@@ -109,31 +149,31 @@ def _absorb_to_count(
     splats, views = task.scene()
     origin, refits = task.origin, task.survivors == "refit"
     truth = known[0].ray_sample if origin is None else origin.ray_sample
-    used = views.spread(task.settings.views)
+    used, left = views.spread(task.settings.views), int(np.count_nonzero(keep))
+    absorbing_progress, comparing, refitting, last = phases(progress, *_to_count(task, left))
 
-    def estimated(survivors: Splats, share: float) -> float | None:
+    def estimated(survivors: Splats, progress: Progress) -> float | None:
         if truth is None:
             return None
-        last = part(progress, share, min(share + 0.05, 1.0))
-        return psnr_against(truth, survivors, used, progress=last, threads=threads)
+        return psnr_against(truth, survivors, used, progress=progress, threads=threads)
 
     absorbed = absorb_removed(
-        splats, views, int(np.count_nonzero(keep)), task.settings,
+        splats, views, left, task.settings,
         known=known, protected=task.protected,
         began=None if origin is None else len(origin.splats),
-        progress=part(progress, 0.0, ABSORBED if refits else 0.95), threads=threads,
+        progress=absorbing_progress, threads=threads,
     )  # fmt: skip
     if not refits:
-        return Made(absorbed, estimated(absorbed.splats, 0.95))
-    plain = estimated(splats.take(keep), ABSORBED)
-    psnr = estimated(absorbed.splats, ABSORBED + 0.05)
+        return Made(absorbed, estimated(absorbed.splats, comparing))
+    plain = estimated(splats.take(keep), part(comparing, 0.0, 0.5))
+    psnr = estimated(absorbed.splats, part(comparing, 0.5, 1.0))
     made = Made(absorbed, psnr, before={"unchanged": plain, "absorb": psnr})
     if plain is not None and psnr is not None and plain > psnr:
         made = replace(made, absorbed=_deleted(splats, keep), psnr=plain, began="unchanged")
-    made = refit_made(task, made, part(progress, ABSORBED + 0.1, 0.95), threads)
+    made = refit_made(task, made, refitting, threads)
     if made.refitted is None or made.stopped is not None:
         return made
-    return replace(made, psnr=estimated(made.refitted.splats, 0.95))
+    return replace(made, psnr=estimated(made.refitted.splats, last))
 
 
 def _deleted(splats: Splats, keep: NDArray[np.bool_]) -> Absorbed:
@@ -160,14 +200,15 @@ def _absorb_to_psnr(
     curve = quality_of(scores)
     way: Became = "refit" if task.survivors == "refit" else "absorb"
     origin = None if task.origin is None else task.origin.psnr
+    once = costs.joined(_to_count(task, total // 2))
+    tries = phases(progress, once, once, [])
     gone, tried, best = curve.share(left_to_lose(goal, origin), way), list[_Try](), None
     for number in range(TRIES):
         count = max(total - math.floor(gone * total), 1)
         if any(count == one.survivors for one in tried):
             break
-        try_progress = part(progress, number / TRIES, (number + 1) / TRIES)
         keep = select(known[0], Budget(keep=count), protected=task.protected)
-        made = _absorb_to_count(task, keep, known, try_progress, threads)
+        made = _absorb_to_count(task, keep, known, tries[number], threads)
         if made.stopped is not None:
             return replace(best or made, stopped=made.stopped)
         if made.psnr is None:
@@ -248,9 +289,13 @@ def absorb_removed(  # noqa: PLR0913 - as `pipeline.prune`
         See `score_splats.score`.
     """
     used, total = views.spread(settings.views), len(splats)
-    scores, measured = known or score_once(
-        splats, views, settings, part(progress, 0.0, 0.2), threads
+    scoring, absorbing_progress = phases(
+        progress,
+        [] if known else costs.joined(costs.scoring_once(total, costs.Images.of(used))),
+        _stages(total, count, costs.Images.of(used)),
+        threads=threads,
     )
+    scores, measured = known or score_once(splats, views, settings, scoring, threads)
     began = total if began is None else began
     # How many of all are deleted before any are merged, and how many of those are still there.
     deleted = max(min(math.floor(FIRST * began), began - count), 0)
@@ -278,5 +323,5 @@ def absorb_removed(  # noqa: PLR0913 - as `pipeline.prune`
         return absorbing.absorb(
             splats, used, measure, count,
             began=began - deleted, deleted=~rest, protected=protected,
-            progress=part(progress, 0.2, 1.0), threads=threads,
+            progress=absorbing_progress, threads=threads,
         )  # fmt: skip

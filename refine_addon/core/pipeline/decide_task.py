@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import selection
+from ..costs import Cost, Plan, joined
 from ..estimate.cost import expected_seconds
 from ..estimate.psnr import psnr_kept
 from ..estimate.quality import AS_GOOD, PLAIN, deletion_will_do, in_words, needed
+from ..pace import phases
 from ..report import (
     MEASURES,
     Clock,
@@ -27,10 +29,11 @@ from ..report import (
     remark,
 )
 from ..task import DEFAULTS, Result, Settings, Task
-from ..work import Progress, part, report, silent
-from .absorb_splats import CLOSE, absorb_task
+from ..views import refuse_other
+from ..work import Progress, report, silent
+from .absorb_splats import CLOSE, absorb_task, absorbing_plans
 from .refit_splats import unchanged_note
-from .score_splats import score, score_once, with_quality
+from .score_splats import score, score_once, scoring_plans, with_quality
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -43,6 +46,10 @@ if TYPE_CHECKING:
     from ..survivor_choice import Became, SurvivorChoice
     from ..views import ViewSet
     from .refit_splats import Made
+
+
+TYPICAL = 0.5
+"""Share of the splats that is expected to go where only scores tell it."""
 
 
 def prune(  # noqa: PLR0913 - the main function of core; all but three are optional
@@ -146,6 +153,36 @@ def decide(
     return result
 
 
+def planned(task: Task) -> Plan:
+    """Return what it is expected to cost to decide on a task."""
+    return joined(_plans(task) if task.absorb else _deleting_plans(task))
+
+
+def _deleting_plans(task: Task) -> list[Plan]:
+    """Return what scoring and selecting are expected to cost."""
+    if task.scores is not None:
+        return [[], [Cost("selecting", len(task.scores.values))]]
+    splats, views = task.scene()
+    refuse_other(views)
+    quality = task.budget.psnr is not None
+    scored = joined(scoring_plans(splats, views, task.settings, _settled(task), quality=quality))
+    selecting = [Cost("selecting", len(splats))] if quality or task.settings.estimates else []
+    return [scored, selecting]
+
+
+def _plans(task: Task) -> list[Plan]:
+    """Return what scoring once, selecting, and absorbing are expected to cost."""
+    splats, views = task.scene()
+    refuse_other(views)
+    count, budget = len(splats), task.budget
+    left = round(count * (1.0 - TYPICAL))
+    if budget.ratio is not None or budget.keep is not None:
+        left = count - min(budget.removals(count) or 0, count)
+    by_default = task.survivors == "auto"
+    scored, *rest = absorbing_plans(task, left, scored=None if by_default else task.scores)
+    return [scored, [Cost("selecting", count)], joined(rest)]
+
+
 def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -> Result:
     """Decide on a task from which nothing has to go in any case."""
     if not task.absorb:
@@ -153,17 +190,18 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
     by_default = task.survivors == "auto"
     # Stored scores rank otherwise, and must not change what is chosen by default.
     trial = replace(task, scores=None) if by_default else task
-    scores, known = _scored(trial, clock, part(progress, 0.0, 0.2), threads)
+    scoring, selecting, absorbing, deleting = phases(progress, *_plans(task), [], threads=threads)
+    scores, known = _scored(trial, clock, scoring, threads)
+    report(selecting, 0.0, "selecting")
     keep, plain = _deleting(trial, scores, threads)
     clock.lap("select_s")
     made = None
     if not (by_default and _will_do(task, scores, plain)):
-        made = absorb_task(task, keep, known, part(progress, 0.2, 1.0), threads)
+        made = absorb_task(task, keep, known, absorbing, threads)
         clock.lap("absorb_s")
         if not (by_default and _as_good(task, keep, plain, made)):
             return _absorbed(task, scores, plain, made, clock)
-    rest = part(progress, 0.2 if made is None else 0.95, 1.0)
-    result = _delete(replace(task, survivors="unchanged"), clock, rest, threads)
+    result = _delete(replace(task, survivors="unchanged"), clock, deleting, threads)
     facts, psnr = result.report, result.report["estimated_psnr"]
     measured: dict[Became, float | None] = {"unchanged": psnr}
     if made is not None and task.budget.psnr is None:  # of as many survivors
@@ -177,11 +215,13 @@ def _decide(task: Task, clock: Clock, progress: Progress, threads: int | None) -
 
 def _delete(task: Task, clock: Clock, progress: Progress, threads: int | None) -> Result:
     """Decide by scores alone."""
-    scores, _ = _scored(task, clock, part(progress, 0.0, 0.95), threads)
+    scoring, selecting = phases(progress, *_deleting_plans(task), threads=threads)
+    scores, _ = _scored(task, clock, scoring, threads)
+    report(selecting, 0.0, "selecting")
     keep, psnr = _deleting(task, scores, threads)
     clock.lap("select_s")
     facts = _facts(task, scores, keep, psnr, clock)
-    conclude_between(facts, _estimated_between(scores, keep, threads))
+    conclude_between(facts, _estimated_between(scores, keep, threads), scores.seen)
     gone = facts["splats"]["removed"] / len(keep)
     facts["survivors"] = {
         "asked": task.survivors,
@@ -207,7 +247,7 @@ def _absorbed(task: Task, scores: Scores, plain: float | None, made: Made, clock
     """
     absorbed = made.absorbed
     facts = _facts(task, scores, absorbed.keep, made.psnr, clock, absorbed)
-    conclude_between(facts, made.psnr_between)
+    conclude_between(facts, made.psnr_between, scores.seen)
     gone = facts["splats"]["removed"] / len(absorbed.keep)
     measured = made.measured()
     if task.budget.psnr is None:  # else deletion keeps another number of splats
@@ -255,7 +295,6 @@ def _scored(
         # Others may have been protected when these were scored.
         scores = with_quality(scores, protected=task.protected, threads=threads)
     clock.lap("score_s")
-    report(progress, 1.0, "selecting")
     return scores, known
 
 

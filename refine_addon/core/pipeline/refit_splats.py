@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from ..estimate.quality import in_words
+from ..pace import named
 from ..refitting.refit import refit_rounds
 from ..work import Cancelled
 
@@ -137,7 +138,7 @@ def refit_made(task: Task, made: Made, progress: Progress, threads: int | None) 
         for reached in refit_rounds(
             absorbed.splats, original, views.spread(task.settings.views),
             protected=None if task.protected is None else task.protected[absorbed.keep],
-            progress=lambda fraction, _what: progress(fraction, DOING), threads=threads,
+            progress=named(progress, DOING), threads=threads,
         ):  # fmt: skip
             done = reached
     except (Cancelled, KeyboardInterrupt) as stop:

@@ -7,18 +7,21 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .. import costs
 from ..estimate.alignment import alignment
 from ..estimate.psnr import psnr_after, quality_curve
+from ..pace import phases
 from ..scoring import auto, closed_form, occlusion
 from ..seeing.ray_sample import validation_rays
 from ..task import DEFAULTS, Settings
 from ..views import refuse_other
 from ..volumes import refuse_all
-from ..work import Progress, part, silent
+from ..work import Progress, silent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from ..costs import Plan
     from ..scores import Scores
     from ..seeing.measuring import Measured
     from ..splats import Splats
@@ -83,31 +86,42 @@ def score(  # noqa: PLR0913 - as `pipeline.prune`
             quality=quality, settled=settled, progress=progress, threads=threads,
         )  # fmt: skip
         return scores.for_all(rest)
-    whole, estimates = progress, quality or settings.estimates
-    progress = part(progress, 0.0, 0.9 if estimates else 1.0)
+    used = views.spread(settings.views)
+    plans = scoring_plans(splats, views, settings, settled, quality=quality)
+    scoring, casting, checking, telling = phases(progress, *plans, threads=threads)
     # Numbers that underflow to 0 are negligible in all sums.
     with np.errstate(under="ignore"):
-        used = views.spread(settings.views)
         if settings.method == "occlusion":
             scores = occlusion.score(
                 splats, used, settings.occlusion,
-                settled=settled, progress=progress, threads=threads,
+                settled=settled, progress=scoring, threads=threads,
             )  # fmt: skip
         elif settings.method == "auto":
             scores = auto.score(
                 splats, used, settings.tolerance, settings.occlusion,
-                settled=settled, progress=progress, threads=threads,
+                settled=settled, progress=scoring, threads=threads,
             )  # fmt: skip
         else:
             scores = closed_form.score(
-                splats, used, settings.closed_form, progress=progress, threads=threads
+                splats, used, settings.closed_form, progress=scoring, threads=threads
             )
         if quality and scores.ray_sample is None:
-            rays = validation_rays(splats, used, progress=part(whole, 0.9, 0.95), threads=threads)
+            rays = validation_rays(splats, used, progress=casting, threads=threads)
             scores = replace(scores, ray_sample=rays)
-    scores = _with_views(scores, splats, views, used, part(whole, 0.95, 0.95), threads)
-    progress = part(whole, 0.95, 1.0)
-    return with_quality(scores, protected=protected, progress=progress, threads=threads)
+    scores = _with_views(scores, splats, views, used, checking, threads)
+    return with_quality(scores, protected=protected, progress=telling, threads=threads)
+
+
+def scoring_plans(
+    splats: Splats, views: ViewSet, settings: Settings, settled: int | None, *, quality: bool
+) -> list[Plan]:
+    """Return the costs of scores, of validation rays, of checks and of a curve; see `score`."""
+    count, used = len(splats), costs.Images.of(views.spread(settings.views))
+    stays = occlusion.survivors_of_rounds(count, settings.occlusion.rounds, settled)
+    scored, rays, checked, told = costs.scoring(count, used, settings.method, stays)
+    if not (quality or settings.estimates):
+        rays = told = []
+    return [scored, rays, checked, told]
 
 
 def with_quality(
@@ -177,10 +191,11 @@ def score_once(
         of them, which tell that of a result.
     """
     used = views.spread(settings.views)
+    plans = costs.scoring_once(len(splats), costs.Images.of(used))
+    scoring, checking = phases(progress, *plans, threads=threads)
     with np.errstate(under="ignore"):  # as in `score`
         scores, measured = occlusion.score_once(
             splats, used, settings.occlusion, few_views=not curve,
-            progress=part(progress, 0.0, 0.99), threads=threads,
+            progress=scoring, threads=threads,
         )  # fmt: skip
-    progress = part(progress, 0.99, 1.0)
-    return _with_views(scores, splats, views, used, progress, threads), measured
+    return _with_views(scores, splats, views, used, checking, threads), measured

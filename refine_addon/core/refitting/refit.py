@@ -22,16 +22,19 @@ loses is undone, and the next is damped more. Rounds end where little is gained,
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from .. import costs
 from ..errors import RefineError
+from ..pace import phases
 from ..splats import rotation_matrices, unit_quaternions
 from ..work import Progress, part, silent
 from .linear import COLOR, COUNT, MEAN, OPACITY, SCALE, TURN, LinearRays
-from .round_rays import RoundRays
+from .round_rays import RoundRays, limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -41,7 +44,7 @@ if TYPE_CHECKING:
     from ..splats import Splats
     from ..views import ViewSet
 
-STEPS = 6
+STEPS = 8
 """Steps of conjugate gradients in a round."""
 
 DAMPING, LEAST_DAMPING = 4.0, 0.1
@@ -189,7 +192,7 @@ def refit(  # noqa: PLR0913 - all but three are optional
     Notes
     -----
     Memory: about 700 bytes a survivor, and 14 bytes for each hit of a round, see
-    `round_rays.MAX_HITS`.
+    `round_rays.limits`.
     """
     *_, last = refit_rounds(
         survivors, original, views, settings,
@@ -214,10 +217,14 @@ def refit_rounds(  # noqa: PLR0913 - as `refit`
     """
     share = 1.0 if settings.geometry else SIMPLER
     count = round(share * len(survivors))
-    rays = RoundRays.of(original, views, count, part(progress, 0.0, 0.05), threads)
+    rounds = settings.rounds or expected_rounds(len(survivors))
+    most = limits(count)[0]
+    preparing, *plans = costs.refitting(len(original), len(survivors), len(views), most, rounds)
+    prepared, refitting = phases(progress, preparing, costs.joined(plans), threads=threads)
+    rays = RoundRays.of(original, views, count, prepared, threads)
     yield from refit_on(
         rays, survivors, settings,
-        protected=protected, progress=part(progress, 0.05, 1.0), threads=threads,
+        protected=protected, progress=refitting, threads=threads,
     )  # fmt: skip
 
 
@@ -237,34 +244,37 @@ def refit_on(
     movable = moving[:, None] & ~(
         np.zeros(len(survivors), np.bool_) if protected is None else protected
     )
-    psnr = rays.psnr(survivors, part(progress, 0.0, 0.04))
+    rounds, cast = settings.rounds or MAX_ROUNDS, 0
+    ahead = settings.rounds or expected_rounds(len(survivors))
+    checked, one_round = rays.costs(len(survivors))
+    validating, later = phases(progress, checked, ahead * costs.joined(one_round))
+    psnr = rays.psnr(survivors, validating)
     best = Refitted(survivors, np.zeros(len(survivors), np.bool_), 0, psnr, psnr)
     yield best
-    rounds, cast = settings.rounds or MAX_ROUNDS, 0
     enough = np.inf if settings.rounds else max(ENOUGH_RAYS[0] * len(survivors), ENOUGH_RAYS[1])
     enough *= 1.0 if geometry else ENOUGH_SIMPLER
     before = _Told(*np.zeros((2, COUNT, len(survivors)), np.float32))
     more = 1.0 if geometry else SIMPLER
     undone = False
     for number in range(1, rounds + 1):
-        begin, middle, near, end = (
-            0.04 + 0.96 * (number - 1 + share) / rounds for share in (0.0, 0.4, 0.9, 1.0)
+        casting, solving, checking, later = phases(
+            later, *one_round, (ahead - number) * costs.joined(one_round)
         )
         linear = rays.linear(
             best.splats, number,
-            geometry=geometry, progress=part(progress, begin, middle),
+            geometry=geometry, progress=casting,
         )  # fmt: skip
         cast += linear.count
+        if not settings.rounds:
+            ahead = max(min(math.ceil(enough * number / cast), rounds), number)
+            (later,) = phases(later, (ahead - number) * costs.joined(one_round))
         damping = more * max(DAMPING * len(survivors) / linear.count, LEAST_DAMPING)
-        change, told = _solve(
-            linear, movable, damping, before,
-            progress=part(progress, middle, near), threads=threads,
-        )  # fmt: skip
+        change, told = _solve(linear, movable, damping, before, progress=solving, threads=threads)
         del linear  # the hits, before those of the next round
         if not change.any():
             return
         trial = _moved(best.splats, change)
-        psnr = rays.psnr(trial, part(progress, near, end))
+        psnr = rays.psnr(trial, checking)
         gain = psnr - best.psnr
         if gain > 0.0:
             before = told
@@ -277,6 +287,12 @@ def refit_on(
             return
         else:
             more, undone = more * MORE_DAMPING, True
+
+
+def expected_rounds(count: int) -> int:
+    """Return how many rounds it takes to refit so many survivors, if all of them gain."""
+    enough = max(ENOUGH_RAYS[0] * count, ENOUGH_RAYS[1])
+    return min(math.ceil(enough / limits(count)[0]), MAX_ROUNDS)
 
 
 class _Told(NamedTuple):

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import numpy as np
 
+from .. import costs
 from ..estimate.quality import PSNR_CAP
 from ..processes import for_each
 from ..seeing import projection
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..costs import Plan
     from ..seeing.projection import Footprints, Gaussians
     from ..seeing.scene import Scene
     from ..splats import Splats
@@ -37,15 +39,19 @@ if TYPE_CHECKING:
 
 Result = TypeVar("Result")
 
-RAYS_OF_SPLAT = 4.0
-"""Rays of a round for each survivor: with fewer, survivors learn them by heart."""
+RAYS_OF_SPLAT = 7.0
+"""Rays of a round for each survivor: with fewer, survivors learn them by heart, and two rounds of
+half as many bring less than one."""
 
 MIN_RAYS = 1 << 17
 """Rays of a round where that would be fewer."""
 
-HITS_OF_SPLAT, MIN_HITS = 64, 3 << 21
+HITS_OF_SPLAT, MIN_HITS = 112, 3 << 21
 """About how many hits of a round may show in the unpruned splats (`linear.LEAST_WEIGHT`), for each
 survivor, and where that would be fewer. Each takes 14 bytes."""
+
+MANY_HITS, FEWER_HITS = 1 << 24, 64
+"""Rounds of more hits have no more than so many for each survivor, to bound memory."""
 
 SHIFT, MAX_SHIFT = 0.7, 0.1
 """About how far a view is moved in a round: so many times as far as the view next to it is, at most
@@ -292,6 +298,12 @@ class RoundRays:
         target = InMemory.of(original, gaussians, scene)
         return cls(windows, scene, target, len(original), threads)
 
+    def costs(self, survivors: int) -> tuple[Plan, list[Plan]]:
+        """Return what checking so many survivors for the first time, and a round, cost."""
+        counts = self._count + self.around, survivors, len(self.windows)
+        rays = sum(window.rays for window in self.windows)
+        return costs.refitting(*counts, rays, 0)[1], costs.refit_round(*counts, rays)
+
     def linear(
         self, splats: Splats, number: int, *, geometry: bool, progress: Progress
     ) -> LinearRays:
@@ -359,7 +371,8 @@ class RoundRays:
 
 def limits(count: int) -> tuple[float, float]:
     """Return about how many rays and hits a round of `count` survivors may have."""
-    return max(RAYS_OF_SPLAT * count, MIN_RAYS), max(HITS_OF_SPLAT * count, MIN_HITS)
+    hits = min(max(HITS_OF_SPLAT * count, MIN_HITS), max(FEWER_HITS * count, MANY_HITS))
+    return max(RAYS_OF_SPLAT * count, MIN_RAYS), hits
 
 
 def steps_of(views: Sequence[View], scene: Scene) -> list[float]:

@@ -17,12 +17,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .. import costs
 from ..estimate.psnr import psnr_by_views
 from ..estimate.quality import UNSEEN
-from ..work import Progress, part, silent
-from .occlusion import FIRST_END, MemoryScoring, OcclusionScoring
+from ..pace import phases
+from ..work import Progress, silent
+from .occlusion import MemoryScoring, OcclusionScoring, survivors_of_rounds
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ..scores import Scores
     from ..splats import Splats
     from ..views import ViewSet
@@ -37,10 +41,6 @@ LEAST_VIEWS = 16
 FIRST, MORE, VALIDATING = (0, 1, 2, 3), (4,), (5, 6)
 """Groups of views, of eight: those that measure first, those that measure next, and those that
 validate. The latter and the eighth group measure too if the others are not enough."""
-
-CASTING = 0.05
-"""Share of the time of the first round that the rays of the validation views take, to show
-progress."""
 
 
 def score(  # noqa: PLR0913 - as `occlusion.score`, and the tolerance
@@ -75,13 +75,13 @@ def score(  # noqa: PLR0913 - as `occlusion.score`, and the tolerance
     RefineError, Cancelled
         See `occlusion.score`.
     """
+    stays = survivors_of_rounds(len(splats), settings.rounds, settled)
+    preparing, *later = costs.by_auto(len(splats), costs.Images.of(views), stays)
+    prepared, rest = phases(progress, preparing, costs.joined(later), threads=threads)
     scoring = MemoryScoring(
-        splats, views, settings, groups=groups_of(views),
-        progress=part(progress, 0.0, 0.1), threads=threads,
-    )  # fmt: skip
-    return finish(
-        scoring, tolerance, settled=settled, progress=part(progress, 0.1, 1.0), threads=threads
+        splats, views, settings, groups=groups_of(views), progress=prepared, threads=threads
     )
+    return finish(scoring, tolerance, settled=settled, progress=rest, threads=threads)
 
 
 def finish(
@@ -101,16 +101,36 @@ def finish(
     tolerance, settled, progress, threads
         See `score`.
     """
-    end = FIRST_END if scoring.rounds > 1 else 1.0
-    measuring_progress = part(progress, 0.0, end)
-    if len(scoring.measuring.views) < LEAST_VIEWS or not tolerance:
+    count = len(scoring.prior)
+    images = costs.Images.of(view for view, _ in scoring.measuring.views)
+    stays = survivors_of_rounds(count, scoring.rounds, settled)
+    finds_out = images.views >= LEAST_VIEWS and bool(tolerance)
+    plan = costs.by_auto if finds_out else costs.occlusion
+    measuring_progress, ranking = phases(progress, *plan(count, images, stays)[1:])
+    if not finds_out:
         scoring.measure(range(scoring.measuring.count), measuring_progress)
         loss, expected = 0.0, dict[str, list[float]]()
     else:
         loss, expected = _measure(scoring, tolerance, measuring_progress, threads)
-    scores = scoring.rank(part(progress, end, 1.0), settled)
-    facts = {"views": scores.views_used, "loss": loss, "tolerance": tolerance, "expected": expected}
+    scores = scoring.rank(ranking, settled)
+    used = scores.views_used
+    facts = {
+        "views": used,
+        "given": images.views,
+        "loss": loss,
+        "tolerance": tolerance,
+        "expected": expected,
+        "saved": round(saved(count, images, used, stays), 3) if finds_out else 0.0,
+    }
     return replace(scores, facts={**scores.facts, "auto": facts}, method="auto")
+
+
+def saved(count: int, images: costs.Images, used: int, stays: Sequence[int]) -> float:
+    """Return about which part of the time of scoring by all views was saved; see `costs`."""
+    every = costs.seconds(costs.joined(costs.occlusion(count, images, stays)))
+    casting, _, _, comparing, _ = costs.auto(count, images, *costs.auto_views(images.views))
+    spared = costs.seconds([images.measuring(count, images.views - used)])
+    return (spared - costs.seconds([*casting, *comparing])) / every
 
 
 def groups_of(views: ViewSet) -> list[list[int]] | None:
@@ -150,26 +170,29 @@ def _measure(
     groups, rays = scoring.measuring.groups, scoring.validation_rays
     validating = [number for k in VALIDATING for number in groups[k]]
     assert rays is not None  # noqa: S101 - a scoring of several views has them
-    casting_progress = part(progress, 0.0, CASTING)
-    rays.cast(validating, scoring.gaussians, scoring.measuring.scene, casting_progress, threads)
-    scoring.measure(FIRST, part(progress, CASTING, 0.55))
-    scoring.measure(MORE, part(progress, 0.55, 0.7))
     few, more, every = (
         sum(len(groups[k]) for k in chosen) for chosen in (FIRST, FIRST + MORE, range(len(groups)))
     )
-    psnr = {}
-    for count, chosen in ((few, FIRST), (more, FIRST + MORE)):
-        values = scoring.in_one_round(chosen, part(progress, 0.7, 0.7))
-        told = psnr_by_views(rays, values, RATIOS, validating, threads=threads)
-        if told is not None:
-            psnr[count] = told
-    expected = {f"{count} views": told.round(2).tolist() for count, told in psnr.items()}
-    loss = math.inf
-    if len(psnr) == 2:  # noqa: PLR2004 - both were told
+    count = len(scoring.prior)
+    images = costs.Images.of(view for view, _ in scoring.measuring.views)
+    casting, first, second, comparing, rest = phases(
+        progress,
+        *costs.auto(count, images, len(validating), few, more - few, every - more),
+    )
+    rays.cast(validating, scoring.gaussians, scoring.measuring.scene, casting, threads)
+    scoring.measure(FIRST, first)
+    scoring.measure(MORE, second)
+    rankings = [scoring.in_one_round(chosen, comparing) for chosen in (FIRST, FIRST + MORE)]
+    psnr = psnr_by_views(rays, rankings, RATIOS, validating, threads=threads)
+    loss, expected = math.inf, dict[str, list[float]]()
+    if psnr is not None:
+        told = zip((few, more), psnr.round(2).tolist(), strict=True)
+        expected = {f"{count} views": of_count for count, of_count in told}
         # No eye tells apart what is above `UNSEEN`.
-        gain = np.minimum(psnr[more], UNSEEN) - np.minimum(psnr[few], UNSEEN)
+        gain = np.diff(np.minimum(psnr, UNSEEN), axis=0)
         loss = max(float(gain.max()), 0.0) * (1 / more - 1 / every) / (1 / few - 1 / more)
     if loss <= tolerance:
         return loss, expected
-    scoring.measure(range(len(FIRST + MORE), len(groups)), part(progress, 0.7, 1.0))
+    (rest,) = phases(rest, [images.measuring(count, every - more)])
+    scoring.measure(range(len(FIRST + MORE), len(groups)), rest)
     return 0.0, expected

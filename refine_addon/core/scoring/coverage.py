@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..costs import SAMPLE
 from ..seeing.scene import MIX, fingerprint
 
 if TYPE_CHECKING:
@@ -49,9 +50,6 @@ DOUBTS = (0.03, 0.03, 0.0, 0.0, 0.0)
 """What a weight ten times as large must gain to be preferred, as a share of the error removed, for
 each of `SHARES`: the first losses are uncertain by as much, and a floor that is not needed costs
 quality."""
-
-SAMPLE = 1 << 16
-"""How many splats are enough to choose the floor weights."""
 
 _NO_WEIGHT = 10.0**-5.5  # stands for 0 in a mean of logarithms
 

@@ -24,8 +24,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .. import processes
+from .. import costs, processes
 from ..errors import RefineError
+from ..pace import phases
 from ..scores import Scores, shares_gone
 from ..seeing import projection
 from ..seeing.measuring import SECONDS, Measured, Measuring, Sampling
@@ -51,18 +52,6 @@ LEAST = 0.1
 
 EXPONENT = 0.25
 """Exponent of the contribution."""
-
-FIRST_END = 0.75
-"""Where measuring ends and rounds begin, as a share of all the time, to show progress."""
-
-ROUNDS_BEGIN = 0.3
-"""Share of the time after `FIRST_END` that getting scoring rays ready takes, to show progress."""
-
-ROUND_COST = 0.3
-"""Share of the time that is still ahead that a round takes, to show progress."""
-
-BETWEEN = 12
-"""So many views at most tell what lies between those that score."""
 
 BETWEEN_RAYS = 0.375
 """How many rays they have together, as a part of `VALIDATION_RAYS`."""
@@ -143,12 +132,13 @@ def score(
     (`points.MAX_POINTS`); only a view that shows more than 3 million splats has more.
     Each hit of the scoring rays takes 16 bytes, see `removal_rounds.RemovalRounds`.
     """
-    scoring = MemoryScoring(
-        splats, views, settings, progress=part(progress, 0.0, 0.1), threads=threads
+    stays = survivors_of_rounds(len(splats), settings.rounds, settled)
+    preparing, measuring, ranking = phases(
+        progress, *costs.occlusion(len(splats), costs.Images.of(views), stays), threads=threads
     )
-    end = FIRST_END if settings.rounds > 1 else 1.0
-    scoring.measure(range(scoring.measuring.count), part(progress, 0.1, end))
-    return scoring.rank(part(progress, end, 1.0), settled)
+    scoring = MemoryScoring(splats, views, settings, progress=preparing, threads=threads)
+    scoring.measure(range(scoring.measuring.count), measuring)
+    return scoring.rank(ranking, settled)
 
 
 def score_once(
@@ -178,12 +168,15 @@ def score_once(
     RefineError, Cancelled
         See `score`.
     """
+    preparing, measuring, ranking = phases(
+        progress, *costs.occlusion(len(splats), costs.Images.of(views)), threads=threads
+    )
     scoring = MemoryScoring(
         splats, views, replace(settings, rounds=1), few_views=few_views,
-        progress=part(progress, 0.0, 0.1), threads=threads,
+        progress=preparing, threads=threads,
     )  # fmt: skip
-    measured = scoring.measure(range(scoring.measuring.count), part(progress, 0.1, 1.0))
-    return scoring.rank(silent), measured.for_all(scoring.gaussians.index, len(splats))
+    measured = scoring.measure(range(scoring.measuring.count), measuring)
+    return scoring.rank(ranking), measured.for_all(scoring.gaussians.index, len(splats))
 
 
 def measure_part(  # noqa: PLR0913 - as `score`, and which part
@@ -219,11 +212,11 @@ def measure_part(  # noqa: PLR0913 - as `score`, and which part
         If `progress` answers ``False``.
     """
     gaussians, scene, _ = projection.prepare(
-        splats, views, progress=part(progress, 0.0, 0.1), threads=threads
+        splats, views, progress=part(progress, 0.0, 0.05), threads=threads
     )
     measuring = Measuring(scene, views, settings, threads)
     groups = measuring.groups_of_part(turn, parts)
-    sums = measuring.measure(gaussians, groups, part(progress, 0.1, 1.0))
+    sums = measuring.measure(gaussians, groups, part(progress, 0.05, 1.0))
     measured = Measured.sum(sums.values()).for_all(gaussians.index, len(splats))
     return measured, measuring.weight_share(groups)
 
@@ -340,21 +333,20 @@ class OcclusionScoring:
             raise RefineError(msg)
         seen = np.zeros(len(self.prior), np.int32)
         seen[self.gaussians.index] = measured.seen
-        weights = self._floor_weights(measured, list(self._sums), part(progress, 0.0, 0.0))
+        threads = self.measuring.threads
+        stays = survivors_of_rounds(len(self.prior), self.rounds, settled)
+        views_used = sum(len(self.measuring.groups[k]) for k in self._sums)
+        weighing, casting, loading, *each_round = phases(
+            progress, *costs.ranking(len(self.gaussians), views_used, stays)
+        )
+        weights = self._floor_weights(measured, list(self._sums), weighing)
         if self.between is not None:
-            self.between.cast_all(
-                self.gaussians, self.measuring.scene, part(progress, 0.0, 0.0),
-                self.measuring.threads,
-            )  # fmt: skip
-        left, done, rounds = np.arange(len(self.gaussians)), ROUNDS_BEGIN, None
+            self.between.cast_all(self.gaussians, self.measuring.scene, casting, threads)
+        left, rounds = np.arange(len(self.gaussians)), None
         if self.scoring_rays is not None:
-            rounds = RemovalRounds(
-                self.scoring_rays, measured, part(progress, 0.0, done), self.measuring.threads
-            )
+            rounds = RemovalRounds(self.scoring_rays, measured, loading, threads)
             self.scoring_rays = None  # its hits are let go as splats go
-        for stay in _survivors(len(self.prior), self.rounds, settled):
-            end = 1.0 if not stay else done + (1.0 - done) * ROUND_COST
-            round_progress, done = part(progress, done, end), end
+        for stay, round_progress in zip(stays, each_round, strict=True):
             now = measured if rounds is None else rounds.remove_and_measure(left, round_progress)
             report(round_progress, 1.0, "scoring")
             go = max(len(left) - stay, 0)
@@ -365,7 +357,7 @@ class OcclusionScoring:
         return Scores(
             values=removal.values,
             seen=seen,
-            views_used=sum(len(self.measuring.groups[k]) for k in self._sums),
+            views_used=views_used,
             undrawable=int(np.count_nonzero(self.undrawable)),
             facts={"floor": weights},
             method="occlusion",
@@ -466,14 +458,13 @@ class MemoryScoring(OcclusionScoring):
             msg = "there are no splats to score"
             raise RefineError(msg)
         processes.start(SECONDS * len(splats) * len(views), threads)
+        activating, scoring = phases(progress, *costs.preparing(len(splats), len(views)))
         gaussians, scene, good = projection.prepare(
-            splats, views, progress=part(progress, 0.0, 0.5), threads=threads
+            splats, views, progress=activating, threads=threads
         )
         refuse_undrawable(int(np.count_nonzero(good)), len(good))
         measuring = Measuring(scene, views, settings, threads, groups)
-        prior = closed_form.score(
-            splats, views, PRIOR, progress=part(progress, 0.5, 1.0), threads=threads
-        ).values
+        prior = closed_form.score(splats, views, PRIOR, progress=scoring, threads=threads).values
         rays = RaySample(measuring.views, gaussians, splats, few_views=few_views)
         super().__init__(gaussians, measuring, settings.rounds, prior, ~good, rays)
         if settings.rounds > 1:
@@ -491,7 +482,7 @@ def rays_between(views: ViewSet, gaussians: Gaussians, splats: Splats) -> RaySam
     gaussians, splats
         See `RaySample`.
     """
-    halfway = views_between(views, BETWEEN)
+    halfway = views_between(views, costs.BETWEEN)
     if not halfway:
         return None
     sample = RaySample(ViewSet(tuple(halfway)).by_distance(), gaussians, splats)
@@ -517,7 +508,7 @@ class _Removal:
         self.gone = end
 
 
-def _survivors(count: int, rounds: int, settled: int | None = None) -> list[int]:
+def survivors_of_rounds(count: int, rounds: int, settled: int | None = None) -> list[int]:
     """Return how many of `count` splats stay after each round: `LEAST` before the last, then 0.
 
     The last is the first round that removes `settled` splats or more together with those before.

@@ -19,7 +19,6 @@ from ..estimate.psnr import psnr_kept
 from ..estimate.quality import needed
 from ..formats.ply_header import with_count
 from ..operation.run import Request, Written, run
-from ..pipeline.absorb_splats import ABSORBED
 from ..refitting.refit import Refit
 from ..report import (
     MEASURES,
@@ -61,6 +60,9 @@ if TYPE_CHECKING:
     from .scoring import MeasuredTiles
     from .units import Tile, Unit
     from .workers import Workers
+
+ABSORBED = 0.3
+"""Share of the work that absorbing is where refitting follows, for a progress bar."""
 
 SCORED = 0.82
 """Part of the progress that scoring is, or scoring and absorbing; the rest is writing."""

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .. import costs
+from ..pace import phases
 from ..pipeline.score_splats import with_quality
 from ..scoring import auto
-from ..scoring.occlusion import FIRST_END, PRIOR, OcclusionScoring
+from ..scoring.occlusion import PRIOR, OcclusionScoring, survivors_of_rounds
 from ..seeing.scene import Scene, principal_axes
-from ..work import Progress, part
 from .closed_form import by_closed_form
 from .gaussians import SceneContext, SumMoments, store_gaussians
 from .seeing import StoredRays, TileMeasuring
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from ..scoring.occlusion import Occlusion
     from ..seeing.measuring import Measured
     from ..task import Settings
+    from ..work import Progress
     from .closed_form import ClosedFormContext
     from .units import Unit
     from .workers import Runner
@@ -138,9 +140,12 @@ class _TileScoring(OcclusionScoring):
 
     def finish(self, progress: Progress, settled: int | None = None) -> Scores:
         """Measure all groups of views, and return the scores; see `occlusion.score`."""
-        end = FIRST_END if self.rounds > 1 else 1.0
-        self.measure(range(self.measuring.count), part(progress, 0.0, end))
-        return self.rank(part(progress, end, 1.0), settled)
+        count, stays = len(self.prior), survivors_of_rounds(len(self.prior), self.rounds, settled)
+        images = costs.Images.of(view for view, _ in self.measuring.views)
+        _, *plans = costs.occlusion(count, images, stays)
+        measuring, ranking = phases(progress, *plans)
+        self.measure(range(self.measuring.count), measuring)
+        return self.rank(ranking, settled)
 
     def save(self, scores: Scores, progress: Progress) -> Scores:
         """Save the scores of each unit; return them with the curve of the estimated PSNR."""

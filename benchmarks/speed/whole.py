@@ -1,0 +1,122 @@
+"""Whole commands on scenes that look like captures, beside splat-transform, and what changed.
+
+    python -m benchmarks.speed.whole [--quick] [--write]
+
+160,000, 1 million and 2.2 million splats of degree 3 (`capture`); with ``--quick`` the first alone,
+a minute of the processor. Each command is a process of its own and runs once, from file to file,
+one after the other: every method, absorbing half and nine tenths, and splat-transform to the same
+numbers; refitting where it takes minutes, not tens of them. Told are seconds of the processor and
+the most memory (RssAnon) of the whole tree of processes, both over splat-transform's, and by how
+much they differ from the committed figures, `figures.json`, which ``--write`` replaces. Seconds of
+another machine are compared by what copying and decimating take there, so look at ratios first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from ..baselines import splat_transform
+from ..tables.million import write_cameras, write_ply
+from . import capture
+from .file_to_file import run
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+SIZES = (160_000, 1_000_000, 2_200_000)
+FIGURES = Path(__file__).parent / "figures.json"
+REFITTED = 200_000
+"""Scenes of at most so many splats are refitted, too."""
+
+CHANGED = 0.1
+"""A figure that differs by more than this share is marked."""
+
+
+class Figure(NamedTuple):
+    """What a command took: seconds of the processor, and most memory, megabytes."""
+
+    busy: float
+    megabytes: float
+
+
+def commands(folder: Path, count: int) -> Mapping[str, Sequence[str | Path]]:
+    """Return all commands by name, from ``in.ply`` in a folder to ``out.ply`` there."""
+    source, output = folder / "in.ply", folder / "out.ply"
+    ours: list[str | Path] = [sys.executable, "-m", "refine_addon", "prune", source, "-o", output]
+    ours += ["--cameras", folder / "cameras.json", "--quiet", "--overwrite"]
+    deleted = [*ours, "--ratio", "0.5", "--survivors", "unchanged", "--method"]
+    found: dict[str, Sequence[str | Path]] = {"copy": ["cp", source, output]}
+    found |= {name: [*deleted, name] for name in ("closed-form", "auto", "occlusion")}
+    for ratio in (0.5, 0.9):
+        name = f"absorb {ratio:.0%}"
+        found[name] = [*ours, "--ratio", str(ratio), "--survivors", "absorb"]
+        if splat_transform.find() is not None:
+            left = count - round(ratio * count)
+            flag = splat_transform.FLAGS[0]
+            name = f"splat-transform {ratio:.0%}"
+            found[name] = splat_transform.command(source, output, flag, left)
+    if count <= REFITTED:
+        found["refit 50%"] = [*ours, "--ratio", "0.5", "--survivors", "refit"]
+    return found
+
+
+def measured(count: int) -> dict[str, Figure]:
+    """Return the figures of all commands on a scene of so many splats, by name."""
+    figures = {}
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        write_ply(folder / "in.ply", capture.make(count))
+        write_cameras(folder / "cameras.json", capture.cameras())
+        for name, command in commands(folder, count).items():
+            _, busy, megabytes = run(command)
+            figures[name] = Figure(round(busy, 2), round(megabytes))
+            (folder / "out.ply").unlink()
+    return figures
+
+
+def table(figures: Mapping[str, Figure], before: Mapping[str, Sequence[float]]) -> list[str]:
+    """Return the lines of a table: figures, over splat-transform's, and against those before."""
+    lines = ["| | processor | memory | over splat-transform | since the committed figures |"]
+    lines.append("|---|---:|---:|---:|---|")
+    for name, figure in figures.items():
+        other = figures.get(f"splat-transform {name[-3:] if '%' in name else '50%'}")
+        over = ""
+        if other is not None and "splat" not in name and name != "copy":
+            over = " / ".join(f"{a / max(b, 1e-9):.2f}" for a, b in zip(figure, other, strict=True))
+        changes = []
+        for now, then, what in zip(figure, before.get(name, figure), Figure._fields, strict=True):
+            if abs(now - then) > CHANGED * then:
+                changes.append(f"{what} {now / max(then, 1e-9) - 1.0:+.0%}")
+        known = ", ".join(changes) or ("as before" if name in before else "new")
+        lines.append(
+            f"| {name} | {figure.busy:.1f} s | {figure.megabytes:.0f} MB | {over} | {known} |"
+        )
+    return lines
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Measure, print tables, and write the figures if asked."""
+    parser = argparse.ArgumentParser(description="Time every method beside splat-transform.")
+    parser.add_argument("--quick", action="store_true", help=f"{SIZES[0]:,} splats alone")
+    parser.add_argument("--write", action="store_true", help="keep the figures as those to compare")
+    options = parser.parse_args(arguments)
+    known = json.loads(FIGURES.read_text()) if FIGURES.exists() else {}
+    if splat_transform.find() is None:
+        print(splat_transform.MISSING)
+    for count in SIZES[:1] if options.quick else SIZES:
+        figures = measured(count)
+        lines = table(figures, known.get(str(count), {}))
+        print(f"\n{count:,} splats\n", *lines, sep="\n", flush=True)
+        known[str(count)] = figures
+    if options.write:
+        rows = (f'"{count}": {json.dumps(figures)}' for count, figures in known.items())
+        FIGURES.write_text("{\n" + ",\n".join(rows) + "\n}\n")
+
+
+if __name__ == "__main__":
+    main()
