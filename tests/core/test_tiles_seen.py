@@ -97,7 +97,9 @@ def test_of_tiles_the_same_rows_stay_as_of_one_file(tmp_path, tiles, views, budg
     assert told["estimated_psnr"] == pytest.approx(whole.report["estimated_psnr"], abs=0.011)
     for key in ("psnr", "absorbed"):
         assert told["quality"][key] == pytest.approx(whole.report["quality"][key], abs=1e-6)
-    assert told["notes"] == whole.report["notes"]
+    # Tiles tell nothing of views between those that decided, and so not what these cannot know.
+    notes = [note for note in whole.report["notes"] if "one view or none" not in note]
+    assert told["notes"] == notes
 
 
 @pytest.mark.slow
