@@ -811,7 +811,7 @@ def test_progress_is_drawn_on_a_terminal_and_wiped_away():
             steps = drawn.split(b"\r\x1b[K")
             assert b"" == steps[0] == steps[-1]
             assert any(re.fullmatch(rb"in\.ply: scoring +\d+%", step) for step in steps)
-            assert b"in.ply: writing  80%" in steps
+            assert any(re.fullmatch(rb"in\.ply: writing +\d+%", step) for step in steps)
             assert b"\x1b" not in done.stdout
 
 

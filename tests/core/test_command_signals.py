@@ -112,7 +112,7 @@ def test_ctrl_c_while_refitting_writes_what_that_has_reached(folder):
     """
     words = [*PRUNE[:6], "--survivors", "refit", "--views", "8", "--keep", "100"]
 
-    with start("-c", CALLED, "solve", *words) as process:
+    with start("-c", CALLED, "_solve", *words) as process:
         said = process.communicate(timeout=SECONDS)
 
     told = b"refine: error: cancelled; refitting was stopped before its first round was done; "
@@ -125,7 +125,7 @@ def test_ctrl_c_while_refitting_writes_what_that_has_reached(folder):
 def test_ctrl_c_while_refitting_writes_nothing_in_a_dry_run(folder):
     words = [*PRUNE[:4], "--survivors", "refit", "--views", "8", "--dry-run"]
 
-    with start("-c", CALLED, "solve", *words) as process:
+    with start("-c", CALLED, "_solve", *words) as process:
         said = process.communicate(timeout=SECONDS)
 
     assert process.returncode == 130
