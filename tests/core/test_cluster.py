@@ -28,6 +28,8 @@ from refine_addon.core import (
 from refine_addon.core.formats.ply_header import with_count
 from refine_addon.core.tiles import absorbing, cluster, units
 from refine_addon.core.tiles.folder import Folder, Interrupted
+from refine_addon.core.tiles.workers import Batch
+from refine_addon.core.work import silent
 
 ROOM = Path(__file__).parents[2] / "tests/data/room_small"
 CLOSED = Settings(method="closed-form", views=8)
@@ -263,6 +265,25 @@ def test_workers_lost_while_they_are_asked_do_not_end_a_job(tmp_path, answers, r
         check(Folder(tmp_path), [])
 
     assert not left
+
+
+@pytest.mark.parametrize("counts", [[], [{}, {"there": 1}]], ids=["for good", "for a while"])
+def test_a_job_whose_workers_are_all_lost_ends(monkeypatch, counts):
+    """They may come back, so not at once; a job that has ended goes on where it was."""
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(cluster, "_ALONE", 0.5)
+    left, never = [*counts], SimpleNamespace(add_done_callback=lambda _: None)
+    client = SimpleNamespace(
+        nthreads=lambda: left.pop(0) if left else {}, submit=lambda *_, **__: never,
+        cancel=lambda _: None,
+    )  # fmt: skip
+    began = time.monotonic()
+
+    with pytest.raises(Interrupted, match="all workers were lost"):
+        next(cluster.Cluster(client).run(Batch(None, [0], silent, "")))
+
+    assert not left
+    assert time.monotonic() - began > 0.5
 
 
 def test_without_dask_the_extra_is_named(tmp_path, tiles, capsys, monkeypatch):

@@ -13,6 +13,7 @@ import functools
 import pickle
 import signal
 import threading
+import time
 import uuid
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
@@ -42,6 +43,8 @@ _TURNS = 4
 """Groups a thread at least, where there are as many steps, so that all end at about one time."""
 
 _PATIENCE = 0.2  # seconds between two looks whether to go on
+
+_ALONE = 60.0  # seconds without any worker after which a job ends
 
 _MEMORY = {
     "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 28,
@@ -223,12 +226,24 @@ class Cluster:
         return self._client.submit(_run, packed, [*group], key=key)
 
     def _result(self, future: Any, batch: Batch[Any, Any], done: float) -> Any:  # noqa: ANN401
-        """Return the result of a future, and ask meanwhile whether to go on."""
-        ended = threading.Event()
+        """Return the result of a future, and ask meanwhile whether to go on.
+
+        Raises
+        ------
+        Interrupted
+            If there is no worker any more; those that are lost are started again, if not at once.
+        """
+        ended, seen = threading.Event(), time.monotonic()
         future.add_done_callback(lambda _: ended.set())
         report(batch.progress, done, batch.what)
         while not ended.wait(_PATIENCE):
             report(batch.progress, done, batch.what)
+            alone = time.monotonic() - seen
+            if alone > _ALONE / 10.0 and self._client.nthreads():
+                seen = time.monotonic()
+            elif alone > _ALONE:
+                msg = "all workers were lost"
+                raise Interrupted(msg)
         return future.result()
 
 
