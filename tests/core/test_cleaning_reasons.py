@@ -268,6 +268,22 @@ def test_a_view_sees_past_what_little_light_stops_near(alphas, near, views, past
     assert (evidence.views[0], evidence.past[0]) == (views, past)
 
 
+@pytest.mark.parametrize(("absent", "expected"), [(False, {0, 1}), (True, {0, 1, 2})])
+def test_what_takes_no_light_hides_nothing(absent, expected):
+    """Behind two splats of opacity .99 nothing is looked at, unless these are suspects."""
+    dense = made([[0.0, 0.0, 2.0], [0.0, 0.0, 2.1]], 0.5, 0.9999, 0.1)
+    splats = joined(dense, made([[0.0, 0.0, 4.0]], 0.01, 0.9, 0.1))
+    view = View(np.eye(3), np.zeros(3), 60, 60, 8, 8, 16, 16, name="a")
+    gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)))
+    footprints = projection.project(gaussians, scene, view)
+
+    seen = support.hits_of_view(
+        gaussians, footprints, scene, (view, 0), np.array([absent, absent, False])
+    )
+
+    assert set(gaussians.index[seen.hit[seen.owner]].tolist()) == expected
+
+
 def test_a_splat_lies_where_it_is_densest_on_a_ray(monkeypatch):
     """A large flat splat turned by 45 degrees: z = 4 + x, so 4 (1 + u) on the ray x = u z.
 
