@@ -34,6 +34,9 @@ _ENDS_UNSEEN = bpy.app.version < (5, 0, 0)
 See `RE_FreeUnusedGPUResources` in its source; one frame of sixty ended Blender 4.3 on X11.
 """
 
+_SETTLED = 0.5
+"""Seconds after a render in which windows have drawn themselves; see `_draw_whole`."""
+
 
 @dataclass
 class _Watch:
@@ -177,12 +180,15 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         display = view.render_display_type
         if self._opened:
             view.render_display_type = "NONE"
-        if _ENDS_UNSEEN and step.what == "meshes":
+        shows = _ENDS_UNSEEN and step.what == "meshes"
+        if shows:
             context.window.scene = bpy.data.scenes[step.scene]
         try:
             bpy.ops.render.render("INVOKE_DEFAULT", scene=step.scene, animation=step.animation)
         finally:
             view.render_display_type = display
+        if shows and not self._opened:
+            _draw_whole()
         self._opened = True
         _watch_anew()
 
@@ -224,11 +230,19 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         if self._steps is not None:
             self._steps.close()
             self._steps = None
+        if _ENDS_UNSEEN and not bpy.app.background:
+            bpy.app.timers.register(_draw_whole, first_interval=_SETTLED)
         if self._timer is not None:
             context.window_manager.event_timer_remove(self._timer)
             self._timer = None
             for workspace in bpy.data.workspaces:
                 workspace.status_text_set(None)
+
+
+def _draw_whole() -> None:
+    """Have windows drawn whole: where a scene was changed, 4.3 leaves the top bar empty."""
+    for window in bpy.context.window_manager.windows:
+        window.screen.show_statusbar = window.screen.show_statusbar
 
 
 def _shows_render(image: bpy.types.Image | None) -> bool:
