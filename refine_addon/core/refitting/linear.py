@@ -65,9 +65,10 @@ LEAST_WEIGHT = ALPHA_CUT
 """Hits that make up less of their pixel are left out: a quarter less to do than with 1e-3, and the
 same results to .01 dB."""
 
+HUBER = 1.0
+"""Errors count in proportion beyond so many times the root mean square of their view: `_trust`."""
 
-HUBER, VIEWS = 1.0, 1.0
-_LEAST_ERROR = 1e-10
+_LEAST_ERROR = 1e-10  # squared; keeps a division finite
 
 
 @dataclass(frozen=True, eq=False)
