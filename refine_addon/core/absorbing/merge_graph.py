@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from .merge_field import Array, Field, Index
 
     Rows = NDArray[np.int32]
+    Costs = NDArray[np.float32]
 
 NEIGHBOURS = 8
 """How many nearest neighbours each splat may be merged with."""
@@ -58,7 +59,7 @@ class MergeGraph:
         How many splats were deleted.
     first, second : (E,) int32
         Rows of the pairs that may be merged.
-    cost : (E,) float64
+    cost : (E,) float32
         Of merging each pair; infinite where it is not less than that of deleting one of the two.
     connected : int
         How many splats were alive when neighbours were last searched; 0 before.
@@ -79,7 +80,7 @@ class MergeGraph:
         self.merges: list[tuple[Index, Index, Array]] = []
         self.deleted = 0
         self.first = self.second = np.empty(0, np.int32)
-        self.cost = np.empty(0)
+        self.cost = np.empty(0, np.float32)
         self.connected = 0
 
     @classmethod
@@ -88,7 +89,7 @@ class MergeGraph:
         field: Field,
         scene: Scene,
         patience: float,
-        pairs: tuple[Rows, Rows, Array],
+        pairs: tuple[Rows, Rows, Costs],
         *,
         threads: int | None = None,
     ) -> MergeGraph:
@@ -98,7 +99,7 @@ class MergeGraph:
         graph.connected = len(graph.alive)
         return graph
 
-    def best(self) -> tuple[Array, NDArray[np.bool_]]:
+    def best(self) -> tuple[Costs, NDArray[np.bool_]]:
         """Return the cost of each splat's cheapest operation, (N,), and whether it is a merge."""
         error = self._errors()
         best = error.copy()
@@ -126,7 +127,7 @@ class MergeGraph:
             count -= self._round(min(max(int(BATCH * count), 1), count - goal), of_round)
         # The pairs are no longer needed; a large scene has ten million of them.
         self.first = self.second = np.empty(0, np.int32)
-        self.cost = np.empty(0)
+        self.cost = np.empty(0, np.float32)
 
     def connect(self, progress: Progress = silent) -> None:
         """Find the pairs of neighbouring splats, and price them."""
@@ -151,7 +152,7 @@ class MergeGraph:
         # int32 takes half the memory of int64, and no file holds two billion splats.
         self.first = np.concatenate([none, *(first for first, _ in chunks)])
         self.second = np.concatenate([none, *(second for _, second in chunks)])
-        self.cost = np.empty(len(self.first))
+        self.cost = np.empty(len(self.first), np.float32)
         self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.5, 1.0))
         self.connected = int(np.count_nonzero(self.alive))
 
@@ -161,7 +162,7 @@ class MergeGraph:
         def price(piece: slice) -> None:
             rows = edges[piece]
             first, second = self.first[rows], self.second[rows]
-            least = np.minimum(self.field.error[first], self.field.error[second])
+            least = np.minimum(self.field.error.take(first), self.field.error.take(second))
             with np.errstate(under="ignore"):
                 cost = merging.costs(self.field, first, second, least / self.patience)
             self.cost[rows] = self.patience * cost
@@ -191,7 +192,7 @@ class MergeGraph:
         self._carry_out(doomed[order[~is_merge]], chosen[order[is_merge] - len(doomed)], progress)
         return len(order)
 
-    def _limit(self, error: Array, count: int) -> float:
+    def _limit(self, error: Costs, count: int) -> float:
         """Return the cost of the most expensive operation that a round looks at.
 
         These are twice `count`, since operations that share a splat exclude each other.
@@ -201,7 +202,7 @@ class MergeGraph:
         return float(np.partition(costs, last)[last])
 
     def _cheapest(
-        self, error: Array, edges: Index, limit: float
+        self, error: Costs, edges: Index, limit: float
     ) -> tuple[NDArray[np.bool_], Index]:
         """Return which splats cost least by deleting them, (N,), and which pairs by merging, (m,).
 
@@ -224,14 +225,16 @@ class MergeGraph:
         every: Index = np.concatenate([chosen, others])
         return every
 
-    def _errors(self) -> Array:
-        """Return the costs of deleting splats, (N,); infinite where unknown.
+    def _errors(self) -> Costs:
+        """Return the costs of deleting splats, (N,) float32; infinite where unknown.
 
         So the cheapest operation is always carried out, and every round removes a splat; a
         comparison with NaN would choose none.
         """
-        known = self.alive & ~np.isnan(self.field.error)
-        return np.where(known, self.field.error, np.inf)
+        with np.errstate(over="ignore", under="ignore"):
+            error = self.field.error.astype(np.float32)
+        error[~self.alive | np.isnan(error)] = np.inf
+        return error
 
     def _carry_out(self, doomed: Index, edges: Index, progress: Progress) -> None:
         """Delete splats, merge pairs, and price the pairs of the merged splats again."""
