@@ -233,6 +233,92 @@ def test_colours_and_opacities_alone_have_the_derivatives_that_they_have_among_a
         assert not one[linear.MEAN.start :].any()
 
 
+def test_a_round_solves_its_damped_least_squares(monkeypatch):
+    """As a dense system in float64 does, with what the rounds before told and left.
+
+    Of these K counts as it is and what is left of J'r half; the diagonal is damped by k times
+    itself and its median over splats. What is left of J'r is what damping by k leaves.
+    """
+    monkeypatch.setattr(refit, "STEPS", 300)
+    found = linear_of(few(), ring()[0])
+    random = np.random.default_rng(6)
+    told, left = (
+        (scale * random.uniform(size=(linear.COUNT, 12))).astype(np.float32) for scale in (5.0, 2.0)
+    )
+    movable = np.ones((linear.COUNT, 12), np.bool_)
+    movable[:, 3] = False
+    rows = found.shapes.gaussians.index
+
+    change, after = refit._solve(
+        found, movable, 0.5, refit._Told(told, left), progress=silent, threads=1
+    )
+
+    units = np.eye(movable.size, dtype=np.float32).reshape(-1, *movable.shape)
+    columns = [found.normal(unit, silent, 1).ravel() for unit in units]
+    diagonal = found.diagonal.astype(np.float64)
+    diagonal[:, rows == 3] = 0.0
+    medians = [np.median(row[row > 0.0]) for row in diagonal]
+    prior = 0.5 * (diagonal + np.array(medians)[:, None])
+    matrix = np.array(columns, np.float64) + np.diag((prior + told[:, rows]).ravel())
+    sought = (diagonal > 0.0).ravel()
+    right = (found.residual + 0.5 * left[:, rows]).ravel()
+    expected = np.linalg.solve(matrix[sought][:, sought], right[sought])
+    np.testing.assert_allclose(change[:, rows].ravel()[sought], expected, atol=1e-4)
+    assert not change[:, 3].any()
+    np.testing.assert_allclose(after.diagonal[:, rows], told[:, rows] + diagonal, rtol=1e-6)
+    damped = (prior * change[:, rows]).ravel()[sought]
+    np.testing.assert_allclose(after.left[:, rows].ravel()[sought], damped, atol=2e-4)
+
+
+def test_a_ray_counts_as_much_with_its_error_as_with_its_derivatives(monkeypatch):
+    """Half as much with both: half of the errors, a quarter of J'r and of the diagonal."""
+    found = {}
+    for trust in (1.0, 0.5):
+        every = lambda errors, trust=trust: np.full(errors.shape[1], trust, np.float32)  # noqa: E731
+        monkeypatch.setattr(linear, "_trust", every)
+        found[trust] = linear_of(few(), ring()[0])
+
+    whole, half = found[1.0], found[0.5]
+    np.testing.assert_array_equal(half.views[0].errors, 0.5 * whole.views[0].errors)
+    np.testing.assert_array_equal(half.residual, 0.25 * whole.residual)
+    np.testing.assert_array_equal(half.diagonal, 0.25 * whole.diagonal)
+
+
+@pytest.mark.usefixtures("squares")
+def test_where_alpha_is_clipped_nothing_but_the_colour_changes():
+    """A splat of opacity .9999 is drawn with alpha .99 up to .14 standard deviations: there alone.
+
+    Since exp(-.14^2 / 2) = .9902. At 1 px per 40th of a standard deviation that is every pixel.
+    """
+    view = ring()[0]
+    splats = replace(few().take([0]), opacity_logits=np.array([9.21]), log_scales=np.zeros((1, 3)))
+    middle = projection.project(*projection.prepare(splats, ViewSet((view,)))[:2], view).centers
+    pixels = tuple(np.arange(3) + round(float(place)) - 2 for place in middle[:, 0])
+
+    found = linear_of(splats, view, 1, pixels=pixels)
+
+    assert (found.diagonal[linear.COLOR] > 0.0).all()
+    assert not found.diagonal[linear.OPACITY.start :].any()
+
+
+def test_no_parameter_moves_farther_in_a_round_than_it_may():
+    """Whatever is asked for: vectors keep their direction, the rest is cut off."""
+    splats = few()
+    change = np.full((linear.COUNT, 12), 7.0)
+
+    moved = refit._moved(splats, change)
+
+    step = np.linalg.norm(moved.means - splats.means, axis=1)
+    np.testing.assert_allclose(step, 0.5 * np.exp(splats.log_scales.max(axis=1)), rtol=1e-6)
+    np.testing.assert_allclose(moved.log_scales - splats.log_scales, 0.3)
+    np.testing.assert_allclose(moved.opacity_logits - splats.opacity_logits, 1.0)
+    np.testing.assert_allclose(moved.sh_dc - splats.sh_dc, 0.5)
+    turns = np.einsum(
+        "nij,nkj->nik", rotation_matrices(moved.quaternions), rotation_matrices(splats.quaternions)
+    )
+    np.testing.assert_allclose((np.trace(turns, axis1=1, axis2=2) - 1.0) / 2.0, np.cos(0.3))
+
+
 @pytest.mark.slow
 def test_refitted_survivors_are_nearer_to_what_the_views_see():
     """Half of a cloud, colours and all: some dB on rays that nothing was fitted to."""
