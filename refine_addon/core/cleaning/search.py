@@ -63,7 +63,7 @@ SUPPORT = 0.5
 ISOLATED_SUPPORT = 0.05
 """The same of what only belongs to a small cluster."""
 
-AGREE = 0.2
+AGREE = 0.1
 """At least this share of the views that see it must see past it, but for giants and needles."""
 
 FEW = 2.0
@@ -73,24 +73,32 @@ POWER = 1.5
 """The evidence is by how much a splat changes a pixel, times this power of one more than the views
 that see past it."""
 
-NEEDED = 11 / 255
+NEEDED = 4 / 255
 """So much evidence is needed against a splat that touches nothing."""
 
-HELD = 7.0
+HELD = 8.0
 """That is multiplied by this to the power of the square root of how many neighbours touch the splat
 and stay."""
 
-GIANT_NEEDED, NEEDLE_NEEDED = 3.0, 1 / 3
+GIANT_NEEDED, NEEDLE_NEEDED = 8.0, 1 / 3
 """It is multiplied by these, too, for giants and needles."""
+
+AT_SURFACE = 150.0
+"""For giants by this to the power of their support, too: a sky is made of giants that lie near each
+other, and a veil hangs before what lies behind."""
 
 FAINT = 0.15
 """Haze is of lower opacity."""
 
+HAZE_HELD = 1.35
+"""For what is so faint, but for giants, by this to the power of how many faint neighbours touch it,
+whether they stay or go: a cloud of faint splats was trained as one, and pictures need it as one."""
+
 VISIBLE, GLARING, WIDE = 4 / 255, 40 / 255, 0.05
 """A change of a pixel is opacity times contrast to what lies behind, at most the second of these.
-Where the standard deviation reaches across more than the third share of a picture's longer side it
-counts by so much more: the root mean square of the picture's change is the same. What stays, but
-would go if it changed a pixel by the first, is nearly transparent."""
+Where the standard deviation of a giant reaches across more than the third share of a picture's
+longer side it counts by so much more. What stays, but would go if it changed a pixel by the first
+and touched no haze, is nearly transparent."""
 
 NEAR = 0.3
 """Haze is at most so far from a camera, scene sizes."""
@@ -308,29 +316,44 @@ class Search:
 
     def _floats(self, suspects: _Suspects) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return which suspects float and show, and which float but do not show, (M,) each."""
+        giant, large = suspects.giant, suspects.giant | suspects.needle
         seen, past, support = self.evidence.views, self.evidence.past, self.evidence.support()
-        giant, needle, large = suspects.giant, suspects.needle, suspects.giant | suspects.needle
         passed = np.where(large, np.maximum(past, seen * (1.0 - support)), past)
         self.sure = (passed + 1.0) / (seen + 2.0)
         most = np.where(large | suspects.doubted, SUPPORT, ISOLATED_SUPPORT)
         may = suspects.mask & (support < most) & (large | (past >= AGREE * seen))
         may &= (past >= FEW) | (giant & (passed >= FEW))
         rows = np.flatnonzero(may)
-        needed = np.select([giant, needle], [GIANT_NEEDED, NEEDLE_NEEDED], 1.0)
-        needed = NEEDED * needed[rows] / (1.0 + passed[rows]) ** POWER
-        wide = np.maximum(self.width[rows], WIDE) / WIDE
-        change = np.minimum(self._effect()[rows], GLARING) * wide
         near, touch = touching(self.gaussians, rows, threads=self.threads)
-        shows = may.copy()
-        while True:  # what stays holds its neighbours: fewer go each time
-            held = HELD ** np.sqrt(np.count_nonzero(touch & ~shows[near], axis=1))
-            goes = change >= needed * held
-            if np.array_equal(goes, shows[rows]):
-                break
-            shows[rows] = goes
-        faint = may & ~shows
-        faint[rows] &= VISIBLE * wide >= needed * held
-        return shows, faint
+        needed = self._needed(suspects, passed, support)[rows]
+        wide = np.where(giant[rows], np.maximum(self.width[rows], WIDE) / WIDE, 1.0)
+        change = np.minimum(self._effect()[rows], GLARING) * wide
+        hazy = self.gaussians.alphas < FAINT
+        in_haze = np.count_nonzero(touch & hazy[near], axis=1) * (hazy & ~giant)[rows]
+
+        def unheld(change: NDArray[np.float64], needed: NDArray[np.float64]) -> NDArray[np.bool_]:
+            goes = may.copy()
+            while True:  # what stays holds its neighbours: fewer go each time
+                stay = np.count_nonzero(touch & ~goes[near], axis=1)
+                left = change >= needed * HELD ** np.sqrt(stay)
+                if np.array_equal(left, goes[rows]):
+                    return goes
+                goes[rows] = left
+
+        shows = unheld(change, needed * HAZE_HELD**in_haze)
+        return shows, unheld(np.maximum(change, VISIBLE), needed) & ~shows
+
+    def _needed(
+        self, suspects: _Suspects, passed: NDArray[np.float64], support: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return how much evidence is needed against each suspect that touches nothing, (M,).
+
+        `passed`, (M,), are the views that see past each, `support`, (M,), the share of the light
+        that stops near it.
+        """
+        giant = GIANT_NEEDED * AT_SURFACE**support
+        kind = np.select([suspects.giant, suspects.needle], [giant, NEEDLE_NEEDED], 1.0)
+        return np.asarray(NEEDED * kind / (1.0 + passed) ** POWER)
 
     def _effect(self) -> NDArray[np.float64]:
         """Return by how much each suspect changes a pixel that it covers, (M,)."""
