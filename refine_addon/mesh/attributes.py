@@ -9,6 +9,8 @@ go in as those of a mesh.
 from __future__ import annotations
 
 import zlib
+from collections import Counter, deque
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +25,7 @@ from ..core.splats import Splats, single_unit_quaternions, with_model
 from .layout import KINDS, Column, Layout, SplatObject, add_attributes, rest_count, splat_count
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -116,31 +118,48 @@ def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
     return with_model(splats, checked.layout.model)
 
 
-def file_from_object(
-    checked: SplatObject, columns: dict[str, NDArray[Any]] | None = None
-) -> SplatFile:
-    """Return a splat object as the file it would be.
+def file_from_object(checked: SplatObject) -> SplatFile:
+    """Return a splat object as the file it would be, in memory; `SplatFile.write` writes it."""
+    return _file(checked.obj.name, checked.layout, len(checked), _groups_of(checked, {}))
+
+
+def read_for_file(
+    checked: SplatObject, columns: Mapping[str, NDArray[Any]]
+) -> Callable[[], SplatFile]:
+    """Read a splat object; return what makes the file that it would be of that, on any thread.
 
     Parameters
     ----------
     checked : SplatObject
-    columns : mapping of str to (N,), optional
+    columns : mapping of str to (N,)
         Properties to write with these values in place of the object's.
-
-    Returns
-    -------
-    SplatFile
-        In memory; `SplatFile.write` writes it.
     """
-    layout = checked.layout
-    columns = columns or {}
-    rows = np.empty(len(checked), layout.row_dtype)
-    read = _Reader(checked)
-    for names in _groups([column.name for column in layout.columns], rows.dtype):
-        planes = [columns[name] if name in columns else read.stored(name) for name in names]
+    groups = deque(_groups_of(checked, columns))
+    one_by_one = (groups.popleft() for _ in range(len(groups)))  # to be forgotten when written
+    return partial(_file, checked.obj.name, checked.layout, len(checked), one_by_one)
+
+
+def _file(
+    name: str, layout: Layout, count: int, groups: Iterable[tuple[list[str], Sequence[Any]]]
+) -> SplatFile:
+    """Return a file of so many splats, from columns that are transposed together."""
+    rows = np.empty(count, layout.row_dtype)
+    for names, planes in groups:
         _interleave(rows, names, planes)
     no_elements = np.empty(0, np.uint8)
-    return SplatFile(Path(checked.obj.name), rows, layout.header, no_elements, no_elements)
+    return SplatFile(Path(name), rows, layout.header, no_elements, no_elements)
+
+
+def _groups_of(
+    checked: SplatObject, columns: Mapping[str, NDArray[Any]]
+) -> Iterator[tuple[list[str], Sequence[NDArray[Any]]]]:
+    """Yield names and values of columns that are transposed together; some are given."""
+    read, dtype = _Reader(checked), checked.layout.row_dtype
+    for names in _groups([column.name for column in checked.layout.columns], dtype):
+        if dtype[names[0]].str == "<f4" and not columns.keys() & set(names):
+            yield names, read.planes(names)  # as one array, which Linux gives large pages
+        else:
+            yield names, [columns[name] if name in columns else read[name] for name in names]
 
 
 def stored_columns(checked: SplatObject) -> Columns:
@@ -159,15 +178,19 @@ def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> 
     """
     mesh = checked.mesh
     places = {column.name: column for column in checked.layout.columns}
+    given = Counter(places[name].place.attribute for name in columns)
     vectors: dict[str, NDArray[Any]] = {}
     for name, values in columns.items():
         place = places[name].place
         attribute = mesh.attributes[place.attribute]
         coded = place.coding.to_attribute(values) if place.coding else values
-        if KINDS[attribute.data_type].width == 1:
+        width = KINDS[attribute.data_type].width
+        if width == 1:
             write_attribute(mesh, place.attribute, attribute.data_type, coded)
             continue
-        if place.attribute not in vectors:
+        if place.attribute not in vectors and given[place.attribute] == width:
+            vectors[place.attribute] = np.empty((len(values), width), np.float32)
+        elif place.attribute not in vectors:
             vectors[place.attribute] = read_attribute(mesh, place.attribute)
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
             vectors[place.attribute][:, place.component] = coded
@@ -178,6 +201,26 @@ def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> 
         )
     if columns:
         updated(mesh)
+
+
+def write_rows(
+    checked: SplatObject, rows: NDArray[np.int64], columns: Mapping[str, NDArray[Any]]
+) -> None:
+    """Store what some splats become: columns, (M,) each, of the splats of M rows.
+
+    Column by column, as memory that is taken anew takes longest; all others stay to the bit.
+    """
+    attributes: dict[str, list[str]] = {}
+    for column in checked.layout.columns:
+        if column.name in columns:
+            attributes.setdefault(column.attribute, []).append(column.name)
+    for names in attributes.values():
+        stored = stored_columns(checked)
+        whole = {name: stored[name].copy() for name in names}
+        with np.errstate(over="ignore", under="ignore"):  # a double may be too large for a float
+            for name, values in whole.items():
+                values[rows] = columns[name]
+        write_columns(checked, whole)
 
 
 def move_columns(checked: SplatObject, layout: Layout) -> None:

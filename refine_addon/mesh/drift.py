@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -136,32 +136,38 @@ def found(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Drift | None:
     if notes.undisturbed():
         return None
     step = max(1, len(notes.codes) // _SHOWN)
-    moves, loose = notes.moves(step)
-    drift = Drift(
-        turned=min(step * sum(len(move.rows) for move in moves), len(notes.codes)),
-        bent=step * loose if step * loose > max(_FEW, _FEW_SHARE * len(notes.codes)) else 0,
-        mirrored=any(move.mirrors for move in moves),
-        sources=len(notes.objects()),
-        regrouped=len(notes.regrouped()),
-        unlisted=tuple(unlisted(mesh)) if len(notes.objects()) > 1 else (),
-        strangers=int(np.count_nonzero(notes.codes == 0)),
-    )
-    return drift if drift.mendable or drift.strangers else None
+    return notes.drift(*notes.moves(step), step)
 
 
-def turned(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[Move]:
-    """Return by what maps which splats were moved that did not follow, but in their positions."""
-    return _Notes(mesh).moves()[0] if is_stamped(mesh) else []
+class Mending(NamedTuple):
+    """What it takes to have splats follow what others did to them.
+
+    Attributes
+    ----------
+    moves : list of Move
+        By what maps which splats were moved that did not follow, but in their positions.
+    regrouped : list of (int, (M,) int64)
+        Which splats have their harmonics under the names of which other degree.
+    """
+
+    moves: list[Move]
+    regrouped: list[tuple[int, NDArray[np.int64]]]
 
 
-def regrouped(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[tuple[int, NDArray[np.int64]]]:
-    """Return which splats have their harmonics under the names of which other degree."""
+def mending(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Mending | None:
+    """Return what it takes to mend a mesh, None if nothing was found that others did to it."""
     if not is_stamped(mesh):
-        return []
+        return None
     notes = _Notes(mesh)
+    if notes.undisturbed():
+        return None
+    moves, loose = notes.moves()
+    if notes.drift(moves, loose) is None:
+        return None
     rows = notes.regrouped()
     degrees = notes.codes[rows] & _DEGREE
-    return [(int(degree), rows[degrees == degree]) for degree in np.unique(degrees)]
+    regrouped = [(int(degree), rows[degrees == degree]) for degree in np.unique(degrees)]
+    return Mending(moves, regrouped)
 
 
 def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
@@ -205,6 +211,20 @@ class _Notes:
             and (origins == origins[0]).all()
             and (native.is_native(self.mesh) or origins[0] & _DEGREE == sh_degree(self.mesh))
         )
+
+    def drift(self, moves: list[Move], loose: int, step: int = 1) -> Drift | None:
+        """Return what `found` does, of what `moves` has found."""
+        bent, objects = step * loose, self.objects()
+        drift = Drift(
+            turned=min(step * sum(len(move.rows) for move in moves), len(self.codes)),
+            bent=bent if bent > max(_FEW, _FEW_SHARE * len(self.codes)) else 0,
+            mirrored=any(move.mirrors for move in moves),
+            sources=len(objects),
+            regrouped=len(self.regrouped()),
+            unlisted=tuple(unlisted(self.mesh)) if len(objects) > 1 else (),
+            strangers=int(np.count_nonzero(self.codes == 0)),
+        )
+        return drift if drift.mendable or drift.strangers else None
 
     def objects(self) -> list[int]:
         """Return the numbers of the objects that the splats came from."""

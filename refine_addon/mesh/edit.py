@@ -119,6 +119,7 @@ def delete_vertices(obj: bpy.types.Object, remove: NDArray[np.bool_]) -> None:
     tree = _deleting_tree()
     modifier = obj.modifiers.new("REFINE delete", "NODES")
     name = modifier.name
+    modifier.show_viewport = False  # or Blender runs it once more, before it applies it
     try:
         modifier.node_group = tree
         # First, or Blender warns that those before it are not applied.

@@ -23,8 +23,10 @@ from ..mesh.scores import Provenance, store
 from .demands import NONE, Demands
 from .splat_object import (
     can_become,
+    changed,
     drift_notes,
     find,
+    frame_of,
     gather,
     modifier_notes,
     reduce_object,
@@ -229,10 +231,10 @@ class ObjectSink:
             raise result.stopped
         written = self.file.write(loaded, result, runtime)
         if self.save:
-            columns = loaded.columns(result.absorbed)
+            change = changed(frame_of(self.checked), result.keep, result.absorbed)
             with mesh_edit.all_or_nothing(self.checked.obj):
                 store(self.checked, result.scores, Provenance(self.request.settings))
-                reduce_object(self.checked, result.keep, columns)
+                reduce_object(self.checked, change)
                 _save(written.path)
         return written
 

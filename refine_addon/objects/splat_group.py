@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from ..core.views import ViewSet
     from ..mesh.layout import SplatObject
     from ..mesh.scores import Provenance
+    from .splat_object import Change, Frame
 
 Members = list["SplatObject"]
 """The objects, by name; one at least."""
@@ -272,26 +273,57 @@ def mark_removed(group: Members, keep: NDArray[np.bool_]) -> None:
         mesh_edit.mark_removed(member.obj, ~keep[rows])
 
 
-def apply(group: Members, result: Result) -> Outcome:
+def frames_of(group: Members) -> list[Frame]:
+    """Read what `changes` needs of each object; see `splat_object.frame_of`."""
+    return [splat_object.frame_of(member) for member in group]
+
+
+def changes(frames: Sequence[Frame], counts: Sequence[int], result: Result) -> list[Change]:
+    """Return what is to become of each object's splats; touches nothing of Blender's.
+
+    Parameters
+    ----------
+    frames : sequence of Frame
+        Of each object.
+    counts : sequence of int
+        How many splats each has.
+    result : Result
+        What was decided of all of them.
+    """
+    if len(frames) == 1:
+        return [splat_object.changed(frames[0], result.keep, result.absorbed)]
+    return [
+        splat_object.changed(
+            frame, result.keep[rows], result.absorbed and _part(result.absorbed, rows)
+        )
+        for frame, rows in zip(frames, _runs(counts), strict=True)
+    ]
+
+
+def apply(group: Members, parts: Sequence[Change]) -> Outcome:
     """Delete the splats that do not stay, and store what the others became: in all objects or none.
+
+    Parameters
+    ----------
+    group : list of SplatObject
+    parts : sequence of Change
+        See `changes`.
 
     Raises
     ------
     RefineError
-        See `splat_object.apply_object`; also if an object would be left without splats.
+        See `splat_object.apply`; also if an object would be left without splats.
     """
-    if len(group) == 1:
-        return splat_object.apply_object(group[0], result)
-    _check_counts(group, len(result.keep))
-    parts = list(zip(group, _split(group, result), strict=True))
-    for member, result_of_member in parts:
-        if not result_of_member.keep.any():
+    if len(group) > 1:
+        _check_counts(group, sum(len(part.keep) for part in parts))
+    for member, part in zip(group, parts, strict=True):
+        if len(group) > 1 and not part.keep.any():
             msg = (
                 f"no splat of object '{member.obj.name}' would be left; nothing was removed: "
                 "delete the object, or let more stay"
             )
             raise RefineError(msg)
-    outcomes = splat_object.apply_objects(parts)
+    outcomes = splat_object.apply(list(zip(group, parts, strict=True)))
     totals = {
         field.name: sum(getattr(outcome, field.name) for outcome in outcomes)
         for field in fields(Outcome)
@@ -301,7 +333,12 @@ def apply(group: Members, result: Result) -> Outcome:
 
 def _rows(group: Members) -> list[slice]:
     """Return which of all splats are those of each object."""
-    ends = np.cumsum([len(member) for member in group]).tolist()
+    return _runs([len(member) for member in group])
+
+
+def _runs(counts: Sequence[int]) -> list[slice]:
+    """Return which of all splats are those of each object, of which each has so many."""
+    ends = np.cumsum(counts).tolist()
     return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
@@ -376,21 +413,10 @@ def _joined_masks(parts: list[Any], counts: list[int]) -> NDArray[np.bool_]:
     ])  # fmt: skip
 
 
-def _split(group: Members, result: Result) -> list[Result]:
-    """Return what was decided of each object."""
-    parts = []
-    for member, rows in zip(group, _rows(group), strict=True):
-        absorbed = None
-        if result.absorbed is not None:
-            absorbed = _part(result.absorbed, rows, mesh_layout.sh_degree(member.mesh))
-        parts.append(replace(result, keep=result.keep[rows], absorbed=absorbed))
-    return parts
-
-
-def _part(absorbed: Absorbed, rows: slice, degree: int) -> Absorbed:
-    """Return the survivors of one object, with harmonics up to its own degree."""
+def _part(absorbed: Absorbed, rows: slice) -> Absorbed:
+    """Return the survivors of one object."""
     first = int(np.count_nonzero(absorbed.keep[: rows.start]))
     keep = absorbed.keep[rows]
     survivors = slice(first, first + int(np.count_nonzero(keep)))
-    splats = absorbed.splats.take(survivors).up_to_degree(degree)
+    splats = absorbed.splats.take(survivors)
     return replace(absorbed, keep=keep, splats=splats, changed=absorbed.changed[survivors])

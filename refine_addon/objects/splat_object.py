@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import bpy
 import numpy as np
@@ -19,7 +19,6 @@ from ..core.affine import baked, is_uniform, transformed
 from ..core.errors import RefineError
 from ..core.formats.ply_columns import values_by_name
 from ..core.moves import Move
-from ..core.survivors import survivor_columns
 from ..core.task import DEFAULTS, Result, Settings, Task
 from ..core.volumes import FREE, Forced
 from ..core.work import for_chunks
@@ -31,7 +30,7 @@ from ..mesh import layout as mesh_layout
 from ..mesh.scores import RECORD, stored_scores
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -197,45 +196,103 @@ def stored_task(
     )
 
 
-def apply_object(checked: SplatObject, result: Result | Level) -> Outcome:
-    """Delete the splats that do not stay, and store what the others became: all of it or nothing.
+class Frame(NamedTuple):
+    """What is to be known of an object to prepare a change of its splats on any thread.
 
-    Everything else of the object and its mesh stays: attributes, vertex groups, custom properties,
-    materials, modifiers. The scores stay to be looked at, but the next apply asks for new ones.
+    Attributes
+    ----------
+    degree : int
+        Of its harmonics.
+    matrix : (4, 4) float64
+        From the world to the object.
+    """
+
+    degree: int
+    matrix: NDArray[np.float64]
+
+
+class Change(NamedTuple):
+    """What is to become of the splats of an object.
+
+    Attributes
+    ----------
+    keep : (N,) bool
+        Which stay; K of them.
+    rows : (M,) int64
+        Which of the K change, ascending.
+    columns : dict of str to (M,)
+        What their properties become, in the object's frame.
+    """
+
+    keep: NDArray[np.bool_]
+    rows: NDArray[np.int64]
+    columns: dict[str, NDArray[Any]]
+
+
+def frame_of(checked: SplatObject) -> Frame:
+    """Read what `changed` needs of an object."""
+    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
+    return Frame(mesh_layout.sh_degree(checked.mesh), np.linalg.inv(matrix))
+
+
+def changed(frame: Frame, keep: NDArray[np.bool_], absorbed: Absorbed | None) -> Change:
+    """Return what is to become of an object's splats; touches nothing of Blender's.
 
     Parameters
     ----------
-    checked : SplatObject
-    result : Result or Level
-        What was decided of the object's splats.
+    frame : Frame
+    keep : (N,) bool
+    absorbed : Absorbed or None
+        What the survivors became, in the world.
+    """
+    if absorbed is None:
+        return Change(keep, np.empty(0, np.int64), {})
+    rows = np.flatnonzero(absorbed.changed)
+    splats = absorbed.splats.take(rows).up_to_degree(frame.degree)
+    if not np.array_equal(frame.matrix, np.eye(4)):
+        splats = transformed(splats, frame.matrix)
+    columns = {name: np.ascontiguousarray(v) for name, v in values_by_name(splats).items()}
+    return Change(keep, rows, columns)
+
+
+def apply_object(checked: SplatObject, result: Result | Level) -> Outcome:
+    """Do what `apply` does, with what was decided of an object's splats."""
+    change = changed(frame_of(checked), result.keep, result.absorbed)
+    (outcome,) = apply([(checked, change)])
+    return outcome
+
+
+def apply(parts: Sequence[tuple[SplatObject, Change]]) -> list[Outcome]:
+    """Delete the splats that do not stay, and store what the others became: all of it or nothing.
+
+    Everything else of the objects and their meshes stays: attributes, vertex groups, custom
+    properties, materials, modifiers. The scores stay to be looked at, but the next apply asks for
+    new ones.
+
+    Parameters
+    ----------
+    parts : sequence of (SplatObject, Change)
 
     Raises
     ------
     RefineError
         See `mesh_edit.check_deletable`; also if there are no longer as many splats.
     """
-    (outcome,) = apply_objects([(checked, result)])
-    return outcome
-
-
-def apply_objects(parts: Sequence[tuple[SplatObject, Result | Level]]) -> list[Outcome]:
-    """Do what `apply_object` does to several objects: to all of them or to none."""
-    outcomes, columns = [], []
-    for checked, result in parts:
+    outcomes = []
+    for checked, change in parts:
         mesh_edit.check_deletable(checked.obj)
-        if len(result.keep) != len(checked):
+        if len(change.keep) != len(checked):
             msg = (
                 f"object '{checked.obj.name}': has {len(checked)} splats and had "
-                f"{len(result.keep)} when it was decided which stay; apply again"
+                f"{len(change.keep)} when it was decided which stay; apply again"
             )
             raise RefineError(msg)
-        outcomes.append(_outcome(checked, result.keep))
-        columns.append(absorbed_columns(checked, result.absorbed) if result.absorbed else {})
+        outcomes.append(_outcome(checked, change.keep))
     with ExitStack() as stack:
         for checked, _ in parts:
             stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
-        for (checked, result), changed in zip(parts, columns, strict=True):
-            reduce_object(checked, result.keep, changed)
+        for checked, change in parts:
+            reduce_object(checked, change)
     return outcomes
 
 
@@ -260,33 +317,27 @@ def delete_splats(checked: SplatObject, keep: NDArray[np.bool_]) -> Outcome:
         raise RefineError(msg)
     outcome = _outcome(checked, keep)
     with mesh_edit.all_or_nothing(checked.obj):
-        reduce_object(checked, keep, {})
+        reduce_object(checked, changed(frame_of(checked), keep, None))
     return outcome
 
 
-def reduce_object(
-    checked: SplatObject, keep: NDArray[np.bool_], columns: dict[str, NDArray[Any]]
-) -> None:
+def reduce_object(checked: SplatObject, change: Change) -> None:
     """Delete what does not stay, store what the others became, and drop the scores' record."""
-    mesh_edit.delete_vertices(checked.obj, ~keep)
-    columns = {name: values[keep] for name, values in columns.items()}
-    mesh_attributes.write_columns(checked, columns)
-    if columns:
+    mesh_edit.delete_vertices(checked.obj, ~change.keep)
+    mesh_attributes.write_rows(checked, change.rows, change.columns)
+    if change.columns:
         mesh_drift.renew(checked.mesh)
     mesh_floaters.forget(checked.mesh)
     if RECORD in checked.mesh:
         del checked.mesh[RECORD]
 
 
-def absorbed_columns(checked: SplatObject, absorbed: Absorbed) -> dict[str, NDArray[Any]]:
-    """Return an object's columns with the survivors as they became, in the object's frame."""
-    matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
-    stored = mesh_attributes.stored_columns(checked)
-    return survivor_columns(stored, absorbed, np.linalg.inv(matrix))
+def read_for_export(
+    checked: SplatObject, *, apply_transform: bool = False
+) -> Callable[[], SplatFile]:
+    """Read an object; return what makes its PLY file of that, in memory, on any thread.
 
-
-def exported_file(checked: SplatObject, *, apply_transform: bool = False) -> SplatFile:
-    """Return an object as the PLY file it would be, in the layout it was imported with; in memory.
+    The file is in the layout that the object was imported with.
 
     Parameters
     ----------
@@ -299,12 +350,12 @@ def exported_file(checked: SplatObject, *, apply_transform: bool = False) -> Spl
     RefineError
         If the transform is to be applied and cannot be, being flat.
     """
-    columns = None
+    columns = {}
     if apply_transform:
         matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
         if not np.array_equal(matrix, np.eye(4)):
             columns = moved_columns(checked, [Move(np.arange(len(checked)), matrix)])
-    return mesh_attributes.file_from_object(checked, columns)
+    return mesh_attributes.read_for_file(checked, columns)
 
 
 def export_notes(checked: SplatObject, *, apply_transform: bool = False) -> list[str]:

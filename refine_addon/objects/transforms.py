@@ -87,11 +87,12 @@ def mend(group: Sequence[SplatObject]) -> int:
 def _mend(checked: SplatObject) -> int:
     """Do what `mend` says to one object, without a net."""
     mesh = checked.mesh
-    if not mesh_drift.found(mesh):
+    mending = mesh_drift.mending(mesh)
+    if mending is None:
         return 0
+    moves, regrouped = mending
     mesh_layout.list_all(mesh)
     checked = mesh_layout.check(checked.obj)
-    regrouped, moves = mesh_drift.regrouped(mesh), mesh_drift.turned(mesh)
     for degree, rows in regrouped:
         _regroup(checked, degree, rows)
     if moves:

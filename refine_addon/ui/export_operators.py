@@ -26,6 +26,8 @@ from .on_thread import AskedFirst
 from .operator_bases import Answer, OnSplats
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ..core.formats.ply import SplatFile
     from ..core.work import Progress
     from ..mesh.layout import SplatObject
@@ -41,7 +43,7 @@ _FORMATS = (
 class _Export:
     """What is to be written where."""
 
-    file: SplatFile
+    file: Callable[[], SplatFile]
     target: Path
     overwrite: bool
     notes: list[str]
@@ -130,7 +132,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
         """Refuse what cannot be written, and gather what is."""
         target = expanded(bpy.path.abspath(self.filepath))
         refuse_existing(target, overwrite=self.overwrite)
-        file = splat_object.exported_file(checked, apply_transform=self.apply_transform)
+        file = splat_object.read_for_export(checked, apply_transform=self.apply_transform)
         notes = splat_object.export_notes(checked, apply_transform=self.apply_transform)
         return _Export(file, target, self.overwrite, notes)
 
@@ -138,7 +140,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
     def work(job: _Export, progress: Progress) -> SplatFile | Packed:
         """Write the file."""
         report(progress, 0.0, job.target.name)
-        file = as_written(job.file, job.target)
+        file = as_written(job.file(), job.target)
         file.write(job.target, overwrite=job.overwrite)
         return file
 
@@ -159,7 +161,7 @@ class REFINE_OT_export_ply(Exporting, bpy.types.Operator):
 class _LevelExport:
     """What is to be written where: the finest level first."""
 
-    files: list[SplatFile]
+    files: list[Callable[[], SplatFile]]
     width: float
     target: Path
     overwrite: bool
@@ -188,7 +190,7 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
         objects = level_objects.levels_of(checked.obj)
         moved = self.apply_transform
         each = [mesh_layout.check(obj) for obj in objects]
-        files = [splat_object.exported_file(one, apply_transform=moved) for one in each]
+        files = [splat_object.read_for_export(one, apply_transform=moved) for one in each]
         notes = [
             note for one in each for note in splat_object.export_notes(one, apply_transform=moved)
         ]
@@ -206,7 +208,7 @@ class REFINE_OT_export_levels(Exporting, bpy.types.Operator):
             scene = None
             for number, file in enumerate(job.files):
                 report(progress, number / len(job.files), f"level {number}")
-                splats = Packed(file, sog.FORMAT).chosen(job.target, None, {})
+                splats = Packed(file(), sog.FORMAT).chosen(job.target, None, {})
                 scene = scene or StreamedSog(splats.means, job.width, made)
                 scene.add(splats)
             assert scene is not None  # noqa: S101 - there is an object at least

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from ..core.volumes import Forced
     from ..core.work import Progress
     from ..mesh.layout import SplatObject
+    from ..objects.splat_object import Change, Frame
 
 
 _SCORED = 0.97
@@ -216,6 +217,20 @@ class _Applying:
     task: Task
     uids: tuple[int, ...]
     forced: list[Forced]
+    frames: list[Frame]
+    counts: list[int]
+
+
+class _Applied(NamedTuple):
+    """What was decided of all objects, and what is to become of each."""
+
+    result: Result
+    changes: list[Change]
+
+    @property
+    def stopped(self) -> BaseException | None:
+        """By what it was ended early, if it was; see `OnThread.offers`."""
+        return self.result.stopped
 
 
 def _scored_or_applied(context: bpy.types.Context) -> str:
@@ -259,21 +274,25 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         for member in group:
             mesh_edit.check_deletable(member.obj)
         forced = splat_group.forced_of_each(context.scene, group)
-        return _Applying(apply_task(context, group, forced), splat_group.uids_of(group), forced)
+        task, counts = apply_task(context, group, forced), [len(member) for member in group]
+        uids, frames = splat_group.uids_of(group), splat_group.frames_of(group)
+        return _Applying(task, uids, forced, frames, counts)
 
     def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
         """Return the objects that lose splats, the active one first."""
         return splat_group.active_first(context.view_layer, checked)
 
     @staticmethod
-    def work(job: _Applying, progress: Progress) -> Result:
+    def work(job: _Applying, progress: Progress) -> _Applied:
         """Decide which splats stay, and what they become."""
-        return pipeline.decide(job.task, progress=progress)
+        result = pipeline.decide(job.task, progress=progress)
+        return _Applied(result, splat_group.changes(job.frames, job.counts, result))
 
     def finish(
-        self, context: bpy.types.Context, checked: SplatObject, job: _Applying, result: Result
+        self, context: bpy.types.Context, checked: SplatObject, job: _Applying, applied: _Applied
     ) -> Answer:
         """Delete what does not stay, and change what does."""
+        result = applied.result
         context.view_layer.update()
         group = splat_group.by_uids(job.uids, checked)
         if job.task.absorb:  # on a thread, while volumes can be moved
@@ -281,7 +300,7 @@ class REFINE_OT_apply(OnThread, OnSplats, Adjustable, bpy.types.Operator):
         decided = job.task.budget.needs_scores or not result.absorbed  # by the scores
         changed = _changes_since_scoring(context, group, job) if decided else []
         drifts = [note for each in group for note in splat_object.drift_notes(each)]
-        outcome = splat_group.apply(group, result)
+        outcome = splat_group.apply(group, applied.changes)
         for member in group:
             plans.forget(member.mesh)
         plans.refresh(context)

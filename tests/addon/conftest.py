@@ -58,8 +58,8 @@ def core(addon):
 
 
 def export(addon, checked, path, **options):
-    """Write an object to a file, as *Export* does; see `exported_file` for the options."""
-    file = addon.objects.splat_object.exported_file(checked, **options)
+    """Write an object to a file, as *Export* does; see `read_for_export` for the options."""
+    file = addon.objects.splat_object.read_for_export(checked, **options)()
     addon.core.formats.registry.as_written(file, path).write(path)
 
 

@@ -250,7 +250,7 @@ def test_an_apply_that_fails_leaves_the_point_cloud_as_it_was(addon, cloud, room
         msg = "refused"
         raise addon.core.RefineError(msg)
 
-    monkeypatch.setattr(addon.mesh.attributes, "write_columns", refuse)
+    monkeypatch.setattr(addon.mesh.attributes, "write_rows", refuse)
     with pytest.raises(RuntimeError, match="refused"):
         bpy.ops.refine.apply()
 

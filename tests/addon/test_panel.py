@@ -85,7 +85,7 @@ def draw(addon, monkeypatch):
     def draw():
         drawn = []
         with monkeypatch.context() as patch:
-            for name in ("stored_scores", "gather", "apply_object"):
+            for name in ("stored_scores", "gather", "apply"):
                 patch.setattr(addon.objects.splat_object, name, never)
             for name in ("members", "stored_task", "mark_removed", "gather", "apply"):
                 patch.setattr(addon.objects.splat_group, name, never)

@@ -243,7 +243,7 @@ def test_an_operation_in_a_window_is_dropped_when_it_is_over(  # noqa: PLR0917
             raise addon.core.RefineError(msg)
 
         monkeypatch.setattr(addon.mesh.scores, "store", refuse)
-        monkeypatch.setattr(addon.objects.splat_object, "apply_object", refuse)
+        monkeypatch.setattr(addon.objects.splat_object, "apply", refuse)
     operator, context, said = started(name)
     assert addon.ui.running.now().operator == f"refine.{name}"
     if how == "escape":

@@ -27,8 +27,8 @@ def test_renders_show_splats_among_meshes(binary: Binary, blend: Path, cloud: Pa
     So it is where the shader draws the splats, as with a graphics card, and between both.
 
     Every setting is as before, also after Esc, which ends an animation and a render of 160,000
-    splats within a second of processor (two before 5.0), what draws the window left out. F12 says
-    that it leaves splats out.
+    splats within a second of processor, what draws the window left out. F12 says that it leaves
+    splats out.
     """
     try:
         found = binary.window_step("render", blend, simulate=False, pictures=binary.work)
@@ -41,8 +41,7 @@ def test_renders_show_splats_among_meshes(binary: Binary, blend: Path, cloud: Pa
     assert found["alike"] == [True] * 4
     assert found["began"]
     assert found["stopped"]
-    # Before 5.0 Blender draws the scene anew that it showed no more while the world was rendered.
-    assert max(found["busy"]) < (2.0 if binary.name == "trixie" else 1.0)
+    assert max(found["busy"]) < 1.0
     assert found["notice"]
     # Else Blender before 5.0 may free, as it goes on, what a render draws with.
     assert binary.name != "trixie" or (found["in_windows"] and all(found["in_windows"]))
