@@ -208,7 +208,7 @@ def test_a_merge_along_the_viewing_direction_costs_what_views_from_aside_see():
 @pytest.mark.parametrize("model", ["default", "antialiased", "2dgs"])
 @pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
 def test_costs_in_float32_are_those_in_float64_whatever_the_unit(model, unit):
-    """Of 500 neighbours by 1 % and a millionth of what deleting both costs; a pair alone costs the same to the bit."""
+    """By 1 % and a millionth of what deleting both costs; a pair alone costs as much to the bit."""
     splats, views = cloud(1000), around()
     known = replace(field_of(splats, views, measure(splats)), model=model)
     field = replace(
