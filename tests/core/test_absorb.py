@@ -208,7 +208,7 @@ def test_a_merge_along_the_viewing_direction_costs_what_views_from_aside_see():
 @pytest.mark.parametrize("model", ["default", "antialiased", "2dgs"])
 @pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
 def test_costs_in_float32_are_those_in_float64_whatever_the_unit(model, unit):
-    """Of 500 neighbours by 1 % and a millionth of what deleting both costs; a pair alone costs the same to the bit."""
+    """By 1 % and a millionth of what deleting both costs; a pair alone costs as much to the bit."""
     splats, views = cloud(1000), around()
     known = replace(field_of(splats, views, measure(splats)), model=model)
     field = replace(
@@ -738,6 +738,19 @@ def test_of_pairs_in_a_chain_as_many_are_chosen_as_share_no_splat(monkeypatch):
     assert len(np.unique(taken)) == len(taken)
     assert (np.isin(first, taken) | np.isin(first + 1, taken)).all()
     assert 1 < len(passes) < 10
+
+
+@given(
+    st.lists(st.sampled_from([0.0, 1e-45, 1.0, 1.0000001, 1.01, 3e38, np.inf]), min_size=1),
+    st.data(),
+)
+def test_the_number_of_a_rank_is_found_among_two_arrays(numbers, data):
+    values = np.array(numbers, np.float32)
+    cut, rank = (data.draw(st.integers(0, len(values) - 1)) for _ in range(2))
+
+    found = merge_graph._smallest((values[:cut], -values[cut:] * np.float32(-1.0)), rank, 1)
+
+    assert found == np.sort(values)[rank]
 
 
 @pytest.fixture
