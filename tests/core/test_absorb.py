@@ -740,6 +740,19 @@ def test_of_pairs_in_a_chain_as_many_are_chosen_as_share_no_splat(monkeypatch):
     assert 1 < len(passes) < 10
 
 
+@given(
+    st.lists(st.sampled_from([0.0, 1e-45, 1.0, 1.0000001, 1.01, 3e38, np.inf]), min_size=1),
+    st.data(),
+)
+def test_the_number_of_a_rank_is_found_among_two_arrays(numbers, data):
+    values = np.array(numbers, np.float32)
+    cut, rank = (data.draw(st.integers(0, len(values) - 1)) for _ in range(2))
+
+    found = merge_graph._smallest((values[:cut], -values[cut:] * np.float32(-1.0)), rank, 1)
+
+    assert found == np.sort(values)[rank]
+
+
 @pytest.fixture
 def rounds(monkeypatch):
     """Fail where a round does nothing, since `reduce` would then repeat it forever."""
