@@ -24,7 +24,16 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, TypeVar
 
-from .work import REPLACES_MAPPED, Progress, default_threads, each_chunk, for_chunks, part, silent
+from .work import (
+    REPLACES_MAPPED,
+    Progress,
+    default_threads,
+    each_chunk,
+    for_chunks,
+    part,
+    return_freed,
+    silent,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -350,6 +359,8 @@ def serve() -> None:
             else:
                 work = None  # first, so that the arrays of both never are there at once
                 work = _unpacked(message) if message else None
+                if work is None:
+                    return_freed()
                 result = True, None
         except BaseException as error:  # noqa: BLE001 - raised again where it was asked for
             result = False, error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
 import sys
 import time
@@ -61,6 +62,20 @@ def end_elsewhere(here: int, number: int) -> int:
     return number
 
 
+def memory_of(pid: int) -> int:
+    """Return how much memory a process has that is no file's, bytes."""
+    status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+    return 1024 * int(status.split("RssAnon:")[1].split()[0])
+
+
+def filled(_number: int) -> tuple[int, int]:
+    """Fill five arrays of 8 MB; return which process did, and what it takes then."""
+    arrays = [np.ones(1 << 20) for _ in range(5)]
+    took = memory_of(os.getpid())
+    del arrays
+    return os.getpid(), took
+
+
 def gone(pid: int) -> bool:
     """Return whether a process has ended, within a minute."""
     end = time.monotonic() + 60
@@ -108,6 +123,18 @@ def test_processes_forget_the_work_when_it_is_done():
     list(found)
 
     assert "/arrays" not in maps.read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(
+    platform.libc_ver()[0] != "glibc" or not Path("/proc/self/status").exists(),
+    reason="what other C libraries keep is not known",
+)
+def test_idle_processes_return_the_memory_that_their_work_took():
+    """Of 40 MB that glibc would keep for the next call, less than a quarter is left."""
+    took = dict(for_each(filled, 8, MUCH, threads=2))
+
+    for pid, before in took.items():
+        assert memory_of(pid) < before - 30_000_000
 
 
 def test_processes_that_were_started_ahead_do_the_work():

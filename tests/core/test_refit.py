@@ -11,8 +11,9 @@ import pytest
 from refine_addon.core import ViewSet, processes, spherical_harmonics
 from refine_addon.core.refitting import linear, refit, round_rays
 from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS
+from refine_addon.core.seeing import cast as casting
 from refine_addon.core.seeing import projection
-from refine_addon.core.seeing.cast import cast, pixels
+from refine_addon.core.seeing.cast import cast, cast_visible, pixels
 from refine_addon.core.seeing.ray_sample import colors_from
 from refine_addon.core.splats import SH_C0, rotation_matrices, with_model
 from refine_addon.core.work import Cancelled, silent
@@ -502,6 +503,41 @@ def test_rays_see_the_same_without_their_hidden_hits():
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("pairs", [50, 1 << 15])
+def test_rays_end_behind_what_is_opaque_and_see_the_same(monkeypatch, pairs):
+    """To the bit what is visible of all hits, however many pairs are looked at together.
+
+    With 50 at a time far fewer hits are computed: behind opaque ones rays are not followed.
+    """
+    splats, view = cloud(400), ring()[0]
+    splats = replace(
+        splats,
+        opacity_logits=np.full(400, 3.0, np.float32),
+        log_scales=splats.log_scales + np.float32(1.5),
+    )
+    gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)))
+    footprints = projection.project(gaussians, scene, view)
+    every = cast(footprints, COLUMNS, ROWS)
+    seen, transmittance = every.visible()
+    monkeypatch.setattr(casting, "_PAIRS", pairs)
+    followed, hits = [], casting.hits
+
+    def spy(*some):
+        for piece in hits(*some):
+            followed.append(len(piece[0]))
+            yield piece
+
+    monkeypatch.setattr(casting, "hits", spy)
+
+    found, left = cast_visible(footprints, COLUMNS, ROWS)
+
+    for name in ("ray", "owner", "alpha", "log_passed", "hit"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(seen, name))
+    np.testing.assert_array_equal(left, transmittance)
+    assert len(seen.ray) < 0.6 * len(every.ray)
+    assert (sum(followed) < 0.7 * len(every.ray)) == (pairs == 50)
+
+
 @pytest.mark.parametrize("degree", range(5))
 def test_colours_in_float32_are_those_in_float64(degree):
     """To a few roundings of sums of up to 25 products."""
@@ -590,7 +626,7 @@ def test_processes_change_no_bit(monkeypatch):
     expected = refit.refit(splats.take(np.arange(100)), splats, ring(), refit.Refit(rounds=2))
     for name in ("WORTH", "WORTH_READY"):
         monkeypatch.setattr(processes, name, 0.0)
-    monkeypatch.setattr(round_rays, "cast", lambda *some: here.append(some))
+    monkeypatch.setattr(round_rays, "cast_visible", lambda *some: here.append(some))
 
     found = refit.refit(
         splats.take(np.arange(100)), splats, ring(), refit.Refit(rounds=2), threads=2

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ..estimate.quality import in_words
 from ..pace import named
 from ..refitting.refit import refit_rounds
-from ..work import Cancelled
+from ..work import Cancelled, return_freed
 
 if TYPE_CHECKING:
     from ..absorbing.absorb import Absorbed
@@ -134,6 +134,7 @@ def refit_made(task: Task, made: Made, progress: Progress, threads: int | None) 
         return made
     done: Refitted | None = None
     stopped = None
+    return_freed()
     try:
         for reached in refit_rounds(
             absorbed.splats, original, views.spread(task.settings.views),

@@ -19,11 +19,11 @@ from .. import costs
 from ..estimate.quality import PSNR_CAP
 from ..processes import for_each
 from ..seeing import projection
-from ..seeing.cast import cast, depth_complexity, pixels
+from ..seeing.cast import cast_visible, depth_complexity, pixels
 from ..seeing.ray_sample import MAX_HITS_OF_VIEW, MAX_RAYS_OF_VIEW, VALIDATION_VIEWS
 from ..spherical_harmonics import single_colors
 from ..views import ViewSet
-from ..work import Progress, part
+from ..work import Progress, chunks, part, return_freed
 from .linear import LEAST_WEIGHT, LinearRays, SeenView, Shapes, linear_view
 
 if TYPE_CHECKING:
@@ -62,6 +62,7 @@ SECONDS, SECONDS_OF_RAY = 2.5e-7, 4e-6
 worth a process."""
 
 _SAME = 1e-6  # scene sizes; views nearer to each other stand in one place
+_CHUNK = 1 << 14
 _EVERY = 2  # validation rays go through every second row of a round's rays
 _NOTHING = 1e-30  # hits of a ray; keeps a division finite
 _LEAST_ERROR = 10.0 ** (-PSNR_CAP / 10.0)
@@ -196,8 +197,9 @@ def _colored(
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Return means and harmonics of some splats, see `InMemory`."""
     harmonics = np.empty((len(rows), 3, 1 + splats.sh_rest.shape[1]), np.float32)
-    harmonics[:, :, 0] = splats.sh_dc[rows]
-    harmonics[:, :, 1:] = splats.sh_rest[rows].transpose(0, 2, 1)
+    for piece in chunks(len(rows), _CHUNK):  # copies of all would take as much again
+        harmonics[piece, :, 0] = splats.sh_dc[rows[piece]]
+        harmonics[piece, :, 1:] = splats.sh_rest[rows[piece]].transpose(0, 2, 1)
     return splats.means[rows].astype(np.float64), harmonics
 
 
@@ -296,6 +298,7 @@ class RoundRays:
             for number, (view, weight) in enumerate(chosen)
         ]
         target = InMemory.of(original, gaussians, scene)
+        return_freed()
         return cls(windows, scene, target, len(original), threads)
 
     def costs(self, survivors: int) -> tuple[Plan, list[Plan]]:
@@ -412,14 +415,13 @@ class CastTruth:
         window = self.windows[place]
         with np.errstate(under="ignore"):
             footprints = self.target.footprints(window)
-            # Casting takes memory for all hits, also hidden ones, but for one view at a time.
+            # Casting takes memory for all hits, also faint ones, but for one view at a time.
             share = window.hits / MAX_HITS_OF_VIEW
             foretold = depth_complexity(footprints, window.part)
             each = (share if self.shown is None else self.shown) * foretold
             columns, rows = window.pixels(each, self.round)
-            rays = cast(footprints, columns, rows)
+            rays, transmittance = cast_visible(footprints, columns, rows)
             most = share * len(rays.ray)
-            rays, transmittance = rays.visible()
             weight = transmittance * rays.alpha
             colors = rays.composited(weight, self.target.colors(rays.hit, window.view))
         each = max(np.count_nonzero(weight > LEAST_WEIGHT), most) / max(rays.count, 1)
@@ -439,7 +441,7 @@ class _CastErrors:
         window, truth = self.windows[number], self.truths[number]
         with np.errstate(under="ignore"):
             footprints = self.target.footprints(window)
-            rays, transmittance = cast(footprints, truth.columns, truth.rows).visible()
+            rays, transmittance = cast_visible(footprints, truth.columns, truth.rows)
             colors = self.target.colors(rays.hit, window.view)
             seen = rays.composited(transmittance * rays.alpha, colors)
         error = np.mean(np.square(truth.colors - seen), dtype=np.float64)
@@ -459,6 +461,6 @@ class _Linearize:
         window, truth = self.truth.windows[number], self.truth(number)
         with np.errstate(under="ignore"):
             footprints = self.target.footprints(window)
-            seen = cast(footprints, truth.columns, truth.rows).visible()
+            seen = cast_visible(footprints, truth.columns, truth.rows)
             colors = self.target.colors(seen.rays.hit, window.view)
             return linear_view(seen, footprints, truth.colors, colors, self.shapes, window.view)

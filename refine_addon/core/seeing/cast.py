@@ -10,10 +10,10 @@ import numpy as np
 
 from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..work import checkpoint
-from .rays import Rays
+from .rays import LOG_OPAQUE, Rays, VisibleRays
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from typing import Any
 
     from numpy.typing import NDArray
@@ -29,6 +29,7 @@ BEHIND = 1e-4
 not hit."""
 
 _PAIRS = 1 << 15  # pairs of footprint and pixel at a time: what the second-level cache holds
+_MARGIN = 1e-6  # of a logarithm; far more than sums in float64 differ by their order
 _MAX_TABLE = 1 << 14  # pixels; images up to this size are looked up in a table, see `_before`
 
 _CROSSING = 1e-3  # a disc of which this much is left of a plane through the camera crosses it
@@ -136,12 +137,42 @@ def cast(
     aims : (2, P) int64, optional
         See `aimed`.
     """
+    found = hits(footprints, columns, rows, _PAIRS, aims=aims)
+    return _front_to_back(footprints, (columns, rows, aims), found)
+
+
+def cast_visible(
+    footprints: Footprints, columns: NDArray[np.int64], rows: NDArray[np.int64]
+) -> VisibleRays:
+    """Return what `Rays.visible` does of `cast`, and do not follow rays on behind opaque hits.
+
+    Footprints come front to back, some at a time: it is known of each ray how much is left of it.
+    """
+    log_left = np.zeros(len(columns) * len(rows))
+
+    def found() -> Iterator[tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]]:
+        for piece in hits(footprints, columns, rows, _PAIRS, wanted):
+            yield piece
+            log_left[:] += np.bincount(piece[1], np.log1p(-piece[2]), len(log_left))
+
+    def wanted(_footprint: NDArray[np.int64], ray: NDArray[np.int32]) -> NDArray[np.bool_]:
+        return np.asarray((log_left > LOG_OPAQUE - _MARGIN).take(ray))
+
+    return _front_to_back(footprints, (columns, rows, None), found()).visible()
+
+
+def _front_to_back(
+    footprints: Footprints,
+    through: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64] | None],
+    found: Iterable[tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float32]]],
+) -> Rays:
+    """Return rays with their hits, as `hits` yields them; for what rays go through see `cast`."""
     pieces = [_compact(np.empty(0), np.empty(0), np.empty(0))]
-    pieces += [_compact(*piece) for piece in hits(footprints, columns, rows, _PAIRS, aims=aims)]
+    pieces += [_compact(*piece) for piece in found]
     footprint, ray, alpha = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
     order = np.argsort(ray, kind="stable")  # footprints are front to back, and so stay hits
     hit, owner = _members(footprints.index, footprint.take(order))
-    alpha = alpha.take(order)
+    alpha, (columns, rows, aims) = alpha.take(order), through
     return Rays(
         columns, rows, ray.take(order).astype(np.int32), owner, alpha, np.log1p(-alpha), hit, aims
     )
@@ -196,8 +227,9 @@ def hits(
         pixel = row * np.int32(len(columns)) + column
         if wanted is not None:
             left = np.flatnonzero(wanted(owner, pixel))
-            owner, pixel = owner[left], pixel[left]
-            column, row = column[left], row[left]
+            if len(left) < len(owner):
+                owner, pixel = owner.take(left), pixel.take(left)
+                column, row = column.take(left), row.take(left)
         if aims is None:
             place = columns.take(column), rows.take(row)
         else:
