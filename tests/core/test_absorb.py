@@ -12,6 +12,7 @@ from refine_addon.core.absorbing import merge_field, merge_graph, merging
 from refine_addon.core.absorbing.absorb import ALONE, STAGE, absorb, patience, stages
 from refine_addon.core.absorbing.merge_field import Field, ViewSums
 from refine_addon.core.absorbing.merge_graph import MergeGraph
+from refine_addon.core.absorbing.neighbours import nearest
 from refine_addon.core.affine import transformed
 from refine_addon.core.rendering import ALPHA_MAX
 from refine_addon.core.seeing.scene import Scene, scene_of
@@ -202,6 +203,30 @@ def test_a_merge_along_the_viewing_direction_costs_what_views_from_aside_see():
 
     assert front < 1e-4 * aside
     np.testing.assert_allclose(aside, merging.price(turned, *pair).cost, rtol=1e-6)
+
+
+@pytest.mark.parametrize("model", ["default", "antialiased", "2dgs"])
+@pytest.mark.parametrize("unit", [1e-12, 1.0, 1e12])
+def test_costs_in_float32_are_those_in_float64_whatever_the_unit(model, unit):
+    """By 1 % and a millionth of what deleting both costs; a pair alone costs as much to the bit."""
+    splats, views = cloud(1000), around()
+    known = replace(field_of(splats, views, measure(splats)), model=model)
+    field = replace(
+        known, means=known.means * unit, covariances=known.covariances * unit**2,
+        blur=known.blur * unit**2,
+    )  # fmt: skip
+    near = nearest(splats.means.astype(float), 1)[:500, 0]
+    pairs = np.arange(500), near
+    exact = sum(0.5 * merging.price(known, *pairs, tilt).cost for tilt in (-1.0, 1.0))
+
+    found = merging.costs(field, *pairs, np.inf)
+    alone = np.concatenate([merging.costs(field, pairs[0][k:k + 1], near[k:k + 1], np.inf)
+                            for k in range(0, 500, 7)])  # fmt: skip
+
+    assert found.dtype == np.float32
+    deleted = field.error[pairs[0]] + field.error[near]
+    assert (np.abs(found - exact) <= 0.01 * exact + 1e-6 * deleted).all()
+    np.testing.assert_array_equal(alone, found[::7])
 
 
 def test_splats_that_do_not_stand_out_cost_nothing_to_merge_whatever_their_colours():
@@ -713,6 +738,19 @@ def test_of_pairs_in_a_chain_as_many_are_chosen_as_share_no_splat(monkeypatch):
     assert len(np.unique(taken)) == len(taken)
     assert (np.isin(first, taken) | np.isin(first + 1, taken)).all()
     assert 1 < len(passes) < 10
+
+
+@given(
+    st.lists(st.sampled_from([0.0, 1e-45, 1.0, 1.0000001, 1.01, 3e38, np.inf]), min_size=1),
+    st.data(),
+)
+def test_the_number_of_a_rank_is_found_among_two_arrays(numbers, data):
+    values = np.array(numbers, np.float32)
+    cut, rank = (data.draw(st.integers(0, len(values) - 1)) for _ in range(2))
+
+    found = merge_graph._smallest((values[:cut], -values[cut:] * np.float32(-1.0)), rank, 1)
+
+    assert found == np.sort(values)[rank]
 
 
 @pytest.fixture

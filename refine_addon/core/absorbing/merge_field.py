@@ -371,7 +371,7 @@ def across(normal: Array) -> tuple[Array, Array]:
     Duff et al. 2017, "Building an Orthonormal Basis, Revisited".
     """
     x, y, z = normal.T
-    sign = np.where(z >= 0.0, 1.0, -1.0)
+    sign = np.where(z >= 0.0, z.dtype.type(1.0), z.dtype.type(-1.0))
     a = -1.0 / (sign + z)
     b = x * y * a
     u = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x])

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..seeing.scene import MIX
-from ..work import Progress, for_chunks, part, report, silent
+from ..work import Progress, chunks, for_chunks, part, report, silent
 from . import merging
 from .neighbours import nearest
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     from numpy.typing import NDArray
 
     from ..seeing.scene import Scene
     from .merge_field import Array, Field, Index
 
     Rows = NDArray[np.int32]
+    Costs = NDArray[np.float32]
 
 NEIGHBOURS = 8
 """How many nearest neighbours each splat may be merged with."""
@@ -40,6 +43,8 @@ DISC_PATIENCE = 0.5
 full cost is 1.6 dB worse, and a quarter or .7 of it .1 dB."""
 
 _CHUNK = 1 << 14  # pairs at a time: some MB of temporary memory a thread
+_SCANNED = 1 << 18  # pairs at a time that are only looked at
+_UNSIGNED, _HALF = np.uint32(0x7FFFFFFF), np.uint32(16)  # of the bits of a number
 
 
 class MergeGraph:
@@ -58,7 +63,7 @@ class MergeGraph:
         How many splats were deleted.
     first, second : (E,) int32
         Rows of the pairs that may be merged.
-    cost : (E,) float64
+    cost : (E,) float32
         Of merging each pair; infinite where it is not less than that of deleting one of the two.
     connected : int
         How many splats were alive when neighbours were last searched; 0 before.
@@ -79,7 +84,7 @@ class MergeGraph:
         self.merges: list[tuple[Index, Index, Array]] = []
         self.deleted = 0
         self.first = self.second = np.empty(0, np.int32)
-        self.cost = np.empty(0)
+        self.cost = np.empty(0, np.float32)
         self.connected = 0
 
     @classmethod
@@ -88,7 +93,7 @@ class MergeGraph:
         field: Field,
         scene: Scene,
         patience: float,
-        pairs: tuple[Rows, Rows, Array],
+        pairs: tuple[Rows, Rows, Costs],
         *,
         threads: int | None = None,
     ) -> MergeGraph:
@@ -98,7 +103,7 @@ class MergeGraph:
         graph.connected = len(graph.alive)
         return graph
 
-    def best(self) -> tuple[Array, NDArray[np.bool_]]:
+    def best(self) -> tuple[Costs, NDArray[np.bool_]]:
         """Return the cost of each splat's cheapest operation, (N,), and whether it is a merge."""
         error = self._errors()
         best = error.copy()
@@ -126,7 +131,7 @@ class MergeGraph:
             count -= self._round(min(max(int(BATCH * count), 1), count - goal), of_round)
         # The pairs are no longer needed; a large scene has ten million of them.
         self.first = self.second = np.empty(0, np.int32)
-        self.cost = np.empty(0)
+        self.cost = np.empty(0, np.float32)
 
     def connect(self, progress: Progress = silent) -> None:
         """Find the pairs of neighbouring splats, and price them."""
@@ -143,15 +148,15 @@ class MergeGraph:
             first = np.broadcast_to(of_piece, others.shape)[once]
             return rows[first].astype(np.int32), rows[others[once]].astype(np.int32)
 
-        chunks = for_chunks(
+        found = for_chunks(
             pairs, len(rows), _CHUNK,
             progress=part(progress, 0.4, 0.5), what="absorbing", threads=self.threads,
         )  # fmt: skip
         none = np.empty(0, np.int32)
         # int32 takes half the memory of int64, and no file holds two billion splats.
-        self.first = np.concatenate([none, *(first for first, _ in chunks)])
-        self.second = np.concatenate([none, *(second for _, second in chunks)])
-        self.cost = np.empty(len(self.first))
+        self.first = np.concatenate([none, *(first for first, _ in found)])
+        self.second = np.concatenate([none, *(second for _, second in found)])
+        self.cost = np.empty(len(self.first), np.float32)
         self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.5, 1.0))
         self.connected = int(np.count_nonzero(self.alive))
 
@@ -161,7 +166,7 @@ class MergeGraph:
         def price(piece: slice) -> None:
             rows = edges[piece]
             first, second = self.first[rows], self.second[rows]
-            least = np.minimum(self.field.error[first], self.field.error[second])
+            least = np.minimum(self.field.error.take(first), self.field.error.take(second))
             with np.errstate(under="ignore"):
                 cost = merging.costs(self.field, first, second, least / self.patience)
             self.cost[rows] = self.patience * cost
@@ -191,17 +196,16 @@ class MergeGraph:
         self._carry_out(doomed[order[~is_merge]], chosen[order[is_merge] - len(doomed)], progress)
         return len(order)
 
-    def _limit(self, error: Array, count: int) -> float:
+    def _limit(self, error: Costs, count: int) -> float:
         """Return the cost of the most expensive operation that a round looks at.
 
         These are twice `count`, since operations that share a splat exclude each other.
         """
-        costs = np.concatenate([error[self.alive], self.cost[np.isfinite(self.cost)]])
-        last = min(2 * count, len(costs)) - 1
-        return float(np.partition(costs, last)[last])
+        operations = np.count_nonzero(self.alive) + np.count_nonzero(np.isfinite(self.cost))
+        return _smallest((error, self.cost), min(2 * count, operations) - 1, self.threads)
 
     def _cheapest(
-        self, error: Array, edges: Index, limit: float
+        self, error: Costs, edges: Index, limit: float
     ) -> tuple[NDArray[np.bool_], Index]:
         """Return which splats cost least by deleting them, (N,), and which pairs by merging, (m,).
 
@@ -224,14 +228,16 @@ class MergeGraph:
         every: Index = np.concatenate([chosen, others])
         return every
 
-    def _errors(self) -> Array:
-        """Return the costs of deleting splats, (N,); infinite where unknown.
+    def _errors(self) -> Costs:
+        """Return the costs of deleting splats, (N,) float32; infinite where unknown.
 
         So the cheapest operation is always carried out, and every round removes a splat; a
         comparison with NaN would choose none.
         """
-        known = self.alive & ~np.isnan(self.field.error)
-        return np.where(known, self.field.error, np.inf)
+        with np.errstate(over="ignore", under="ignore"):
+            error = self.field.error.astype(np.float32)
+        error[~self.alive | np.isnan(error)] = np.inf
+        return error
 
     def _carry_out(self, doomed: Index, edges: Index, progress: Progress) -> None:
         """Delete splats, merge pairs, and price the pairs of the merged splats again."""
@@ -241,8 +247,13 @@ class MergeGraph:
         self.deleted += len(doomed)
         changed = np.zeros(len(self.alive), np.bool_)
         changed[doomed] = changed[gone] = changed[into] = True
+
+        def concerning(piece: slice) -> Index:
+            either = changed.take(self.first[piece]) | changed.take(self.second[piece])
+            return np.asarray(np.flatnonzero(either) + piece.start)
+
         # Few pairs are concerned; the rest are not looked at again.
-        concerned = np.flatnonzero(changed.take(self.first) | changed.take(self.second))  # (e,)
+        concerned = self._joined(concerning)[0]  # (e,)
         # Pairs of an absorbed splat become pairs of the splat that absorbed it.
         survivor = np.arange(len(self.alive), dtype=np.int32)  # (N,)
         survivor[gone] = into
@@ -253,22 +264,63 @@ class MergeGraph:
         self._price(concerned[remain], progress)
         valid = np.ones(len(self.first), np.bool_)
         valid[concerned[~remain]] = False
-        self.first, self.second, self.cost = self.first[valid], self.second[valid], self.cost[valid]
+
+        def left(piece: slice) -> tuple[NDArray[Any], ...]:
+            stays = valid[piece]
+            return tuple(each[piece][stays] for each in (self.first, self.second, self.cost))
+
+        self.first, self.second, self.cost = self._joined(left)
+
+    def _joined(self, of_pairs: Callable[[slice], Any]) -> list[NDArray[Any]]:
+        """Return what a function returns for slices of the pairs, one array or more, joined."""
+        parts = for_chunks(of_pairs, max(len(self.first), 1), _SCANNED, threads=self.threads)
+        several = [part if isinstance(part, tuple) else (part,) for part in parts]
+        return [np.concatenate(each) for each in zip(*several, strict=True)]
 
     def _merge(self, edges: Index) -> tuple[Index, Index]:
         """Merge pairs; return the survivors and the splats they absorbed, (m,) each.
 
-        Of each pair the splat of which the views see more survives.
+        Of each pair the splat of which the views see more survives. No two pairs share a splat.
         """
         field, first, second = self.field, self.first[edges], self.second[edges]
-        with np.errstate(under="ignore"):
-            pairs = merging.price(field, first, second)
-            merged = merging.merge(field, first, second, pairs)
         swap = field.contribution[second] > field.contribution[first]
         into, gone = np.where(swap, second, first), np.where(swap, first, second)
-        self.merges.append((into, gone, np.where(swap, 1.0 - pairs.color, pairs.color)))
-        field.put(into, merged)
+        share = np.empty(len(edges))
+
+        def merge(piece: slice) -> None:
+            with np.errstate(under="ignore"):
+                pairs = merging.price(field, first[piece], second[piece])
+                field.put(into[piece], merging.merge(field, first[piece], second[piece], pairs))
+            share[piece] = np.where(swap[piece], 1.0 - pairs.color, pairs.color)
+
+        for_chunks(merge, len(edges), _CHUNK, threads=self.threads)
+        self.merges.append((into, gone, share))
         return into, gone
+
+
+def _smallest(arrays: Sequence[Costs], rank: int, threads: int | None) -> float:
+    """Return the number of a rank, from 0, among all numbers of some arrays, each >= 0.
+
+    The upper halves of such numbers, as integers, sort as they do: they are counted first, and only
+    numbers that share the upper half of the one looked for are compared.
+    """
+    pieces = [values[each] for values in arrays for each in chunks(len(values), _SCANNED)]
+
+    def in_pieces(of_piece: Callable[[Costs], NDArray[Any]]) -> list[NDArray[Any]]:
+        def work(number: slice) -> NDArray[Any]:
+            return of_piece(pieces[number.start])
+
+        return for_chunks(work, len(pieces), 1, threads=threads)
+
+    def upper(values: Costs) -> NDArray[np.uint32]:
+        return np.asarray((values.view(np.uint32) & _UNSIGNED) >> _HALF)
+
+    counts = sum(in_pieces(lambda values: np.bincount(upper(values), minlength=1 << 16)))
+    ends = np.cumsum(counts)
+    half = int(np.searchsorted(ends, rank, side="right"))
+    alike = np.concatenate(in_pieces(lambda values: values[upper(values) == half]))
+    place = rank - (int(ends[half - 1]) if half else 0)
+    return float(np.partition(alike, place)[place])
 
 
 def _disjoint(first: Index, second: Index) -> Index:

@@ -39,8 +39,14 @@ from ..splats import LOG_ZERO, rotation_matrices
 from .merge_field import Field, across, footprint, normalized
 
 if TYPE_CHECKING:
+    from typing import Any
+
+    from numpy.typing import NDArray
+
     from ..rendering import Model
     from .merge_field import Array, Footprint, Index
+
+    Real = NDArray[np.floating[Any]]
 
 FLATTEST = 1e-14
 """Least eigenvalue of a covariance over the sum of the three; rounding hides smaller ones."""
@@ -54,8 +60,10 @@ CHANNELS = 3
 
 _CANCELLED = 1e-6  # a mean of two unit vectors with a smaller squared length counts as 0
 _TINY = 1e-280  # replaces 0 as a divisor
-_THINNEST = 1e-12  # least determinant over xx yy; rounding leaves less of thinner footprints
-_FARTHEST = 700.0  # standard deviations, squared: exp(-350) is as good as 0 and does not underflow
+# Bytes of a number -> what replaces 0 as a divisor, and the least determinant over xx yy: rounding
+# leaves less of thinner footprints.
+_LEAST = {4: (1e-37, 1e-6), 8: (_TINY, 1e-12)}
+_FARTHEST = 160.0  # standard deviations, squared: exp(-80) is as good as 0 and does not underflow
 
 
 class Pairs(NamedTuple):
@@ -93,78 +101,133 @@ def price(splats: Field, first: Index, second: Index, tilt: float = 0.0) -> Pair
     tilt : float
         How many standard deviations of the viewing directions to add to their mean.
     """
-    return _price(_gather(splats, first, second), tilt)
+    return _price(_gather(splats, first, second, np.float64), tilt)
 
 
-def costs(splats: Field, first: Index, second: Index, limit: Array | float) -> Array:
+def costs(splats: Field, first: Index, second: Index, limit: Array | float) -> Real:
     """Return the costs of merges, (M,): the mean over two viewing directions.
+
+    They are float32, and computed in float32 from the steps between means on; those of discs are
+    computed in float64, since discs have a thickness of 0. `price` tells what a merge makes.
 
     Parameters
     ----------
     splats, first, second
         See `price`.
-    limit : (M,) float64, or float
+    limit : (M,) floating, or float
         Costs of at least this much are given as infinity, which takes less time.
     """
-    ends = _gather(splats, first, second)
-    cost = 0.5 * _price(ends, -1.0).cost
-    cheap = np.flatnonzero(cost < limit)
-    cost[cheap] += 0.5 * _price(ends.take(cheap), 1.0).cost
+    # What leaves the range of float32 costs infinity, or NaN: it is not merged.
+    with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+        ends = _gather(splats, first, second, np.float64 if splats.model == "2dgs" else np.float32)
+        cost = np.asarray(0.5 * _price(ends, -1.0).cost, np.float32)
+        cheap = np.flatnonzero(cost < limit)
+        others = ends if len(cheap) == len(cost) else ends.take(cheap)
+        cost[cheap] += np.asarray(0.5 * _price(others, 1.0).cost, np.float32)
     cost[~(cost < limit)] = np.inf
     return cost
 
 
-class _Ends(NamedTuple):
-    """The two splats of M pairs, and means over the two.
+class _Side(NamedTuple):
+    """One splat of each of M pairs.
 
     Attributes
     ----------
-    one, two : Field
+    covariances : (6, M) floating
+        See `Field`; in units of the pair, see `_Ends`.
+    opacity, contribution, error : (M,) floating
+        See `Field`.
+    """
+
+    covariances: Real
+    opacity: Real
+    contribution: Real
+    error: Real
+
+
+class _Ends(NamedTuple):
+    """The two splats of M pairs, and means over the two; all in float32, or all in float64.
+
+    Costs and results of merges do not depend on the unit of length. That of a pair is the root of
+    the sum of its variances, low-pass included, so that squares of areas fit into float32.
+
+    Attributes
+    ----------
+    model : {"default", "antialiased", "2dgs"}
+        How they are drawn, see `rendering.Model`.
+    one, two : _Side
         The first and the second splats.
-    color, rest : (M,) float64
+    color, rest : (M,) floating
         Shares of the first and of the second splat in the colour.
-    direction, deviation : (M, 3) float64
+    step : (3, M) floating
+        From the mean of the first to that of the second.
+    direction, deviation : (3, M) floating
         From where the pair is viewed; see `merge_field.Viewing`.
-    blur : (M,) float64
-        Variance of the low-pass, world units squared.
-    apart : (M,) float64
+    blur : (M,) floating
+        Variance of the low-pass.
+    apart : (M,) floating
         Squared difference of their colours.
     """
 
-    one: Field
-    two: Field
-    color: Array
-    rest: Array
-    direction: Array
-    deviation: Array
-    blur: Array
-    apart: Array
+    model: Model
+    one: _Side
+    two: _Side
+    color: Real
+    rest: Real
+    step: Real
+    direction: Real
+    deviation: Real
+    blur: Real
+    apart: Real
 
     def take(self, rows: Index) -> _Ends:
         """Return the ends of some pairs."""
-        means = (values[rows] for values in self[2:])
-        return _Ends(self.one.take(rows), self.two.take(rows), *means)
+        one, two = (
+            _Side(*(values.take(rows, axis=-1) for values in side)) for side in (self.one, self.two)
+        )
+        return _Ends(self.model, one, two, *(values.take(rows, axis=-1) for values in self[3:]))
 
 
-def _gather(splats: Field, first: Index, second: Index) -> _Ends:
-    """Return the ends of pairs."""
-    one, two = splats.take(first), splats.take(second)
-    color, rest = _shares(one.contribution, two.contribution)  # (M,) each
-    direction = one.direction * color[:, None]  # (M, 3)
-    direction += two.direction * rest[:, None]
+def _gather(splats: Field, first: Index, second: Index, kind: type[np.floating[Any]]) -> _Ends:
+    """Return the ends of pairs as `kind`, float32 or float64."""
+
+    def both(values: Array) -> list[Real]:
+        return [
+            values.take(rows, axis=0).T.astype(kind, order="C", copy=False)
+            for rows in (first, second)
+        ]
+
+    seen = [splats.contribution.take(rows) for rows in (first, second)]  # (M,) each, as all these
+    color, rest = _shares(*seen)
+    blur = color * splats.blur.take(first) + rest * splats.blur.take(second)
+    shapes = [splats.covariances.take(rows, axis=0).T for rows in (first, second)]  # (6, M) each
+    spread = sum((xx + yy + zz for xx, _, _, yy, _, zz in shapes), blur)
+    unit = 1.0 / np.maximum(spread, _TINY)  # (M,), over the squared unit of length
+    step = (splats.means.take(second, axis=0) - splats.means.take(first, axis=0)).T * np.sqrt(unit)
+    color, rest = color.astype(kind, copy=False), rest.astype(kind, copy=False)
+    one, two = (
+        _Side(np.multiply(shape, unit, dtype=kind, casting="same_kind", order="C"), *amounts)
+        for shape, *amounts in zip(
+            shapes, both(splats.opacity), both(splats.contribution), both(splats.error), strict=True
+        )
+    )
+    directions, deviations, colors = map(both, (splats.direction, splats.deviation, splats.color))
+    direction = color * directions[0] + rest * directions[1]  # (3, M)
     # Opposite directions cancel. Both define the same plane, so the first is used.
-    lost = np.einsum("ij,ij->i", direction, direction) < _CANCELLED  # (M,)
-    direction[lost] = one.direction[lost]
-    step = one.color - two.color  # (M, 3)
+    lost = np.flatnonzero(_dot(direction, direction) < _CANCELLED)
+    direction[:, lost] = directions[0][:, lost]
+    apart = colors[0] - colors[1]
     return _Ends(
+        splats.model,
         one,
         two,
         color,
         rest,
-        normalized(direction),
-        _mean_deviation(one.deviation, two.deviation, color),
-        color * one.blur + rest * two.blur,
-        np.einsum("ij,ij->i", step, step),
+        step.astype(kind, order="C"),
+        _unit(direction),
+        _mean_deviation(deviations[0], deviations[1], color),
+        (blur * unit).astype(kind, copy=False),
+        _dot(apart, apart),
     )
 
 
@@ -191,16 +254,16 @@ def _price(ends: _Ends, tilt: float) -> Pairs:
 
 
 def _products(
-    plane: _Plane, color: Array, rest: Array, squares: tuple[Array, Array, Array]
-) -> tuple[Array, Array, Array]:
+    plane: _Plane, color: Real, rest: Real, squares: tuple[Real, Real, Real]
+) -> tuple[Real, Real, Real]:
     """Return ``<p, p>``, ``<q, q>`` and ``<p, q>``, (M,) each.
 
     `color` and `rest` are l_i and l_j, `squares` the inner products of i, j and m with themselves.
     """
-    (ii, jj, mm), x, y = squares, plane.x, plane.y
+    ii, jj, mm = squares
     # The merged centre lies between the two, away from each by the other's share of the step.
-    im = plane.one.times(plane.merged, plane.other * x, plane.other * y)
-    jm = plane.two.times(plane.merged, plane.position * x, plane.position * y)
+    im = plane.one.times(plane.merged, plane.step, plane.other * plane.other)
+    jm = plane.two.times(plane.merged, plane.step, plane.position * plane.position)
     pq = plane.overlap - rest * im - color * jm
     pq += color * rest * mm
     return ii - 2.0 * color * im + color * color * mm, jj - 2.0 * rest * jm + rest * rest * mm, pq
@@ -229,20 +292,20 @@ class _Signal(NamedTuple):
         """Return ``<f, f>``, (M,)."""
         return self.mass * self.mass / (2.0 * self.area)
 
-    def times(self, other: _Signal, x: Array, y: Array) -> Array:
-        """Return ``<f, g>``, (M,), given the step from f to the other."""
-        product = _product(self.footprint, other.footprint, x, y)
+    def times(self, other: _Signal, step: Footprint, factor: Real | float) -> Real:
+        """Return ``<f, g>``, (M,), given xx, xy, yy of the step between the two, times a factor."""
+        product = _product(self.footprint, other.footprint, step, factor)
         return self.mass * other.mass * product
 
 
 class _Plane(NamedTuple):
-    """M pairs and their merged splats in the plane viewed; arrays are (M,) float64.
+    """M pairs and their merged splats in the plane viewed; arrays are (M,).
 
     Attributes
     ----------
     one, two, merged : _Signal
-    x, y
-        Step from the centre of the first to that of the second.
+    step
+        xx, xy, yy: products of the step from the centre of the first to that of the second.
     position, other
         Shares of the first and of the second in the mass.
     growth
@@ -254,64 +317,73 @@ class _Plane(NamedTuple):
     one: _Signal
     two: _Signal
     merged: _Signal
-    x: Array
-    y: Array
-    position: Array
-    other: Array
-    growth: Array
-    overlap: Array
+    step: Footprint
+    position: Real
+    other: Real
+    growth: Real
+    overlap: Real
 
 
 def _in_plane(ends: _Ends, tilt: float) -> _Plane:
     """Return pairs and their merged splats in the plane viewed; `tilt`: see `price`."""
-    normal = normalized(ends.direction + tilt * ends.deviation) if tilt else ends.direction
-    plane = across(normal)
-    x, y = (np.einsum("ji,ji->i", (ends.two.means - ends.one.means).T, axis) for axis in plane)
-    blur = ends.blur
-    one, two = (_signal(splats, plane, blur) for splats in (ends.one, ends.two))
+    plane = across((_unit(ends.direction + tilt * ends.deviation) if tilt else ends.direction).T)
+    x, y = (_dot(ends.step, axis) for axis in plane)
+    step, blur = (x * x, x * y, y * y), ends.blur
+    one, two = (_signal(side, plane, blur, ends.model) for side in (ends.one, ends.two))
     position, other = _shares(one.mass, two.mass)
-    overlap = one.times(two, x, y)
-    discs = ends.one.model == "2dgs"
+    overlap = one.times(two, step, 1.0)
+    discs = ends.model == "2dgs"
     if discs:
-        disc = _mixture(ends.one, ends.two, position, ends[4:6])
-        sharp = footprint(disc, plane, np.zeros(len(blur)))
+        sharp = footprint(_mixed_disc(ends, position), plane, np.zeros(len(blur)))
         mixed = _disc_as_drawn(sharp, blur)
     else:
         between = position * other
+        xx, xy, yy = step
         mixed = _mixed(
-            one.footprint, two.footprint, position,
-            (between * x * x, between * x * y, between * y * y),
-        )  # fmt: skip
+            one.footprint, two.footprint, position, (between * xx, between * xy, between * yy)
+        )
     # The estimated overlap of nearly opaque splats can exceed the smaller mass; the true one never.
     mass = one.mass + two.mass - np.minimum(overlap, np.minimum(one.mass, two.mass))
-    base = _base(mixed, blur, ends.one.model)
+    area = _area(mixed)
+    base = _base(mixed, area, blur, ends.model)
     growth = np.maximum(mass / (base * ALPHA_MAX), 1.0)
     grown = sharp if discs else mixed
     mixed = (grown[0] * growth, grown[1] * growth, grown[2] * growth)
     if discs:
         mixed = _disc_as_drawn(mixed, blur)
-    area = _area(mixed)
-    merged = _Signal(mixed, area, _base(mixed, blur * growth, ends.one.model), mass)
-    return _Plane(one, two, merged, x, y, position, other, growth, overlap)
+        area = base = _area(mixed)
+    else:
+        area, base = area * growth, base * growth
+    return _Plane(
+        one, two, _Signal(mixed, area, base, mass), step, position, other, growth, overlap
+    )
 
 
-def _signal(splats: Field, plane: tuple[Array, Array], blur: Array) -> _Signal:
+def _signal(side: _Side, plane: tuple[Real, Real], blur: Real, model: Model) -> _Signal:
     """Return splats in a plane, spanned by unit vectors, with a low-pass of variance `blur`."""
-    if splats.model == "2dgs":
-        sharp = footprint(splats.covariances, plane, np.zeros(len(blur)))
+    if model == "2dgs":
+        sharp = footprint(side.covariances.T, plane, np.zeros(len(blur)))
         ellipse = _disc_as_drawn(sharp, blur)
     else:
-        ellipse = footprint(splats.covariances, plane, blur)
-    base = _base(ellipse, blur, splats.model)
-    return _Signal(ellipse, _area(ellipse), base, splats.opacity * base)
+        ellipse = footprint(side.covariances.T, plane, blur)
+    area = _area(ellipse)
+    base = _base(ellipse, area, blur, model)
+    return _Signal(ellipse, area, base, side.opacity * base)
 
 
-def _base(footprint: Footprint, blur: Array, model: Model) -> Array:
-    """Return the area that opacity is meant for, (M,): see `_Signal`."""
+def _mixed_disc(ends: _Ends, share: Array) -> Array:
+    """Return the covariances of mixtures of discs, (M, 6); `share`, (M,), is that of the first."""
+    whole = _mixture(ends.one.covariances.T, ends.two.covariances.T, ends.step.T, share)
+    viewed = (np.ascontiguousarray(each.T, np.float64) for each in (ends.direction, ends.deviation))
+    return flat_as_viewed(whole, *viewed)
+
+
+def _base(footprint: Footprint, area: Real, blur: Real, model: Model) -> Real:
+    """Return the area that opacity is meant for, (M,): see `_Signal`; `area` has the low-pass."""
     if model != "antialiased":
-        return _area(footprint)
-    xx, xy, yy = footprint
-    return _area((np.maximum(xx - blur, _TINY), xy, np.maximum(yy - blur, _TINY)))
+        return area
+    (xx, xy, yy), (tiny, _) = footprint, _least(area)
+    return _area((np.maximum(xx - blur, tiny), xy, np.maximum(yy - blur, tiny)))
 
 
 def _disc_as_drawn(sharp: Footprint, blur: Array) -> Footprint:
@@ -354,8 +426,10 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
     direction = normalized(color * one.direction + (1.0 - color) * two.direction)
     lost = ~direction.any(axis=1)
     direction[lost] = one.direction[lost]
-    deviation = _mean_deviation(one.deviation, two.deviation, pairs.color)
-    covariances = _mixture(one, two, pairs.position, (direction, deviation))
+    deviation = _mean_deviation(one.deviation.T, two.deviation.T, pairs.color).T
+    covariances = _mixture(one.covariances, two.covariances, step, pairs.position)
+    if one.model == "2dgs":
+        covariances = flat_as_viewed(covariances, direction, deviation)
     return Field(
         one.means + (1.0 - position) * step,
         covariances * pairs.growth[:, None],
@@ -370,18 +444,16 @@ def merge(splats: Field, first: Index, second: Index, pairs: Pairs) -> Field:
     )
 
 
-def _mixture(one: Field, two: Field, share: Array, viewed: tuple[Array, Array]) -> Array:
-    """Return the covariances of mixtures of pairs, (M, 6); of discs as a disc can have it.
+def _mixture(one: Array, two: Array, step: Array, share: Array) -> Array:
+    """Return the covariances of mixtures of pairs, (M, 6), given theirs.
 
-    `share`, (M,), is that of the first; `viewed` is the direction and the deviation of the pairs,
-    see `merge_field.Viewing`.
+    `step`, (M, 3), is from the mean of the first to that of the second, whose share in the mixture
+    is `share`, (M,).
     """
-    position, step = share[:, None], two.means - one.means
+    position = share[:, None]
     rows, columns = np.triu_indices(3)
     between = step[:, rows] * step[:, columns] * (position * (1.0 - position))  # (M, 6)
-    apart = position * one.covariances + (1.0 - position) * two.covariances
-    whole = np.asarray(apart + between, np.float64)
-    return flat_as_viewed(whole, *viewed) if one.model == "2dgs" else whole
+    return np.asarray(position * one + (1.0 - position) * two + between, np.float64)
 
 
 def flat_as_viewed(covariances: Array, direction: Array, deviation: Array) -> Array:
@@ -508,26 +580,40 @@ def flattened(merged: Field, logs: Array, quaternions: Array) -> tuple[Array, Ar
     return flat, turned, np.minimum(merged.opacity * thick / thin, ALPHA_MAX)
 
 
-def _shares(one: Array, two: Array) -> tuple[Array, Array]:
+def _dot(one: Real, other: Real) -> Real:
+    """Return the inner products of vectors, (M,), given (3, M) each.
+
+    Written out, so that rounding does not depend on where they lie in memory.
+    """
+    return np.asarray(one[0] * other[0] + one[1] * other[1] + one[2] * other[2])
+
+
+def _unit(vectors: Real) -> Real:
+    """Return vectors, (3, M), with length 1; zero vectors stay 0."""
+    length = np.sqrt(_dot(vectors, vectors))
+    length[length == 0.0] = 1.0
+    return np.asarray(vectors / length)
+
+
+def _shares(one: Real, two: Real) -> tuple[Real, Real]:
     """Return the shares of two positive amounts in their sum, (M,) each."""
     total = one + two
     return one / total, two / total
 
 
-def _squared_contrast(error: Array, whole: Array) -> Array:
+def _squared_contrast(error: Real, whole: Real) -> Real:
     """Return the squared contrast that a measured error implies, (M,).
 
     Colours are in 0..1, so it is at most 1 for each channel. `whole` is the error for |s| = 1.
     """
-    squared: Array = np.minimum(error, CHANNELS * whole) / np.maximum(whole, _TINY)
-    return squared
+    return np.asarray(np.minimum(error, CHANNELS * whole) / np.maximum(whole, _least(whole)[0]))
 
 
-def _mean_deviation(one: Array, two: Array, share: Array) -> Array:
-    """Return the mean of deviations, (M, 3), whose signs are arbitrary, so they are made alike."""
-    sign = np.where(np.einsum("ij,ij->i", one, two) < 0.0, -1.0, 1.0)
-    mean: Array = share[:, None] * one + ((1.0 - share) * sign)[:, None] * two
-    return mean
+def _mean_deviation(one: Real, two: Real, share: Real) -> Real:
+    """Return the mean of deviations, (3, M), whose signs are arbitrary, so they are made alike."""
+    rest = 1.0 - share
+    np.negative(rest, where=_dot(one, two) < 0.0, out=rest)
+    return np.asarray(share * one + rest * two)
 
 
 def _mixed(one: Footprint, two: Footprint, share: Array, between: Footprint) -> Footprint:
@@ -543,25 +629,31 @@ def _mixed(one: Footprint, two: Footprint, share: Array, between: Footprint) -> 
     )
 
 
-def _determinant(footprint: Footprint) -> Array:
+def _least(values: Real) -> tuple[float, float]:
+    """Return what replaces 0 as a divisor, and the least determinant over xx yy: see `_LEAST`."""
+    return _LEAST[values.dtype.itemsize]
+
+
+def _determinant(footprint: Footprint) -> Real:
     """Return the determinant, (M,), kept above 0 where rounding would leave 0 or less."""
     xx, xy, yy = footprint
-    return np.maximum(xx * yy - xy * xy, _THINNEST * xx * yy + _TINY)
+    tiny, thinnest = _least(xx)
+    squared = xx * yy
+    return np.asarray(np.maximum(squared - xy * xy, thinnest * squared + tiny))
 
 
-def _area(footprint: Footprint) -> Array:
+def _area(footprint: Footprint) -> Real:
     """Return the area of the ellipse of one standard deviation, divided by pi, (M,)."""
-    return np.sqrt(_determinant(footprint))
+    return np.asarray(np.sqrt(_determinant(footprint)))
 
 
-def _product(one: Footprint, other: Footprint, x: Array, y: Array) -> Array:
+def _product(one: Footprint, other: Footprint, step: Footprint, factor: Real | float) -> Real:
     """Return 2 pi times the integral of the product of two normal densities, (M,).
 
-    The integral is a normal density at the step `x`, `y` between their centres; its covariance is
-    the sum of the two.
+    The integral is a normal density at the step between their centres, whose products are `step`
+    times `factor`; its covariance is the sum of the two.
     """
-    total = (one[0] + other[0], one[1] + other[1], one[2] + other[2])
-    determinant = _determinant(total)
-    square = (total[2] * x * x - 2.0 * total[1] * x * y + total[0] * y * y) / determinant
-    product: Array = np.exp(-0.5 * np.clip(square, 0.0, _FARTHEST)) / np.sqrt(determinant)
-    return product
+    xx, xy, yy = one[0] + other[0], one[1] + other[1], one[2] + other[2]
+    determinant = _determinant((xx, xy, yy))
+    square = (yy * step[0] - 2.0 * xy * step[1] + xx * step[2]) * factor / determinant
+    return np.asarray(np.exp(-0.5 * np.clip(square, 0.0, _FARTHEST)) / np.sqrt(determinant))
