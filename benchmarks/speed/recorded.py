@@ -18,8 +18,13 @@ from collections import defaultdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from refine_addon.core import Budget, pace, prune_file, read_cameras
+import numpy as np
+
+from refine_addon.core import Budget, pace, prune_file, prune_tiles, read_cameras, read_ply
 from refine_addon.core.costs import Cost
+from refine_addon.core.formats.ply_header import with_count
+from refine_addon.core.levels.files import LevelsRequest, lod_file
+from refine_addon.core.levels.lod import Levels
 from refine_addon.core.operation.requests import PruneRequest
 from refine_addon.core.survivor_choice import SURVIVORS
 from refine_addon.core.task import METHODS, Settings
@@ -50,9 +55,14 @@ class Recorder:
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self.events: list[list[Any]] = []
-        self._clock, self._start = clock, clock()
+        self._clock = clock
+        self.begin()
         self._numbers: dict[int, int] = {}
         self._kept: list[pace.Phase] = []  # so that no number is given twice
+
+    def begin(self) -> None:
+        """Begin to count the seconds of the run."""
+        self._start = self._clock()
 
     def seconds(self) -> float:
         """Return how long the run has been going on."""
@@ -94,6 +104,17 @@ class Recorder:
         return self._numbers.setdefault(id(phase), len(self._numbers))
 
 
+def cut(source: Path, folder: Path, count: int) -> list[Path]:
+    """Write the splats of a file as so many tiles; return their paths."""
+    file, tiles = read_ply(source), []
+    for number, rows in enumerate(np.array_split(np.arange(len(file)), count)):
+        tiles.append(folder / f"tile{number}.ply")
+        with tiles[-1].open("wb") as stream:
+            stream.write(with_count(file.header, len(rows)))
+            stream.write(file.rows[rows[0] : rows[-1] + 1].tobytes())
+    return tiles
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Record a run, and print what it took."""
     parser = argparse.ArgumentParser(description="Record how a prune goes by.")
@@ -102,6 +123,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--survivors", choices=SURVIVORS, default="unchanged")
     parser.add_argument("--ratio", type=float, default=0.5)
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--tiles", type=int, help="cut it into so many tiles of one scene")
+    parser.add_argument(
+        "--levels",
+        type=float,
+        nargs="+",
+        help="make levels of these shares (taskset -c 0 has that done by one thread)",
+    )
     parser.add_argument("--record", type=Path, help="file of runs to add this one to")
     options = parser.parse_args(arguments)
     clock = time.process_time if options.threads == 1 else time.perf_counter
@@ -115,12 +143,31 @@ def main(arguments: Sequence[str] | None = None) -> None:
         request = PruneRequest(
             views, Budget(ratio=options.ratio), settings, survivors=options.survivors
         )
-        result = prune_file(
-            source, Path(made) / "out.ply", request, threads=options.threads,
-            progress=lambda fraction, what: told.append((recorder.seconds(), fraction, what)),
-        )  # fmt: skip
-    total, splats = recorder.seconds(), len(result.keep)
+        files = [source] if options.tiles is None else cut(source, Path(made), options.tiles)
+        recorder.begin()
+
+        def progress(fraction: float, what: str) -> None:
+            told.append((recorder.seconds(), fraction, what))
+
+        if options.levels:
+            levels = Levels(tuple(options.levels), survivors=options.survivors)
+            asked = LevelsRequest(views, levels, settings)
+            report = lod_file(source, Path(made) / "levels", asked, progress=progress)
+            splats = report["splats"]["before"]
+        elif options.tiles is None:
+            result = prune_file(
+                source, Path(made) / "out.ply", request,
+                progress=progress, threads=options.threads,
+            )  # fmt: skip
+            splats = result.report["splats"]["before"]
+        else:
+            report = prune_tiles(
+                files, Path(made) / "out", request, progress=progress, threads=options.threads
+            )
+            splats = report["splats"]["before"]
+    total = recorder.seconds()
     name = f"{options.scene.name}, {splats:,} splats, {options.method}, {options.survivors}"
+    name += " over tiles" if options.tiles else " in levels" if options.levels else ""
     print(f"{name}, {options.ratio:.0%}: {total:.1f} s")
     _tell_kinds(recorder.events, total, options.threads)
     for part in range(1, 20):

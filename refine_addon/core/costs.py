@@ -23,10 +23,11 @@ SECONDS = {
     "sorting": (0.0, 0.37e-6, 0.0, 1.0),
     "ordering": (0.0012, 1.2e-6, 0.0, 0.5),
     "aligning": (0.08, 0.0, 0.0, 1.0),
-    "estimating": (0.005, 0.0, 0.105e-6, 0.0),
-    "selecting": (0.15, 1.6e-6, 0.0, 0.8),
+    "estimating": (0.0065, 0.0, 0.13e-6, 0.0),
+    "selecting": (0.25, 1.1e-6, 0.0, 0.8),
     "comparing": (0.004, 0.0, 0.15e-6, 0.0),
-    "merging": (0.0, 25e-6, 0.0, 0.5),
+    "picturing": (0.02, 0.0, 0.5e-6, 0.1),
+    "merging": (0.0, 22e-6, 0.0, 0.5),
     "refit casting": (0.0, 0.0, 0.62e-6, 0.0),
     "refit solving": (0.0, 8.6e-6, 0.0, 0.3),
     "refit checking": (0.0, 0.0, 0.14e-6, 0.0),
@@ -215,6 +216,11 @@ def absorbing(count: int, left_after: Sequence[int], images: Images) -> list[Pla
 def comparing(count: int, views: int) -> Plan:
     """Return the costs of estimating a PSNR by casting the rays of some views again."""
     return [Cost("activating", count), Cost("comparing", count, views)]
+
+
+def picturing(count: int, views: int) -> Plan:
+    """Return the costs of comparing pictures of some views in patches."""
+    return [Cost("activating", count), Cost("picturing", count, views)]
 
 
 def refit_round(original: int, survivors: int, views: int, rays: float) -> list[Plan]:

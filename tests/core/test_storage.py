@@ -26,6 +26,7 @@ from refine_addon.core import (
 from refine_addon.core.tiles import storage, units, writing
 from refine_addon.core.urls import Url
 from tests.strategies import plain_header, plain_ply, splat_names
+from tests.tiles import told_by_plan
 
 ROOM = Path(__file__).parents[2] / "tests/data/room_small"
 CLOSED = Settings(method="closed-form", views=8)
@@ -55,6 +56,7 @@ def folder(tmp_path, monkeypatch):
     """Stand in a folder with two tiles; the second has elements before and after its splats."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(units, "ROWS", 100)
+    told_by_plan(monkeypatch)
     random = np.random.default_rng(1)
     (tmp_path / "a.ply").write_bytes(plain_ply(130, seed=1))
     rows = random.normal(size=(170, len(splat_names(1)))).astype("<f4")

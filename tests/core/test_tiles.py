@@ -35,9 +35,15 @@ from refine_addon.core.tiles import folder as folder_module
 from refine_addon.core.tiles import storage, units, writing
 from refine_addon.core.tiles.folder import Folder, Interrupted
 from tests.strategies import plain_ply, ply_of
-from tests.tiles import COUNT, ROOM, cut, joined, room_rows, write
+from tests.tiles import COUNT, ROOM, cut, joined, room_rows, told_by_plan, write
 
 CLOSED = Settings(method="closed-form", views=8)
+
+
+@pytest.fixture(autouse=True)
+def by_plan(monkeypatch):
+    """Have what is interrupted at a share be the same step, however busy the machine is."""
+    told_by_plan(monkeypatch)
 
 
 @pytest.fixture
@@ -400,7 +406,7 @@ def columns(path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stop", [0.1, 0.5, 0.77, 0.8, 0.83, 0.9])
+@pytest.mark.parametrize("stop", [0.1, 0.5, 0.735, 0.755, 0.8, 0.9])
 def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views, monkeypatch, stop):
     """Units that were read are not read again, tiles that were written not written again.
 
@@ -438,7 +444,7 @@ def test_a_job_that_was_interrupted_goes_on_where_it_was(tmp_path, tiles, views,
     assert len(list((tmp_path / "out").iterdir())) == 4
     assert sorted(index for index in done if index < 5) == [0, 1, 2, 3, 4]
     # Rows that are copied: of each tile once, or once more of the tile under way.
-    assert sum(index for index in done if index >= 5) <= COUNT + (1900 if stop > 0.82 else 0)
+    assert sum(index for index in done if index >= 5) <= COUNT + (1900 if stop > 0.79 else 0)
 
 
 def renaming_stops(monkeypatch, name, error):
@@ -595,7 +601,7 @@ def test_an_array_that_a_power_cut_truncated_is_made_again(tmp_path, tiles, view
     """It is named, what was not damaged stays, and the next run ends with the same bytes."""
     budget, out = Budget(ratio=0.5), tmp_path / "out"
     prune_tiles(tiles, tmp_path / "once", PruneRequest(views, budget, CLOSED))
-    stop = {"means.npy": 0.4, "plain.npy": 0.77, "values.npy": 0.82}[name]
+    stop = {"means.npy": 0.4, "plain.npy": 0.74, "values.npy": 0.79}[name]
     with pytest.raises(KeyboardInterrupt):
         prune_tiles(tiles, out, PruneRequest(views, budget, CLOSED), progress=interrupted_at(stop))
     damaged = next(path for path in sorted(out.rglob(name)) if path.stat().st_size > 300)

@@ -30,7 +30,7 @@ from refine_addon.core.splats import joined
 from refine_addon.core.tiles import absorbing, gaussians, refitting, units
 from refine_addon.core.views import ViewSet
 from tests.strategies import plain_header, splat_names
-from tests.tiles import COUNT, ROOM, cut, room_rows, write
+from tests.tiles import COUNT, ROOM, cut, room_rows, told_by_plan, write
 
 OCCLUSION = Settings(method="occlusion", views=8)
 HALF = Budget(ratio=0.5)
@@ -39,6 +39,7 @@ HALF = Budget(ratio=0.5)
 @pytest.fixture(autouse=True)
 def small(monkeypatch):
     """Make units, chunks and regions so small that 5000 splats have several of each; few rays."""
+    told_by_plan(monkeypatch)
     monkeypatch.setattr(closed_form, "ROWS", 1000)
     monkeypatch.setattr(units, "ROWS", 1000)
     monkeypatch.setattr(gaussians, "CHUNK", 700)

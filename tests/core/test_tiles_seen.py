@@ -33,7 +33,7 @@ from refine_addon.core.tiles.seeing import StoredRays
 from refine_addon.core.tiles.workers import InProcess, Runner
 from refine_addon.core.views import ViewSet
 from tests.strategies import plain_header, splat_names
-from tests.tiles import COUNT, ROOM, cut, room_rows, write
+from tests.tiles import COUNT, ROOM, cut, room_rows, told_by_plan, write
 
 OCCLUSION = Settings(method="occlusion", views=12)
 AUTO = Settings(views=20)
@@ -42,6 +42,7 @@ AUTO = Settings(views=20)
 @pytest.fixture
 def small(monkeypatch):
     """Make units, chunks and regions so small that 5000 splats have several of each."""
+    told_by_plan(monkeypatch)
     monkeypatch.setattr(closed_form, "ROWS", 1000)
     monkeypatch.setattr(units, "ROWS", 1000)
     monkeypatch.setattr(gaussians, "CHUNK", 700)

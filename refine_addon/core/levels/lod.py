@@ -13,15 +13,17 @@ from fractions import Fraction
 from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
+from .. import costs
 from ..errors import RefineError
 from ..estimate.quality import PSNR_CAP
-from ..pipeline import decide, score
+from ..pace import phases
+from ..pipeline import decide, planned, score, scoring_plans
 from ..selection import Budget
 from ..splats import among_all
 from ..survivor_choice import SURVIVORS, refuse_unknown
 from ..task import DEFAULTS, Origin, Task
-from ..work import Progress, part, silent
-from .distance import OriginalPictures
+from ..work import Progress, silent
+from .distance import VIEWS, OriginalPictures
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..absorbing.absorb import Absorbed
+    from ..costs import Plan
     from ..scores import Scores
     from ..splats import Splats
     from ..survivor_choice import Became
@@ -40,9 +43,6 @@ if TYPE_CHECKING:
 
 MAX_LEVELS = 16
 """No more levels than this: the last of so many halvings would hold .0015 % of the splats."""
-
-COMPARING = 0.05
-"""Share of the work that taking pictures of the original is, for a progress bar."""
 
 
 @dataclass(frozen=True)
@@ -279,30 +279,48 @@ def each_level(
     """
     total, forced = len(scene.scene()[0]), scene.forced()
     scene = replace(scene, forced_out=None) if forced is None else scene.without(forced)
-    original = OriginalPictures(
-        *scene.scene(), progress=part(progress, 0.0, COMPARING), threads=threads
-    )
-    after = part(progress, COMPARING, 1.0)
-    scene = replace(scene, survivors=levels.survivors)
+    scene, budgets = replace(scene, survivors=levels.survivors), levels.budgets(total)
+    first, *later = phases(progress, *_plans(scene, budgets), threads=threads)
+    deciding, comparing = later[::2], later[1::2]
+    original = OriginalPictures(*scene.scene(), progress=first, threads=threads)
     decide_levels = _absorbing if scene.absorb else _deleting
-    decided = decide_levels(scene, levels.budgets(total), after, threads)
+    decided = decide_levels(scene, budgets, deciding, threads)
     left_before, number = total, 0
     for place, (keep, splats, result, absorbed) in enumerate(decided):
         if len(splats) == left_before:
             continue
         number, left_before = number + 1, len(splats)
-        end = (place + 1) / len(levels) if scene.absorb else 1.0
         if number == 1:
             scores = result.scores
         level = Level(
             number, levels.asked[place], keep, splats, result.report["estimated_psnr"],
-            original.reach(splats, progress=part(after, end, end)), scores,
+            original.reach(splats, progress=comparing[place]), scores,
             absorbed, result.report["budget_remark"], _made_of(result.report),
         )  # fmt: skip
         yield level if forced is None else level.for_all(~forced)
     if not number:
         msg = f"no level has fewer splats than the input, which has {total}"
         raise RefineError(msg)
+
+
+def _plans(scene: Task, budgets: Sequence[Budget]) -> list[Plan]:
+    """Return the costs of pictures of the original, and of each level: deciding, comparing."""
+    splats, views = scene.scene()
+    plans, left = [costs.picturing(len(splats), VIEWS)], len(splats)
+    for budget in budgets:
+        deciding: Plan = []
+        if scene.absorb:
+            task = replace(scene, budget=budget, splats=splats.take(slice(left)), protected=None)
+            deciding = planned(task)
+        elif len(plans) == 1:  # one ranking is for all
+            scored = scoring_plans(splats, views, scene.settings, None, quality=True)
+            deciding = costs.joined(scored)
+        if not scene.absorb:
+            deciding = [*deciding, costs.Cost("selecting", len(splats))]
+        gone = budget.removals(left)
+        left -= left // 2 if gone is None else gone
+        plans += [deciding, costs.picturing(left, VIEWS)]
+    return plans
 
 
 def _made_of(facts: Mapping[str, Any]) -> dict[str, Any]:
@@ -321,24 +339,25 @@ class _Made(NamedTuple):
 
 
 def _deleting(
-    scene: Task, budgets: Sequence[Budget], progress: Progress, threads: int | None
+    scene: Task, budgets: Sequence[Budget], progress: Sequence[Progress], threads: int | None
 ) -> Iterator[_Made]:
-    """Make levels by one ranking."""
+    """Make levels by one ranking, which the first progress callback is told of."""
     splats, views = scene.scene()
-    scores = score(splats, views, scene.settings, quality=True, progress=progress, threads=threads)
+    scores = score(
+        splats, views, scene.settings, quality=True, progress=progress[0], threads=threads
+    )
     for budget in budgets:
         result = decide(replace(scene, budget=budget, scores=scores), threads=threads)
         yield _Made(result.keep, splats.take(result.keep), result, None)
 
 
 def _absorbing(
-    scene: Task, budgets: Sequence[Budget], progress: Progress, threads: int | None
+    scene: Task, budgets: Sequence[Budget], progress: Sequence[Progress], threads: int | None
 ) -> Iterator[_Made]:
-    """Make levels each from the one before."""
+    """Make levels each from the one before; a progress callback is told of each."""
     original, scores, whole = scene.scene()[0], None, None
     task = scene
-    for number, budget in enumerate(budgets):
-        of_level = part(progress, number / len(budgets), (number + 1) / len(budgets))
+    for budget, of_level in zip(budgets, progress, strict=True):
         result = decide(replace(task, budget=budget), progress=of_level, threads=threads)
         if result.stopped is not None:
             raise result.stopped

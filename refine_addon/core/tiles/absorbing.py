@@ -16,11 +16,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..absorbing.absorb import Counts, patience, stages
+from ..costs import Images
+from ..costs import absorbing as plan_stages
 from ..pipeline.absorb_splats import FIRST, PARTS
 from ..seeing.measuring import Measured
 from ..selection import Budget, select
 from .gaussians import store_gaussians
 from .regions import (
+    MEANS,
     SURVIVORS,
     AbsorbAtOnce,
     AbsorbRegion,
@@ -118,9 +121,11 @@ def absorb(tiles: MeasuredTiles, goal: int, settings: Settings, runner: Runner) 
         return _at_once(tiles.context, left, AbsorbAtOnce(goal, total, settings), runner)
     factor = patience(1.0 - goal / len(rows))
     counts = stages(len(rows), goal, ALONE)
+    images = Images.of(tiles.context.views)
+    runners = runner.phases(*plan_stages(len(rows), counts, images))
     for number, count in enumerate(counts):
-        stage_runner = runner.part(number / len(counts), (number + 1) / len(counts))
-        regions, left = _stage(tiles.context, number, left, count, factor, stage_runner)
+        of_stage = runners[2 * number : 2 * number + 2]
+        regions, left = _stage(tiles.context, number, left, count, factor, of_stage)
     folder, numbers = regions[0].folder, range(len(regions))
     origin, members = (folder.joined(numbers, name) for name in ("origin", "members"))
     merged = int(members.sum()) - goal
@@ -149,22 +154,23 @@ def _stage(
     left: _Left,
     count: int,
     factor: float,
-    runner: Runner,
+    runners: Sequence[Runner],
 ) -> tuple[list[Region], _Left]:
     """Reduce the splats that are left to `count`, region by region.
 
-    Before all stages but the first, `number` 0, they are measured anew. For `factor` see
-    `StageContext`.
+    Before all stages but the first, `number` 0, they are measured anew, by the first of two
+    runners. For `factor` see `StageContext`.
     """
+    measuring, runner = runners
     folder = scene.folder.inner(f"stage-{number}")
     if number:
         context = replace(scene, folder=folder.inner("seen"))
-        left = _measured_again(context, left, number - 1, runner.part(0.0, 0.5))
+        left = _measured_again(context, left, number - 1, measuring)
     stage = StageContext(folder, scene.views, scene.scene, left.sources, factor)
     sizes = _save_regions(stage, left, number, runner)
-    stay = _staying(stage, sizes, count, runner.part(0.5, 0.8))
+    stay = _staying(stage, sizes, count, runner.part(0.0, 0.6))
     steps = [AbsorbRegion(index, survivors) for index, survivors in enumerate(stay)]
-    survivors = runner.part(0.8, 1.0).run(stage, steps, "absorbing", sizes)
+    survivors = runner.part(0.6, 1.0).run(stage, steps, "absorbing", sizes)
     regions = [Region(index, size, folder) for index, size in enumerate(survivors)]
     contribution, error = folder.joined(range(len(regions)), "expected", axis=1)
     rows = np.arange(len(error))
@@ -186,7 +192,7 @@ def boxes_of(
     """Divide some splats of the sources of a stage, given their rows; see `divided`."""
     steps = [SaveMeans(source) for source in stage.sources]
     Runner(runner.workers).run_all(stage, steps, "reading")
-    means = stage.folder.joined((source.index for source in stage.sources), "means")
+    means = stage.folder.joined((source.index for source in stage.sources), MEANS)
     return divided(means[rows], most, number)
 
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...version import VERSION
+from ..costs import Cost, Images, joined
 from ..errors import RefineError
 from ..estimate.psnr import psnr_kept
 from ..estimate.quality import needed
@@ -36,6 +37,8 @@ from ..work import Cancelled, Progress, silent
 from . import absorbing
 from .closed_form import ClosedFormContext, by_closed_form
 from .folder import Folder, Interrupted
+from .plans import making as plan_making
+from .plans import scoring as plan_scoring
 from .refitting import refit_survivors
 from .scoring import by_occlusion, measured_once
 from .selecting import ChooseByScore, removals, rule_of
@@ -49,6 +52,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..costs import Plan
     from ..formats.format import Format
     from ..operation.requests import PruneRequest
     from ..operation.run import Runtime
@@ -60,12 +64,6 @@ if TYPE_CHECKING:
     from .scoring import MeasuredTiles
     from .units import Tile, Unit
     from .workers import Workers
-
-ABSORBED = 0.3
-"""Share of the work that absorbing is where refitting follows, for a progress bar."""
-
-SCORED = 0.82
-"""Part of the progress that scoring is, or scoring and absorbing; the rest is writing."""
 
 UNCHANGED = (
     "survivors stay unchanged: over tiles they absorb or are refitted where that is asked for by "
@@ -170,6 +168,11 @@ class TileScene:
         """How many splats there are."""
         return sum(map(len, self.units))
 
+    @property
+    def bytes(self) -> int:
+        """Of all files."""
+        return sum(tile.size for tile in self.tiles)
+
     def read(self, _form: Format | None) -> TileScene:
         """Raise `RefineError` if a worker does not see all files, `Interrupted` if much is done."""
         goes_on, _ = self.folder.noted("begun")
@@ -243,6 +246,25 @@ class TilesRequest(Request[TileScene, TileDecision]):
             raise RefineError(msg)
         budget.refuse_meaningless(settings.method, frustum=settings.frustum)
 
+    def costs(self, scene: TileScene) -> list[Plan]:
+        """Return what the steps are expected to cost; see `Request.costs`."""
+        writing = Cost("rewriting" if self.prune.absorb else "writing", scene.bytes)
+        return [joined(self._plans(scene)), [writing], []]
+
+    def _plans(self, scene: TileScene) -> list[Plan]:
+        """Return what getting ready, scoring, saving scores, and making survivors may cost."""
+        asked, count = self.prune, scene.total
+        images = Images.of(asked.views.spread(asked.settings.views))
+        removed = removals(asked.budget, scene.tiles)
+        known = removed is not None and not removed.by_bytes
+        settled = needed(removed.amount, count) if removed is not None and known else None
+        plans = plan_scoring(count, images, asked.settings, settled, once=asked.absorb)
+        if not asked.absorb:
+            return [*plans, []]
+        left = count - removed.amount if removed is not None and known else count // 2
+        made = plan_making(count, left, images, refits=asked.survivors == "refit")
+        return [*plans, joined(made)]
+
     def decide(self, scene: TileScene, runtime: Runtime) -> TileDecision:
         """Score the tiles and decide what stays.
 
@@ -252,17 +274,18 @@ class TilesRequest(Request[TileScene, TileDecision]):
             See `prune_tiles`.
         """
         asked, runner = self.prune, Runner(scene.workers, runtime.progress)
-        scores, measured = self._score(scene, runner)
+        *scoring, making = runner.phases(*self._plans(scene))
+        scores, measured = self._score(scene, scoring)
         notes = (*scores.notes, asked.views.note) if asked.views.note else scores.notes
         scores = replace(scores, notes=notes, views_given=len(asked.views))
         runtime.clock.lap("score_s")
-        counts = _select(scene, asked.budget, scores, runner.part(SCORED, SCORED))
+        silently = Runner(scene.workers)
+        counts = _select(scene, asked.budget, scores, silently)
         runtime.clock.lap("select_s")
         made = None
         if measured is not None:
-            made = self._made(measured, int(counts[:, 0].sum()), runner)
-            last = runner.part(SCORED, SCORED)
-            settled = absorbing.settle(made.survivors, scene.units, scene.folder, last)
+            made = self._made(measured, int(counts[:, 0].sum()), making)
+            settled = absorbing.settle(made.survivors, scene.units, scene.folder, silently)
             counts = _counted(scene, settled)
             runtime.clock.lap("absorb_s")
         changed = made is not None and bool(made.survivors.regions)
@@ -274,7 +297,7 @@ class TilesRequest(Request[TileScene, TileDecision]):
             psnr = psnr if changed else psnr_kept(scores.ray_sample, keep)
         facts = make_report(scores, keep, asked.budget, asked.settings, runtime.clock)
         kept, unseen = counts.sum(axis=0).tolist()
-        size, removed = sum(tile.size for tile in scene.tiles), scene.total - kept
+        size, removed = scene.bytes, scene.total - kept
         why = remark(asked.budget, removed, scene.total, psnr, size)
         conclude(facts, scores, keep, psnr, made.absorbed if made else None, why)
         conclude_between(facts, None)
@@ -296,38 +319,43 @@ class TilesRequest(Request[TileScene, TileDecision]):
         facts["splats"] |= {"unseen": unseen, "left_out": 0, "protected": 0, "forced": 0}
         return TileDecision(counts, changed, facts)
 
-    def _score(self, scene: TileScene, runner: Runner) -> tuple[Scores, MeasuredTiles | None]:
-        """Score all splats; to absorb, also return what the views see of them."""
+    def _score(
+        self, scene: TileScene, runners: Sequence[Runner]
+    ) -> tuple[Scores, MeasuredTiles | None]:
+        """Score all splats; to absorb, also return what the views see of them.
+
+        Of the runners one gets tiles ready, one scores and one saves the scores.
+        """
         settings, absorb = self.prune.settings, self.prune.absorb
         used = self.prune.views.spread(settings.views)
         closed_form = ClosedFormContext(scene.folder, used, settings.closed_form, used.middle())
-        runner = runner.part(0.0, SCORED * (0.3 if absorb else 1.0))
         if absorb:
-            measured = measured_once(closed_form, scene.units, settings, runner)
+            measured = measured_once(closed_form, scene.units, settings, runners)
             return measured.scores, measured
         if settings.method == "closed-form":
-            return by_closed_form(closed_form, scene.units, runner)[0], None
+            return by_closed_form(closed_form, scene.units, runners[1])[0], None
         removed = removals(self.prune.budget, scene.tiles)
         settled = None
         if removed is not None and not removed.by_bytes:
             settled = needed(removed.amount, scene.total)
-        return by_occlusion(closed_form, scene.units, settings, settled, runner), None
+        return by_occlusion(closed_form, scene.units, settings, settled, runners), None
 
     def _made(self, measured: MeasuredTiles, kept: int, runner: Runner) -> _Made:
         """Return what so many survivors become."""
         settings, refits = self.prune.settings, self.prune.survivors == "refit"
-        runner, absorbed_at = runner.part(0.3 * SCORED, SCORED), ABSORBED if refits else 0.95
-        absorbed = absorbing.absorb(measured, kept, settings, runner.part(0.0, absorbed_at))
+        count, images = len(measured.measured.seen), Images.of(measured.context.views)
+        plans = plan_making(count, kept, images, refits=refits)
+        absorbing_runner, refitting, estimating = runner.phases(*plans)
+        absorbed = absorbing.absorb(measured, kept, settings, absorbing_runner)
         made = _Made(absorbed, absorbed)
-        if refits and kept < len(measured.measured.seen):
+        if refits and kept < count:
             start = time.perf_counter()
-            done = refit_survivors(measured, absorbed, Refit(), runner.part(absorbed_at, 0.95))
+            done = refit_survivors(measured, absorbed, Refit(), refitting)
             if done is not None:
                 made = _Made(absorbed, done.survivors, done, time.perf_counter() - start)
         if not made.survivors.regions:
             return made
-        last = runner.part(0.95, 1.0)
-        _, psnr = absorbing.estimated(measured, made.survivors.regions, last)
+        _, psnr = absorbing.estimated(measured, made.survivors.regions, estimating)
         return replace(made, psnr=psnr)
 
 
@@ -408,11 +436,11 @@ class TileSink:
         if outputs is None:
             sizes = [_size(tile, count) for tile, count in zip(scene.tiles, kept, strict=True)]
         else:
-            runner = Runner(scene.workers, runtime.progress).part(SCORED, 1.0)
+            runner = Runner(scene.workers, runtime.progress)
             sizes = _write(scene, decision, outputs, runner)
             outputs.publish()
         target = None if outputs is None else str(self._folder)
-        before = sum(tile.size for tile in scene.tiles)
+        before = scene.bytes
         return Written(
             files=files_facts(f"{len(scene.tiles)} tiles", target, before, sum(sizes)),
             splats={"written": None if outputs is None else sum(kept)},

@@ -104,6 +104,10 @@ class StageContext:
         return packed(joined(tables)), np.concatenate(origins), np.concatenate(members)
 
 
+MEANS = "source_means"
+"""Means of a source; the field of a region has means too, and may have the same number."""
+
+
 @dataclass(frozen=True)
 class SaveMeans:
     """Saves where the splats of a source are."""
@@ -113,7 +117,7 @@ class SaveMeans:
     def run(self, context: StageContext, _runtime: Runtime) -> None:
         """Save the means, in float32."""
         means = np.asarray(self.source.splats().means, np.float32)
-        context.folder.save(self.source.index, {"means": means})
+        context.folder.save(self.source.index, {MEANS: means})
 
 
 @dataclass(frozen=True)

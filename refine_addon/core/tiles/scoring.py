@@ -46,7 +46,7 @@ def by_occlusion(
     units: Sequence[Unit],
     settings: Settings,
     settled: int | None,
-    runner: Runner,
+    runners: Sequence[Runner],
 ) -> Scores:
     """Score units by occlusion or auto: the same as in memory.
 
@@ -60,7 +60,8 @@ def by_occlusion(
     settings : Settings
     settled : int or None
         See `occlusion.score`.
-    runner : Runner
+    runners : sequence of Runner
+        They get the splats ready, score them, and save the scores.
 
     Raises
     ------
@@ -75,29 +76,29 @@ def by_occlusion(
     """
     by_auto = settings.method == "auto"
     groups = auto.groups_of(closed_form.views) if by_auto else None
-    scoring = _TileScoring(closed_form, units, settings.occlusion, groups, runner.part(0.0, 0.2))
-    progress = runner.part(0.2, 0.98).progress
+    preparing, progress, saving = runners[0], runners[1].progress, runners[2].progress
+    scoring = _TileScoring(closed_form, units, settings.occlusion, groups, preparing)
     with np.errstate(under="ignore"):
         if by_auto:
             scores = auto.finish(scoring, settings.tolerance, settled=settled, progress=progress)
         else:
             scores = scoring.finish(progress, settled)
-    return scoring.save(scores, runner.part(0.98, 1.0).progress)
+    return scoring.save(scores, saving)
 
 
 def measured_once(
     closed_form: ClosedFormContext,
     units: Sequence[Unit],
     settings: Settings,
-    runner: Runner,
+    runners: Sequence[Runner],
 ) -> MeasuredTiles:
     """Score units by occlusion in one round; parameters as `by_occlusion`."""
     how = replace(settings.occlusion, rounds=1)
-    scoring = _TileScoring(closed_form, units, how, None, runner.part(0.0, 0.2))
+    scoring = _TileScoring(closed_form, units, how, None, runners[0])
     with np.errstate(under="ignore"):
-        scores = scoring.finish(runner.part(0.2, 0.98).progress)
+        scores = scoring.finish(runners[1].progress)
         measured = scoring.measured().for_all(scoring.gaussians.index, len(scoring.prior))
-    scores = scoring.save(scores, runner.part(0.98, 1.0).progress)
+    scores = scoring.save(scores, runners[2].progress)
     return MeasuredTiles(scoring.context, units, scores, measured, scoring.validation_rays)
 
 
@@ -119,13 +120,15 @@ class _TileScoring(OcclusionScoring):
     ) -> None:
         self._job, self._units = closed_form.folder, units
         prior = replace(closed_form, folder=self._job.inner("prior"), settings=PRIOR)
-        _, size = by_closed_form(prior, units, runner.part(0.0, 0.5))
+        plans = costs.preparing(sum(map(len, units)), len(prior.views))
+        by_prior, activating = runner.phases(*reversed(plans))
+        _, size = by_closed_form(prior, units, by_prior)
         values = prior.folder.joined((unit.index for unit in units), "values")
         unturned = Scene(prior.middle[0], size, np.eye(3))
         context = SceneContext(self._job.inner("seen"), prior.views, settings, unturned)
-        context = replace(context, scene=_turned(context, units, runner.part(0.5, 0.6)))
+        context = replace(context, scene=_turned(context, units, activating.part(0.0, 0.2)))
         self.context = context
-        gaussians, good = store_gaussians(context, units, runner.part(0.6, 1.0))
+        gaussians, good = store_gaussians(context, units, activating.part(0.2, 1.0))
         # They have what `OcclusionScoring` asks of Gaussians in memory.
         super().__init__(
             gaussians,  # type: ignore[arg-type]

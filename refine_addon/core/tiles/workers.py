@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Generic, Protocol, TypeVar
 
 from ..operation.run import Runtime
+from ..pace import phases
 from ..work import Progress, part, report, silent
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from ..costs import Plan
     from .folder import Folder
     from .units import Tile
 
@@ -87,7 +89,8 @@ class InProcess:
         done = 0.0
         for step, share in zip(batch.steps, batch.shares(), strict=True):
             report(batch.progress, done, batch.what)
-            progress = part(batch.progress, done, done + share)
+            alone = len(batch.steps) == 1
+            progress = batch.progress if alone else part(batch.progress, done, done + share)
             yield step.run(batch.context, Runtime(progress=progress, threads=self._threads))
             done += share
 
@@ -102,6 +105,10 @@ class Runner:
     def part(self, start: float, end: float) -> Runner:
         """Return a runner whose steps are a part of this one's, see `work.part`."""
         return replace(self, progress=part(self.progress, start, end))
+
+    def phases(self, *plans: Plan) -> list[Runner]:
+        """Return a runner for each of several phases, see `pace.phases`."""
+        return [replace(self, progress=phase) for phase in phases(self.progress, *plans)]
 
     def run(
         self,

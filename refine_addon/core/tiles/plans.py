@@ -1,0 +1,68 @@
+"""What the steps of a prune over tiles are expected to cost; see `core/costs.py`."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from .. import costs
+from ..absorbing.absorb import ALONE, stages
+from ..costs import Cost
+from ..pipeline.absorb_splats import FIRST
+from ..refitting.refit import expected_rounds
+from ..refitting.round_rays import limits
+from ..scoring.occlusion import survivors_of_rounds
+from . import absorbing
+
+if TYPE_CHECKING:
+    from ..costs import Images, Plan
+    from ..task import Settings
+
+
+def scoring(
+    count: int, images: Images, settings: Settings, settled: int | None, *, once: bool
+) -> list[Plan]:
+    """Return the costs of getting tiles ready, of scoring, and of saving scores with a curve.
+
+    Parameters
+    ----------
+    count : int
+        How many splats there are.
+    images : Images
+        Of the views that score.
+    settings : Settings
+    settled : int or None
+        See `occlusion.score`.
+    once : bool
+        Whether to score by occlusion in one round, as absorbing needs it.
+    """
+    views = images.views
+    if settings.method == "closed-form" and not once:
+        return [[], [Cost("closed form", count, views)], []]
+    stays = [count] if once else survivors_of_rounds(count, settings.occlusion.rounds, settled)
+    plan = costs.by_auto if settings.method == "auto" and not once else costs.occlusion
+    ready, *scored = plan(count, images, stays)
+    *_, curve = costs.scoring(count, images, settings.method, stays)
+    curve = [Cost("estimating", count, views)] if once else curve
+    return [ready, costs.joined(scored), curve]
+
+
+def making(count: int, left: int, images: Images, *, refits: bool) -> list[Plan]:
+    """Return the costs of absorbing, of refitting if asked, and of estimating what is left.
+
+    Parameters
+    ----------
+    count, left : int
+        Splats before and after.
+    images : Images
+    refits : bool
+    """
+    begin = max(count - math.floor(FIRST * count), left)
+    alone = absorbing.ALONE if begin > absorbing.REGION else ALONE
+    after = stages(begin, left, alone)
+    absorbed = costs.joined(costs.absorbing(begin, after, images))
+    refitted: Plan = []
+    if refits:
+        rays, rounds = limits(left)[0], expected_rounds(left)
+        refitted = costs.joined(costs.refitting(count, left, images.views, rays, rounds))
+    return [absorbed, refitted, costs.comparing(left, images.views)]
