@@ -115,7 +115,8 @@ def colors(
     values = basis(directions, math.isqrt(sh_rest.shape[1] + 1) - 1)  # (N, K + 1)
     color = 0.5 + values[:, :1] * np.asarray(sh_dc, np.float64)
     if sh_rest.shape[1]:
-        color += np.einsum("nk,nkc->nc", values[:, 1:], np.asarray(sh_rest, np.float64))
+        # In one layout, since the order in which einsum sums depends on it.
+        color += np.einsum("nk,nkc->nc", values[:, 1:], np.ascontiguousarray(sh_rest, np.float64))
     return np.asarray(color)
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .errors import RefineError
+from .work import chunks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
 
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+_COPIED = 2048
+"""Rows of a file copied at a time: 0.5 MB at degree 3, in the L2 cache for all columns."""
 
 ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc", "sh_rest")
 """Attributes of `Splats` that have a row for each splat."""
@@ -81,9 +85,13 @@ class Splats:
         Rows of a file have the values of a splat side by side; numbers of many splats are computed
         several times as fast where they stand side by side.
         """
+        rows = {name: getattr(self, name) for name in ARRAYS if name != "sh_rest"}
         columns: dict[str, Any] = {
-            name: np.asfortranarray(getattr(self, name)) for name in ARRAYS if name != "sh_rest"
+            name: np.empty(values.shape, values.dtype, order="F") for name, values in rows.items()
         }
+        for piece in chunks(len(self), _COPIED):
+            for name, values in rows.items():
+                columns[name][piece] = values[piece]
         return replace(self, **columns)
 
 

@@ -187,6 +187,7 @@ def _in_turn(
 
     for done, piece in enumerate(pieces):
         if done % step == 0:
+            checkpoint()  # what this is a part of may be cancelled
             tell()
         with checked_by(check):
             result = work(piece)

@@ -9,7 +9,7 @@ import pytest
 
 from refine_addon.core import RefineError, Splats
 from refine_addon.core.affine import baked, quaternion, transformed
-from refine_addon.core.spherical_harmonics import basis, rotate, stretched
+from refine_addon.core.spherical_harmonics import basis, colors, rotate, stretched
 from refine_addon.core.splats import rotation_matrices
 
 RNG = np.random.default_rng(7)
@@ -70,6 +70,18 @@ def test_the_basis_has_the_signs_of_the_reference_implementation():
     expected += [c2[3] * x * z, c2[4] * (x * x - y * y)]
 
     np.testing.assert_allclose(basis(np.array([x, y, z]), 2), expected, rtol=1e-14)
+
+
+def test_colours_do_not_depend_on_how_harmonics_lie_in_memory():
+    """Files hold them channel by channel, what was joined does not; colours agree to the bit."""
+    splats, along = some(), directions(50)
+    one_way = np.ascontiguousarray(splats.sh_rest.transpose(0, 2, 1)).transpose(0, 2, 1)
+    other_way = np.ascontiguousarray(splats.sh_rest.transpose(2, 1, 0)).transpose(2, 1, 0)
+
+    expected = colors(along, splats.sh_dc, splats.sh_rest)
+
+    for rest in (one_way, other_way):
+        np.testing.assert_array_equal(colors(along, splats.sh_dc, rest), expected)
 
 
 @pytest.mark.parametrize("matrix", [ROTATION, -ROTATION, np.diag([1, 1, -1]), np.eye(3)])

@@ -402,6 +402,21 @@ def test_chunks_threads_and_view_blocks_change_nothing(monkeypatch, chunk, threa
     np.testing.assert_array_equal(scores.seen, expected.seen)
 
 
+def test_blocks_are_scored_side_by_side_to_the_same_bits(monkeypatch):
+    """Ten blocks on three threads, and one after the other; what is told never falls."""
+    splats, views = random_scene(7, count=1000, view_count=3)
+    monkeypatch.setattr(closed_form, "ROWS", 100)
+    expected = closed_form.score(splats, views, threads=1)
+    told = []
+
+    scores = closed_form.score(splats, views, threads=3, progress=lambda done, _: told.append(done))
+
+    np.testing.assert_array_equal(scores.values, expected.values)
+    np.testing.assert_array_equal(scores.seen, expected.seen)
+    assert told == sorted(told)
+    assert told[-1] > 0.9
+
+
 @pytest.mark.parametrize("settings", READINGS, ids=str)
 def test_views_that_are_left_out_or_see_all_of_a_run_change_nothing(monkeypatch, settings):
     """The same as where every view is asked of every splat, but for the order of sums."""

@@ -259,6 +259,29 @@ def test_no_splat_is_merged_twice_and_none_is_lost(tmp_path, tiles, rows, views)
     assert np.isfinite([made[name] for name in made.dtype.names]).all()
 
 
+@pytest.mark.parametrize("model", ["default", "2dgs"])
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 9, 700])
+def test_a_few_splats_are_seen_as_they_are_among_all(views, model, count):
+    """A tile may hold one splat that reaches into a view: its footprint is the same to the bit.
+
+    BLAS multiplies a matrix by one column otherwise than by many.
+    """
+    splats = replace(read_ply(ROOM / "point_cloud.ply").splats(), model=model)
+    gaussians, scene, _ = projection.prepare(splats, views)
+    view = views.views[0]
+    of_all, depths = projection.footprints_and_depths(gaussians, scene, view)
+    few = of_all.index[len(of_all.index) // 2 :][:count]
+
+    of_few, depths_of_few = projection.footprints_and_depths(gaussians.take(few), scene, view)
+
+    where = np.searchsorted(of_all.index, few[of_few.index])
+    assert len(where) == count
+    np.testing.assert_array_equal(depths_of_few, depths[where])
+    expected = of_all.take(where)
+    for item in ("centers", "major", "minor", "alphas", "discs"):
+        np.testing.assert_array_equal(getattr(of_few, item), getattr(expected, item))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("ratio", [0.5, 0.8])
 def test_absorbing_a_single_region_is_absorbing_one_file(

@@ -34,6 +34,22 @@ def test_work_that_takes_long_is_cancelled_within_a_chunk(threads):
 
 
 @pytest.mark.parametrize("threads", [1, 2])
+def test_work_within_a_chunk_is_cancelled_between_its_own_chunks(threads):
+    """Each consists of a hundred, of which nobody is told; the second report stops them."""
+    calls = iter(range(100))
+    begun = []
+
+    def within(_piece: slice) -> None:
+        for_chunks(lambda piece: begun.append(piece.start) or time.sleep(0.05), 100, 1, threads=1)
+
+    with pytest.raises(Cancelled):
+        for_chunks(within, 2, 1, progress=lambda _fraction, _what: next(calls) < 1,
+                   threads=threads)  # fmt: skip
+
+    assert len(begun) < 100
+
+
+@pytest.mark.parametrize("threads", [1, 2])
 def test_an_error_stops_the_chunks_that_run(threads):
     """The first chunk fails while the second runs; nothing waits for the end of that one."""
     running = threading.Event()

@@ -28,13 +28,13 @@ from ..rendering import NEAR_RELATIVE
 from ..scores import Scores
 from ..seeing.scene import principal_axes, size_of
 from ..splats import refuse_undrawable
-from ..work import Progress, part, silent
+from ..work import Progress, chunks, default_threads, for_chunks, part, silent
 from . import adaptive
 from .closed_form_block import CELLS, HIGHEST, ROWS, Frame, RowBlock
 from .closed_form_settings import DEFAULTS, ETA_RELATIVE, ClosedForm
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable
 
     from numpy.typing import NDArray
 
@@ -46,6 +46,9 @@ if TYPE_CHECKING:
 
 SHARES = {"read": 0.2, "count": 0.0, "sum_views": 0.75, "add": 0.0, "compare": 0.0}
 """How much of the time each step takes, for progress; the other steps are too short to tell."""
+
+WHAT = {"read": "reading", "count": "reading"}
+"""What progress is told of a step; of the others "scoring"."""
 
 
 def score(
@@ -82,19 +85,24 @@ def score(
         If `progress` answers ``False``.
     """
     total, middle = len(splats), views.middle()
+    pieces = [*chunks(total, ROWS)]
+    threads = default_threads() if threads is None else threads
+    inner = max(threads // max(len(pieces), 1), 1)  # threads of a block
     blocks = [
-        RowBlock(splats.take(slice(start, start + ROWS)), views, settings, middle, threads=threads)
-        for start in range(0, total, ROWS)
+        RowBlock(splats.take(piece), views, settings, middle, threads=inner) for piece in pieces
     ]
     done = 0.0
 
-    def each(step: str, *arguments: Any) -> Iterator[Any]:  # noqa: ANN401 - of each step its own
+    def each(step: str, *arguments: Any) -> list[Any]:  # noqa: ANN401 - of each step its own
         nonlocal done
-        share = SHARES[step] / len(blocks)
-        for block in blocks:
-            block.progress = part(progress, done, done + share)
-            yield block.step(step, *arguments)
-            done += share
+        progress_of_step = part(progress, done, done + SHARES[step])
+        done += SHARES[step]
+        if len(blocks) == 1:
+            blocks[0].progress = progress_of_step
+        return for_chunks(
+            lambda piece: blocks[piece.start].step(step, *arguments), len(blocks), 1,
+            progress=progress_of_step, what=WHAT.get(step, "scoring"), threads=threads,
+        )  # fmt: skip
 
     scene = steps(each, total, views, settings)
     values, seen = (

@@ -54,7 +54,7 @@ HIGHEST = 64 - radix.DIGIT
 """Bits below the highest digit of a squared distance."""
 
 _CHUNK = 4096
-_RUN = 2000
+_RUN = 1000
 """Splats processed together: so few that their projections into 64 views stay in the L2 cache, and
 not a multiple of the page size, at which loads and stores alias."""
 
@@ -307,6 +307,12 @@ class RowBlock:
     def count(self, prefixes: list[int], shift: int) -> radix.Sparse:
         """Return `radix.counts` of the squared distances of what can be drawn."""
         squared = self.squared if self.good.all() else self.squared[self.good]
+        # Only those that begin like one of the prefixes: few, after the first digit.
+        known, kind = shift + radix.DIGIT, squared.dtype
+        if known < 8 * kind.itemsize:
+            least = radix.value_of(prefixes[0] << known, kind)
+            most = radix.value_of(((prefixes[-1] + 1) << known) - 1, kind)
+            squared = squared[(squared >= least) & (squared <= most)]
         return radix.Sparse.of(radix.counts(radix.keys_of(squared), prefixes, shift))
 
     def sum_views(self, frame: Frame) -> NDArray[np.float64]:

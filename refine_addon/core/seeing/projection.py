@@ -302,13 +302,15 @@ def footprints_and_depths(
         )
         if len(touching):
             local = np.take(local, touching, axis=1)  # (3, n), as all that follows
-            shape = rotation @ np.take(gaussians.covariances[:, piece], touching, axis=1)  # (6, n)
+            shape = _product(
+                rotation, np.take(gaussians.covariances[:, piece], touching, axis=1)
+            )  # (6, n)
             inside = frustum.contains(view, local, planes)
             index = touching + start
             alphas = gaussians.alphas.take(index)
             discs = None
             if gaussians.normals is not None:
-                normals = turned @ np.take(gaussians.normals, index, axis=1)
+                normals = _product(turned, np.take(gaussians.normals, index, axis=1))
                 centers, axes, discs = _discs(local, shape, normals, view, planes[0])
             else:
                 centers, axes, kept = _ellipses(local, shape, view)
@@ -358,7 +360,7 @@ def in_camera(
     gaussians: Gaussians, scene: Scene, view: View
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return centres, (3, M), and covariances, (6, M), in camera coordinates, scene sizes."""
-    turned = _rotation6(view.rotation @ scene.axes.T) @ gaussians.covariances
+    turned = _product(_rotation6(view.rotation @ scene.axes.T), gaussians.covariances)
     return _local(gaussians.means, scene, view), turned
 
 
@@ -384,9 +386,21 @@ def clip_planes(scene: Scene, view: View) -> tuple[float, float]:
 def _local(means: NDArray[np.float32], scene: Scene, view: View) -> NDArray[np.float32]:
     """Return camera coordinates of centres, (3, M), scene sizes."""
     shift = (view.rotation @ ((view.center - scene.origin) / scene.size)).astype(np.float32)
-    local: NDArray[np.float32] = (view.rotation @ scene.axes.T).astype(np.float32) @ means
+    local = _product((view.rotation @ scene.axes.T).astype(np.float32), means)
     local -= shift[:, None]
     return local
+
+
+def _product(matrix: NDArray[np.float32], columns: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a matrix times columns, (n, n) and (n, M).
+
+    Each is summed in the same order. BLAS rounds by where a column stands and how many there are,
+    so a splat would be seen otherwise among the few of a tile than among all.
+    """
+    result = np.multiply.outer(matrix[:, 0], columns[0])
+    for factors, row in zip(matrix.T[1:], columns[1:], strict=True):
+        result += np.multiply.outer(factors, row)
+    return result
 
 
 def _touches(
