@@ -267,7 +267,7 @@ def test_esc_while_the_result_of_refitting_waits_changes_nothing(addon, few):
 
 
 def test_an_object_moved_while_apply_works_keeps_its_survivors_together(addon, few, room_views):
-    """The data is what it is without the move: what a survivor absorbed is in its object's frame."""
+    """The data is what it is without the move: survivors are in the frame of their object."""
     room, budget = few
     expected = absorbed_in_core(addon, room, room_views, budget).absorbed.splats.means
     bpy.ops.refine.score()
