@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .affine import moved
+from .work import chunks
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -28,6 +29,9 @@ _FLAT = 1e-5
 
 _SAMPLE, _FITTED = 2048, 16384
 """Points by which candidates are compared, and to which a map is fitted at last; evenly spread."""
+
+_ROWS = 1 << 14
+"""Points that are mapped at a time."""
 
 _TRIES, _DRAWN = 240, 4
 """Candidates for each map, and points that each is fitted to: the fewest that determine one."""
@@ -163,10 +167,13 @@ def _fits(
     slack: float = 1.0,
 ) -> NDArray[np.bool_]:
     """Return which points a map takes to where they are but for rounding, (N,)."""
-    terms = np.abs(before) @ np.abs(matrix[:3, :3]).T + np.abs(matrix[:3, 3]) + np.abs(after)
-    allowed = slack * _NOISE * terms.max(axis=1)
-    off = np.abs(moved(before, matrix) - after).max(axis=1)
-    return np.asarray(off <= allowed)
+    fits = np.empty(len(before), np.bool_)
+    turn, shift = np.abs(matrix[:3, :3]).T, np.abs(matrix[:3, 3])
+    for part in chunks(len(before), _ROWS):  # whose arrays stay in the caches
+        start, end = before[part], after[part]
+        allowed = slack * _NOISE * (np.abs(start) @ turn + shift + np.abs(end)).max(axis=1)
+        fits[part] = np.abs(moved(start, matrix) - end).max(axis=1) <= allowed
+    return fits
 
 
 def _fitted(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64] | None:

@@ -264,3 +264,17 @@ def test_esc_while_the_result_of_refitting_waits_changes_nothing(addon, few):
     assert answer == {"CANCELLED"}
     assert said == ["Pruning splats cancelled; nothing was changed"]
     assert len(room.data.vertices) == count
+
+
+def test_an_object_moved_while_apply_works_keeps_its_survivors_together(addon, few, room_views):
+    """The data is what it is without the move: survivors are in the frame of their object."""
+    room, budget = few
+    expected = absorbed_in_core(addon, room, room_views, budget).absorbed.splats.means
+    bpy.ops.refine.score()
+    operator, context, _ = started_in_a_window(addon, addon.ui.operators.REFINE_OT_apply)
+    room.location.x += 1.0
+    answer = until_over(operator, context)
+
+    means = addon.mesh.attributes.read_attribute(room.data, "position")
+    assert answer == {"FINISHED"}
+    np.testing.assert_array_equal(means, expected.astype(np.float32))

@@ -71,9 +71,9 @@ def main(pictures: str) -> Generator[float, None, dict[str, Any]]:
         copy.location.z += 0.01 * number
         scene.collection.objects.link(copy)
     found["busy"] = []
-    for animation in (True, False):  # which end by themselves in minutes alone
+    scene.render.resolution_percentage = 400
+    for animation in (True, False):  # which take longer than until Esc
         bpy.data.objects["Cube"].hide_render = not animation  # else it is the splats that are drawn
-        scene.render.resolution_percentage = 400 if animation else 800
         scene.frame_end, scene.render.filepath = 99, f"{pictures}/stopped_##"
         yield 0.5
         before, shown = settings(scene), bpy.data.images[IMAGE].size[:]
@@ -146,7 +146,8 @@ def prepare(scene: bpy.types.Scene) -> None:
     scene.cycles.samples, scene.cycles.use_denoising = 8, False
     scene.view_settings.view_transform = "Standard"
     scene.world = bpy.data.worlds.new("black")
-    scene.world.color = (0.0, 0.0, 0.0)
+    scene.world.use_nodes = True
+    scene.world.node_tree.nodes.clear()
 
 
 def invoke(*, animation: bool = False) -> None:
