@@ -265,6 +265,8 @@ def measured_field(  # noqa: PLR0913 - which splats, seen by what, in which scen
         splats.means[rows], views, scene, progress=part(progress, 0.0, 0.5), threads=threads
     )
     covariances, color = np.empty((len(rows), 6)), np.empty((len(rows), 3))
+    alphas, mass = opacity(splats.opacity_logits[rows]), np.empty(len(rows))
+    blur = LOW_PASS * viewed.pixel
 
     def fill(piece: slice) -> None:
         chunk = splats.take(rows[piece])
@@ -275,6 +277,13 @@ def measured_field(  # noqa: PLR0913 - which splats, seen by what, in which scen
             if color_of is None
             else color_of(rows[piece], direction)
         )
+        with np.errstate(under="ignore"):
+            # Antialiasing keeps the mass that splats have without the low-pass.
+            wider = np.zeros(len(direction)) if splats.model == "antialiased" else blur[piece]
+            xx, xy, yy = footprint(covariances[piece], across(direction), wider)  # (n,) each
+            # In pixels of a view, over 2 pi; a constant factor does not matter here.
+            area = np.sqrt(np.maximum(xx * yy - xy * xy, 0.0))
+            mass[piece] = alphas[piece] * area / viewed.pixel[piece]
 
     for_chunks(
         fill, len(rows), _CHUNK, progress=part(progress, 0.5, 1.0), what="absorbing",
@@ -283,21 +292,15 @@ def measured_field(  # noqa: PLR0913 - which splats, seen by what, in which scen
     field = Field(
         np.asarray(splats.means[rows], np.float64),
         covariances,
-        opacity(splats.opacity_logits[rows]),
+        alphas,
         sums.contribution[rows],
         sums.error[rows],
         viewed.direction,
         viewed.deviation,
         np.maximum(color, 0.0, out=color),
-        LOW_PASS * viewed.pixel,
+        blur,
         splats.model,
     )
-    with np.errstate(under="ignore"):
-        # Antialiasing keeps the mass that splats have without the low-pass.
-        blur = np.zeros(len(rows)) if splats.model == "antialiased" else field.blur
-        xx, xy, yy = footprint(covariances, across(field.direction), blur)  # (M,) each
-        # In pixels of a view, over 2 pi; a constant factor does not matter here.
-        mass = field.opacity * np.sqrt(np.maximum(xx * yy - xy * xy, 0.0)) / viewed.pixel
     return MeasuredField(field, mass, viewed.seen)
 
 
