@@ -27,7 +27,7 @@ SECONDS = {
     "selecting": (0.25, 1.1e-6, 0.0, 0.8),
     "comparing": (0.004, 0.0, 0.15e-6, 0.0),
     "picturing": (0.02, 0.0, 0.5e-6, 0.1),
-    "merging": (0.0, 22e-6, 0.0, 0.5),
+    "merging": (0.0, 11e-6, 0.0, 0.5),
     "refit casting": (0.0, 0.0, 0.62e-6, 0.0),
     "refit solving": (0.0, 8.6e-6, 0.0, 0.3),
     "refit checking": (0.0, 0.0, 0.14e-6, 0.0),
