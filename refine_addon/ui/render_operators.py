@@ -51,10 +51,12 @@ _watch = _Watch(over=True)
 
 
 def _watch_anew() -> None:
-    """Watch for Esc ahead of what waits for it so far."""
+    """Watch for Esc ahead of what waits for it so far, in all windows: one may show the render."""
     global _watch
     _watch.over, _watch = True, _Watch()
-    bpy.ops.refine.watch_render("INVOKE_DEFAULT")
+    for window in bpy.context.window_manager.windows:
+        with bpy.context.temp_override(window=window):
+            bpy.ops.refine.watch_render("INVOKE_DEFAULT")
 
 
 def no_render(_context: bpy.types.Context) -> str:
