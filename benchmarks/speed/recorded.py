@@ -115,13 +115,19 @@ def cut(source: Path, folder: Path, count: int) -> list[Path]:
     return tiles
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Record a run, and print what it took."""
-    parser = argparse.ArgumentParser(description="Record how a prune goes by.")
+def prune_options(description: str) -> argparse.ArgumentParser:
+    """Return a parser of which scene is pruned, and how."""
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("scene", type=Path, help="folder of point_cloud.ply and cameras.json")
     parser.add_argument("--method", choices=METHODS, default="auto")
     parser.add_argument("--survivors", choices=SURVIVORS, default="unchanged")
     parser.add_argument("--ratio", type=float, default=0.5)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Record a run, and print what it took."""
+    parser = prune_options("Record how a prune goes by.")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--tiles", type=int, help="cut it into so many tiles of one scene")
     parser.add_argument(

@@ -12,7 +12,6 @@ by function, most first.
 
 from __future__ import annotations
 
-import argparse
 import cProfile
 import heapq
 import pstats
@@ -23,8 +22,9 @@ from typing import TYPE_CHECKING, TypeVar
 
 from refine_addon.core import Budget, prune_file, read_cameras, work
 from refine_addon.core.operation.requests import PruneRequest
-from refine_addon.core.survivor_choice import SURVIVORS
-from refine_addon.core.task import METHODS, Settings
+from refine_addon.core.task import Settings
+
+from .recorded import prune_options
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -99,11 +99,7 @@ def spread(seconds: Sequence[float], cores: int) -> float:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run once, and print the model."""
-    parser = argparse.ArgumentParser(description="Model how a prune scales with cores.")
-    parser.add_argument("scene", type=Path, help="folder of point_cloud.ply and cameras.json")
-    parser.add_argument("--method", choices=METHODS, default="auto")
-    parser.add_argument("--survivors", choices=SURVIVORS, default="unchanged")
-    parser.add_argument("--ratio", type=float, default=0.5)
+    parser = prune_options("Model how a prune scales with cores.")
     parser.add_argument("--functions", type=int, default=12, help="serial ones to tell")
     options = parser.parse_args(arguments)
     views = read_cameras(options.scene / "cameras.json")

@@ -475,19 +475,26 @@ def test_views_move_a_little_in_each_round_and_along_their_own_axes():
     np.testing.assert_allclose(places[1], places[0] @ turn.T, atol=1e-9)
 
 
+def opaque_cloud(view, logit, larger):
+    """Return 400 large splats of one opacity, with their Gaussians and footprints in a view."""
+    splats = cloud(400)
+    splats = replace(
+        splats,
+        opacity_logits=np.full(400, logit, np.float32),
+        log_scales=splats.log_scales + np.float32(larger),
+    )
+    gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)))
+    return splats, gaussians, projection.project(gaussians, scene, view)
+
+
 def test_rays_see_the_same_without_their_hidden_hits():
     """Behind two opaque splats of alpha .99 no more than 1e-4 is left, and a third hides the rest.
 
     The splats that no ray sees are no longer among those that are hit.
     """
-    splats, view = cloud(400), ring()[0]
-    splats = replace(
-        splats,
-        opacity_logits=np.full(400, 9.0, np.float32),
-        log_scales=splats.log_scales + np.float32(1.0),
-    )
-    gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)))
-    rays = cast(projection.project(gaussians, scene, view), COLUMNS, ROWS)
+    view = ring()[0]
+    splats, gaussians, footprints = opaque_cloud(view, 9.0, 1.0)
+    rays = cast(footprints, COLUMNS, ROWS)
 
     seen, transmittance = rays.visible()
 
@@ -509,14 +516,7 @@ def test_rays_end_behind_what_is_opaque_and_see_the_same(monkeypatch, pairs):
 
     With 50 at a time far fewer hits are computed: behind opaque ones rays are not followed.
     """
-    splats, view = cloud(400), ring()[0]
-    splats = replace(
-        splats,
-        opacity_logits=np.full(400, 3.0, np.float32),
-        log_scales=splats.log_scales + np.float32(1.5),
-    )
-    gaussians, scene, _ = projection.prepare(splats, ViewSet((view,)))
-    footprints = projection.project(gaussians, scene, view)
+    footprints = opaque_cloud(ring()[0], 3.0, 1.5)[2]
     every = cast(footprints, COLUMNS, ROWS)
     seen, transmittance = every.visible()
     monkeypatch.setattr(casting, "_PAIRS", pairs)

@@ -312,10 +312,10 @@ def _plans(scene: Task, budgets: Sequence[Budget]) -> list[Plan]:
         if scene.absorb:
             task = replace(scene, budget=budget, splats=splats.take(slice(left)), protected=None)
             deciding = planned(task)
-        elif len(plans) == 1:  # one ranking is for all
-            scored = scoring_plans(splats, views, scene.settings, None, quality=True)
-            deciding = costs.joined(scored)
-        if not scene.absorb:
+        else:
+            if len(plans) == 1:  # one ranking is for all
+                scored = scoring_plans(splats, views, scene.settings, None, quality=True)
+                deciding = costs.joined(scored)
             deciding = [*deciding, costs.Cost("selecting", len(splats))]
         gone = budget.removals(left)
         left -= left // 2 if gone is None else gone
