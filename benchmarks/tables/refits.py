@@ -1,7 +1,20 @@
-"""What refitting is worth: after each way to begin, round after round, and made cheaper."""
+"""What refitting is worth: after each way to begin, round after round, and made cheaper.
+
+::
+
+    python -m benchmarks.tables.refits SCENE_DIR ... --ratio .5
+    python -m benchmarks.tables.refits 160000 1000000 --ways "as it is"
+
+Run as a command, it says how long refitting takes, over what absorbing took in the same run (all
+views score, one thread, seconds of the processor), and what it gained, on rays that nothing was
+learned from. For a scene's folder see `evaluate`; a number makes one of `speed.capture` of so many
+splats.
+"""
 
 from __future__ import annotations
 
+import argparse
+import sys
 import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
@@ -13,16 +26,21 @@ from refine_addon.core.refitting.round_rays import RoundRays
 from refine_addon.core.selection import Budget
 from refine_addon.core.work import silent
 
+from ..speed import capture
+from .evaluate import read_scene
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from refine_addon.core.refitting.refit import Refitted
     from refine_addon.core.splats import Splats
+    from refine_addon.core.survivor_choice import Became
     from refine_addon.core.views import ViewSet
 
     from .evaluate import Evaluator
     from .methods import Task
 
-STARTS = {
+STARTS: dict[str, tuple[str, Became]] = {
     "absorbed": ("occlusion", "absorb"),
     "deleted by auto": ("auto", "unchanged"),
     "deleted by the closed form": ("closed-form", "unchanged"),
@@ -86,34 +104,66 @@ def measure(task: Task, evaluator: Evaluator, ratios: Sequence[float]) -> list[C
     curves = []
     for ratio in ratios:
         for name, (method, survivors) in STARTS.items():
-            began = time.process_time()
-            left = _left(task, ratio, method, survivors)
-            start = time.process_time() - began
+            left, start = _left(task.splats, task.views, ratio, method, survivors)
             ways = CHEAPER if survivors == "absorb" else {name: Cheaper()}
             for label, way in ways.items():
                 label = name if way == Cheaper() else label  # noqa: PLW2901
-                rounds = list(_timed(left, task, way, evaluator))
+                rounds = [
+                    (seconds, evaluator.evaluate(refitted.splats).renders.mean["psnr"])
+                    for seconds, refitted in _timed(left, task.splats, task.views, way)
+                ]
                 curves.append(Curve(label, ratio, start, rounds))
                 print(f"  {curves[-1]}", flush=True)
     return curves
 
 
-def _left(task: Task, ratio: float, method: str, survivors: str) -> Splats:
-    """Return what refitting begins with, made by one thread, whose time is all that it took."""
-    settings, budget = Settings(method, views=0), Budget(ratio=ratio)
-    result = core.prune(task.splats, task.views, budget, settings, survivors=survivors, threads=1)
-    return result.survivors(task.splats)
+def _left(
+    splats: Splats, views: ViewSet, ratio: float, method: str, survivors: Became
+) -> tuple[Splats, float]:
+    """Return what refitting begins with, made by one thread, and seconds, all that it took."""
+    settings, budget, began = Settings(method, views=0), Budget(ratio=ratio), time.process_time()
+    result = core.prune(splats, views, budget, settings, survivors=survivors, threads=1)
+    return result.survivors(splats), time.process_time() - began
 
 
 def _timed(
-    left: Splats, task: Task, way: Cheaper, evaluator: Evaluator
-) -> Iterator[tuple[float, float]]:
-    """Yield seconds and PSNR, round after round; what comparing takes is left out."""
-    views: ViewSet = task.views.spread(max(round(way.views * len(task.views)), 1))
+    left: Splats, splats: Splats, views: ViewSet, way: Cheaper
+) -> Iterator[tuple[float, Refitted]]:
+    """Yield seconds and result, round after round; what comparing takes is left out."""
+    views = views.spread(max(round(way.views * len(views)), 1))
     began, compared = time.process_time(), 0.0
-    rays = RoundRays.of(task.splats, views, round(way.rays * len(left)), silent, 1)
+    rays = RoundRays.of(splats, views, round(way.rays * len(left)), silent, 1)
     for refitted in refit_on(rays, left, way.settings, threads=1):
         pause = time.process_time()
-        seconds = pause - began - compared
-        yield seconds, evaluator.evaluate(refitted.splats).renders.mean["psnr"]
+        yield pause - began - compared, refitted
         compared += time.process_time() - pause
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print a line for each scene and way; return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.tables.refits",
+        description="How long refitting takes over absorbing, and what it gains.",
+    )
+    parser.add_argument("scenes", nargs="+", metavar="SCENE_DIR | SPLATS")
+    parser.add_argument("--ratio", type=float, default=0.5)
+    parser.add_argument("--ways", nargs="+", choices=CHEAPER, default=list(CHEAPER)[:2])
+    options = parser.parse_args(arguments)
+    for name in options.scenes:
+        if name.isdigit():
+            splats, views = capture.make(int(name)), capture.cameras()
+        else:
+            scene = read_scene(name)
+            splats, views = scene.splats, scene.train
+        left, seconds = _left(splats, views, options.ratio, "auto", "absorb")
+        print(f"{name}, {options.ratio:.0%}: absorbed in {seconds:.1f} s", flush=True)
+        for way in options.ways:
+            for taken, refitted in _timed(left, splats, views, CHEAPER[way]):
+                gained = f"{refitted.psnr_before:.2f} -> {refitted.psnr:.2f} dB"
+                told = f"{way}, {refitted.rounds} rounds: {taken:.1f} s, {taken / seconds:.2f} x"
+                print(f"  {told}, {gained}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

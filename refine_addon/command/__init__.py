@@ -40,8 +40,11 @@ def main(arguments: Sequence[str], *, scene: bool = False, last: bool = False) -
     with Listener(last=last) as listener:
         try:
             # Loads all of core, and with it NumPy: a signal waits until that is there.
+            from ..core.work import share_heap  # noqa: PLC0415
             from . import flow  # noqa: PLC0415
 
+            if last:
+                share_heap()
             listener.interrupt()
             code = flow.run(arguments, scene=scene)
             listener.wait()

@@ -333,6 +333,8 @@ def _shared(work: object) -> Iterator[tuple[_Task, tempfile.TemporaryDirectory[s
                 stream.write(bytes(1))  # an empty file cannot be mapped
         except OSError as error:
             raise _LostError from error
+        arrays.clear()  # copies, where what is pickled made some
+        return_freed()
         yield _Task(pickled, str(path), places), folder
 
 

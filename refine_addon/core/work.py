@@ -23,6 +23,7 @@ Result = TypeVar("Result")
 REPLACES_MAPPED = os.name != "nt"
 """Whether a file that is mapped into memory can be replaced; Windows refuses."""
 
+_HEAPS = -8  # M_ARENA_MAX of glibc's malloc.h
 _HELD = 30_000_000  # bytes; above 32 MB, freeing a block does not raise glibc's threshold
 _REPORT_INTERVAL = 0.1  # seconds between two reports while chunks take long
 _own = threading.local()  # `checkpoint` calls the `check` of its own thread
@@ -88,6 +89,17 @@ def return_freed() -> None:
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):  # another C library
             ctypes.CDLL(None).malloc_trim(0)
+
+
+def share_heap() -> None:
+    """Let all threads of this process allocate from one heap, for a process of our own.
+
+    Each thread would have one of its own, which keeps what the thread freed even if all others need
+    memory: 70 MB of 300 while 160,000 splats are absorbed. Only glibc does that.
+    """
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):  # another C library
+            ctypes.CDLL(None).mallopt(_HEAPS, 1)
 
 
 def chunks(total: int, chunk: int) -> Iterator[slice]:

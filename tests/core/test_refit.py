@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from refine_addon.core import ViewSet, processes, spherical_harmonics
-from refine_addon.core.refitting import linear, refit, round_rays
+from refine_addon.core.refitting import linear, refit, round_rays, stored
 from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS
 from refine_addon.core.seeing import cast as casting
 from refine_addon.core.seeing import projection
@@ -111,7 +112,7 @@ def linear_of(splats, view, count=12, *, geometry=True, pixels=(COLUMNS, ROWS)):
     gaussians, rank = gaussians.take(order), np.argsort(order)
     footprints = replace(footprints, index=rank[footprints.index])
     visible = cast(footprints, *pixels).visible()
-    colors = round_rays.colors_of(splats.take(gaussians.index[visible.rays.hit]), view)
+    colors = round_rays.colors_of(splats, gaussians.index[visible.rays.hit], view)
     shapes = linear.Shapes.of(splats, gaussians.take(slice(count)), scene, geometry=geometry)
     black = np.zeros((3, visible.rays.count), np.float32)
     seen = linear.linear_view(visible, footprints, black, colors, shapes, view)
@@ -422,6 +423,66 @@ def test_threads_change_no_bit(threads):
 
     assert found.psnr == expected.psnr
     np.testing.assert_array_equal(found.splats.means, expected.splats.means)
+
+
+def test_what_lies_in_a_file_changes_no_bit(monkeypatch):
+    """Derivatives of all views but what stays in memory lie in a file, and two threads read it."""
+    splats, views = cloud(3000), ring(5)
+    survivors = splats.take(slice(None, None, 2))
+    inside = refit.refit(survivors, splats, views, refit.Refit(1), threads=2)
+    files, make = [], stored.tempfile.TemporaryFile
+
+    def opened(*given, **named):
+        files.append(make(*given, **named))
+        return files[-1]
+
+    monkeypatch.setattr(stored, "HELD", 0)
+    monkeypatch.setattr(stored.tempfile, "TemporaryFile", opened)
+
+    found = refit.refit(survivors, splats, views, refit.Refit(1), threads=2)
+
+    assert len(files) == 1
+    assert files[0].closed
+    assert found.rounds == 1
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh_dc"):
+        np.testing.assert_array_equal(getattr(found.splats, name), getattr(inside.splats, name))
+
+
+def test_what_a_file_has_no_room_for_stays_in_memory(monkeypatch):
+    """The third write ends half-way, as on a full disk, and the next one begins behind it."""
+    numbers, kept = np.arange(7, dtype=np.int16), stored.Stored(SimpleNamespace)
+    monkeypatch.setattr(stored, "HELD", 0)
+    kept.append(SimpleNamespace(one=numbers, two=numbers * 2.5))
+    file = kept._file
+    full = SimpleNamespace(
+        seek=file.seek, read=file.read, write=lambda given: file.write(given[: len(given) - 3])
+    )
+    kept._file = full
+    kept.append(SimpleNamespace(one=numbers + 1, two=numbers * 3.5))
+    kept._file = file
+    kept.append(SimpleNamespace(one=numbers + 2, two=np.zeros((2, 0))))
+
+    in_memory = [isinstance(place, SimpleNamespace) for place in kept._places]
+    assert in_memory == [False, True, False]
+    assert [each.one.tolist() for each in kept] == [[*range(k, k + 7)] for k in range(3)]
+    np.testing.assert_array_equal(kept[0].two, numbers * 2.5)
+    assert kept[2].two.shape == (2, 0)
+
+
+def test_a_process_maps_the_harmonics_of_splats_that_lie_channel_by_channel():
+    """As in a PLY: a pickle holds no array, which each process would have a copy of."""
+    splats = cloud(300)
+    random = np.random.default_rng(1).normal(size=(300, 3, 15)).astype(np.float32)
+    splats = replace(splats, sh_rest=random.transpose(0, 2, 1))
+    gaussians, scene, _ = projection.prepare(splats, ring(2))
+    target, arrays = round_rays.InMemory.of(splats, gaussians, scene), []
+
+    told = pickle.dumps(target, protocol=5, buffer_callback=arrays.append)
+
+    assert len(told) < 10_000
+    again = pickle.loads(told, buffers=arrays)  # noqa: S301 - our own
+    hit, view = np.arange(0, len(gaussians), 3), ring(2)[0]
+    np.testing.assert_array_equal(again.colors(hit, view), target.colors(hit, view))
 
 
 def test_rays_of_one_round_are_not_next_to_those_of_another():

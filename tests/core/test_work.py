@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import platform
+import subprocess
+import sys
 import threading
 import time
 
@@ -86,3 +89,32 @@ def test_results_come_in_the_order_of_the_slices(threads):
     found = for_chunks(lambda piece: (piece.start, piece.stop), 10, 4, threads=threads)
 
     assert found == [(0, 4), (4, 8), (8, 10)]
+
+
+IN_A_THREAD = """
+import ctypes, threading
+from refine_addon.core.work import share_heap
+if {share}:
+    share_heap()
+libc, found = ctypes.CDLL(None), []
+libc.malloc.restype = ctypes.c_size_t
+thread = threading.Thread(target=lambda: found.append(libc.malloc(2000)))
+thread.start()
+thread.join()
+with open("/proc/self/maps") as maps:
+    heap = next(line for line in maps if "[heap]" in line).split()[0]
+start, end = (int(each, 16) for each in heap.split("-"))
+print(start <= found[0] < end)
+"""
+
+
+@pytest.mark.skipif(
+    sys.platform != "linux" or platform.libc_ver()[0] != "glibc", reason="only glibc has heaps"
+)
+@pytest.mark.parametrize("share", [False, True])
+def test_threads_of_the_command_allocate_from_its_one_heap(share):
+    """A heap of their own would keep what they freed."""
+    code = IN_A_THREAD.format(share=share)
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+
+    assert told.stdout.strip() == str(share)

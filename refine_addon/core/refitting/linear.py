@@ -38,6 +38,7 @@ from ..seeing.cast import BEHIND
 from ..seeing.rays import LEAST_LEFT
 from ..splats import SH_C0, rotation_matrices
 from ..work import Progress, each_chunk
+from .stored import Stored
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -348,15 +349,16 @@ class LinearView:
         if not hits.steepness:
             return result
         x, y, *on_plane = hits.steepness
-        second = [value * x * x, value * x * y, value * y * y]
-        curved = [each * on_plane[0] for each in second] if on_plane else second
-        squares = (x * x, x * y, y * y)
-        fourth = [curved[0] * each for each in squares]
-        fourth += [each * squares[2] for each in curved[1:]]
-        of_second, of_fourth = (
-            [self._sum(each, hits.owner).astype(np.float32) for each in powers]
-            for powers in (second, fourth)
-        )
+        products = (x, x), (x, y), (y, y)
+        second = [value * one * other for one, other in products]
+        of_second = [self._sum(each, hits.owner).astype(np.float32) for each in second]
+        for where in on_plane:
+            second = [each * where for each in second]
+        # One at a time: of all these arrays together a view's peak of memory would be made.
+        of_fourth = [
+            self._sum(second[k] * (one * other), hits.owner).astype(np.float32)
+            for k, (one, other) in [*((0, each) for each in products), (1, (y, y)), (2, (y, y))]
+        ]
         in_image = [[_dot(row, axis) for axis in shapes.axes] for row in self.jacobian]
         longest, squared = np.square(shapes.scales.max(axis=0)), np.square(shapes.scales)
         for axis in range(3):
@@ -408,32 +410,31 @@ class LinearRays:
     Attributes
     ----------
     shapes : Shapes
-    views : list of LinearView
+    views : Stored of LinearView
     residual, diagonal : (13, M) float32
         J'r and the diagonal of J'J, see `refit`.
+    count : int
+        How many rays there are.
     """
 
     shapes: Shapes
-    views: list[LinearView]
+    views: Stored[LinearView]
     residual: NDArray[np.float32]
     diagonal: NDArray[np.float32]
+    count: int
 
     @classmethod
     def of(cls, shapes: Shapes, seen: Iterable[SeenView]) -> LinearRays:
         """Put views together, each as soon as it is there."""
-        views = []
+        views, count = Stored(LinearView), 0
         residual = np.zeros((COUNT if shapes.geometry else MEAN.start, len(shapes)), np.float32)
         diagonal = np.zeros((COUNT, len(shapes)), np.float32)
         for each in seen:
             views.append(each.linear)
+            count += each.linear.errors.shape[1]
             _add(residual, each.linear.hit, each.residual)
             _add(diagonal, each.linear.hit, each.diagonal)
-        return cls(shapes, views, shapes.by_parameter(residual), diagonal)
-
-    @property
-    def count(self) -> int:
-        """How many rays there are."""
-        return sum(view.errors.shape[1] for view in self.views)
+        return cls(shapes, views, shapes.by_parameter(residual), diagonal, count)
 
     def normal(
         self, change: NDArray[np.float32], progress: Progress, threads: int | None
@@ -442,16 +443,15 @@ class LinearRays:
         in_scene = self.shapes.in_scene(change)
         total = np.zeros_like(in_scene)
 
-        def of_view(piece: slice) -> NDArray[np.float32]:
+        def of_view(piece: slice) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+            view = self.views[piece.start]
             with np.errstate(under="ignore"):
-                values: NDArray[np.float32] = self.views[piece.start].normal(in_scene)
-            return values
+                return view.hit, view.normal(in_scene)
 
-        of_views = each_chunk(
+        for hit, values in each_chunk(
             of_view, len(self.views), 1, progress=progress, what="refitting", threads=threads
-        )
-        for view, values in zip(self.views, of_views, strict=True):
-            _add(total, view.hit, values)
+        ):
+            _add(total, hit, values)
         return self.shapes.by_parameter(total)
 
 
@@ -493,6 +493,20 @@ def linear_view(
         Of the first Gaussians; what else is hit does not change.
     view : View
     """
+    linear, shapes = _linear(visible, footprints, truth, colors, shapes, view)
+    del visible, footprints  # as far as the caller lets go, too
+    return SeenView(linear, linear.backward(linear.errors), linear.diagonal(shapes))
+
+
+def _linear(
+    visible: VisibleRays,
+    footprints: Footprints,
+    truth: NDArray[np.float32],
+    colors: NDArray[np.float32],
+    shapes: Shapes,
+    view: View,
+) -> tuple[LinearView, Shapes]:
+    """Return how the colours change, and the shapes that are hit; see `linear_view`."""
     rays, transmittance = visible
     movable = int(np.searchsorted(rays.hit, len(shapes)))  # of those that are hit
     weight, counts = transmittance * rays.alpha, rays.counts()
@@ -527,7 +541,7 @@ def linear_view(
         _halves(of_hits * weight[kept]), _halves(of_hits * by_log_alpha), _halves(steepness),
         ((colors > 0.0) & (colors < projection.BRIGHTEST))[:, :movable], jacobian,
     )  # fmt: skip
-    return SeenView(linear, linear.backward(linear.errors), linear.diagonal(shapes))
+    return linear, shapes
 
 
 def _trust(errors: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -191,8 +191,8 @@ def refit(  # noqa: PLR0913 - all but three are optional
 
     Notes
     -----
-    Memory: about 700 bytes a survivor, and 14 bytes for each hit of a round, see
-    `round_rays.limits`.
+    Memory: about 700 bytes a survivor. 14 bytes for each hit of a round, see `round_rays.limits`,
+    lie in a temporary file.
     """
     *_, last = refit_rounds(
         survivors, original, views, settings,

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -48,10 +48,10 @@ MIN_RAYS = 1 << 17
 
 HITS_OF_SPLAT, MIN_HITS = 112, 3 << 21
 """About how many hits of a round may show in the unpruned splats (`linear.LEAST_WEIGHT`), for each
-survivor, and where that would be fewer. Each takes 14 bytes."""
+survivor, and where that would be fewer. Each takes 14 bytes of a file (`stored`)."""
 
 MANY_HITS, FEWER_HITS = 1 << 24, 64
-"""Rounds of more hits have no more than so many for each survivor, to bound memory."""
+"""Rounds of more hits have no more than so many for each survivor, to bound that file."""
 
 SHIFT, MAX_SHIFT = 0.7, 0.1
 """About how far a view is moved in a round: so many times as far as the view next to it is, at most
@@ -153,27 +153,41 @@ class Target(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class InMemory:
-    """Splats in memory as a `Target`.
+    """Splats in memory as a `Target`. No array is copied but where it is pickled.
 
     Attributes
     ----------
     gaussians : Gaussians
     scene : Scene
-    means : (M, 3) float64
-        Of these, in the world.
-    harmonics : (M, 3, K) float32
-        Of these, see `single_colors`.
+    rows : (M,) int64
+        Which of the splats these are.
+    means, sh_dc, sh_rest
+        Of the splats; see `Splats`.
     """
 
     gaussians: Gaussians
     scene: Scene
-    means: NDArray[np.float64]
-    harmonics: NDArray[np.float32]
+    rows: NDArray[np.int64]
+    means: NDArray[Any]
+    sh_dc: NDArray[Any]
+    sh_rest: NDArray[Any]
 
     @classmethod
     def of(cls, splats: Splats, gaussians: Gaussians, scene: Scene) -> InMemory:
         """Return the splats that some Gaussians were made of."""
-        return cls(gaussians, scene, *_colored(splats, gaussians.index))
+        colored = splats.means, splats.sh_dc, splats.sh_rest
+        return cls(gaussians, scene, gaussians.index, *colored)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return what is pickled: of the arrays, the rows that are wanted, one after the other.
+
+        Processes map what is contiguous, and would have copies of their own of what is not.
+        """
+        colored = {
+            name: np.ascontiguousarray(getattr(self, name)[self.rows])
+            for name in ("means", "sh_dc", "sh_rest")
+        }
+        return {**vars(self), **colored, "rows": np.arange(len(self.rows))}
 
     def footprints(self, window: Window) -> Footprints:
         """Return the footprints in a view that may reach into a window of it."""
@@ -184,33 +198,34 @@ class InMemory:
 
     def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float32]:
         """Return the colours in which a view sees some of the Gaussians, (3, u)."""
-        return _seen_from(self.means.take(hit, axis=0), self.harmonics.take(hit, axis=0), view)
+        return colors_of(self, self.rows.take(hit), view)
 
 
-def colors_of(splats: Splats, view: View) -> NDArray[np.float32]:
-    """Return the colours in which a view sees splats, (3, u), as far as they can be drawn."""
-    return _seen_from(*_colored(splats, np.arange(len(splats))), view)
+class _Colored(Protocol):
+    """Splats, as far as their colours need them."""
+
+    @property
+    def means(self) -> NDArray[Any]: ...
+    @property
+    def sh_dc(self) -> NDArray[Any]: ...
+    @property
+    def sh_rest(self) -> NDArray[Any]: ...
 
 
-def _colored(
-    splats: Splats, rows: NDArray[np.int64]
-) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return means and harmonics of some splats, see `InMemory`."""
-    harmonics = np.empty((len(rows), 3, 1 + splats.sh_rest.shape[1]), np.float32)
-    for piece in chunks(len(rows), _CHUNK):  # copies of all would take as much again
-        harmonics[piece, :, 0] = splats.sh_dc[rows[piece]]
-        harmonics[piece, :, 1:] = splats.sh_rest[rows[piece]].transpose(0, 2, 1)
-    return splats.means[rows].astype(np.float64), harmonics
-
-
-def _seen_from(
-    means: NDArray[np.float64], harmonics: NDArray[np.float32], view: View
-) -> NDArray[np.float32]:
-    """Return the colours that `colors_of` does, of means and harmonics; see `InMemory`."""
-    direction = np.ascontiguousarray((means - view.center).T, np.float32)
-    length = np.sqrt(np.square(direction).sum(axis=0))
-    direction /= np.maximum(length, np.finfo(np.float32).tiny)
-    return single_colors(direction, harmonics).clip(0.0, projection.BRIGHTEST)
+def colors_of(splats: _Colored, rows: NDArray[np.int64], view: View) -> NDArray[np.float32]:
+    """Return the colours in which a view sees some splats, (3, u), as far as they can be drawn."""
+    result = np.empty((3, len(rows)), np.float32)
+    for piece in chunks(len(rows), _CHUNK):
+        chosen = rows[piece]
+        harmonics = np.empty((len(chosen), 3, 1 + splats.sh_rest.shape[1]), np.float32)
+        harmonics[:, :, 0] = splats.sh_dc[chosen]
+        harmonics[:, :, 1:] = splats.sh_rest[chosen].transpose(0, 2, 1)
+        from_view = splats.means[chosen].astype(np.float64) - view.center
+        direction = np.ascontiguousarray(from_view.T, np.float32)
+        length = np.sqrt(np.square(direction).sum(axis=0))
+        direction /= np.maximum(length, np.finfo(np.float32).tiny)
+        result[:, piece] = single_colors(direction, harmonics)
+    return result.clip(0.0, projection.BRIGHTEST)
 
 
 @dataclass(frozen=True, eq=False)
@@ -330,7 +345,10 @@ class RoundRays:
         truth = CastTruth(self._original, windows, number, shown)
         work = _Linearize(truth, self.target(splats, gaussians), shapes)
         count = self._count + len(splats)
-        return LinearRays.of(shapes, self._each(work, windows, count, part(progress, 0.05, 1.0)))
+        seen = self._each(work, windows, count, part(progress, 0.05, 1.0))
+        result = LinearRays.of(shapes, seen)
+        return_freed()
+        return result
 
     def psnr(self, splats: Splats, progress: Progress) -> float:
         """Return the mean PSNR of survivors on validation rays, weighted as the views are, dB."""
@@ -342,6 +360,7 @@ class RoundRays:
         gaussians = self._gaussians(splats, part(progress, 0.5, 0.6))
         work = _CastErrors(self.target(splats, gaussians), windows, self._validation)
         errors = [*self._each(work, windows, len(splats), part(progress, 0.6, 1.0))]
+        return_freed()
         weights = [window.weight for window in windows]
         return float(np.average(-10.0 * np.log10(errors), weights=weights))
 

@@ -69,7 +69,8 @@ class StoredSplats:
 
     def colors(self, hit: NDArray[np.int64], view: View) -> NDArray[np.float32]:
         """Return the colours in which a view sees some of the Gaussians, (3, u)."""
-        return colors_of(self.take(self.index()[hit]), view)
+        chosen = self.take(self.index()[hit])
+        return colors_of(chosen, np.arange(len(chosen)), view)
 
     def take(self, rows: NDArray[np.int64]) -> Splats:
         """Return some splats by their rows, (n,)."""
