@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..core.survivors import Columns
+    from ..core.formats.ply_columns import Columns
 
 _GROUP = 16
 """Columns that are transposed together: float32 numbers in a cache line of 64 bytes."""
