@@ -21,7 +21,7 @@ SECONDS = {
     "weighing": (0.0, 5e-6, 0.0, 1.0),
     "loading": (0.003, 0.0, 0.08e-6, 0.1),
     "sorting": (0.0, 0.37e-6, 0.0, 1.0),
-    "ordering": (0.0012, 1.2e-6, 0.0, 0.5),
+    "ordering": (0.0012, 1.0e-6, 0.0, 0.5),
     "aligning": (0.08, 0.0, 0.0, 1.0),
     "estimating": (0.0065, 0.0, 0.13e-6, 0.0),
     "selecting": (0.25, 1.1e-6, 0.0, 0.8),
@@ -39,6 +39,14 @@ SECONDS = {
 """Of each kind of work: seconds of one core for a view, for a splat (or byte), and for each splat
 in each view; and which share of that one core does alone. By processor time of runs of 40,000 to
 2 million splats, see `benchmarks.speed.recorded`."""
+
+
+def by_views(kind: str) -> bool:
+    """Return whether a kind of work looks at splats in views: how many each sees, it cannot know.
+
+    In other scenes all such work takes longer or shorter than expected by about one factor.
+    """
+    return SECONDS[kind][2] > 0.0
 
 
 BETWEEN = 12

@@ -16,6 +16,7 @@ from collections import defaultdict
 from itertools import chain
 from typing import TYPE_CHECKING
 
+from .costs import by_views
 from .work import default_threads, silent
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ _MINUTE, _TENS_TO = 60, 300  # seconds; up to the latter, times are told in tens
 _EARLY = 2.0  # seconds before which a pace says little
 _RISE = 1.3  # the time left rises if it is so much more than was told; what is less is noise
 _SURE = 0.05  # share of a kind's cost after which what it took counts as much as what others took
+_SURE_OF_GROUP = 0.03  # the same of kinds that look at views, or of the others, against all kinds
 _SURE_OF_MACHINE = 0.01  # the same of all kinds, against the machine that the costs are from
 
 
@@ -204,15 +206,22 @@ class _Course:
                 spent[kind] += seconds * expected / phase.seconds
         for kind, expected in chain.from_iterable(phase.costs for phase in self._phases):
             planned[kind] += expected
-        sure = _SURE_OF_MACHINE * sum(planned.values())
-        all_done, all_spent = sum(done.values()), sum(spent.values())
-        machine = (all_spent + sure) / (all_done + sure) if sure else 1.0
 
-        def factor(kind: str) -> float:
-            sure = _SURE * planned[kind]
-            return (spent[kind] + sure * machine) / (done[kind] + sure) if sure else machine
+        def among(kinds: Iterable[str], sure: float, before: float) -> float:
+            of_kinds = [*kinds]
+            all_planned, all_done, all_spent = (
+                sum(each[kind] for kind in of_kinds) for each in (planned, done, spent)
+            )
+            sure *= all_planned
+            return (all_spent + sure * before) / (all_done + sure) if sure else before
 
-        return factor
+        machine = among(planned, _SURE_OF_MACHINE, 1.0)
+        groups = {
+            group: among((kind for kind in planned if by_views(kind) is group),
+                         _SURE_OF_GROUP, machine)
+            for group in (False, True)
+        }  # fmt: skip
+        return lambda kind: among([kind], _SURE, groups[by_views(kind)])
 
 
 def _expected(phases: Iterable[Phase], factor: Callable[[str], float]) -> float:

@@ -126,6 +126,27 @@ def test_work_that_takes_longer_than_expected_makes_the_rest_of_its_kind_longer(
     assert told == sorted(told)
 
 
+def test_a_scene_of_which_views_see_much_says_little_of_other_work():
+    """Activating as expected, 1 s of 20; measuring 4 times as long, 16 s for 4 expected.
+
+    Comparing (5 s expected) looks at views, too, and takes 20; merging (10 s) some 10: a third to
+    half of the time is over. By one pace for all kinds it would be .28.
+    """
+    kinds = ("activating", 1.0), ("measuring", 4.0), ("merging", 10.0), ("comparing", 5.0)
+    clock, told = Clock(), []
+    first, second, third, _ = phases(
+        lambda fraction, _what: told.append(fraction),
+        *([seconds_of(*each)] for each in kinds), threads=1, clock=clock,
+    )  # fmt: skip
+    first(0.0, "")
+    clock.now = 1.0
+    second(0.0, "")
+    clock.now = 17.0
+    third(0.0, "")
+
+    assert told[-1] == pytest.approx(17 / (17 + 10 + 20), abs=0.05)
+
+
 def test_a_phase_that_is_not_reached_takes_no_time():
     """Of 1, 8 and 1 s the second is left out: at 1 s one more is left."""
     clock, told = Clock(), []

@@ -18,7 +18,7 @@ from .. import costs, spherical_harmonics
 from ..pace import phases
 from ..seeing.scene import scene_of, spatial_order, splat_fingerprint
 from ..splats import ARRAYS, Splats, drawable
-from ..work import Progress, for_chunks, part, report, silent
+from ..work import Progress, for_chunks, part, report, return_freed, silent
 from . import merge_field, merging
 from .merge_field import ViewSums
 from .merge_graph import MergeGraph
@@ -175,6 +175,7 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     goal = max(keep_count, int(np.count_nonzero(spared[lineage.origin])), 0)
     left_after = stages(len(lineage.origin), goal)
     factor = patience(1.0 - goal / max(began or len(lineage.origin), 1))
+    return_freed()  # what scoring took: twice as much as is left of it
     bare = lineage.without_harmonics(progress, threads)
     scene = scene_of(bare.means, drawable(bare, threads=threads), views, threads=threads)
     sums: ViewSums | None = None
@@ -190,6 +191,8 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
         )  # fmt: skip
         bare, sums = stage.splats, stage.expected
         lineage.follow(stage)
+        del stage
+        return_freed()  # views are measured next, by processes that need memory of their own
     report(progress, 1.0, "absorbing")
     return lineage.absorbed(bare, threads)
 
@@ -365,14 +368,14 @@ def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     def make_graph() -> MergeGraph:
         measured = merge_field.measured_field(
             splats, rows, views, scene, sums, color_of,
-            progress=part(progress, 0.0, 0.1), threads=threads,
+            progress=part(progress, 0.0, 0.3), threads=threads,
         )  # fmt: skip
         field = measured.with_allowance(measured.seen_and_whole())
         return MergeGraph(field, scene, factor, threads=threads)
 
     return reduced(
         splats, sums, rows, make_graph, keep_count,
-        protected=protected, progress=part(progress, 0.1, 1.0),
+        protected=protected, progress=part(progress, 0.3, 1.0),
     )  # fmt: skip
 
 

@@ -42,6 +42,9 @@ DISC_PATIENCE = 0.5
 """Factor on the cost of merging discs (2DGS): on `room_small` half of them removed by merging at
 full cost is 1.6 dB worse, and a quarter or .7 of it .1 dB."""
 
+CONNECTING = 0.65
+"""Share of the time of a stage's graph until its pairs are priced; the rest are its rounds."""
+
 _CHUNK = 1 << 14  # pairs at a time: some MB of temporary memory a thread
 _SCANNED = 1 << 18  # pairs at a time that are only looked at
 _UNSIGNED, _HALF = np.uint32(0x7FFFFFFF), np.uint32(16)  # of the bits of a number
@@ -121,9 +124,9 @@ class MergeGraph:
         """
         start = count = len(self.alive)
         if not self.connected:
-            self.connect(part(progress, 0.0, 0.3))
+            self.connect(part(progress, 0.0, CONNECTING))
         while count > goal:
-            done = 0.3 + 0.7 * (start - count) / (start - goal)
+            done = CONNECTING + (1.0 - CONNECTING) * (start - count) / (start - goal)
             of_round = part(progress, done, done)
             report(of_round, 0.0, "absorbing")
             if count < self.connected / 2:
@@ -138,7 +141,7 @@ class MergeGraph:
         rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))  # (R,)
         place = self.scene.positions(self.field.means, rows, threads=self.threads)  # (R, 3)
         near = nearest(
-            place, NEIGHBOURS, progress=part(progress, 0.0, 0.4), threads=self.threads
+            place, NEIGHBOURS, progress=part(progress, 0.0, 0.5), threads=self.threads
         )  # (R, k)
 
         def pairs(piece: slice) -> tuple[Rows, Rows]:
@@ -150,14 +153,14 @@ class MergeGraph:
 
         found = for_chunks(
             pairs, len(rows), _CHUNK,
-            progress=part(progress, 0.4, 0.5), what="absorbing", threads=self.threads,
+            progress=part(progress, 0.5, 0.6), what="absorbing", threads=self.threads,
         )  # fmt: skip
         none = np.empty(0, np.int32)
         # int32 takes half the memory of int64, and no file holds two billion splats.
         self.first = concatenated([none, *(first for first, _ in found)], self.threads)
         self.second = concatenated([none, *(second for _, second in found)], self.threads)
         self.cost = np.empty(len(self.first), np.float32)
-        self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.5, 1.0))
+        self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.6, 1.0))
         self.connected = int(np.count_nonzero(self.alive))
 
     def _price(self, edges: Index, progress: Progress) -> None:

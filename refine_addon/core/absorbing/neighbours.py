@@ -76,7 +76,7 @@ def nearest(
     if count <= 0:
         return np.empty((total, 0), np.int32)
     window = max((count + 1) // 2, WINDOW)
-    candidates = _candidates(points, window, part(progress, 0.0, 0.4), threads)
+    candidates = _candidates(points, window, part(progress, 0.0, 0.2), threads)
     near = np.empty((total, count), np.int32)
 
     def search(piece: slice) -> None:
@@ -84,7 +84,7 @@ def nearest(
 
     for_chunks(
         search, total, _CHUNK,
-        progress=part(progress, 0.4, 1.0), what="finding neighbours", threads=threads,
+        progress=part(progress, 0.2, 1.0), what="finding neighbours", threads=threads,
     )  # fmt: skip
     return near
 
