@@ -40,23 +40,36 @@ _SETTLED = 0.5
 
 @dataclass
 class _Watch:
-    """One render of Blender's during which Esc is watched for."""
+    """What watches for Esc in one window, until it is over."""
 
     escaped: bool = False
     over: bool = False
 
 
-_watch = _Watch(over=True)
-"""The one under way."""
+_watches: dict[int, _Watch] = {}
+"""Those of the render under way, by the windows' addresses."""
 
 
 def _watch_anew() -> None:
-    """Watch for Esc ahead of what waits for it so far, in all windows: one may show the render."""
-    global _watch
-    _watch.over, _watch = True, _Watch()
+    """Watch for Esc in all windows, one of which may show the render.
+
+    In the window of Blender's render ahead of it. In others the first goes on: where nothing
+    happens, they would add up.
+    """
+    here = bpy.context.window.as_pointer()
+    if here in _watches:
+        _watches.pop(here).over = True
     for window in bpy.context.window_manager.windows:
-        with bpy.context.temp_override(window=window):
-            bpy.ops.refine.watch_render("INVOKE_DEFAULT")
+        if window.as_pointer() not in _watches:
+            _watches[window.as_pointer()] = _Watch()
+            with bpy.context.temp_override(window=window):
+                bpy.ops.refine.watch_render("INVOKE_DEFAULT")
+
+
+def _watch_no_more() -> None:
+    for watch in _watches.values():
+        watch.over = True
+    _watches.clear()
 
 
 def no_render(_context: bpy.types.Context) -> str:
@@ -75,7 +88,7 @@ class REFINE_OT_watch_render(bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
         """Begin to watch."""
-        self._watch = _watch
+        self._watch = _watches[context.window.as_pointer()]
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
@@ -85,6 +98,10 @@ class REFINE_OT_watch_render(bpy.types.Operator):
             return {"FINISHED", "PASS_THROUGH"}
         self._watch.escaped |= event.type == "ESC" and event.value == "PRESS"
         return {"PASS_THROUGH"}
+
+    def cancel(self, context: bpy.types.Context) -> None:
+        """Forget the window, which is closed."""
+        _watches.pop(context.window.as_pointer(), None)
 
 
 class REFINE_OT_render(Needing, bpy.types.Operator):
@@ -152,16 +169,25 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         self._shared, self._frames = Shared(card=card.available()), chosen
         self._steps = frames.steps(scene, chosen, self._shared, write=self.animation)
         self._started, self._timer, self._opened = time.monotonic(), None, False
+        self._next: Step | None = None
 
     def _go_on(self, context: bpy.types.Context) -> Answer:
-        """Take what the last render came to, and start the next one."""
+        """Take what the last render came to, or start the next one.
+
+        An Esc may wait behind this event, and Blender's renders forget it when they begin: one
+        begins at the next event.
+        """
         try:
-            if _watch.escaped or self._steps is None:
+            if self._steps is None or any(watch.escaped for watch in _watches.values()):
                 return self._stopped(context)
-            step = next(self._steps)
-            self._show()
-            if step is not None:  # else Blender may do something else for a moment
+            step, self._next = self._next, None
+            if step is None:
+                self._next = next(self._steps)
+                self._show()
+            elif step.scene in bpy.data.scenes:
                 self._render(context, step)
+            else:  # undone
+                return self._stopped(context)
         except StopIteration:
             return self._finished(context)
         except Cancelled:
@@ -228,7 +254,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
 
     def _over(self, context: bpy.types.Context) -> None:
         """Remove all that was made for the render."""
-        _watch.over = True
+        _watch_no_more()
         if self._steps is not None:
             self._steps.close()
             self._steps = None
