@@ -50,15 +50,15 @@ _watches: dict[int, _Watch] = {}
 """Those of the render under way, by the windows' addresses."""
 
 
-def _watch_anew() -> None:
+def _watch_anew(*windows: bpy.types.Window) -> None:
     """Watch for Esc in all windows, one of which may show the render.
 
-    In the window of Blender's render ahead of it. In others the first goes on: where nothing
-    happens, they would add up.
+    In some of them, in which Blender's render waits for it too, ahead of that. In others the first
+    watcher goes on: where nothing happens none ends, and they would add up.
     """
-    here = bpy.context.window.as_pointer()
-    if here in _watches:
-        _watches.pop(here).over = True
+    for window in windows:
+        if watch := _watches.pop(window.as_pointer(), None):
+            watch.over = True
     for window in bpy.context.window_manager.windows:
         if window.as_pointer() not in _watches:
             _watches[window.as_pointer()] = _Watch()
@@ -99,9 +99,10 @@ class REFINE_OT_watch_render(bpy.types.Operator):
         self._watch.escaped |= event.type == "ESC" and event.value == "PRESS"
         return {"PASS_THROUGH"}
 
-    def cancel(self, context: bpy.types.Context) -> None:
-        """Forget the window, which is closed."""
-        _watches.pop(context.window.as_pointer(), None)
+    def cancel(self, _context: bpy.types.Context) -> None:
+        """Forget the window, which is closed: another may come to lie at its address."""
+        for address in [key for key, watch in _watches.items() if watch is self._watch]:
+            del _watches[address]
 
 
 class REFINE_OT_render(Needing, bpy.types.Operator):
@@ -146,6 +147,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         manager = context.window_manager
         self._timer = manager.event_timer_add(_STEP, window=context.window)
         manager.modal_handler_add(self)
+        _watch_no_more()
         _watch_anew()
         return self._go_on(context)
 
@@ -204,7 +206,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         number, total = len(self._shared.frames) + 1, len(self._frames)
         of_all = f" frame {number} of {total}" if total > 1 else ""
         context.workspace.status_text_set(f"Rendering{of_all}: {step.what}; Esc cancels")
-        view = context.preferences.view
+        view, window = context.preferences.view, context.window
         display = view.render_display_type
         if self._opened:
             view.render_display_type = "NONE"
@@ -218,7 +220,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         if shows and not self._opened:
             _draw_whole()
         self._opened = True
-        _watch_anew()
+        _watch_anew(window, context.window)  # which is the new one where one was opened
 
     def _show(self) -> None:
         """Show the last frame wherever a render is shown."""

@@ -515,7 +515,6 @@ def test_one_esc_watcher_a_window_besides_that_of_the_render(addon, monkeypatch)
         yield
 
     context = SimpleNamespace(
-        window=here,
         window_manager=SimpleNamespace(windows=[here, other]),
         temp_override=override,
     )
@@ -524,7 +523,7 @@ def test_one_esc_watcher_a_window_besides_that_of_the_render(addon, monkeypatch)
     monkeypatch.setattr(operators, "bpy", blender)
     monkeypatch.setattr(operators, "_watches", {})
     for _ in range(3):
-        operators._watch_anew()
+        operators._watch_anew(here)
 
     assert began == [1, 2, 1, 1]
     operators._watch_no_more()
