@@ -1,22 +1,25 @@
-"""How a prune would scale with cores, by what it does one after the other.
+"""How prunes would scale with cores, by what they do one after the other.
 
-    python -m benchmarks.speed.scaling SCENE_DIR --survivors absorb --ratio 0.9
+    python -m benchmarks.speed.scaling SCENE_DIR [--ways absorb refit ...] [--ratio 0.9]
 
 One thread does everything; counted are seconds of the processor, so that other work on the machine
 does not matter. Every piece of work that several cores could do at once (`work.each_chunk`) is
 timed, and the pieces of each call are dealt out to 1, 2, 4, 8 and 16 cores, in their order, each to
 the core that is free first; all else is serial (Amdahl's law). That is what is possible: pieces on
-threads also wait for the interpreter's lock, and all of them for the memory. What is serial is told
-by function, most first.
+threads also wait for the interpreter's lock, and all of them for the memory. ``--functions`` tells
+what is serial by function, and what was done in pieces. ``--two`` also runs the whole command on
+one core and on two, and prints seconds of the clock, for a machine that does nothing else.
 """
 
 from __future__ import annotations
 
+import argparse
 import cProfile
 import heapq
 import pstats
 import tempfile
 import time
+from collections import defaultdict
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -24,14 +27,22 @@ from refine_addon.core import Budget, prune_file, read_cameras, work
 from refine_addon.core.operation.requests import PruneRequest
 from refine_addon.core.task import Settings
 
-from .recorded import prune_options
-
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from refine_addon.core.survivor_choice import SurvivorChoice
     from refine_addon.core.work import Progress
 
-CORES = (1, 2, 4, 8, 16)
+CORES = (2, 4, 8, 16)
+WAYS: dict[str, tuple[str, SurvivorChoice]] = {
+    "closed-form": ("closed-form", "unchanged"),
+    "occlusion": ("occlusion", "unchanged"),
+    "auto": ("auto", "unchanged"),
+    "absorb": ("auto", "absorb"),
+    "refit": ("auto", "refit"),
+}
+"""Name -> method, and what survivors may become."""
+
 Result = TypeVar("Result")
 
 
@@ -40,14 +51,14 @@ class Division:
 
     Attributes
     ----------
-    calls : list of list of float
-        Seconds of the pieces of each call.
+    calls : list of (str, list of float)
+        What each call does, and seconds of its pieces.
     serial : cProfile.Profile
         Of all that is not in pieces.
     """
 
     def __init__(self) -> None:
-        self.calls: list[list[float]] = []
+        self.calls: list[tuple[str, list[float]]] = []
         self.serial = cProfile.Profile(time.process_time)
         self._inside = False
 
@@ -65,7 +76,7 @@ class Division:
             if self._inside:
                 return in_turn(whole, pieces, step, progress, what)
             seconds: list[float] = []
-            self.calls.append(seconds)
+            self.calls.append((whole.__qualname__, seconds))
 
             def of_piece(piece: slice) -> Result:
                 self._inside = True
@@ -97,30 +108,70 @@ def spread(seconds: Sequence[float], cores: int) -> float:
     return max(free)
 
 
+def modelled(scene: Path, request: PruneRequest) -> tuple[Division, float]:
+    """Return how a prune is divided, done by one thread, and seconds of the processor."""
+    division = Division()
+    in_turn = work._in_turn  # noqa: SLF001 - put back below
+    division.watch()
+    try:
+        with tempfile.TemporaryDirectory() as made:
+            start = time.process_time()
+            division.serial.enable()
+            prune_file(scene / "point_cloud.ply", Path(made) / "out.ply", request, threads=1)
+            division.serial.disable()
+            return division, time.process_time() - start
+    finally:
+        work._in_turn = in_turn  # noqa: SLF001
+
+
+def clocked(scene: Path, request: PruneRequest, threads: int) -> float:
+    """Return how long a prune takes, seconds of the clock."""
+    with tempfile.TemporaryDirectory() as made:
+        start = time.perf_counter()
+        prune_file(scene / "point_cloud.ply", Path(made) / "out.ply", request, threads=threads)
+        return time.perf_counter() - start
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run once, and print the model."""
-    parser = prune_options("Model how a prune scales with cores.")
-    parser.add_argument("--functions", type=int, default=12, help="serial ones to tell")
+    """Run each way once, and print the model."""
+    parser = argparse.ArgumentParser(description="Model how prunes scale with cores.")
+    parser.add_argument("scene", type=Path, help="folder of point_cloud.ply and cameras.json")
+    parser.add_argument("--ways", choices=[*WAYS], nargs="+", default=[*WAYS])
+    parser.add_argument("--ratio", type=float, default=0.5)
+    parser.add_argument("--functions", type=int, default=0, help="serial ones to tell")
+    parser.add_argument("--two", action="store_true", help="also measure one core and two")
     options = parser.parse_args(arguments)
     views = read_cameras(options.scene / "cameras.json")
-    request = PruneRequest(
-        views, Budget(ratio=options.ratio), Settings(method=options.method),
-        survivors=options.survivors,
-    )  # fmt: skip
-    division = Division()
-    division.watch()
-    with tempfile.TemporaryDirectory() as made:
-        start = time.process_time()
-        division.serial.enable()
-        prune_file(options.scene / "point_cloud.ply", Path(made) / "out.ply", request, threads=1)
-        division.serial.disable()
-        total = time.process_time() - start
-    serial = total - sum(map(sum, division.calls))
-    print(f"{total:.1f} s, of which {serial:.1f} s ({serial / total:.1%}) serial")
-    for cores in CORES:
-        left = serial + sum(spread(call, cores) for call in division.calls)
-        print(f"{cores:2} cores: {left:6.1f} s, {total / left:5.2f} x as fast")
-    pstats.Stats(division.serial).sort_stats("tottime").print_stats(options.functions)
+    print("| | 1 core | serial | " + " | ".join(f"{cores} cores" for cores in CORES) + " |")
+    print("|---|" + "---:|" * (len(CORES) + 2))
+    for way in options.ways:
+        method, survivors = WAYS[way]
+        request = PruneRequest(
+            views, Budget(ratio=options.ratio), Settings(method=method), survivors=survivors
+        )
+        division, total = modelled(options.scene, request)
+        serial = total - sum(sum(seconds) for _, seconds in division.calls)
+        faster = [
+            total / (serial + sum(spread(seconds, cores) for _, seconds in division.calls))
+            for cores in CORES
+        ]
+        told = " | ".join(f"{factor:.2f} x" for factor in faster)
+        print(f"| {way} | {total:.1f} s | {serial / total:.1%} | {told} |", flush=True)
+        if options.functions:
+            _tell(division, options.functions)
+        if options.two:
+            one, two = (clocked(options.scene, request, threads) for threads in (1, 2))
+            print(f"{way}: {one:.1f} s by one, {two:.1f} s by two: {one / two:.2f} x", flush=True)
+
+
+def _tell(division: Division, count: int) -> None:
+    """Print what of a run is serial, and what was done in pieces, most first."""
+    pstats.Stats(division.serial).sort_stats("tottime").print_stats(count)
+    pieces: dict[str, list[float]] = defaultdict(list)
+    for name, seconds in division.calls:
+        pieces[name] += seconds
+    for name, seconds in sorted(pieces.items(), key=lambda pair: -sum(pair[1]))[:count]:
+        print(f"{sum(seconds):8.2f} s in {len(seconds):5} pieces  {name}")
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .errors import RefineError
-from .work import chunks
+from .work import chunks, for_chunks
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 SH_C0 = 0.28209479177387814
 """Value of the constant spherical harmonic, 1 / (2 sqrt(pi))."""
 
+_CHECKED = 1 << 15  # rows of which it is checked together whether they can be drawn
 _COPIED = 2048
 """Rows of a file copied at a time: 0.5 MB at degree 3, in the L2 cache for all columns."""
 
@@ -331,7 +332,7 @@ def rotation_matrices(quaternions: NDArray[Any]) -> NDArray[np.float64]:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def drawable(splats: Splats) -> NDArray[np.bool_]:
+def drawable(splats: Splats, *, threads: int | None = 1) -> NDArray[np.bool_]:
     """Return which splats a renderer can draw.
 
     A splat cannot be drawn if one of its values is NaN or infinite. Two exceptions: an infinite
@@ -339,14 +340,30 @@ def drawable(splats: Splats) -> NDArray[np.bool_]:
     be drawn either if a renderer that computes in float32 gets opacity 0, size 0 along every axis,
     or a mean or scale that overflows.
 
+    Parameters
+    ----------
+    splats : Splats
+    threads : int, optional
+
     Returns
     -------
     (N,) bool
     """
+    good = np.empty(len(splats), np.bool_)
+
+    def fill(piece: slice) -> None:
+        good[piece] = _drawable(splats.take(piece))
+
+    for_chunks(fill, len(splats), _CHECKED, threads=threads)
+    return good
+
+
+def _drawable(splats: Splats) -> NDArray[np.bool_]:
+    """Return which of n splats a renderer can draw, (n,)."""
     s0, s1, s2 = splats.log_scales.T
     largest = np.maximum(np.maximum(s0, s1), s2)
     # Comparisons with NaN are False and np.maximum returns NaN, so every line also rejects NaN.
-    good = splats.opacity_logits >= _LOG_SMALLEST
+    good: NDArray[np.bool_] = splats.opacity_logits >= _LOG_SMALLEST
     good &= (largest <= _LOG_LARGEST) & (largest >= _LOG_SMALLEST)
     for axis in range(3):
         good &= np.abs(splats.means[:, axis]) <= _LARGEST

@@ -5,33 +5,27 @@ This module stands above formats and absorbing, so that neither has to know the 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .affine import transformed
-from .formats.ply_columns import values_by_name
+from .formats.ply_columns import ChangedColumns
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from .absorbing.absorb import Absorbed
-    from .splats import Splats
-
-
-class Columns(Protocol):
-    """Stored properties of N splats by their names, such as a mapping or a structured array."""
-
-    def __getitem__(self, name: str, /) -> NDArray[Any]:
-        """Return a property, (N,)."""
-        ...
+    from .formats.ply_columns import Columns
 
 
 def survivor_columns(
     stored: Columns | NDArray[Any],
     absorbed: Absorbed | None,
     matrix: NDArray[Any] | None = None,
-) -> dict[str, NDArray[Any]]:
+) -> Mapping[str, NDArray[Any]]:
     """Return stored columns with the values of changed survivors put in.
 
     Parameters
@@ -45,7 +39,7 @@ def survivor_columns(
 
     Returns
     -------
-    dict of str to (N,)
+    mapping of str to (N,)
         The properties that make a splat, each in its stored type, rounded once. Rows of all other
         splats, unchanged or removed, are equal to the stored ones to the bit.
 
@@ -63,17 +57,4 @@ def survivor_columns(
     survivors = absorbed.splats.take(changed)
     if matrix is not None and not np.array_equal(matrix, np.eye(4)):
         survivors = transformed(survivors, matrix)
-    return columns_with(stored, rows, survivors)
-
-
-def columns_with(
-    stored: Columns | NDArray[Any], rows: NDArray[np.int64], splats: Splats
-) -> dict[str, NDArray[Any]]:
-    """Return stored columns with the values of some splats put in at their rows, rounded once."""
-    columns = {}
-    # A double may be too large or too small for a float.
-    with np.errstate(over="ignore", under="ignore"):
-        for name, values in values_by_name(splats).items():
-            columns[name] = stored[name].copy()
-            columns[name][rows] = values
-    return columns
+    return ChangedColumns(stored, rows, survivors)

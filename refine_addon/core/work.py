@@ -8,12 +8,15 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
-from typing import TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 Progress = Callable[[float, str], "bool | None"]
 """Called as ``progress(fraction, what)``; returning ``False`` cancels."""
@@ -100,6 +103,25 @@ def chunks(total: int, chunk: int) -> Iterator[slice]:
     """
     for start in range(0, total, chunk):
         yield slice(start, min(start + chunk, total))
+
+
+def concatenated(parts: Sequence[NDArray[Any]], threads: int | None = None) -> NDArray[Any]:
+    """Return arrays joined along their first axis, one at least, copied on several threads.
+
+    Examples
+    --------
+    >>> concatenated([np.array([1, 2]), np.array([3])]).tolist()
+    [1, 2, 3]
+    """
+    ends = np.cumsum([len(part) for part in parts])
+    whole = np.empty((ends[-1], *parts[0].shape[1:]), parts[0].dtype)
+
+    def copy(number: slice) -> None:
+        values, end = parts[number.start], ends[number.start]
+        whole[end - len(values) : end] = values
+
+    for_chunks(copy, len(parts), 1, threads=threads)
+    return whole
 
 
 def for_chunks(

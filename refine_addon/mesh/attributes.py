@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..core.survivors import Columns
+    from ..core.formats.ply_columns import Columns
     from .native import Place
 
 _GROUP = 16

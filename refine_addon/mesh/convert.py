@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ..core.survivors import Columns
+    from ..core.formats.ply_columns import Columns
     from .layout import Column
 
 _TRANSFORM = (

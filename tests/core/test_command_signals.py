@@ -214,8 +214,8 @@ from refine_addon.core.formats import ply
 
 write, unlink = ply.write_rows, Path.unlink
 
-def slow(stream, *arguments):
-    write(stream, *arguments)
+def slow(stream, *arguments, **options):
+    write(stream, *arguments, **options)
     stream.flush()
     print("halfway", flush=True)
     time.sleep(60)

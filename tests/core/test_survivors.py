@@ -11,6 +11,7 @@ import pytest
 from refine_addon.core import Splats, read_ply, survivor_columns
 from refine_addon.core.absorbing.absorb import Absorbed
 from refine_addon.core.affine import transformed
+from refine_addon.core.formats import ply_write
 from refine_addon.core.formats.ply_columns import values_by_name
 from refine_addon.core.splats import ARRAYS
 from tests.strategies import plain_ply
@@ -67,6 +68,28 @@ def test_a_file_is_written_with_its_survivors_in_one_call(file, tmp_path):
     assert written.rows[:2].tobytes() == file.rows[:2].tobytes()
     np.testing.assert_array_equal(written.splats().sh_rest, absorbed.splats.sh_rest)
     np.testing.assert_array_equal(written.splats().means[2:], absorbed.splats.means[2:])
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize("wide", [False, True])
+def test_rows_are_written_as_their_columns_say(tmp_path, monkeypatch, wide, threads):
+    """In chunks of 7 rows, some without a survivor that changed, also as doubles of big endian."""
+    generator, data = np.random.default_rng(0), plain_ply(100, 1)
+    if wide:
+        header, rows = data[: data.index(b"end_header\n") + 11], data[-100 * 23 * 4 :]
+        header = header.replace(b"little", b"big").replace(b"float", b"double")
+        data = header + np.frombuffer(rows, "<f4").astype(">f8").tobytes()
+    (tmp_path / "in.ply").write_bytes(data)
+    file = read_ply(tmp_path / "in.ply")
+    keep = generator.random(100) < 0.7
+    changed = (generator.random(keep.sum()) < 0.4) & (np.flatnonzero(keep) > 30)
+    columns = survivor_columns(file.rows, absorbed_of(file.splats(), keep, changed, 1 / 3))
+    file.write(tmp_path / "whole.ply", keep, columns=dict(columns))
+
+    monkeypatch.setattr(ply_write, "_CHANGED_ROWS", 7)
+    file.write(tmp_path / "out.ply", keep, columns=columns, threads=threads)
+
+    assert (tmp_path / "out.ply").read_bytes() == (tmp_path / "whole.ply").read_bytes()
 
 
 @pytest.mark.parametrize("kind", ["<f4", ">f4", "<f8", ">f8"])

@@ -87,7 +87,7 @@ def test_a_disk_that_is_full_in_the_middle_of_the_rows_leaves_what_was_there(
     (folder / "out.ply").write_bytes(b"old")
     before = contents(folder)
 
-    def fail(stream, *_):
+    def fail(stream, *_, **__):
         stream.write(b"a few rows")
         stream.flush()
         raise OSError(number, os.strerror(number))

@@ -5,9 +5,10 @@ from __future__ import annotations
 import threading
 import time
 
+import numpy as np
 import pytest
 
-from refine_addon.core.work import Cancelled, checkpoint, for_chunks
+from refine_addon.core.work import Cancelled, checkpoint, concatenated, for_chunks
 
 LONG = 600.0  # seconds; a tenth of it is more than any machine needs to notice
 
@@ -86,3 +87,13 @@ def test_results_come_in_the_order_of_the_slices(threads):
     found = for_chunks(lambda piece: (piece.start, piece.stop), 10, 4, threads=threads)
 
     assert found == [(0, 4), (4, 8), (8, 10)]
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_arrays_are_joined_in_their_order(threads):
+    """Along their first axis; empty ones take no room."""
+    parts = [np.arange(6).reshape(3, 2), np.empty((0, 2), int), np.arange(4).reshape(2, 2)]
+
+    whole = concatenated(parts, threads)
+
+    np.testing.assert_array_equal(whole, np.concatenate(parts))

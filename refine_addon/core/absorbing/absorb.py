@@ -175,8 +175,8 @@ def absorb(  # noqa: PLR0913 - three keywords are optional
     goal = max(keep_count, int(np.count_nonzero(spared[lineage.origin])), 0)
     left_after = stages(len(lineage.origin), goal)
     factor = patience(1.0 - goal / max(began or len(lineage.origin), 1))
-    bare = lineage.without_harmonics(progress)
-    scene = scene_of(bare.means, drawable(bare), views)
+    bare = lineage.without_harmonics(progress, threads)
+    scene = scene_of(bare.means, drawable(bare, threads=threads), views, threads=threads)
     sums: ViewSums | None = None
     images = costs.Images.of(views)
     steps = iter(phases(progress, *costs.absorbing(len(bare), left_after, images)))
@@ -216,12 +216,22 @@ class _Lineage:
         self._owner, self._share = np.arange(len(rows), dtype=np.int32), np.ones(len(rows))
         self._colors: Array | None = None  # (K, 3), from the first stage on
 
-    def without_harmonics(self, progress: Progress) -> Splats:
+    def without_harmonics(self, progress: Progress, threads: int | None) -> Splats:
         """Return the splats with their base colour alone, in float64; undrawable ones stay so."""
-        drawn = drawable(self.splats)[self.rows]
-        bare = in_float64(self.splats.up_to_degree(0).take(self.rows), progress)
-        bare.sh_dc[~drawn] = np.nan
-        return bare
+        base, count = self.splats.up_to_degree(0), len(self.rows)
+        columns: dict[str, Any] = {
+            name: np.empty((count, *getattr(base, name).shape[1:])) for name in ARRAYS
+        }
+
+        def fill(piece: slice) -> None:
+            chunk = self.splats.take(self.rows[piece])
+            for name, values in columns.items():
+                values[piece] = getattr(chunk, name) if name != "sh_rest" else 0.0
+            columns["sh_dc"][piece][~drawable(chunk)] = np.nan
+
+        for_chunks(fill, count, _CHUNK, progress=part(progress, 0.0, 0.0), what="absorbing",
+                   threads=threads)  # fmt: skip
+        return replace(base, **columns)
 
     def color_of(self, rows: Index, direction: Array) -> Array:
         """Return the colours of some of the splats left, (n, 3), seen along directions, (n, 3).
@@ -255,7 +265,7 @@ class _Lineage:
         keep[self.origin] = True
         changed = np.bincount(owner, minlength=left) > 1  # (K,)
         bare.sh_dc[~changed] = self.splats.sh_dc[self.origin[~changed]]
-        rest = self.splats.sh_rest[self.origin]
+        rest = _rows(self.splats.sh_rest, self.origin, threads)
         of_changed = changed[owner]
         members = here[of_changed]
         blend = _Blend(self.rows[members], owner[of_changed], self._share[members])
@@ -349,7 +359,7 @@ def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
         See `merge_field.measured_field`.
     """
     sums = ViewSums(np.asarray(sums.contribution, np.float64), np.asarray(sums.error, np.float64))
-    rows = mergeable(splats, scene, protected)
+    rows = mergeable(splats, scene, protected, threads=threads)
     report(progress, 0.0, "absorbing")
 
     def make_graph() -> MergeGraph:
@@ -366,14 +376,18 @@ def absorb_once(  # noqa: PLR0913 - the parameters of `absorb`
     )  # fmt: skip
 
 
-def mergeable(splats: Splats, scene: Scene, protected: NDArray[np.bool_]) -> Index:
+def mergeable(
+    splats: Splats, scene: Scene, protected: NDArray[np.bool_], *, threads: int | None = 1
+) -> Index:
     """Return the rows of the splats that may merge, (M,), by their place in the scene.
 
     So ties do not depend on the order of the file.
     """
-    rows = np.flatnonzero(drawable(splats) & ~protected)
-    place = scene.positions(splats.means[rows])
-    return rows[spatial_order(place, lambda tied: splat_fingerprint(splats, rows[tied]))]
+    rows = np.flatnonzero(drawable(splats, threads=threads) & ~protected)
+    place = scene.positions(splats.means, rows, threads=threads)
+    return rows[
+        spatial_order(place, lambda tied: splat_fingerprint(splats, rows[tied]), threads=threads)
+    ]
 
 
 def reduced(  # noqa: PLR0913 - as `absorb_once`
@@ -442,7 +456,7 @@ def _with_merged(
     # Drop the rest of the field before the survivors are copied, to save memory.
     merged = graph.field = graph.field.take(np.flatnonzero(changed))
     report(progress, 0.0, "absorbing")
-    left, target = splats.take(keep), new_row[rows[changed]]  # (K,), (C,)
+    left, target = _taken(splats, np.flatnonzero(keep), graph.threads), new_row[rows[changed]]
     _put_shapes(left, target, merged, part(progress, 0.0, 0.3), graph.threads)
     with np.errstate(under="ignore"):
         for values, kept in ((splats.sh_dc[:, None], left.sh_dc[:, None]),
@@ -451,6 +465,23 @@ def _with_merged(
     expected = sums.take(keep)
     expected.contribution[target], expected.error[target] = merged.contribution, merged.error
     return Stage(left, keep, survivor, shares, expected, color)
+
+
+def _taken(splats: Splats, rows: Index, threads: int | None) -> Splats:
+    """Return some splats, by their rows, copied on several threads."""
+    columns: dict[str, Any] = {name: _rows(getattr(splats, name), rows, threads) for name in ARRAYS}
+    return replace(splats, **columns)
+
+
+def _rows(values: NDArray[Any], rows: Index, threads: int | None) -> NDArray[Any]:
+    """Return some rows of an array, copied on several threads."""
+    taken = np.empty((len(rows), *values.shape[1:]), values.dtype)
+
+    def copy(piece: slice) -> None:
+        taken[piece] = values[rows[piece]]
+
+    for_chunks(copy, len(rows), _CHUNK, threads=threads)
+    return taken
 
 
 def _owners(merges: Sequence[tuple[Index, Index, Array]], count: int) -> tuple[Index, Array]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..seeing.scene import MIX
-from ..work import Progress, chunks, for_chunks, part, report, silent
+from ..work import Progress, chunks, concatenated, for_chunks, part, report, silent
 from . import merging
 from .neighbours import nearest
 
@@ -136,7 +136,7 @@ class MergeGraph:
     def connect(self, progress: Progress = silent) -> None:
         """Find the pairs of neighbouring splats, and price them."""
         rows = np.flatnonzero(self.alive & (self.field.contribution > 0.0))  # (R,)
-        place = self.scene.positions(self.field.means[rows])  # (R, 3)
+        place = self.scene.positions(self.field.means, rows, threads=self.threads)  # (R, 3)
         near = nearest(
             place, NEIGHBOURS, progress=part(progress, 0.0, 0.4), threads=self.threads
         )  # (R, k)
@@ -154,8 +154,8 @@ class MergeGraph:
         )  # fmt: skip
         none = np.empty(0, np.int32)
         # int32 takes half the memory of int64, and no file holds two billion splats.
-        self.first = np.concatenate([none, *(first for first, _ in found)])
-        self.second = np.concatenate([none, *(second for _, second in found)])
+        self.first = concatenated([none, *(first for first, _ in found)], self.threads)
+        self.second = concatenated([none, *(second for _, second in found)], self.threads)
         self.cost = np.empty(len(self.first), np.float32)
         self._price(np.arange(len(self.first), dtype=np.int32), part(progress, 0.5, 1.0))
         self.connected = int(np.count_nonzero(self.alive))
@@ -275,7 +275,7 @@ class MergeGraph:
         """Return what a function returns for slices of the pairs, one array or more, joined."""
         parts = for_chunks(of_pairs, max(len(self.first), 1), _SCANNED, threads=self.threads)
         several = [part if isinstance(part, tuple) else (part,) for part in parts]
-        return [np.concatenate(each) for each in zip(*several, strict=True)]
+        return [concatenated(each, self.threads) for each in zip(*several, strict=True)]
 
     def _merge(self, edges: Index) -> tuple[Index, Index]:
         """Merge pairs; return the survivors and the splats they absorbed, (m,) each.

@@ -160,7 +160,8 @@ class SplatFile:
         columns = columns or {}
         if self.lines is None:
             count = len(self) if keep is None else int(np.count_nonzero(keep))
-            kinds = [v.dtype for n, v in columns.items() if n not in (self.rows.dtype.names or ())]
+            names = self.rows.dtype.names or ()
+            kinds = [columns[name].dtype for name in columns if name not in names]
             rows = count * (self.rows.dtype.itemsize + sum(kind.itemsize for kind in kinds))
         else:
             rows = sum(map(len, text_lines(self.rows, self.lines, keep, columns)))
@@ -227,6 +228,7 @@ class SplatFile:
         *,
         columns: Mapping[str, NDArray[Any]] | None = None,
         overwrite: bool = False,
+        threads: int | None = 1,
     ) -> None:
         """Write the kept rows in order; their bytes stay as they were read.
 
@@ -241,6 +243,8 @@ class SplatFile:
             appended with the type of their array (float32 -> ``float``).
         overwrite : bool
             Whether an existing file may be replaced, even this one.
+        threads : int, optional
+            How many gather rows of a binary file, while others are written.
 
         Raises
         ------
@@ -264,7 +268,7 @@ class SplatFile:
             if self.lines is not None:
                 stream.writelines(text_lines(self.rows, self.lines, keep, columns))
             else:
-                write_rows(stream, self.rows, keep, columns)
+                write_rows(stream, self.rows, keep, columns, threads=threads)
             stream.write(self.after.data)
 
     def _new_header(

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from ..splats import LOG_ZERO, Splats, above_constant
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -129,6 +130,85 @@ def columns_from_splats(splats: Splats) -> dict[str, NDArray[np.float32]]:
             name: np.ascontiguousarray(values, np.float32)
             for name, values in values_by_name(splats).items()
         }
+
+
+class Columns(Protocol):
+    """Stored properties of N splats by their names, such as a mapping or a structured array."""
+
+    def __getitem__(self, name: str, /) -> NDArray[Any]:
+        """Return a property, (N,)."""
+        ...
+
+
+class ChangedColumns(Mapping[str, "NDArray[Any]"]):
+    """Stored columns with the values of some splats put in, each rounded once to the stored type.
+
+    A column is made when it is asked for, as a copy; a binary PLY is written without that (`put`).
+
+    Parameters
+    ----------
+    stored : mapping of str to (N,), or structured array
+        All properties of N splats; not changed.
+    rows : (M,) int64
+        Those that change, ascending.
+    splats : Splats
+        What these M become.
+    """
+
+    def __init__(
+        self,
+        stored: Columns | NDArray[Any],
+        rows: NDArray[np.int64],
+        splats: Splats,
+    ) -> None:
+        self._stored, self._rows, self._values = stored, rows, values_by_name(splats)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Return a property as it becomes, (N,)."""
+        values = self._values[name]
+        column: NDArray[Any] = self._stored[name].copy()
+        with np.errstate(over="ignore", under="ignore"):  # a double may be no float
+            column[self._rows] = values
+        return column
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names."""
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        """Return the number of properties."""
+        return len(self._values)
+
+    def put(
+        self,
+        chunk: NDArray[Any],
+        dtype: np.dtype[Any],
+        piece: slice,
+        kept: NDArray[np.bool_] | None,
+    ) -> None:
+        """Put the values into rows of a file.
+
+        Parameters
+        ----------
+        chunk : (n,) void
+            The bytes of the kept rows of a piece.
+        dtype : structured
+            Of a row; it has all these properties.
+        piece : slice
+        kept : (m,) bool or None
+            Which rows of the piece are in the chunk; all by default.
+        """
+        low, high = np.searchsorted(self._rows, (piece.start, piece.stop))
+        rows, taken = self._rows[low:high] - piece.start, np.arange(low, high)
+        if kept is not None:
+            stays = kept[rows]
+            rows, taken = (np.cumsum(kept) - 1)[rows[stays]], taken[stays]
+        changed = chunk[rows]
+        fields = changed.view(dtype)
+        with np.errstate(over="ignore", under="ignore"):
+            for name, values in self._values.items():
+                fields[name] = values[taken]
+        chunk[rows] = changed
 
 
 def _stack(columns: Any, names: Sequence[str]) -> NDArray[Any]:  # noqa: ANN401

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RefineError
-from ..work import chunks
+from ..work import chunks, each_chunk
+from .ply_columns import ChangedColumns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -38,22 +39,48 @@ _ROWS = 1 << 12
 _CHANGED_ROWS = 1 << 14
 """Rows copied at a time where columns are set, which takes a few calls for each of them."""
 
+_AHEAD = 16
+"""So many chunks may wait for those before them to be written."""
+
 
 def write_rows(
     stream: BinaryIO,
     rows: NDArray[Any],
     keep: NDArray[np.bool_] | None,
     columns: Mapping[str, NDArray[Any]],
+    *,
+    threads: int | None = 1,
 ) -> None:
     """Write the kept rows as bytes, a chunk at a time, with `columns` set or appended."""
     plain = rows.view(np.dtype((np.void, rows.dtype.itemsize)))
-    for piece in chunks(len(plain), _CHANGED_ROWS if columns else _ROWS):
-        chosen = slice(None) if keep is None else keep[piece]
-        chunk = np.ascontiguousarray(plain[piece][chosen])
-        if columns:
+    changed = columns if isinstance(columns, ChangedColumns) else None
+    if changed is not None and not changed.keys() <= set(rows.dtype.names or ()):
+        changed = None
+
+    def bytes_of(piece: slice) -> NDArray[Any]:
+        kept = None if keep is None else keep[piece]
+        chunk = plain[piece] if kept is None else plain[piece][kept]
+        if changed is not None:
+            chunk = np.array(chunk)
+            changed.put(chunk, rows.dtype, piece, kept)
+        elif columns:
+            chosen = slice(None) if kept is None else kept
             cells = {name: values[piece][chosen] for name, values in columns.items()}
-            chunk = _with_cells(chunk, rows.dtype, cells)
-        stream.write(chunk.data)
+            chunk = _with_cells(np.ascontiguousarray(chunk), rows.dtype, cells)
+        return np.ascontiguousarray(chunk)
+
+    pieces = [*chunks(len(plain), _CHANGED_ROWS if columns else _ROWS)]
+    if threads == 1:
+        stream.writelines(bytes_of(piece).data for piece in pieces)
+        return
+    for batch in chunks(len(pieces), _AHEAD):
+
+        def of_batch(number: slice, begin: int = batch.start) -> NDArray[Any]:
+            return bytes_of(pieces[begin + number.start])
+
+        count = batch.stop - batch.start
+        made = each_chunk(of_batch, count, 1, what="writing", threads=threads)
+        stream.writelines(chunk.data for chunk in made)
 
 
 def _with_cells(
@@ -175,7 +202,10 @@ def declarations(
     """
     present = dict(rows.dtype.fields or {})
     lines = []
-    for name, values in columns.items():
+    for name in columns:
+        if isinstance(columns, ChangedColumns) and name in present:
+            continue  # it has the stored type, and need not be made
+        values = columns[name]
         kind = PLY_TYPES.get(values.dtype.str[1:])
         if values.shape != rows.shape:
             msg = f"{path}: column '{name}' has shape {values.shape}, expected {rows.shape}"

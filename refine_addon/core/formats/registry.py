@@ -303,12 +303,13 @@ class Packed:
         *,
         columns: Mapping[str, NDArray[Any]] | None = None,
         overwrite: bool = False,
+        threads: int | None = 1,  # noqa: ARG002 - formats are written by one
     ) -> None:
         """Write the kept splats; those that cannot be drawn are left out.
 
         Parameters
         ----------
-        path, keep, columns, overwrite
+        path, keep, columns, overwrite, threads
             See `SplatFile.write`.
 
         Raises

@@ -193,7 +193,10 @@ class FileSink:
         columns = choice.columns if isinstance(choice, Kept) else loaded.columns(choice.absorbed)
         path, size = self.written, writer.size(choice.keep, columns)
         if path is not None:
-            writer.write(path, choice.keep, columns=columns, overwrite=self.overwrite)
+            writer.write(
+                path, choice.keep, columns=columns, overwrite=self.overwrite,
+                threads=runtime.threads,
+            )  # fmt: skip
             size = path.stat().st_size
         return Written(
             files=files_facts(loaded.name, str(path) if path else None, loaded.bytes, size),

@@ -11,16 +11,16 @@ from ..formats.registry import Packed
 from ..survivors import survivor_columns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
     from ..absorbing.absorb import Absorbed
     from ..formats.format import Format
     from ..formats.ply import SplatFile
+    from ..formats.ply_columns import Columns
     from ..selection import Budget, RowBytes
     from ..splats import Splats
-    from ..survivors import Columns
     from ..volumes import Forced
 
 
@@ -118,6 +118,6 @@ class Loaded:
             return self
         return replace(self, sizes=replace(sizes, row=sizes.changed))
 
-    def columns(self, absorbed: Absorbed | None) -> dict[str, NDArray[Any]]:
+    def columns(self, absorbed: Absorbed | None) -> Mapping[str, NDArray[Any]]:
         """Return the stored properties with what survivors became; none if they did not change."""
         return survivor_columns(self.stored, absorbed, np.linalg.inv(self.matrix))

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..errors import RefineError
 from ..processes import for_each
+from ..work import for_chunks
 from . import froxels, projection
 from .points import cell_size, scatter
 from .ray_sample import cast_view
@@ -40,6 +41,8 @@ threads."""
 
 SECONDS = 1.2e-6
 """About how long one core takes to measure a splat in one view, to tell what is worth a process."""
+
+_ADDED = 1 << 16  # splats of a view that are added to the sums at a time
 
 
 @dataclass(frozen=True)
@@ -122,12 +125,19 @@ class Measured:
         self.error[:] += other.error
         self.seen[:] += other.seen
 
-    def add_view(self, measurement: ViewMeasurement, weight: float) -> None:
+    def add_view(
+        self, measurement: ViewMeasurement, weight: float, threads: int | None = 1
+    ) -> None:
         """Add what one view sees, times its weight."""
-        self.seen[measurement.rows[measurement.inside]] += 1
-        with np.errstate(under="ignore"):
-            self.contribution[measurement.rows] += weight * measurement.contribution
-            self.error[measurement.rows] += weight * measurement.error
+
+        def add(piece: slice) -> None:
+            rows = measurement.rows[piece]  # no row is there twice
+            self.seen[rows[measurement.inside[piece]]] += 1
+            with np.errstate(under="ignore"):
+                self.contribution[rows] += weight * measurement.contribution[piece]
+                self.error[rows] += weight * measurement.error[piece]
+
+        for_chunks(add, len(measurement.rows), _ADDED, threads=threads)
 
 
 class ViewMeasurement(NamedTuple):
@@ -249,7 +259,7 @@ class Measuring:
             for number in self.groups[k]:
                 measurement, cast = next(measurements)
                 before = total.error[sample]  # (m,)
-                total.add_view(measurement, self.views[number][1])
+                total.add_view(measurement, self.views[number][1], self.threads)
                 errors_of_views.append(total.error[sample] - before)
                 for ray_sample, rays in zip(ray_samples, cast, strict=True):
                     if rays is not None:

@@ -167,11 +167,13 @@ def prepare(
         Which splats can be drawn.
     """
     good, opaque = classify(splats, progress=part(progress, 0.0, 0.4), threads=threads)
-    scene = scene or scene_of(splats.means, good, views)
+    scene = scene or scene_of(splats.means, good, views, threads=threads)
     report(progress, 0.4, "reading")
-    index, positions = near_scene(splats, opaque, scene)
+    index, positions = near_scene(splats, opaque, scene, threads=threads)
     report(progress, 0.4, "reading")
-    order = spatial_order(positions, lambda rows: splat_fingerprint(splats, index[rows]))
+    order = spatial_order(
+        positions, lambda rows: splat_fingerprint(splats, index[rows]), threads=threads
+    )
     gaussians = activate(
         splats, index[order], positions[order], scene, part(progress, 0.4, 1.0), threads
     )
@@ -197,14 +199,14 @@ def classify(
 
 
 def near_scene(
-    splats: Splats, opaque: NDArray[np.bool_], scene: Scene
+    splats: Splats, opaque: NDArray[np.bool_], scene: Scene, *, threads: int | None = 1
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return the rows of opaque splats that are not too far away, (M,).
 
     Also return their positions in the scene's frame, (M, 3) float64.
     """
     index = np.flatnonzero(opaque)
-    positions = scene.positions(splats.means[index])
+    positions = scene.positions(splats.means, index, threads=threads)
     close = np.max(np.abs(positions), axis=1, initial=0.0) <= _FARTHEST
     return index[close], positions[close]
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..work import chunks
+from ..work import chunks, concatenated, for_chunks
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -26,6 +26,7 @@ MIX = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio: its multiples spread numbers that differ little."""
 
 _CHUNK = 1 << 16  # rows that are computed together, which limits temporary memory
+_SORTED, _SAMPLED = 16, 256  # pieces that are sorted one by one, and sampled numbers of each
 _BITS = 21  # of each coordinate in `spatial_order`; three of them fit an int64
 _SPREAD_BITS = (
     (32, 0x1F00000000FFFF),
@@ -56,19 +57,39 @@ class Scene:
     size: float
     axes: NDArray[np.float64]
 
-    def positions(self, means: NDArray[Any]) -> NDArray[np.float64]:
+    def positions(
+        self,
+        means: NDArray[Any],
+        rows: NDArray[np.int64] | None = None,
+        *,
+        threads: int | None = 1,
+    ) -> NDArray[np.float64]:
         """Return positions in the frame, in scene sizes.
 
         Parameters
         ----------
         means : (N, 3) floating
             World units.
+        rows : (M,) int64, optional
+            Which of them; by default all.
+        threads : int, optional
 
         Returns
         -------
-        (N, 3) float64
+        (M, 3) float64
         """
-        return np.asarray((means - self.origin) @ (self.axes.T / self.size))
+        count, turn = len(means) if rows is None else len(rows), self.axes.T / self.size
+        places = np.empty((count, 3))
+
+        def fill(piece: slice) -> None:
+            # At least two rows at a time: BLAS rounds the product of one otherwise.
+            begin = max(min(piece.start, piece.stop - 2), 0)
+            chosen = slice(begin, piece.stop) if rows is None else rows[begin : piece.stop]
+            product = (means[chosen] - self.origin) @ turn
+            places[piece] = product[piece.start - begin :]
+
+        for_chunks(fill, count, _CHUNK, threads=threads)
+        return places
 
 
 def size_of(median: float) -> float:
@@ -82,7 +103,13 @@ def size_of(median: float) -> float:
     return float(np.sqrt(median)) or 1.0
 
 
-def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -> Scene:
+def scene_of(
+    means: NDArray[Any],
+    drawable: NDArray[np.bool_],
+    views: ViewSet,
+    *,
+    threads: int | None = 1,
+) -> Scene:
     """Return the frame of a scene.
 
     Parameters
@@ -92,6 +119,7 @@ def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -
     drawable : (N,) bool
         Which splats count.
     views : ViewSet
+    threads : int, optional
 
     Returns
     -------
@@ -99,15 +127,24 @@ def scene_of(means: NDArray[Any], drawable: NDArray[np.bool_], views: ViewSet) -
     """
     origin, views_squared = views.middle()
     squared = np.empty(len(means))
-    with np.errstate(under="ignore"):
-        for piece in chunks(len(means), _CHUNK):
+
+    def measure(piece: slice) -> None:
+        with np.errstate(under="ignore"):
             # Undrawable splats may hold any number, such as infinity.
             offset = np.where(drawable[piece, None], means[piece], origin) - origin  # (n, 3)
             squared[piece] = np.einsum("ij,ij->i", offset, offset) + views_squared
-        median = float(np.median(squared[drawable])) if drawable.any() else 0.0
-        unturned = Scene(origin, size_of(median), np.eye(3))
-        total = sum(moments(means, drawable, unturned), np.zeros((4, 3)))
-        return replace(unturned, axes=principal_axes(total))
+
+    for_chunks(measure, len(means), _CHUNK, threads=threads)
+    median = float(np.median(squared[drawable])) if drawable.any() else 0.0
+    unturned = Scene(origin, size_of(median), np.eye(3))
+    total = sum(
+        for_chunks(
+            lambda piece: _moments(means[piece][drawable[piece]], unturned),
+            len(means), _CHUNK, threads=threads,
+        ),
+        np.zeros((4, 3)),
+    )  # fmt: skip
+    return replace(unturned, axes=principal_axes(total))
 
 
 def moments(
@@ -125,10 +162,16 @@ def moments(
         Unturned, that is with the axes of the world.
     """
     for piece in chunks(len(means), _CHUNK):
-        positions = scene.positions(means[piece][drawable[piece]])  # (n, 3)
+        yield _moments(means[piece][drawable[piece]], scene)
+
+
+def _moments(means: NDArray[Any], scene: Scene) -> NDArray[np.float64]:
+    """Return `moments` of n drawable splats, (4, 3)."""
+    with np.errstate(under="ignore"):
+        positions = scene.positions(means)  # (n, 3)
         nearness = (1.0 + np.einsum("ij,ij->i", positions, positions)) ** -2.0  # (n,)
         weighted = positions * nearness[:, None]
-        yield np.vstack([weighted.T @ positions, weighted.sum(axis=0)])
+        return np.vstack([weighted.T @ positions, weighted.sum(axis=0)])
 
 
 def principal_axes(total: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -175,6 +218,8 @@ def splat_fingerprint(splats: Splats, rows: NDArray[np.int64]) -> NDArray[np.uin
 def spatial_order(
     positions: NDArray[np.float64],
     ties: Callable[[NDArray[np.int64]], NDArray[np.uint64]] | None = None,
+    *,
+    threads: int | None = 1,
 ) -> NDArray[np.int64]:
     """Return the order of positions along a Z-shaped curve: neighbours follow (Morton, 1966).
 
@@ -184,6 +229,7 @@ def spatial_order(
         As `Scene.positions` returns them.
     ties : callable, optional
         ``ties(rows)`` returns numbers that order rows at the same place.
+    threads : int, optional
 
     Returns
     -------
@@ -191,7 +237,13 @@ def spatial_order(
         Positions that agree in 21 bits of each coordinate are at the same place; without `ties`
         they keep their order.
     """
-    return code_order(spatial_code(positions), ties)
+    code = np.empty(len(positions), np.int64)
+
+    def fill(piece: slice) -> None:
+        code[piece] = spatial_code(positions[piece])
+
+    for_chunks(fill, len(positions), _CHUNK, threads=threads)
+    return code_order(code, ties, threads=threads)
 
 
 def spatial_code(positions: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -212,12 +264,39 @@ def spatial_code(positions: NDArray[np.float64]) -> NDArray[np.int64]:
 def code_order(
     code: NDArray[np.int64],
     ties: Callable[[NDArray[np.int64]], NDArray[np.uint64]] | None = None,
+    *,
+    threads: int | None = 1,
 ) -> NDArray[np.int64]:
     """Return the order of the numbers of `spatial_code`; see `spatial_order`."""
-    order = np.argsort(code, kind="stable")
+    order = _stable_order(code, threads)
+    if ties is None:
+        return order
     same = np.diff(code[order]) == 0  # (N - 1,)
-    if ties is not None and same.any():
+    if same.any():
         tied = np.flatnonzero(np.append(same, False) | np.append(False, same))
         rows = order[tied]
         order[tied] = rows[np.lexsort((ties(rows), code[rows]))]
     return order
+
+
+def _stable_order(keys: NDArray[np.int64], threads: int | None) -> NDArray[np.int64]:
+    """Return the order of numbers, equal ones as they stand: that of `argsort`, on all threads.
+
+    Each piece of it has the numbers between two that are equally many places apart in a sample.
+    """
+    count = len(keys)
+    if count <= _CHUNK:
+        return np.argsort(keys, kind="stable")
+    pieces = min(count // _CHUNK + 1, _SORTED)
+    sample = np.sort(keys[:: max(count // (pieces * _SAMPLED), 1)])
+    ends = sample[np.linspace(0, len(sample) - 1, pieces + 1).astype(int)[1:-1]]  # (pieces - 1,)
+
+    def sort(number: slice) -> NDArray[np.int64]:
+        low, high = number.start, number.start + 1
+        within = keys >= ends[low - 1] if low else np.ones(count, np.bool_)
+        if high < pieces:
+            within &= keys < ends[high - 1]
+        rows = np.flatnonzero(within)
+        return rows[np.argsort(keys[rows], kind="stable")]
+
+    return concatenated(for_chunks(sort, pieces, 1, threads=threads), threads)

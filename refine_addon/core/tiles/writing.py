@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import RefineError
-from ..formats.ply_columns import splats_from_columns
+from ..formats.ply_columns import ChangedColumns, splats_from_columns
 from ..formats.ply_header import with_count, with_model
 from ..formats.ply_write import write_rows
-from ..survivors import columns_with
 from ..urls import Url
 from ..whole_file import refuse_one_file
 from . import storage
@@ -70,14 +69,14 @@ class WriteTile:
                 stream.write(beside.data)
             return stream.tell()
 
-    def _columns(self, folder: Folder, rows: NDArray[Any], piece: Piece) -> dict[str, NDArray[Any]]:
+    def _columns(self, folder: Folder, rows: NDArray[Any], piece: Piece) -> ChangedColumns:
         """Return the columns of rows, with what those became that absorbed others."""
         changed = folder.map(piece.unit, "changed")
         here = slice(*np.searchsorted(changed, (piece.place.start, piece.place.stop)).tolist())
         splats = unpacked(folder.map(piece.unit, "became")[here])
         degree = splats_from_columns(rows[:1]).sh_rest.shape[1]
         splats = replace(splats, sh_rest=splats.sh_rest[:, :degree])
-        return columns_with(rows, changed[here] - piece.place.start, splats)
+        return ChangedColumns(rows, changed[here] - piece.place.start, splats)
 
 
 @dataclass(frozen=True)
