@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ..core.formats.ply_columns import Columns
+    from .native import Place
 
 _GROUP = 16
 """Columns that are transposed together: float32 numbers in a cache line of 64 bytes."""
@@ -167,6 +168,11 @@ def stored_columns(checked: SplatObject) -> Columns:
     return _Reader(checked)
 
 
+def held_columns(checked: SplatObject, names: Iterable[str]) -> Columns:
+    """Return columns of a splat object by their names, all read now, for any thread."""
+    return _Held(checked, names)
+
+
 def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> None:
     """Store columns of a splat object in the attributes that hold them.
 
@@ -177,30 +183,55 @@ def write_columns(checked: SplatObject, columns: Mapping[str, NDArray[Any]]) -> 
         Properties of the PLY that the object has, of as many splats as there are by now.
     """
     mesh = checked.mesh
-    places = {column.name: column for column in checked.layout.columns}
-    given = Counter(places[name].place.attribute for name in columns)
+    places = {column.name: column.place for column in checked.layout.columns}
+    kinds = {
+        place.attribute: mesh.attributes[place.attribute].data_type for place in places.values()
+    }
+    asked = {name: places[name] for name in columns}
+    for attribute in coded(columns, asked, kinds, partial(read_attribute, mesh)):
+        write_attribute(mesh, *attribute)
+    if columns:
+        updated(mesh)
+
+
+def coded(
+    columns: Columns | Mapping[str, NDArray[Any]],
+    places: Mapping[str, Place],
+    kinds: Mapping[str, str],
+    stored: Callable[[str], NDArray[Any]],
+) -> Iterator[tuple[str, str, NDArray[Any]]]:
+    """Yield the attributes that hold columns: name, type and values of each, one after another.
+
+    Parameters
+    ----------
+    columns : mapping of str to (N,)
+        Properties of the PLY.
+    places : mapping of str to Place
+        Where those go that are to be held.
+    kinds : mapping of str to str
+        Types of the attributes.
+    stored : callable
+        ``stored(name)``: values of an attribute of which some components alone are given.
+    """
+    given = Counter(place.attribute for place in places.values())
     vectors: dict[str, NDArray[Any]] = {}
-    for name, values in columns.items():
-        place = places[name].place
-        attribute = mesh.attributes[place.attribute]
-        coded = place.coding.to_attribute(values) if place.coding else values
-        width = KINDS[attribute.data_type].width
+    for name, place in places.items():
+        values, kind = columns[name], kinds[place.attribute]
+        values = place.coding.to_attribute(values) if place.coding else values
+        width = KINDS[kind].width
         if width == 1:
-            write_attribute(mesh, place.attribute, attribute.data_type, coded)
+            yield place.attribute, kind, values
             continue
         if place.attribute not in vectors and given[place.attribute] == width:
             vectors[place.attribute] = np.empty((len(values), width), np.float32)
         elif place.attribute not in vectors:
-            vectors[place.attribute] = read_attribute(mesh, place.attribute)
+            vectors[place.attribute] = stored(place.attribute)
         with np.errstate(over="ignore", under="ignore", invalid="ignore"):  # rounding of float64
-            vectors[place.attribute][:, place.component] = coded
-    for name, values in vectors.items():
-        kind = mesh.attributes[name].data_type
-        write_attribute(
-            mesh, name, kind, single_unit_quaternions(values) if kind == "QUATERNION" else values
-        )
-    if columns:
-        updated(mesh)
+            vectors[place.attribute][:, place.component] = values
+    for attribute, values in vectors.items():
+        kind = kinds[attribute]
+        unit = single_unit_quaternions(values) if kind == "QUATERNION" else values
+        yield attribute, kind, unit
 
 
 def write_rows(
@@ -328,15 +359,21 @@ class _Reader:
         """
         column = self.columns[name]
         place = column.place
-        if KINDS[self.mesh.attributes[place.attribute].data_type].width > 1:
-            if place.attribute not in self.vectors:
-                self.vectors = {place.attribute: read_attribute(self.mesh, place.attribute)}
-            values = self.vectors[place.attribute][:, place.component]
-        else:
-            values = read_attribute(self.mesh, place.attribute)
+        values = self._values(place.attribute)
+        if values.ndim > 1:
+            values = values[:, place.component]
         if place.coding:
             return place.coding.to_file(values)
         return values.view(np.uint32) if column.dtype[1:] == "u4" else values
+
+    def _values(self, attribute: str) -> NDArray[Any]:
+        """Return the values of an attribute."""
+        if attribute in self.vectors:
+            return self.vectors[attribute]
+        values = read_attribute(self.mesh, attribute)
+        if values.ndim > 1:
+            self.vectors = {attribute: values}
+        return values
 
     __getitem__ = stored
 
@@ -352,6 +389,15 @@ class _Reader:
             else:
                 row[:] = self.stored(name)
         return values
+
+
+class _Held(_Reader):
+    """Columns that were read at once, which can be asked for on any thread."""
+
+    def __init__(self, checked: SplatObject, names: Iterable[str]) -> None:
+        super().__init__(checked)
+        attributes = dict.fromkeys(self.columns[name].attribute for name in names)
+        self.vectors = {name: read_attribute(self.mesh, name) for name in attributes}
 
 
 def _fill(mesh: bpy.types.Mesh, rows: NDArray[Any], columns: Iterable[Column]) -> None:

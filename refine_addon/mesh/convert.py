@@ -6,18 +6,26 @@ with its name, transform, parent, collections and custom properties, and for all
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import bpy
+import numpy as np
 
 from ..core.errors import RefineError
 from . import attributes as mesh_attributes
 from . import drift, native
 from .edit import check_changeable, group_weights
-from .layout import KINDS, STORAGE, SplatObject, check, rest_count
+from .layout import KINDS, PLACES, STORAGE, SplatObject, check, rest_count
+from .native import Place
 from .node_trees import add, chain, new_tree
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from ..core.formats.ply_columns import Columns
     from .layout import Column
 
 _TRANSFORM = (
@@ -29,7 +37,56 @@ _TRANSFORM = (
 _LOOKS = ("hide_viewport", "hide_render", "hide_select", "pass_index", "color", "show_in_front")
 
 
-def converted(checked: SplatObject) -> tuple[bpy.types.Object, list[str]]:
+Attributes = list[tuple[str, str, "NDArray[Any]"]]
+"""Names, types and values of attributes."""
+
+
+def read(checked: SplatObject) -> Callable[[], Attributes]:
+    """Read what makes the splats of an object; return what makes the other form's attributes of it.
+
+    That may run on any thread, and takes most of the time.
+
+    Raises
+    ------
+    RefineError
+        See `converted`.
+    """
+    obj = checked.obj
+    check_changeable(obj)
+    if obj.type == "POINTCLOUD" and not checked.layout.native:
+        msg = f"object '{obj.name}': is a point cloud without {native.NAMES}: nothing to convert"
+        raise RefineError(msg)
+    columns = _moved(checked)
+    names = [column.name for column in columns]
+    if checked.layout.native:
+        places = {c.name: PLACES.get(c.name) or Place(c.name, 0, (_kind(c),)) for c in columns}
+    else:
+        made = PLACES | native.places(rest_count(checked.mesh) // 3)
+        places = {name: made[name] for name in names}
+    held = mesh_attributes.held_columns(checked, names)
+    return partial(_attributes, held, places, len(checked))
+
+
+def _kind(column: Column) -> str:
+    """Return the type of the attribute that a mesh holds a property in."""
+    return STORAGE[column.dtype[1:]]
+
+
+def _attributes(held: Columns, places: dict[str, Place], count: int) -> Attributes:
+    """Return the attributes of the other form."""
+    kinds = {place.attribute: place.kinds[0] for place in places.values()}
+
+    def nothing(name: str) -> NDArray[np.float32]:  # of discs, whose third scale is none
+        return np.zeros((count, KINDS[kinds[name]].width), np.float32)
+
+    attributes = mesh_attributes.coded(held, places, kinds, nothing)
+    with np.errstate(over="ignore"):  # a double may be too large for a float
+        return [(n, k, np.ascontiguousarray(v, KINDS[k].dtype)) for n, k, v in attributes]
+
+
+def converted(
+    checked: SplatObject, attributes: Attributes | None = None
+) -> tuple[bpy.types.Object, list[str]]:
     """Put an object of the other form in the place of one: a point cloud for a mesh, or a mesh.
 
     Point attributes, scores, materials and custom properties come along. Vertex groups become float
@@ -41,6 +98,8 @@ def converted(checked: SplatObject) -> tuple[bpy.types.Object, list[str]]:
     ----------
     checked : SplatObject
         It is gone afterwards.
+    attributes : list of (str, str, ndarray), optional
+        What the callable of `read` has returned; None to do that now.
 
     Returns
     -------
@@ -56,15 +115,13 @@ def converted(checked: SplatObject) -> tuple[bpy.types.Object, list[str]]:
         needs. Nothing is changed then.
     """
     old = checked.obj
+    attributes = read(checked)() if attributes is None else attributes
     check_changeable(old)
-    if old.type == "POINTCLOUD" and not checked.layout.native:
-        msg = f"object '{old.name}': is a point cloud without {native.NAMES}: nothing to convert"
-        raise RefineError(msg)
     notes = _left(old)
     data = _mesh_of(checked) if checked.layout.native else _point_cloud_of(checked)
     obj = bpy.data.objects.new(old.name, data)
     try:
-        _fill(checked, obj)
+        _fill(checked, obj, attributes)
     except BaseException:
         bpy.data.objects.remove(obj)
         bpy.data.batch_remove([data])
@@ -146,7 +203,7 @@ def _moved(checked: SplatObject) -> list[Column]:
     return [column for column in checked.layout.columns if column.name in {*"xyz", *places}]
 
 
-def _fill(checked: SplatObject, obj: bpy.types.Object) -> None:
+def _fill(checked: SplatObject, obj: bpy.types.Object, attributes: Attributes) -> None:
     """Give a new object what the old one holds."""
     _copy_attributes(checked, obj.data)
     for group in checked.obj.vertex_groups:
@@ -158,7 +215,11 @@ def _fill(checked: SplatObject, obj: bpy.types.Object) -> None:
             target[key] = value.to_dict() if hasattr(value, "to_dict") else value
     for material in checked.mesh.materials:
         obj.data.materials.append(material)
-    _copy_columns(checked, check(obj))
+    check(obj)
+    while attributes:  # each is forgotten when it is written
+        name, _, values = attributes.pop()
+        mesh_attributes.write_attribute(obj.data, name, obj.data.attributes[name].data_type, values)
+    mesh_attributes.updated(obj.data)
     drift.carry(checked.mesh, obj.data)
 
 
@@ -181,17 +242,6 @@ def _copy_attributes(checked: SplatObject, data: bpy.types.ID) -> None:
             raise RefineError(msg)
         values = mesh_attributes.read_attribute(checked.mesh, name)
         mesh_attributes.write_attribute(data, name, attribute.data_type, values)
-
-
-def _copy_columns(source: SplatObject, target: SplatObject) -> None:
-    """Copy what makes the splats, attribute by attribute of the target."""
-    stored = mesh_attributes.stored_columns(source)
-    attributes = {column.name: column.attribute for column in target.layout.columns}
-    names: dict[str, list[str]] = {}
-    for column in _moved(source):
-        names.setdefault(attributes[column.name], []).append(column.name)
-    for columns in names.values():
-        mesh_attributes.write_columns(target, {name: stored[name] for name in columns})
 
 
 def _take_place(old: bpy.types.Object, new: bpy.types.Object) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -17,9 +17,11 @@ from ..core.formats.ply_columns import THIRD_SCALE
 from ..core.moves import Move, affine_moves
 from . import attributes as mesh_attributes
 from . import native
-from .layout import sh_degree, splat_count, unlisted
+from .layout import sh_degree, unlisted
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
     import bpy
     from numpy.typing import NDArray
 
@@ -114,7 +116,7 @@ def stamp(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
     position = mesh_attributes.read_attribute(mesh, "position")
     mesh_attributes.write_attribute(mesh, HOME, "FLOAT_VECTOR", position)
     number = (zlib.crc32(position.data) << 3 & _OBJECT) or 1 << 3
-    codes = _checksums(mesh) << _CHECKSUM | np.uint32(number | sh_degree(mesh))
+    codes = _checksums(_shapes(mesh)) << _CHECKSUM | np.uint32(number | sh_degree(mesh))
     mesh_attributes.write_attribute(mesh, SHAPE, "INT", codes.view(np.int32))
 
 
@@ -154,20 +156,14 @@ class Mending(NamedTuple):
     regrouped: list[tuple[int, NDArray[np.int64]]]
 
 
-def mending(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Mending | None:
-    """Return what it takes to mend a mesh, None if nothing was found that others did to it."""
+def mending(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> Callable[[], Mending | None]:
+    """Read what was noted of a mesh; return what finds out what it takes to mend it.
+
+    That may run on any thread. None comes of it if nothing was found that others did to the mesh.
+    """
     if not is_stamped(mesh):
-        return None
-    notes = _Notes(mesh)
-    if notes.undisturbed():
-        return None
-    moves, loose = notes.moves()
-    if notes.drift(moves, loose) is None:
-        return None
-    rows = notes.regrouped()
-    degrees = notes.codes[rows] & _DEGREE
-    regrouped = [(int(degree), rows[degrees == degree]) for degree in np.unique(degrees)]
-    return Mending(moves, regrouped)
+        return lambda: None
+    return _Notes(mesh).held().mending
 
 
 def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
@@ -175,7 +171,7 @@ def renew(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> None:
     if not is_stamped(mesh):
         return
     notes = _Notes(mesh)
-    checksums = _checksums(mesh)
+    checksums = _checksums(_shapes(mesh))
     rows = notes.codes >> _CHECKSUM != checksums
     notes.home[rows] = notes.position[rows]
     codes = np.where(rows, checksums << _CHECKSUM | notes.codes & _ORIGIN, notes.codes)
@@ -190,7 +186,9 @@ def carry(
     if is_stamped(source):
         codes = mesh_attributes.read_attribute(source, SHAPE).view(np.uint32)
         # A checksum that was right is right again, and one that was not is not.
-        changed = (_checksums(source) ^ _checksums(target)) << np.uint32(_CHECKSUM)
+        changed = (_checksums(_shapes(source)) ^ _checksums(_shapes(target))) << np.uint32(
+            _CHECKSUM
+        )
         mesh_attributes.write_attribute(target, SHAPE, "INT", (codes ^ changed).view(np.int32))
 
 
@@ -202,6 +200,26 @@ class _Notes:
         self.home: NDArray[np.float32] = mesh_attributes.read_attribute(mesh, HOME)
         self.position: NDArray[np.float32] = mesh_attributes.read_attribute(mesh, "position")
         self.codes = mesh_attributes.read_attribute(mesh, SHAPE).view(np.uint32)
+        self.native, self.degree = native.is_native(mesh), sh_degree(mesh)
+        self.unlisted = tuple(unlisted(mesh))
+        self._shapes: list[NDArray[np.float32]] | None = None
+
+    def held(self) -> _Notes:
+        """Read the rest, so that any thread can go on; return self."""
+        self._shapes = _shapes(self.mesh)
+        return self
+
+    def mending(self) -> Mending | None:
+        """Return what `mending` says."""
+        if self.undisturbed():
+            return None
+        moves, loose = self.moves()
+        if self.drift(moves, loose) is None:
+            return None
+        rows = self.regrouped()
+        degrees = self.codes[rows] & _DEGREE
+        regrouped = [(int(degree), rows[degrees == degree]) for degree in np.unique(degrees)]
+        return Mending(moves, regrouped)
 
     def undisturbed(self) -> bool:
         """Tell whether all splats are where they were, of one object of that degree."""
@@ -209,7 +227,7 @@ class _Notes:
         return bool(
             np.array_equal(self.home.view(np.uint32), self.position.view(np.uint32))
             and (origins == origins[0]).all()
-            and (native.is_native(self.mesh) or origins[0] & _DEGREE == sh_degree(self.mesh))
+            and (self.native or origins[0] & _DEGREE == self.degree)
         )
 
     def drift(self, moves: list[Move], loose: int, step: int = 1) -> Drift | None:
@@ -221,7 +239,7 @@ class _Notes:
             mirrored=any(move.mirrors for move in moves),
             sources=len(objects),
             regrouped=len(self.regrouped()),
-            unlisted=tuple(unlisted(self.mesh)) if len(objects) > 1 else (),
+            unlisted=self.unlisted if len(objects) > 1 else (),
             strangers=int(np.count_nonzero(self.codes == 0)),
         )
         return drift if drift.mendable or drift.strangers else None
@@ -237,7 +255,8 @@ class _Notes:
         """
         rows = np.arange(0, len(self.codes), step)
         codes = self.codes[rows]
-        rows = rows[(codes >> _CHECKSUM == _checksums(self.mesh, step)) & (codes != 0)]
+        shapes = _shapes(self.mesh) if self._shapes is None else self._shapes
+        rows = rows[(codes >> _CHECKSUM == _checksums(shapes, step)) & (codes != 0)]
         moves, loose = [], 0
         for number in self.objects():
             own = rows[self.codes[rows] & _OBJECT == number]
@@ -250,10 +269,10 @@ class _Notes:
 
     def regrouped(self) -> NDArray[np.int64]:
         """Return the splats whose harmonics stand under the names of another degree."""
-        if native.is_native(self.mesh):  # names of harmonics do not depend on the degree
+        if self.native:  # names of harmonics do not depend on the degree
             return np.empty(0, np.int64)
         degrees = self.codes & _DEGREE
-        other = (self.codes != 0) & (degrees != sh_degree(self.mesh)) & (degrees != 0)
+        other = (self.codes != 0) & (degrees != self.degree) & (degrees != 0)
         return np.flatnonzero(other)
 
 
@@ -276,16 +295,20 @@ def _followed(rows: NDArray[np.int64], moves: list[Move]) -> list[Move]:
     ]
 
 
-def _checksums(mesh: bpy.types.Mesh | bpy.types.PointCloud, step: int = 1) -> NDArray[np.uint32]:
-    """Return a checksum of 16 bits of the scales and the rotation of one splat of `step`."""
+def _shapes(mesh: bpy.types.Mesh | bpy.types.PointCloud) -> list[NDArray[np.float32]]:
+    """Return the attributes that hold scales and rotations, (N,) or (N, width) each."""
     names = [*(f"scale_{axis}" for axis in range(3)), *(f"rot_{index}" for index in range(4))]
     if THIRD_SCALE not in mesh.attributes:  # discs
         names.remove(THIRD_SCALE)
     if native.is_native(mesh):
         names = [native.SCALE, native.ROTATION]
-    total = np.zeros(len(range(0, splat_count(mesh), step)), np.uint32)
-    for name in names:
-        values: NDArray[Any] = mesh_attributes.read_attribute(mesh, name)
+    return [mesh_attributes.read_attribute(mesh, name) for name in names]
+
+
+def _checksums(shapes: Sequence[NDArray[np.float32]], step: int = 1) -> NDArray[np.uint32]:
+    """Return a checksum of 16 bits of the scales and the rotation of one splat of `step`."""
+    total = np.zeros(len(range(0, len(shapes[0]), step)), np.uint32)
+    for values in shapes:
         for plane in values[::step].reshape(len(total), -1).T:
             total ^= np.ascontiguousarray(plane).view(np.uint32)
             total *= _MIX

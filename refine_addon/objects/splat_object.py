@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import bpy
@@ -402,14 +403,25 @@ def moved_columns(checked: SplatObject, moves: Sequence[Move]) -> dict[str, NDAr
     RefineError
         See `refine_addon.core.affine.baked`.
     """
+    return read_to_move(checked)(moves)
+
+
+def read_to_move(checked: SplatObject) -> Callable[[Sequence[Move]], dict[str, NDArray[Any]]]:
+    """Read a splat object; return what does as `moved_columns` on any thread, given the moves."""
     splats = mesh_attributes.splats_from_object(checked)
+    with_normals = {"nx", "ny", "nz"} <= {column.name for column in checked.layout.columns}
+    return partial(_moved, splats, mesh_attributes.normals(checked) if with_normals else None)
+
+
+def _moved(
+    splats: Splats, normals: NDArray[np.float32] | None, moves: Sequence[Move]
+) -> dict[str, NDArray[Any]]:
     stored = {name: row for name, row in values_by_name(splats).items() if name != "opacity"}
     copied = np.empty_like if any(len(move.rows) == len(splats) for move in moves) else np.array
     columns = {name: copied(column) for name, column in stored.items()}
     for move in moves:
         _move_rows(splats, columns, move)
-    if {"nx", "ny", "nz"} <= {column.name for column in checked.layout.columns}:
-        normals = mesh_attributes.normals(checked)
+    if normals is not None:
         for move in moves:
             normals[move.rows] = _turned_normals(normals[move.rows], move.matrix)
         columns.update(zip(("nx", "ny", "nz"), normals.T, strict=True))

@@ -6,7 +6,7 @@ Each does all it says, or raises `RefineError` and leaves the scene as it was.
 from __future__ import annotations
 
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import bpy
 import numpy as np
@@ -26,10 +26,10 @@ from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
 from ..mesh.convert import converted
 from . import demands
-from .splat_object import moved_columns, uneven_notes
+from .splat_object import moved_columns, read_to_move, uneven_notes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -60,11 +60,43 @@ _OF_ALL = (
 """Attributes that say something of a splat among all others of its scene."""
 
 
-def mend(group: Sequence[SplatObject]) -> int:
+class Mended(NamedTuple):
+    """What an object's splats become: what it takes, and columns, where nothing else changes."""
+
+    mending: mesh_drift.Mending | None
+    columns: dict[str, NDArray[Any]]
+
+
+def read_to_mend(checked: SplatObject) -> Callable[[], Mended]:
+    """Read an object; return what finds out how its splats are put right, on any thread.
+
+    Raises
+    ------
+    RefineError
+        See `mesh.edit.check_changeable`; the callable raises it if a map is flat.
+    """
+    mesh_edit.check_changeable(checked.obj)
+    find, move = mesh_drift.mending(checked.mesh), read_to_move(checked)
+
+    def work() -> Mended:
+        mending = find()
+        whole = mending is not None and mending.moves and not mending.regrouped
+        return Mended(mending, move(mending.moves) if mending and whole else {})
+
+    return work
+
+
+def mend(group: Sequence[SplatObject], found: Sequence[Mended] | None = None) -> int:
     """Have splats follow what others did to their positions: see `mesh.drift`.
 
     Positions stay. Scales, rotations, harmonics and normals are moved by the maps that the
     positions tell, and properties of joined splats become part of a file.
+
+    Parameters
+    ----------
+    group : sequence of SplatObject
+    found : sequence of Mended, optional
+        What the callables of `read_to_mend` have returned; None to do that now.
 
     Returns
     -------
@@ -81,22 +113,26 @@ def mend(group: Sequence[SplatObject]) -> int:
     with ExitStack() as stack:
         for checked in group:
             stack.enter_context(mesh_edit.all_or_nothing(checked.obj))
-        return sum(_mend(checked) for checked in group)
+        each = [None] * len(group) if found is None else found
+        return sum(map(_mend, group, each))
 
 
-def _mend(checked: SplatObject) -> int:
+def _mend(checked: SplatObject, found: Mended | None = None) -> int:
     """Do what `mend` says to one object, without a net."""
     mesh = checked.mesh
-    mending = mesh_drift.mending(mesh)
+    mending = mesh_drift.mending(mesh)() if found is None else found.mending
     if mending is None:
         return 0
     moves, regrouped = mending
+    names = [column.name for column in checked.layout.columns]
     mesh_layout.list_all(mesh)
     checked = mesh_layout.check(checked.obj)
     for degree, rows in regrouped:
         _regroup(checked, degree, rows)
     if moves:
-        columns = moved_columns(checked, moves)
+        columns = found.columns if found else {}
+        if not columns or names != [column.name for column in checked.layout.columns]:
+            columns = moved_columns(checked, moves)
         mesh_attributes.write_columns(
             checked, {name: values for name, values in columns.items() if name not in "xyz"}
         )

@@ -23,10 +23,9 @@ from ..core.report import scoring_notes, sizes_in_words
 from ..core.seeing import frustum
 from ..core.task import may_absorb
 from ..core.work import part
+from ..mesh import convert
 from ..mesh import edit as mesh_edit
-from ..mesh import layout as mesh_layout
 from ..mesh import scores as mesh_scores
-from ..mesh.convert import converted
 from ..mesh.scores import Provenance
 from ..objects import level_objects, splat_group, splat_object
 from ..objects.demands import Demands
@@ -35,7 +34,6 @@ from .adjust import Adjustable
 from .on_thread import OnThread
 from .operator_bases import (
     Answer,
-    AtOnce,
     OnSplats,
     in_object_mode,
     scored,
@@ -44,6 +42,8 @@ from .running import Sketch
 from .wrapped import counted
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from ..core.scores import Scores
@@ -396,16 +396,34 @@ class REFINE_OT_levels(OnThread, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_convert(AtOnce, OnSplats, bpy.types.Operator):
+class REFINE_OT_convert(OnThread, OnSplats, bpy.types.Operator):
     """Turn a splat mesh into a point cloud of Blender's own splats, or such a point cloud back"""
 
     bl_idname = "refine.convert"
     bl_label = "Convert Splats"
     bl_options = {"REGISTER", "UNDO"}
+    doing = "Converting splats"
 
-    def act(self, context: bpy.types.Context) -> Answer:
-        """Put the other form in the place of the active object."""
-        obj, notes = converted(mesh_layout.check(context.object))
+    def prepare(
+        self, _context: bpy.types.Context, checked: SplatObject
+    ) -> Callable[[], convert.Attributes]:
+        """Read what makes the splats."""
+        return convert.read(checked)
+
+    @staticmethod
+    def work(job: Callable[[], convert.Attributes], _progress: Progress) -> convert.Attributes:
+        """Bring them into the other form."""
+        return job()
+
+    def finish(
+        self,
+        context: bpy.types.Context,
+        checked: SplatObject,
+        _job: object,
+        attributes: convert.Attributes,
+    ) -> Answer:
+        """Put the other form in the place of the object."""
+        obj, notes = convert.converted(checked, attributes)
         plans.refresh(context)
         for note in notes:
             self.report({"WARNING"}, note)

@@ -40,23 +40,36 @@ _SETTLED = 0.5
 
 @dataclass
 class _Watch:
-    """One render of Blender's during which Esc is watched for."""
+    """What watches for Esc in one window, until it is over."""
 
     escaped: bool = False
     over: bool = False
 
 
-_watch = _Watch(over=True)
-"""The one under way."""
+_watches: dict[int, _Watch] = {}
+"""Those of the render under way, by the windows' addresses."""
 
 
-def _watch_anew() -> None:
-    """Watch for Esc ahead of what waits for it so far, in all windows: one may show the render."""
-    global _watch
-    _watch.over, _watch = True, _Watch()
+def _watch_anew(*windows: bpy.types.Window) -> None:
+    """Watch for Esc in all windows, one of which may show the render.
+
+    In some of them, in which Blender's render waits for it too, ahead of that. In others the first
+    watcher goes on: where nothing happens none ends, and they would add up.
+    """
+    for window in windows:
+        if watch := _watches.pop(window.as_pointer(), None):
+            watch.over = True
     for window in bpy.context.window_manager.windows:
-        with bpy.context.temp_override(window=window):
-            bpy.ops.refine.watch_render("INVOKE_DEFAULT")
+        if window.as_pointer() not in _watches:
+            _watches[window.as_pointer()] = _Watch()
+            with bpy.context.temp_override(window=window):
+                bpy.ops.refine.watch_render("INVOKE_DEFAULT")
+
+
+def _watch_no_more() -> None:
+    for watch in _watches.values():
+        watch.over = True
+    _watches.clear()
 
 
 def no_render(_context: bpy.types.Context) -> str:
@@ -75,7 +88,7 @@ class REFINE_OT_watch_render(bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
         """Begin to watch."""
-        self._watch = _watch
+        self._watch = _watches[context.window.as_pointer()]
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
@@ -85,6 +98,11 @@ class REFINE_OT_watch_render(bpy.types.Operator):
             return {"FINISHED", "PASS_THROUGH"}
         self._watch.escaped |= event.type == "ESC" and event.value == "PRESS"
         return {"PASS_THROUGH"}
+
+    def cancel(self, _context: bpy.types.Context) -> None:
+        """Forget the window, which is closed: another may come to lie at its address."""
+        for address in [key for key, watch in _watches.items() if watch is self._watch]:
+            del _watches[address]
 
 
 class REFINE_OT_render(Needing, bpy.types.Operator):
@@ -129,6 +147,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         manager = context.window_manager
         self._timer = manager.event_timer_add(_STEP, window=context.window)
         manager.modal_handler_add(self)
+        _watch_no_more()
         _watch_anew()
         return self._go_on(context)
 
@@ -152,16 +171,25 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         self._shared, self._frames = Shared(card=card.available()), chosen
         self._steps = frames.steps(scene, chosen, self._shared, write=self.animation)
         self._started, self._timer, self._opened = time.monotonic(), None, False
+        self._next: Step | None = None
 
     def _go_on(self, context: bpy.types.Context) -> Answer:
-        """Take what the last render came to, and start the next one."""
+        """Take what the last render came to, or start the next one.
+
+        An Esc may wait behind this event, and Blender's renders forget it when they begin: one
+        begins at the next event.
+        """
         try:
-            if _watch.escaped or self._steps is None:
+            if self._steps is None or any(watch.escaped for watch in _watches.values()):
                 return self._stopped(context)
-            step = next(self._steps)
-            self._show()
-            if step is not None:  # else Blender may do something else for a moment
+            step, self._next = self._next, None
+            if step is None:
+                self._next = next(self._steps)
+                self._show()
+            elif step.scene in bpy.data.scenes:
                 self._render(context, step)
+            else:  # undone
+                return self._stopped(context)
         except StopIteration:
             return self._finished(context)
         except Cancelled:
@@ -178,7 +206,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         number, total = len(self._shared.frames) + 1, len(self._frames)
         of_all = f" frame {number} of {total}" if total > 1 else ""
         context.workspace.status_text_set(f"Rendering{of_all}: {step.what}; Esc cancels")
-        view = context.preferences.view
+        view, window = context.preferences.view, context.window
         display = view.render_display_type
         if self._opened:
             view.render_display_type = "NONE"
@@ -192,7 +220,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         if shows and not self._opened:
             _draw_whole()
         self._opened = True
-        _watch_anew()
+        _watch_anew(window, context.window)  # which is the new one where one was opened
 
     def _show(self) -> None:
         """Show the last frame wherever a render is shown."""
@@ -228,7 +256,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
 
     def _over(self, context: bpy.types.Context) -> None:
         """Remove all that was made for the render."""
-        _watch.over = True
+        _watch_no_more()
         if self._steps is not None:
             self._steps.close()
             self._steps = None

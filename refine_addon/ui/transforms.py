@@ -3,6 +3,7 @@
 # ruff: noqa: D400, N801, RUF012, TC002 - Blender's names and tooltips; annotations are run
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import bpy
@@ -11,18 +12,22 @@ from bpy.app.handlers import persistent
 from bpy.props import BoolProperty
 
 from ..core.errors import RefineError
+from ..core.work import report
 from ..mesh import drift as mesh_drift
 from ..mesh import layout as mesh_layout
 from ..objects import splat_group, transforms
 from ..viewport import draw as viewport_draw
 from . import plans, wrapped
+from .on_thread import OnThread
 from .operator_bases import Answer, AtOnce, OnSplats, in_object_mode
 from .wrapped import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
+    from ..core.work import Progress
     from ..mesh.drift import Drift
+    from ..mesh.layout import SplatObject
 
 _SOON = 0.1
 """Seconds until new splats are noted: Blender's operator that made them is over by then."""
@@ -82,19 +87,55 @@ class REFINE_OT_join(AtOnce, OnSplats, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class REFINE_OT_mend(AtOnce, OnSplats, bpy.types.Operator):
+@dataclass(frozen=True, eq=False)
+class _Mending:
+    """What finds out how splats are put right, and of which objects."""
+
+    uids: tuple[int, ...]
+    find: list[Callable[[], transforms.Mended]]
+
+
+class REFINE_OT_mend(OnThread, OnSplats, bpy.types.Operator):
     """Have sizes, rotations and colours follow what Blender's own tools did to the positions"""
 
     bl_idname = "refine.mend"
     bl_label = "Mend Splats"
     bl_options = {"REGISTER", "UNDO"}
     needs = (*OnSplats.needs, in_object_mode)
+    doing = "Mending splats"
 
-    def act(self, context: bpy.types.Context) -> Answer:
-        """Mend the selected objects."""
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Mending:
+        """Read the selected objects, and what was noted of them."""
+        group = self.written(context, checked)
+        return _Mending(splat_group.uids_of(group), [transforms.read_to_mend(m) for m in group])
+
+    def written(
+        self, context: bpy.types.Context, _checked: SplatObject | None
+    ) -> list[SplatObject]:
+        """Return the selected objects to which something was done."""
         chosen = splat_group.chosen(context.view_layer, context.object)
         drifted = {obj.data: obj for obj in chosen if of(obj)}
-        count = transforms.mend([mesh_layout.check(obj) for obj in drifted.values()])
+        return [mesh_layout.check(obj) for obj in drifted.values()]
+
+    @staticmethod
+    def work(job: _Mending, progress: Progress) -> list[transforms.Mended]:
+        """Find the maps by which others moved splats, and move the rest of each splat by them."""
+        found = []
+        for number, find in enumerate(job.find):
+            report(progress, number / len(job.find), "")
+            found.append(find())
+        return found
+
+    def finish(
+        self,
+        context: bpy.types.Context,
+        checked: SplatObject | None,
+        job: _Mending,
+        found: list[transforms.Mended],
+    ) -> Answer:
+        """Mend the objects."""
+        group = splat_group.by_uids(job.uids, checked) if checked else []
+        count = transforms.mend(group, found)
         plans.refresh(context)
         self.report({"INFO"}, f"Mended {counted(count, 'splat')}")
         return {"FINISHED"}

@@ -481,7 +481,7 @@ def test_a_conversion_that_fails_changes_nothing(addon, room, unchanged, monkeyp
         msg = "refused"
         raise addon.core.RefineError(msg)
 
-    monkeypatch.setattr(addon.mesh.attributes, "write_columns", refuse)
+    monkeypatch.setattr(addon.mesh.drift, "carry", refuse)
     unchanged.start()
     with pytest.raises(RuntimeError, match="refused"):
         bpy.ops.refine.convert()

@@ -30,6 +30,7 @@ BINARIES = ("trixie", "sid")
 # Seconds. The slowest step is the window's: about 80 on two idle cores, far more on busy ones.
 # A step in Blender gives up by itself a minute before, and says where it was.
 PATIENCE = 600
+_TO_SAY_WHERE = 60
 
 
 class StepError(AssertionError):
@@ -69,12 +70,15 @@ class Blender:
         Where its files go.
     resources : Path
         Its preferences and extensions (``BLENDER_USER_RESOURCES``).
+    patience : float
+        Seconds after which a step is ended.
     """
 
     name: str
     path: Path
     work: Path
     resources: Path
+    patience: float = PATIENCE
 
     def environment(self) -> dict[str, str]:
         """Return the variables that keep Blender to the test's folders."""
@@ -82,6 +86,7 @@ class Blender:
             "HOME": os.fspath(self.work),
             "BLENDER_USER_RESOURCES": os.fspath(self.resources),
             "LC_ALL": "C.UTF-8",
+            "REFINE_PATIENCE": f"{self.patience - _TO_SAY_WHERE}",
         }
 
     def python(self, *words: str) -> subprocess.CompletedProcess[str]:
@@ -129,7 +134,7 @@ class Module(Blender):
     def python(self, *words: str) -> subprocess.CompletedProcess[str]:
         """Run a script with the environment's interpreter."""
         environment = {"PATH": "/usr/bin:/bin", **self.environment()}
-        return _run([self.path, *words], env=environment, cwd=self.work)
+        return _run([self.path, *words], patience=self.patience, env=environment, cwd=self.work)
 
 
 class Binary(Blender):
@@ -137,7 +142,7 @@ class Binary(Blender):
 
     def run(self, *words: str | Path) -> subprocess.CompletedProcess[str]:
         """Run a command in the root, offline; it can write to the test's folders alone."""
-        return _run(self.entered(*words))
+        return _run(self.entered(*words), patience=self.patience)
 
     def entered(self, *words: str | Path) -> list[str | Path]:
         """Return the command that runs a command as `run` does."""

@@ -20,7 +20,7 @@ import bpy
 
 # Seconds. Ended from outside a step would not say where it was; Blender that quits amid a render of
 # its own may never end.
-PATIENCE, PATIENCE_TO_QUIT = 540, 60
+PATIENCE, PATIENCE_TO_QUIT = float(os.environ["REFINE_PATIENCE"]), 60
 
 
 def answer_with(answer: str, value: object) -> None:

@@ -1,0 +1,202 @@
+"""How long the main thread is blocked by what an artist clicks, without a window.
+
+What runs on a thread in a window does so here, too, and the main thread's part is cut where it
+waits. The processor time of one stretch is what the window would stand still for, but for drawing.
+"""
+
+from __future__ import annotations
+
+import importlib
+import time
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import bpy
+import extension
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_LEAST = 0.001
+"""Seconds; less is not told."""
+
+_POLL = 0.05
+"""Seconds between two looks at a thread, as in a window."""
+
+
+class Clock:
+    """Stretches of the main thread, by what was done: its own processor time, and Blender's.
+
+    Blender's is that of all threads, some of which the main thread may wait for: at most so long it
+    is blocked on a quiet machine. While a thread works that nobody waits for, both are the first.
+    """
+
+    def __init__(self) -> None:
+        self.stretches: dict[str, list[tuple[float, float]]] = {}
+        self._name, self._since = "", (0.0, 0.0)
+
+    def cut(self, *, alone: bool = True) -> None:
+        """End a stretch, in which no other thread worked: the window is alive for a moment."""
+        now = time.thread_time(), time.process_time()
+        own, all_of = (end - start for end, start in zip(now, self._since, strict=True))
+        if own > _LEAST:
+            self.stretches[self._name].append((own, all_of if alone else own))
+        self._since = now
+
+    def time(self, name: str, operator: Callable[..., set[str]], **options: Any) -> None:
+        """Run an operator as a click does, with the undo step and the update that follow."""
+        self._name, self._since = name, (time.thread_time(), time.process_time())
+        self.stretches[name] = []
+        operator("EXEC_DEFAULT", True, **options)
+        bpy.context.view_layer.update()
+        self.cut()
+        print(name, self.stretches[name], flush=True)
+
+
+def main(
+    cloud: str,
+    folder: str,
+    views: int,
+    refit: bool,  # noqa: FBT001 - by name
+) -> dict[str, list[tuple[float, float]]]:
+    """Return the stretches of each operator, seconds: see `Clock`.
+
+    Parameters
+    ----------
+    cloud
+        A file of splats, beside its cameras.
+    folder
+        Where files are written to.
+    views
+        How many views score.
+    refit
+        Whether survivors are refitted, too: minutes at a million splats.
+    """
+    extension.enable()
+    on_thread = importlib.import_module(f"{extension.MODULE}.ui.on_thread")
+    clock, refine = Clock(), bpy.ops.refine
+    at_once = on_thread.OnThread.execute
+    on_thread.OnThread.execute = threaded = on_a_thread(clock, on_thread)
+    bpy.data.batch_remove(bpy.data.objects)
+    clock.time("import with cameras", refine.import_ply, filepath=cloud, cameras=True)
+    settings = bpy.context.scene.refine
+    settings.method, settings.views, settings.levels = "closed-form", views, "0.5, 0.25"
+    clock.time("score", refine.score)
+    clock.time("slider", slide, ratio=0.6)
+    settings.ratio = 0.5
+    scored = Scored(bpy.context.object)
+
+    selecting(clock, scored)
+    changing(clock, scored, f"{folder}/out.ply")
+    scored.again()
+    on_thread.OnThread.execute = at_once  # as in a window
+    clock.time("apply", refine.apply, survivors="unchanged")
+    clock.time("undo of apply", bpy.ops.ed.undo)
+    on_thread.OnThread.execute = threaded
+    for survivors in ("absorb", "refit")[: 1 + refit]:
+        scored.again()
+        clock.time(f"apply, {survivors}", refine.apply, survivors=survivors)
+    scored.again()
+    bpy.context.scene.refine.level_survivors = "unchanged"
+    clock.time("make levels", refine.levels)
+    return clock.stretches
+
+
+def selecting(clock: Clock, scored: Scored) -> None:
+    """Select, hide and protect splats, part and join them, and crop them."""
+    refine = bpy.ops.refine
+    scored.again()
+    clock.time("select by range", refine.select_by, what="RANGE", low=0.4)
+    clock.time("select what goes", refine.select_by, what="GOING")
+    clock.time("invert", refine.select, action="INVERT")
+    clock.time("grow", refine.grow_selection)
+    clock.time("shrink", refine.grow_selection, shrink=True)
+    clock.time("hide", refine.select, action="HIDE")
+    clock.time("reveal", refine.select, action="REVEAL")
+    clock.time("protect", refine.protect)
+    clock.time("separate", refine.separate_selected)
+    bpy.context.view_layer.objects.active.location.x += 0.5
+    clock.time("join", refine.join)
+    clock.time("undo of join", bpy.ops.ed.undo)
+    scored.again()
+    clock.time("add volume", refine.add_volume, role="REMOVE", shape="BOX")
+    clock.time("select outside", refine.select_by, what="OUTSIDE")
+    clock.time("crop", refine.crop)
+    bpy.context.scene.refine.volumes.clear()
+    scored.again()
+    clock.time("find floaters", refine.find_floaters)
+
+
+def changing(clock: Clock, scored: Scored, path: str) -> None:
+    """Convert, export, bake and mend splats."""
+    refine = bpy.ops.refine
+    scored.again()
+    clock.time("convert to points", refine.convert)
+    clock.time("convert back", refine.convert)
+    clock.time("export", refine.export_ply, filepath=path, overwrite=True)
+    obj = scored.again()
+    obj.rotation_euler.x, obj.location.x = 0.3, 1.0
+    bpy.context.view_layer.update()
+    clock.time(
+        "export moved", refine.export_ply, filepath=path, overwrite=True, apply_transform=True
+    )
+    clock.time("bake transform", refine.bake_transform)
+    obj.rotation_euler.y = 0.3
+    bpy.context.view_layer.update()
+    bpy.ops.object.transform_apply(location=False, rotation=True, scale=True)
+    clock.time("mend after Ctrl+A", refine.mend)
+
+
+def on_a_thread(clock: Clock, on_thread: Any) -> Callable[..., set[str]]:
+    """Return what runs an operator as `OnThread` does in a window, and waits for its thread."""
+    main_thread = importlib.import_module(f"{extension.MODULE}.main_thread")
+
+    def waited(work: Callable[..., Any]) -> Any:
+        clock.cut()
+        worker = on_thread.Worker(work)
+        while worker.running():
+            time.sleep(_POLL)
+            main_thread.serve()
+            clock.cut(alone=False)
+        return worker.result()
+
+    def execute(self: Any, context: bpy.types.Context) -> set[str]:
+        checked = self._checked(context)
+        job = self.prepare(context, checked)
+        targets = [on_thread.Target.of(each) for each in self.written(context, checked)]
+        if sketch := self.sketch(job):
+            sketched = waited(sketch.work)
+            self.show(context, next(target.unchanged() for target in targets), job, sketched)
+        result = waited(partial(self.work, job))
+        first = next(iter([target.unchanged() for target in targets]), None)
+        return self.finish(context, first, job, result)
+
+    return execute
+
+
+def slide(_how: str, _undo: bool, *, ratio: float) -> None:  # noqa: FBT001 - as operators are called
+    """Move the slider of the budget."""
+    bpy.context.scene.refine.ratio = ratio
+
+
+class Scored:
+    """An object of scored splats, to be there again as it was after each operator."""
+
+    def __init__(self, obj: bpy.types.Object) -> None:
+        self.name, self.mesh = obj.name, obj.data
+        self.mesh.use_fake_user = True
+
+    def again(self) -> bpy.types.Object:
+        """Return the object anew, alone of its kind, active and selected."""
+        scene = bpy.context.scene
+        for obj in list(scene.objects):
+            if obj.type in {"MESH", "POINTCLOUD"}:
+                bpy.data.objects.remove(obj)
+        obj = bpy.data.objects.new(self.name, self.mesh.copy())
+        scene.collection.objects.link(obj)
+        for other in scene.objects:
+            other.select_set(other == obj)
+        bpy.context.view_layer.objects.active = obj
+        bpy.context.view_layer.update()
+        bpy.ops.ed.undo_push(message="again")
+        return obj
