@@ -67,6 +67,8 @@ class Shared:
         The last one, as `drawing.draw` returns it.
     error : BaseException or None
         Why drawing ended.
+    stopped : bool
+        Whether Esc was pressed; Blender forgets one that came as its render began.
     """
 
     layers: Callable[[], Layers | None] | None = None
@@ -78,6 +80,7 @@ class Shared:
     engine: str = ""
     picture: NDArray[np.float64] | None = None
     error: BaseException | None = None
+    stopped: bool = False
 
 
 _now: list[Shared] = []
@@ -160,13 +163,16 @@ class REFINE_engine(bpy.types.RenderEngine):  # type: ignore[misc] # noqa: N801 
         return picture
 
     def _check(self) -> None:
-        if self.test_break():
+        if self._is_stopped():
             raise Cancelled
 
     def _progress(self, fraction: float, what: str) -> bool:
         self.update_progress(fraction)
         self.update_stats("", f"Splats: {what}")
-        return not self.test_break()
+        return not self._is_stopped()
+
+    def _is_stopped(self) -> bool:
+        return bool(self.test_break()) or (bool(_now) and _now[0].stopped)
 
 
 class _Place(NamedTuple):

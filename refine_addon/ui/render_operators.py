@@ -40,36 +40,23 @@ _SETTLED = 0.5
 
 @dataclass
 class _Watch:
-    """What watches for Esc in one window, until it is over."""
+    """One render of Blender's during which Esc is watched for."""
 
     escaped: bool = False
     over: bool = False
 
 
-_watches: dict[int, _Watch] = {}
-"""Those of the render under way, by the windows' addresses."""
+_watch = _Watch(over=True)
+"""The one under way."""
 
 
-def _watch_anew(*windows: bpy.types.Window) -> None:
-    """Watch for Esc in all windows, one of which may show the render.
-
-    In some of them, in which Blender's render waits for it too, ahead of that. In others the first
-    watcher goes on: where nothing happens none ends, and they would add up.
-    """
-    for window in windows:
-        if watch := _watches.pop(window.as_pointer(), None):
-            watch.over = True
+def _watch_anew() -> None:
+    """Watch for Esc ahead of what waits for it so far, in all windows: one may show the render."""
+    global _watch
+    _watch.over, _watch = True, _Watch()
     for window in bpy.context.window_manager.windows:
-        if window.as_pointer() not in _watches:
-            _watches[window.as_pointer()] = _Watch()
-            with bpy.context.temp_override(window=window):
-                bpy.ops.refine.watch_render("INVOKE_DEFAULT")
-
-
-def _watch_no_more() -> None:
-    for watch in _watches.values():
-        watch.over = True
-    _watches.clear()
+        with bpy.context.temp_override(window=window):
+            bpy.ops.refine.watch_render("INVOKE_DEFAULT")
 
 
 def no_render(_context: bpy.types.Context) -> str:
@@ -88,7 +75,7 @@ class REFINE_OT_watch_render(bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> Answer:
         """Begin to watch."""
-        self._watch = _watches[context.window.as_pointer()]
+        self._watch = _watch
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
@@ -98,11 +85,6 @@ class REFINE_OT_watch_render(bpy.types.Operator):
             return {"FINISHED", "PASS_THROUGH"}
         self._watch.escaped |= event.type == "ESC" and event.value == "PRESS"
         return {"PASS_THROUGH"}
-
-    def cancel(self, _context: bpy.types.Context) -> None:
-        """Forget the window, which is closed: another may come to lie at its address."""
-        for address in [key for key, watch in _watches.items() if watch is self._watch]:
-            del _watches[address]
 
 
 class REFINE_OT_render(Needing, bpy.types.Operator):
@@ -147,13 +129,13 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         manager = context.window_manager
         self._timer = manager.event_timer_add(_STEP, window=context.window)
         manager.modal_handler_add(self)
-        _watch_no_more()
         _watch_anew()
         return self._go_on(context)
 
     def modal(self, context: bpy.types.Context, event: bpy.types.Event) -> Answer:
         """Start the next render when one is over."""
         if event.type == "TIMER":
+            self._shared.stopped |= _watch.escaped
             main_thread.serve()
             if not bpy.app.is_job_running("RENDER"):
                 return self._go_on(context)
@@ -180,7 +162,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         begins at the next event.
         """
         try:
-            if self._steps is None or any(watch.escaped for watch in _watches.values()):
+            if _watch.escaped or self._steps is None:
                 return self._stopped(context)
             step, self._next = self._next, None
             if step is None:
@@ -206,7 +188,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         number, total = len(self._shared.frames) + 1, len(self._frames)
         of_all = f" frame {number} of {total}" if total > 1 else ""
         context.workspace.status_text_set(f"Rendering{of_all}: {step.what}; Esc cancels")
-        view, window = context.preferences.view, context.window
+        view = context.preferences.view
         display = view.render_display_type
         if self._opened:
             view.render_display_type = "NONE"
@@ -220,7 +202,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
         if shows and not self._opened:
             _draw_whole()
         self._opened = True
-        _watch_anew(window, context.window)  # which is the new one where one was opened
+        _watch_anew()
 
     def _show(self) -> None:
         """Show the last frame wherever a render is shown."""
@@ -256,7 +238,7 @@ class REFINE_OT_render(Needing, bpy.types.Operator):
 
     def _over(self, context: bpy.types.Context) -> None:
         """Remove all that was made for the render."""
-        _watch_no_more()
+        _watch.over = True
         if self._steps is not None:
             self._steps.close()
             self._steps = None

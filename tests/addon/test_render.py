@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager
 from types import SimpleNamespace
 
 import bpy
@@ -392,6 +391,50 @@ def test_a_render_that_is_stopped_leaves_nothing(addon, shot, monkeypatch):
     assert IMAGE not in bpy.data.images
 
 
+def test_an_esc_that_blender_forgets_ends_the_drawing_of_splats(addon, shot, monkeypatch):
+    """`Shared.stopped` alone tells the engine, amid drawing."""
+    before, draw, asked = settings(shot), addon.render.engine.draw, []
+
+    def pressed(*arguments, progress, **named):
+        addon.render.engine._now[0].stopped = True
+
+        def noted(fraction, what):
+            asked.append(progress(fraction, what))
+            return asked[-1]
+
+        return draw(*arguments, progress=noted, **named)
+
+    monkeypatch.setattr(addon.render.engine, "draw", pressed)
+
+    assert bpy.ops.refine.render() == {"CANCELLED"}
+    assert asked == [False]
+    assert settings(shot) == before
+
+
+def test_an_esc_that_waits_behind_a_timer_is_heard_before_the_next_render(addon, monkeypatch):
+    """Blender's renders forget it when they begin, and would run on to their end."""
+    operators, begun = addon.ui.render_operators, []
+    watch = operators._Watch()
+    monkeypatch.setattr(operators, "_watch", watch)
+    step = addon.render.frames.Step(bpy.context.scene.name, animation=False, what="meshes")
+    waiting = SimpleNamespace(
+        _steps=iter([step, step]),
+        _next=None,
+        _show=lambda: None,
+        _render=lambda _context, step: begun.append(step),
+        _stopped=lambda _context: {"CANCELLED"},
+    )
+
+    def event():
+        return operators.REFINE_OT_render._go_on(waiting, bpy.context)
+
+    assert [event(), event(), len(begun)] == [{"RUNNING_MODAL"}, {"RUNNING_MODAL"}, 1]
+    assert event() == {"RUNNING_MODAL"}
+    watch.escaped = True
+    assert event() == {"CANCELLED"}
+    assert len(begun) == 1
+
+
 def test_f12_says_that_splats_are_not_in_it(addon, shot, quarter, capfd):
     """On stderr where there is no window; not where renders hide the splats."""
     bpy.ops.render.render()
@@ -477,54 +520,3 @@ def test_the_command_names_the_frames_that_it_leaves(addon, shot, tmp_path, caps
     assert said.startswith(there)
     assert said.count(there) == 2
     assert said.count(" splats") == 1
-
-
-def test_an_esc_that_waits_behind_a_timer_is_heard_before_the_next_render(addon, monkeypatch):
-    """Blender's renders forget it when they begin, and would run on to their end."""
-    operators = addon.ui.render_operators
-    watch, begun = operators._Watch(), []
-    monkeypatch.setattr(operators, "_watches", {0: watch})
-    step = addon.render.frames.Step(bpy.context.scene.name, animation=False, what="meshes")
-    waiting = SimpleNamespace(
-        _steps=iter([step, step]),
-        _next=None,
-        _show=lambda: None,
-        _render=lambda _context, step: begun.append(step),
-        _stopped=lambda _context: {"CANCELLED"},
-    )
-
-    def event():
-        return operators.REFINE_OT_render._go_on(waiting, bpy.context)
-
-    assert [event(), event(), len(begun)] == [{"RUNNING_MODAL"}, {"RUNNING_MODAL"}, 1]
-    assert event() == {"RUNNING_MODAL"}
-    watch.escaped = True
-    assert event() == {"CANCELLED"}
-    assert len(begun) == 1
-
-
-def test_one_esc_watcher_a_window_besides_that_of_the_render(addon, monkeypatch):
-    """In a window without events none ends, so that each render would add one."""
-    operators = addon.ui.render_operators
-    here, other = (SimpleNamespace(as_pointer=lambda number=number: number) for number in (1, 2))
-    began = []
-
-    @contextmanager
-    def override(window):
-        began.append(window.as_pointer())
-        yield
-
-    context = SimpleNamespace(
-        window_manager=SimpleNamespace(windows=[here, other]),
-        temp_override=override,
-    )
-    watch = SimpleNamespace(watch_render=lambda _how: None)
-    blender = SimpleNamespace(context=context, ops=SimpleNamespace(refine=watch))
-    monkeypatch.setattr(operators, "bpy", blender)
-    monkeypatch.setattr(operators, "_watches", {})
-    for _ in range(3):
-        operators._watch_anew(here)
-
-    assert began == [1, 2, 1, 1]
-    operators._watch_no_more()
-    assert operators._watches == {}

@@ -72,8 +72,7 @@ def main(turns: int, kinds: str) -> Generator[float, None, dict[str, list[list[f
             if kind == "plain":
                 with bpy.context.temp_override(window=bpy.context.window_manager.windows[0]):
                     bpy.ops.render.render("INVOKE_DEFAULT", animation=True)
-                operators._watch_no_more()
-                operators._watch_anew(*bpy.context.window_manager.windows)
+                operators._watch_anew()
             else:
                 invoke(animation=kind == "cycles")
             yield _WAITS[turn % len(_WAITS)]
