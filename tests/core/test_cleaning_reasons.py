@@ -112,7 +112,7 @@ def seen_as(monkeypatch, near, behind, contrast, views, past):
     monkeypatch.setattr(search.Search, "_suspects", find)
     # The splat put in last is the last Gaussian, too.
     monkeypatch.setattr(
-        projection, "spatial_order", lambda place, _ties=None: np.arange(len(place))
+        projection, "spatial_order", lambda place, _ties=None, **_: np.arange(len(place))
     )
 
 
