@@ -32,7 +32,7 @@ from blenders import BINARIES, Binary, provide  # noqa: E402 - a module of the t
 
 SPLATS = 160_000
 GOALS = {160_000: 0.3, 1_000_000: 1.0}
-"""Seconds that a stretch may take at most, by the number of splats; between them, in proportion."""
+"""Seconds that a stretch may take at most, of up to so many splats."""
 
 PATIENCE = 3600
 """Seconds that a run may take."""
