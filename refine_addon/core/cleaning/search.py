@@ -298,8 +298,8 @@ class Search:
 
         total = _Sight(Support.zero(count), Evidence.zero(count))
         self.seen_by[:], self.past_by[:] = 0.0, 0.0
-        sights = self._in_groups(of_group, progress, "looking past suspects")
-        for number, sight in enumerate(sights):
+        of_groups = self._in_groups(of_group, progress, "looking past suspects")
+        for number, sight in enumerate(of_groups):
             total.support.merge(sight.support)
             total.evidence.merge(sight.evidence)
             self.seen_by[number % VIEW_PARTS] += sight.evidence.views
