@@ -4,11 +4,14 @@
 
     python -m benchmarks.tables.refits SCENE_DIR ... --ratio .5
     python -m benchmarks.tables.refits 160000 1000000 --ways "as it is"
+    python -m benchmarks.tables.refits SCENE_DIR --views 8 --near --compared 16
 
 Run as a command, it says how long refitting takes, over what absorbing took in the same run (all
 views score, one thread, seconds of the processor), and what it gained, on rays that nothing was
 learned from. For a scene's folder see `evaluate`; a number makes one of `speed.capture` of so many
-splats.
+splats. With ``--views`` so many views score, spread out, or by ``--near`` those nearest to the
+first, so that most of the held-out views are far from them. With ``--compared`` so many held-out
+views are rendered before and after each round.
 """
 
 from __future__ import annotations
@@ -19,15 +22,18 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from refine_addon import core
 from refine_addon.core import Settings
 from refine_addon.core.refitting.refit import SIMPLER, Refit, refit_on
 from refine_addon.core.refitting.round_rays import RoundRays
 from refine_addon.core.selection import Budget
+from refine_addon.core.views import ViewSet
 from refine_addon.core.work import silent
 
 from ..speed import capture
-from .evaluate import read_scene
+from .evaluate import Evaluator, read_scene
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -35,9 +41,7 @@ if TYPE_CHECKING:
     from refine_addon.core.refitting.refit import Refitted
     from refine_addon.core.splats import Splats
     from refine_addon.core.survivor_choice import Became
-    from refine_addon.core.views import ViewSet
 
-    from .evaluate import Evaluator
     from .methods import Task
 
 STARTS: dict[str, tuple[str, Became]] = {
@@ -148,21 +152,51 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("scenes", nargs="+", metavar="SCENE_DIR | SPLATS")
     parser.add_argument("--ratio", type=float, default=0.5)
     parser.add_argument("--ways", nargs="+", choices=CHEAPER, default=list(CHEAPER)[:2])
+    parser.add_argument("--views", type=int, default=0, help="how many score; 0: all")
+    parser.add_argument("--near", action="store_true", help="those nearest to the first view")
+    parser.add_argument("--compared", type=int, default=0, help="held-out views that are rendered")
     options = parser.parse_args(arguments)
     for name in options.scenes:
-        if name.isdigit():
-            splats, views = capture.make(int(name)), capture.cameras()
-        else:
-            scene = read_scene(name)
-            splats, views = scene.splats, scene.train
+        splats, views, evaluator = _scene(name, options.compared)
+        views = _scoring(views, options.views, near=options.near)
         left, seconds = _left(splats, views, options.ratio, "auto", "absorb")
-        print(f"{name}, {options.ratio:.0%}: absorbed in {seconds:.1f} s", flush=True)
+        told = f"{name}, {options.ratio:.0%}, {len(views)} views: absorbed in {seconds:.1f} s"
+        print(told + _held_out(evaluator, left), flush=True)
         for way in options.ways:
             for taken, refitted in _timed(left, splats, views, CHEAPER[way]):
                 gained = f"{refitted.psnr_before:.2f} -> {refitted.psnr:.2f} dB"
                 told = f"{way}, {refitted.rounds} rounds: {taken:.1f} s, {taken / seconds:.2f} x"
-                print(f"  {told}, {gained}", flush=True)
+                held_out = _held_out(evaluator, refitted.splats)
+                print(f"  {told}, {gained}{held_out}", flush=True)
     return 0
+
+
+def _scene(name: str, compared: int) -> tuple[Splats, ViewSet, Evaluator | None]:
+    """Return splats and scoring views of a folder or of a number, and what compares."""
+    if name.isdigit():
+        return capture.make(int(name)), capture.cameras(), None
+    scene = read_scene(name)
+    if not compared:
+        return scene.splats, scene.train, None
+    held_out = scene.test.spread(compared)
+    return scene.splats, scene.train, Evaluator(scene.splats, held_out, metrics=("psnr",))
+
+
+def _scoring(views: ViewSet, count: int, *, near: bool) -> ViewSet:
+    """Return so many views, spread out or those nearest to the first; all for 0."""
+    if not 0 < count < len(views):
+        return views
+    if not near:
+        return views.spread(count)
+    distances = np.linalg.norm(views.centers - views.centers[0], axis=1)
+    return ViewSet(tuple(views[row] for row in np.argsort(distances, kind="stable")[:count]))
+
+
+def _held_out(evaluator: Evaluator | None, splats: Splats) -> str:
+    """Return what the held-out views show, for a line."""
+    if evaluator is None:
+        return ""
+    return f", held out {evaluator.evaluate(splats).renders.mean['psnr']:.2f} dB"
 
 
 if __name__ == "__main__":

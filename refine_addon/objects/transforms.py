@@ -17,6 +17,7 @@ from ..core.errors import RefineError
 from ..core.formats.ply import REST_COUNTS
 from ..core.moves import Move
 from ..core.splats import above_constant, refuse_mixed
+from ..core.work import report
 from ..mesh import attributes as mesh_attributes
 from ..mesh import drift as mesh_drift
 from ..mesh import edit as mesh_edit
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ..core.work import Progress
     from ..mesh.layout import SplatObject
 
 _UNMOVED = {
@@ -216,13 +218,22 @@ def _own_matrix(obj: bpy.types.Object, *, location: bool) -> NDArray[np.float64]
     return matrix
 
 
-def _move_all(checked: SplatObject, matrix: NDArray[np.float64]) -> None:
-    """Move all splats of an object's data, after what others did to them was mended."""
-    if _mend(checked):
-        checked = mesh_layout.check(checked.obj)
-    if not np.array_equal(matrix, np.eye(4)):
+def _move_all(
+    checked: SplatObject,
+    matrix: NDArray[np.float64],
+    columns: dict[str, NDArray[Any]] | None = None,
+) -> None:
+    """Move all splats of an object's data, after what others did to them was mended.
+
+    What they become may be known: then there is nothing to mend.
+    """
+    if columns is None:
+        if _mend(checked):
+            checked = mesh_layout.check(checked.obj)
+        stays = np.array_equal(matrix, np.eye(4))
         everything = Move(np.arange(len(checked)), matrix)
-        mesh_attributes.write_columns(checked, moved_columns(checked, [everything]))
+        columns = {} if stays else moved_columns(checked, [everything])
+    mesh_attributes.write_columns(checked, columns)
     mesh_drift.stamp(checked.mesh)
 
 
@@ -243,7 +254,60 @@ def _take_away(obj: bpy.types.Object, *, location: bool) -> None:
     bpy.context.view_layer.update()
 
 
-def join(active: SplatObject, others: Sequence[SplatObject]) -> list[str]:
+class Joined(NamedTuple):
+    """What the splats of several objects become in the frame of the first.
+
+    Attributes
+    ----------
+    matrices : list of (4, 4) float64
+        From the frames of the objects to that of the first.
+    columns : list of dict of str to (N,) float32
+        What changes of each object; None where something is to be mended before.
+    """
+
+    matrices: list[NDArray[np.float64]]
+    columns: list[dict[str, NDArray[Any]] | None]
+
+
+def read_to_join(
+    active: SplatObject, others: Sequence[SplatObject]
+) -> Callable[[Progress], Joined]:
+    """Read objects; return what moves their splats into the frame of the first, on any thread.
+
+    Raises
+    ------
+    RefineError
+        See `join`.
+    """
+    group = [active, *others]
+    for member in group:
+        mesh_edit.check_changeable(member.obj)
+    matrices = _to_first(group)
+    parts = [_read_to_move_all(*pair) for pair in zip(group, matrices, strict=True)]
+
+    def work(progress: Progress) -> Joined:
+        columns = []
+        for number, part in enumerate(parts):
+            report(progress, number / len(parts), "")
+            columns.append(part())
+        return Joined(matrices, columns)
+
+    return work
+
+
+def _read_to_move_all(
+    member: SplatObject, matrix: NDArray[np.float64]
+) -> Callable[[], dict[str, NDArray[Any]] | None]:
+    """Read an object; return what moves all of its splats, None if they are to be mended first."""
+    find, stays = mesh_drift.mending(member.mesh), np.array_equal(matrix, np.eye(4))
+    everything = [] if stays else [Move(np.arange(len(member)), matrix)]
+    move = None if stays else read_to_move(member)
+    return lambda: None if find() else move(everything) if move else {}
+
+
+def join(
+    active: SplatObject, others: Sequence[SplatObject], found: Joined | None = None
+) -> list[str]:
     """Put the splats of several objects into one, which keep what they look like and all they have.
 
     The others go; their children are parented to the one. Marks, vertex groups and properties come
@@ -256,6 +320,9 @@ def join(active: SplatObject, others: Sequence[SplatObject]) -> list[str]:
         Which has the splats afterwards; it keeps its place, name and type.
     others : sequence of SplatObject
         One at least.
+    found : Joined, optional
+        What the callable of `read_to_join` has returned; None to do that now. It does not count if
+        an object was moved since.
 
     Returns
     -------
@@ -275,8 +342,10 @@ def join(active: SplatObject, others: Sequence[SplatObject]) -> list[str]:
     notes = [note for member, matrix in pairs for note in uneven_notes(member, matrix)]
     with _workbench() as bench:
         parts = [_copied(member, bench) for member in group]
-        for part, matrix in zip(parts, matrices, strict=True):
-            _move_all(mesh_layout.check(part), matrix)
+        holds = found is not None and np.array_equal(found.matrices, matrices)
+        columns = found.columns if found and holds else [None] * len(parts)
+        for part, matrix, moved in zip(parts, matrices, columns, strict=True):
+            _move_all(mesh_layout.check(part), matrix, moved)
         notes += _made_alike([mesh_layout.check(part) for part in parts], group)
         whole = _as_one(parts)
         if active.layout.native:

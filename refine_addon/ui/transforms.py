@@ -66,24 +66,54 @@ def _several(context: bpy.types.Context) -> str:
     return "" if len(chosen) > 1 else "Select several objects that hold splats"
 
 
-class REFINE_OT_join(AtOnce, OnSplats, bpy.types.Operator):
+@dataclass(frozen=True, eq=False)
+class _Joining:
+    """What moves splats into one frame, and of which objects, the active one first."""
+
+    uids: tuple[int, ...]
+    move: Callable[[Progress], transforms.Joined]
+
+
+class REFINE_OT_join(OnThread, OnSplats, bpy.types.Operator):
     """Put the splats of the selected objects into the active one; they keep what they look like"""
 
     bl_idname = "refine.join"
     bl_label = "Join Splats"
     bl_options = {"REGISTER", "UNDO"}
     needs = (*OnSplats.needs, in_object_mode, _several)
+    doing = "Joining splats"
 
-    def act(self, context: bpy.types.Context) -> Answer:
+    def prepare(self, context: bpy.types.Context, checked: SplatObject) -> _Joining:
+        """Read the selected objects."""
+        group = self.written(context, checked)
+        return _Joining(splat_group.uids_of(group), transforms.read_to_join(group[0], group[1:]))
+
+    def written(self, context: bpy.types.Context, checked: SplatObject | None) -> list[SplatObject]:
+        """Return the selected objects, the active one first."""
+        if checked is None:
+            return []
+        chosen = splat_group.chosen(context.view_layer, checked.obj)
+        return [checked, *(mesh_layout.check(obj) for obj in chosen if obj != checked.obj)]
+
+    @staticmethod
+    def work(job: _Joining, progress: Progress) -> transforms.Joined:
+        """Move splats, sizes, rotations and harmonics into the frame of the active object."""
+        return job.move(progress)
+
+    def finish(
+        self,
+        context: bpy.types.Context,
+        checked: SplatObject,
+        job: _Joining,
+        found: transforms.Joined,
+    ) -> Answer:
         """Join them."""
-        active = mesh_layout.check(context.object)
-        chosen = splat_group.chosen(context.view_layer, context.object)
-        others = [mesh_layout.check(obj) for obj in chosen if obj != active.obj]
-        for note in transforms.join(active, others):
+        active, *others = splat_group.by_uids(job.uids, checked)
+        for note in transforms.join(active, others, found):
             self.report({"WARNING"}, note)
         plans.refresh(context)
-        count = mesh_layout.splat_count(context.object.data)
-        self.report({"INFO"}, f"Joined {len(chosen)} objects: {count:,} splats; score them again")
+        count = mesh_layout.splat_count(active.obj.data)
+        self.report({"INFO"}, f"Joined {1 + len(others)} objects: {count:,} splats; score again")
         return {"FINISHED"}
 
 

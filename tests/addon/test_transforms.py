@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 
 import bpy
@@ -11,6 +12,7 @@ import pytest
 
 from benchmarks.renderer.rasterizer import render
 from tests.strategies import ply_of
+from tests.windows import event, started_in_a_window, until_over
 
 from .conftest import export
 from .test_native import as_blender_imports
@@ -312,6 +314,71 @@ def test_a_join_that_fails_leaves_the_scene_as_it_was(addon, imported, monkeypat
         bpy.ops.refine.join()
 
     unchanged()
+
+
+@pytest.fixture
+def held_join(addon, imported, monkeypatch):
+    """Click *Join Splats* of a turned object and another; its thread waits until it is let go."""
+    second, go, joined = parted(imported), threading.Event(), addon.objects.transforms.read_to_join
+    second.matrix_world = SOMEWHERE
+    select(imported, second)
+    bpy.context.view_layer.update()
+
+    def held(*group):
+        move = joined(*group)
+
+        def work(progress):
+            while not go.wait(0.01):
+                addon.core.work.report(progress, 0.0, "")
+            return move(progress)
+
+        return work
+
+    monkeypatch.setattr(addon.objects.transforms, "read_to_join", held)
+    yield second, lambda: started_in_a_window(addon, addon.ui.transforms.REFINE_OT_join), go
+    addon.ui.running._end()
+
+
+def test_a_join_that_is_cancelled_leaves_the_scene_as_it_was(held_join, unchanged):
+    """Esc while the thread moves the splats."""
+    _, start, _ = held_join
+    unchanged.start()
+    operator, context, said = start()
+    operator.modal(context, event("ESC"))
+
+    assert until_over(operator, context) == {"CANCELLED"}
+    assert said == ["Joining splats cancelled; nothing was changed"]
+    unchanged()
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_what_is_joined_stays_where_it_is_when_the_thread_is_done(held_join, imported, seen, moved):
+    """Also where somebody moves an object while the thread works."""
+    second, start, go = held_join
+    operator, context, said = start()
+    if moved:
+        second.location.x += 0.2
+    before = seen()
+    go.set()
+
+    assert until_over(operator, context) == {"FINISHED"}
+    assert said == ["Joined 2 objects: 19,878 splats; score again"]
+    assert len(imported.data.vertices) == 2 * 9939
+    assert psnr(seen(), before) > 60.0
+
+
+def test_a_join_of_splats_that_changed_since_is_refused(held_join, seen):
+    """A vertex of the second object is moved while the thread works."""
+    second, start, go = held_join
+    operator, context, said = start()
+    second.data.vertices[0].co.x += 1.0
+    second.data.update()
+    before = seen()
+    go.set()
+
+    assert until_over(operator, context) == {"CANCELLED"}
+    assert "its splats were changed meanwhile" in said[0]
+    assert psnr(seen(), before) == 99.0
 
 
 @pytest.mark.parametrize("degrees", [(3, 3), (1, 3), (3, 1)])

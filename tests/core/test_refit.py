@@ -9,6 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from benchmarks.speed import capture
+from refine_addon import core
 from refine_addon.core import ViewSet, processes, spherical_harmonics
 from refine_addon.core.refitting import linear, refit, round_rays, stored
 from refine_addon.core.rendering import DISC_LOW_PASS, LOW_PASS
@@ -319,6 +321,41 @@ def test_no_parameter_moves_farther_in_a_round_than_it_may():
         "nij,nkj->nik", rotation_matrices(moved.quaternions), rotation_matrices(splats.quaternions)
     )
     np.testing.assert_allclose((np.trace(turns, axis1=1, axis2=2) - 1.0) / 2.0, np.cos(0.3))
+
+
+def test_means_move_where_that_is_worth_a_change_of_order():
+    """Moves of 1, 2 and 4 times the least one: none, three quarters, and 15 of 16 parts of it.
+
+    They keep their direction, and all other parameters what they were.
+    """
+    change = np.full((linear.COUNT, 3), 0.5, np.float32)
+    way, lengths = np.array([2.0, -3.0, 6.0]) / 7.0, np.array([1.0, 2.0, 4.0]) * refit.LEAST_MOVE
+    change[linear.MEAN] = way[:, None] * lengths
+
+    found = refit._worthwhile(change)
+
+    expected = way[:, None] * lengths * [0.0, 0.75, 0.9375]
+    np.testing.assert_allclose(found[linear.MEAN], expected, atol=1e-7)
+    others = np.delete(np.arange(linear.COUNT), linear.MEAN)
+    np.testing.assert_array_equal(found[others], change[others])
+    assert not refit._worthwhile(np.zeros_like(change)).any()
+
+
+def test_among_splats_that_nearly_touch_all_parameters_gain_more_than_colours_alone(monkeypatch):
+    """Thin ones on a floor and on objects, where any move changes which of them is in front.
+
+    With means that move however little it is worth, all parameters gained .7 dB less.
+    """
+    monkeypatch.setattr(round_rays, "MIN_RAYS", 1 << 15)
+    splats, views = capture.make(4_000), capture.cameras(8, 160)
+    survivors = core.prune(
+        splats, views, core.Budget(ratio=0.5), core.Settings(views=0), survivors="absorb"
+    ).survivors(splats)
+
+    colors = refit.refit(survivors, splats, views, refit.Refit(1, geometry=False))
+    every = refit.refit(survivors, splats, views, refit.Refit(1))
+
+    assert every.psnr > colors.psnr + 0.1 > colors.psnr_before + 1.0
 
 
 @pytest.mark.slow

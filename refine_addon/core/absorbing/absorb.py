@@ -278,12 +278,11 @@ class _Lineage:
         return Absorbed(replace(bare, sh_rest=rest), keep, changed, merged, total - len(here))
 
 
-def in_float64(splats: Splats, progress: Progress = silent) -> Splats:
+def in_float64(splats: Splats) -> Splats:
     """Return splats in float64: merged ones merge again, and rounding would depend on the frame."""
-    columns: dict[str, Any] = {}
-    for name in ARRAYS:
-        report(progress, 0.0, "absorbing")
-        columns[name] = np.asarray(getattr(splats, name), np.float64)
+    columns: dict[str, Any] = {
+        name: np.asarray(getattr(splats, name), np.float64) for name in ARRAYS
+    }
     return replace(splats, **columns)
 
 

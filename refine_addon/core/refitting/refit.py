@@ -71,6 +71,9 @@ LEAST_GAIN = 0.05
 MAX_STEP = {"color": 0.5, "opacity": 1.0, "mean": 0.5, "scale": 0.3, "turn": 0.3}
 """How far a parameter moves in a round: as `linear` has them, means by the longest scale."""
 
+LEAST_MOVE = 0.02
+"""A mean that would move by less in a round stays, in longest scales; see `_worthwhile`."""
+
 
 _NOTHING = 1e-30  # rays that tell less of a parameter tell nothing; 1 over it is a float32
 
@@ -273,7 +276,7 @@ def refit_on(
         del linear  # the hits, before those of the next round
         if not change.any():
             return
-        trial = _moved(best.splats, change)
+        trial = _moved(best.splats, _worthwhile(change))
         psnr = rays.psnr(trial, checking)
         gain = psnr - best.psnr
         if gain > 0.0:
@@ -409,6 +412,28 @@ def _conjugate_gradients(
 def _dot(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
     """Return the inner product of two arrays, (13, N), summed in float64."""
     return float(sum(np.sum(a * b, dtype=np.float64) for a, b in zip(one, other, strict=True)))
+
+
+def _worthwhile(change: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return a change in which means move only where that is worth it, (13, N).
+
+    Splats are drawn in the order of their means, and each move puts some behind others that were
+    behind them, which no derivative tells of. The squared error that costs grows in proportion to
+    the move, what a move gains with its square. So those shorter than `LEAST_MOVE` are left out,
+    and others are shortened by less the longer they are (Breiman's garrote)::
+
+        m <- m max(1 - (LEAST_MOVE / |m|)^2, 0)
+
+    Parameters
+    ----------
+    change : (13, N) float32
+    """
+    means = change[MEAN]
+    squared = np.maximum(np.square(means).sum(axis=0), np.float32(_NOTHING))
+    kept = np.maximum(np.float32(1.0) - np.float32(LEAST_MOVE**2) / squared, np.float32(0.0))
+    result = change.copy()
+    result[MEAN] = means * kept
+    return result
 
 
 def _moved(splats: Splats, change: NDArray[np.floating[Any]]) -> Splats:
