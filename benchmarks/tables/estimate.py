@@ -9,6 +9,9 @@ estimates are those of the reports. Every view that scores is rendered. "Expecte
 without absorbing says of absorbing. With `--psnr` the pictures are those of that budget. The last
 columns are of single views: by how much their estimates are off on average and at most, and which
 place the view that is expected to change most has among those that do (1: it does).
+
+With `--between` the estimate of the views between is set beside the held-out views instead, with
+the standard error of their mean, and it is said whether the report warns that few views see much.
 """
 
 from __future__ import annotations
@@ -25,6 +28,7 @@ import numpy as np
 from refine_addon.core import Settings, prune
 from refine_addon.core.errors import RefineError
 from refine_addon.core.pipeline.score_splats import with_quality
+from refine_addon.core.report import little_seen
 from refine_addon.core.selection import Budget
 
 from .evaluate import Evaluator, read_scene
@@ -44,6 +48,11 @@ HEADING = (
     f"{'scene':12}{'':10}{'budget':>12}{'removed':>9}{'estimate':>10}{'truth':>8}{'off by':>8}"
     f"{'expected':>10}{'seconds':>9}"
     f"{'views off':>11}{'at most':>9}{'worst is':>9}"
+)
+
+BETWEEN_HEADING = (
+    f"{'scene':12}{'':10}{'removed':>9}{'between':>10}{'held out':>10}{'+-':>8}{'off by':>8}"
+    f"{'median':>8}"
 )
 
 
@@ -130,18 +139,84 @@ def measure(
             )
 
 
+@dataclass(frozen=True)
+class Between:
+    """The estimate of the views between, and what held-out views see.
+
+    Attributes
+    ----------
+    way : {"delete", "absorb", "refit"}
+    ratio : float
+    estimate : float
+        Of the views between, dB.
+    held : (H,) float64
+        PSNR of each held-out view, dB.
+    warned : bool
+        Whether the report says that views from elsewhere may lose more.
+    """
+
+    way: str
+    ratio: float
+    estimate: float
+    held: NDArray[np.float64]
+    warned: bool
+
+    def line(self, name: str) -> str:
+        """Return it as a line of the table."""
+        mean, error = self.held.mean(), self.held.std(ddof=1) / np.sqrt(len(self.held))
+        return (
+            f"{name:12}{self.way:10}{self.ratio:9.1%}{self.estimate:10.2f}{mean:10.2f}"
+            f"{error:8.2f}{self.estimate - mean:+8.2f}{np.median(self.held):8.2f}"
+            f"{'  warned' if self.warned else ''}"
+        )
+
+
+def measure_between(
+    splats: Splats,
+    views: ViewSet,
+    held: ViewSet,
+    ratios: Sequence[float],
+    ways: Sequence[str] = (DELETE, ABSORB),
+) -> Iterator[Between]:
+    """Yield, by `views`, the estimate of those between them beside the held-out views.
+
+    Raises
+    ------
+    RefineError
+        If there is no estimate, since nothing lies between the views.
+    """
+    evaluator = Evaluator(splats, held, metrics=("psnr",))
+    for way in ways:
+        for ratio in ratios:
+            result = prune(
+                splats, views, Budget(ratio=ratio), Settings("occlusion"), survivors=BECOMING[way]
+            )
+            estimate = result.report["estimated_psnr_between"]
+            if estimate is None:
+                msg = f"of {len(views)} views nothing is told of what lies between them"
+                raise RefineError(msg)
+            renders = evaluator.evaluate(result.survivors(splats)).renders
+            warned = bool(little_seen(result.scores.seen))
+            yield Between(way, ratio, estimate, np.asarray(renders.values["psnr"]), warned)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print a line for each scene, way and budget; return the exit code."""
     options = _parse(arguments)
     budgets = [Budget(ratio=ratio) for ratio in options.ratios]
     budgets += [Budget(psnr=psnr) for psnr in options.psnr]
     ways = [options.only] if options.only else [DELETE, ABSORB]
-    print(HEADING)
+    print(BETWEEN_HEADING if options.between else HEADING)
     errors: list[float] = []
     for folder in options.scenes:
         try:
             scene = read_scene(folder)
             views = scene.train.spread(options.views)
+            if options.between:
+                for each in measure_between(scene.splats, views, scene.test, options.ratios, ways):
+                    errors.append(abs(each.estimate - float(each.held.mean())))
+                    print(each.line(folder.name), flush=True)
+                continue
             for row in measure(scene.splats, views, budgets, ways):
                 errors.append(abs(row.off))
                 print(_line(folder.name, row), flush=True)
@@ -173,6 +248,9 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--psnr", type=float, nargs="*", default=[40.0])
     parser.add_argument("--views", type=int, default=64, help="that score, at most")
     parser.add_argument("--only", choices=BECOMING, help="one of the ways")
+    parser.add_argument(
+        "--between", action="store_true", help="the views between, beside the held-out views"
+    )
     return parser.parse_args(arguments)
 
 
