@@ -171,9 +171,12 @@ def test_evidence_decides_of_giants(monkeypatch, evidence, expected):
 
 @pytest.mark.parametrize(("near", "expected"), [(0.049, 1), (0.051, 0)])
 def test_what_is_only_isolated_must_have_little_near(monkeypatch, near, expected):
-    """Of 12 splats that support each other, the last has .049 or .051 of the light near it."""
+    """Of 9 splats that support each other, the last has .049 or .051 of the light near it.
+
+    Ten would be judged as one clump.
+    """
     seen_as(monkeypatch, near, 1.0 - near, 0.8, 6, 6)
-    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (12, 3))
+    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (9, 3))
     inmost_last = np.argsort(-np.linalg.norm(places - places.mean(axis=0), axis=1))
 
     told = reasons(made(places[inmost_last], 0.06, 0.95, 0.1))

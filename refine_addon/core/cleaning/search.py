@@ -17,6 +17,7 @@ from ..errors import RefineError
 from ..seeing import projection
 from ..seeing.measuring import VIEW_GROUPS
 from ..work import Progress, for_chunks, part
+from .clumps import VIEW_PARTS, Looks, judge
 from .clusters import cluster_sizes, touching
 from .support import Evidence, Support, hits_of_view
 
@@ -40,8 +41,9 @@ share of its light."""
 SMALL = 100
 """A cluster of fewer splats is suspect."""
 
-SOLID = 0.1
-"""Splats of lower opacity do not hold clusters together."""
+SOLID = (0.1, 0.3)
+"""Splats of lower opacity do not hold clusters together: by each of these, since faint ones between
+a dense cluster and a bush make one of the two."""
 
 HUGE, GIANT = 0.15, 0.25
 """A giant is longer than this many scene sizes, and its standard deviation reaches across this
@@ -76,9 +78,12 @@ that see past it."""
 NEEDED = 4 / 255
 """So much evidence is needed against a splat that touches nothing."""
 
+CLUMP_NEEDED = 125.0
+"""That is multiplied by this for a clump that is judged as one, whatever it touches."""
+
 HELD = 8.0
-"""That is multiplied by this to the power of the square root of how many neighbours touch the splat
-and stay."""
+"""For a single splat it is multiplied by this to the power of the square root of how many
+neighbours touch it and stay."""
 
 GIANT_NEEDED, NEEDLE_NEEDED = 8.0, 1 / 3
 """It is multiplied by these, too, for giants and needles."""
@@ -163,6 +168,7 @@ class Search:
         self.seen, self.width, self.sure = np.zeros((3, len(gaussians)))
         self.shown = np.zeros(len(gaussians), np.bool_)
         self.evidence = Evidence.zero(len(gaussians))
+        self.seen_by, self.past_by = np.zeros((2, VIEW_PARTS, len(gaussians)), np.float32)
         self.hits: list[ViewHits | None] = [None] * len(self.views)
         with np.errstate(invalid="ignore"):
             scales = np.sort(splats.log_scales[gaussians.index].astype(np.float64), axis=1)
@@ -291,17 +297,26 @@ class Search:
             return total
 
         total = _Sight(Support.zero(count), Evidence.zero(count))
-        for sight in self._in_groups(of_group, progress, "looking past suspects"):
+        self.seen_by[:], self.past_by[:] = 0.0, 0.0
+        of_groups = self._in_groups(of_group, progress, "looking past suspects")
+        for number, sight in enumerate(of_groups):
             total.support.merge(sight.support)
             total.evidence.merge(sight.evidence)
+            self.seen_by[number % VIEW_PARTS] += sight.evidence.views
+            self.past_by[number % VIEW_PARTS] += sight.evidence.past
         return total
 
     def _clusters(self, solid: NDArray[np.bool_], progress: Progress) -> NDArray[np.bool_]:
         """Return which Gaussians are of a small cluster, (M,), of those that are solid."""
-        rows = np.flatnonzero(solid & (self.gaussians.alphas >= SOLID))
         small = np.zeros(len(solid), np.bool_)
-        sizes = cluster_sizes(self.gaussians.take(rows), progress=progress, threads=self.threads)
-        small[rows] = sizes < SMALL
+        for number, least in enumerate(SOLID):
+            rows = np.flatnonzero(solid & (self.gaussians.alphas >= least))
+            sizes = cluster_sizes(
+                self.gaussians.take(rows),
+                progress=part(progress, number / len(SOLID), (number + 1) / len(SOLID)),
+                threads=self.threads,
+            )
+            small[rows[sizes < SMALL]] = True
         return small
 
     def _in_groups(
@@ -323,8 +338,10 @@ class Search:
         most = np.where(large | suspects.doubted, SUPPORT, ISOLATED_SUPPORT)
         may = suspects.mask & (support < most) & (large | (past >= AGREE * seen))
         may &= (past >= FEW) | (giant & (passed >= FEW))
-        rows = np.flatnonzero(may)
+        rows = np.flatnonzero(suspects.mask)
         near, touch = touching(self.gaussians, rows, threads=self.threads)
+        in_clumps = self._clumps(np.flatnonzero(~large[rows]), rows, near, touch)
+        near, touch, rows = near[may[rows]], touch[may[rows]], rows[may[rows]]
         needed = self._needed(suspects, passed, support)[rows]
         wide = np.where(giant[rows], np.maximum(self.width[rows], WIDE) / WIDE, 1.0)
         change = np.minimum(self._effect()[rows], GLARING) * wide
@@ -340,8 +357,37 @@ class Search:
                     return goes
                 goes[rows] = left
 
-        shows = unheld(change, needed * HAZE_HELD**in_haze)
+        shows = unheld(change, needed * HAZE_HELD**in_haze) | in_clumps
         return shows, unheld(np.maximum(change, VISIBLE), needed) & ~shows
+
+    def _clumps(
+        self,
+        chosen: NDArray[np.int64],
+        rows: NDArray[np.int64],
+        near: NDArray[np.int64],
+        touch: NDArray[np.bool_],
+    ) -> NDArray[np.bool_]:
+        """Return which Gaussians go as the clump that they are in, (M,).
+
+        `rows`, (s,), are the suspects, `chosen` the places among them of those that are not large,
+        and `near` and `touch`, (s, k), say which splats each touches.
+        """
+        count = len(self.gaussians)
+        chosen = chosen[self.gaussians.alphas[rows[chosen]] >= SOLID[-1]]
+        members = rows[chosen]
+        place = np.full(count, -1)
+        place[members] = np.arange(len(members))
+        one, other = np.nonzero(touch[chosen] & (place[near[chosen]] >= 0))
+        evidence, change = self.evidence, np.minimum(self._effect()[members], GLARING)
+        looks = Looks(
+            evidence.near[members], evidence.behind[members], evidence.past[members], change,
+            self.seen_by[:, members], self.past_by[:, members],
+        )  # fmt: skip
+        pairs = one, place[near[chosen[one], other]]
+        needed = CLUMP_NEEDED * NEEDED, POWER
+        goes = np.zeros(count, np.bool_)
+        goes[members] = judge(looks, self.gaussians.alphas[members], pairs, needed)
+        return goes
 
     def _needed(
         self, suspects: _Suspects, passed: NDArray[np.float64], support: NDArray[np.float64]
