@@ -12,7 +12,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from benchmarks.baselines import splat_transform
-from refine_addon.core import Splats, as_written, read_splats
+from benchmarks.tables.million import write_cameras
+from refine_addon.command import main
+from refine_addon.core import Splats, View, ViewSet, as_written, read_splats
 from refine_addon.core.formats import streamed_sog_write
 from refine_addon.core.formats.registry import format_named
 from refine_addon.core.formats.streamed_sog_write import StreamedSog, folder_for
@@ -194,6 +196,24 @@ def test_of_a_streamed_sog_of_ours_it_reads_every_level(tmp_path, level, monkeyp
 
     compare(theirs, levels[level], BOUNDS[".sog"], count)
     compare(theirs, read_splats(path, level=level).splats(), EXACT[".sog"], count)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_of_levels_that_the_command_writes_it_reads_each(tmp_path, level):
+    """``lod IN -o DIR/lod-meta.json``: all splats, half and a tenth of them, as we read them."""
+    source, path, back = room(tmp_path, 1), tmp_path / "web/lod-meta.json", tmp_path / "back.ply"
+    cameras = [View(np.eye(3), np.array([x, 0.0, -6.0]), 60, 60, 40, 30, 80, 60) for x in (-1, 1)]
+    write_cameras(tmp_path / "cameras.json", ViewSet(tuple(cameras)))
+    options = ["--levels", ".5,.1", "--nested", "--method", "closed-form"]
+    order = ["lod", source, "--cameras", tmp_path / "cameras.json", *options, "-o", path]
+    assert main([str(word) for word in order]) == 0
+
+    transformed(path, back, before=("-L", str(level)))
+
+    count = (COUNT, COUNT // 2, COUNT // 10)[level]
+    compare(
+        read_splats(back).splats(), read_splats(path, level=level).splats(), EXACT[".sog"], count
+    )
 
 
 @pytest.mark.parametrize("level", [0, 1])

@@ -126,6 +126,15 @@ def test_what_changes_no_pixel_is_nearly_transparent_and_stays():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("model", "goes"), [("default", 1), ("antialiased", 0), ("2dgs", 1)])
+def test_a_floater_is_judged_as_its_model_draws_it(model, goes):
+    """One that is .015 px wide: antialiased it changes a pixel by .1 of 255, else it fills one."""
+    dot = made(FLOATER.means, 0.0005, 0.8, 0.1)
+    splats = replace(joined(wall(), dot), model=model)
+
+    assert clean(splats, cameras()).counts()["front"] == goes
+
+
 def test_switches_and_protection_spare():
     """A reason that is off takes nothing, and a protected splat has no reason."""
     splats = joined(wall(), FLOATER)
