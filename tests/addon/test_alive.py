@@ -454,7 +454,7 @@ def test_files_are_written_and_read_on_the_thread_as_at_once(start, addon, few, 
 
 
 def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, monkeypatch):  # noqa: ARG001
-    """Packing does not listen; what it wrote is not put in place afterwards."""
+    """Packing does not listen; what it wrote is not put in place afterwards, a second file is."""
     begun, free = threading.Event(), threading.Event()
     form = addon.core.formats.dot_splat.FORMAT
     registry = addon.core.formats.registry
@@ -464,7 +464,9 @@ def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, 
         begun.set()
         free.wait(600.0)
 
-    held = SimpleNamespace(suffix=".splat", degree=form.degree, write=write, loss="", sizes=None)
+    held = SimpleNamespace(
+        suffix=".splat", degree=form.degree, write=write, loss="", sizes=None, models=form.models
+    )
     monkeypatch.setattr(registry, "format_named", lambda _path: held)
     export = addon.ui.export_operators.REFINE_OT_export_ply
     options = {"overwrite": False, "apply_transform": False}
@@ -478,6 +480,10 @@ def test_a_file_whose_writing_is_cancelled_is_none(start, addon, few, tmp_path, 
 
     assert answer == {"CANCELLED"}
     assert list(tmp_path.iterdir()) == []
+    assert until_over(*start(export, filepath=str(tmp_path / "out.splat"), **options)[:2]) == {
+        "FINISHED"
+    }
+    assert (tmp_path / "out.splat").read_bytes() == b"half"
 
 
 def served(addon, function):

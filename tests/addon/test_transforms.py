@@ -339,9 +339,9 @@ def held_join(addon, imported, monkeypatch):
     addon.ui.running._end()
 
 
-def test_a_join_that_is_cancelled_leaves_the_scene_as_it_was(held_join, unchanged):
-    """Esc while the thread moves the splats."""
-    _, start, _ = held_join
+def test_a_join_that_is_cancelled_leaves_the_scene_as_it_was(held_join, imported, unchanged):
+    """Esc while the thread moves the splats; a second click joins them."""
+    _, start, go = held_join
     unchanged.start()
     operator, context, said = start()
     operator.modal(context, event("ESC"))
@@ -349,6 +349,9 @@ def test_a_join_that_is_cancelled_leaves_the_scene_as_it_was(held_join, unchange
     assert until_over(operator, context) == {"CANCELLED"}
     assert said == ["Joining splats cancelled; nothing was changed"]
     unchanged()
+    go.set()
+    assert until_over(*start()[:2]) == {"FINISHED"}
+    assert len(imported.data.vertices) == 2 * 9939
 
 
 @pytest.mark.parametrize("moved", [False, True])
