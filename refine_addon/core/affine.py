@@ -84,7 +84,7 @@ def transformed(splats: Splats, matrix: NDArray[Any], *, rotate_sh: bool = True)
         cannot express.
     """
     matrix = np.asarray(matrix, np.float64)
-    _check(matrix, with_sh=rotate_sh)
+    check_affine(matrix, with_sh=rotate_sh)
     means, linear = moved(splats.means, matrix), matrix[:3, :3]
     if not is_uniform(matrix):
         return _stretched(splats, means, linear)
@@ -128,8 +128,15 @@ def baked(splats: Splats, matrix: NDArray[Any]) -> Splats:
     return replace(result, sh_dc=sh_dc, sh_rest=sh_rest)
 
 
-def _check(matrix: NDArray[np.float64], *, with_sh: bool) -> None:
-    """Refuse a matrix that splats, or with `with_sh` their harmonics, cannot follow."""
+def check_affine(matrix: NDArray[np.float64], *, with_sh: bool = False) -> None:
+    """Refuse a matrix that splats, or with `with_sh` their harmonics, cannot follow.
+
+    Raises
+    ------
+    RefineError
+        If it is not an affine (4, 4) matrix, or flat, or scales by what float32 does not hold; with
+        `with_sh` also if it scales directions differently.
+    """
     if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
         msg = f"expected a finite (4, 4) matrix, got {matrix.tolist()}"
         raise RefineError(msg)

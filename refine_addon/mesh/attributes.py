@@ -25,7 +25,8 @@ from ..core.splats import Splats, single_unit_quaternions, with_model
 from .layout import KINDS, Column, Layout, SplatObject, add_attributes, rest_count, splat_count
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Set as AbstractSet
 
     from numpy.typing import NDArray
 
@@ -121,46 +122,60 @@ def splats_from_object(checked: SplatObject, *, sh_rest: bool = True) -> Splats:
 
 def file_from_object(checked: SplatObject) -> SplatFile:
     """Return a splat object as the file it would be, in memory; `SplatFile.write` writes it."""
-    return _file(checked.obj.name, checked.layout, len(checked), _groups_of(checked, {}))
+    return _file(
+        checked.obj.name, checked.layout, len(checked), _groups_of(checked, frozenset()), dict
+    )
 
 
 def read_for_file(
-    checked: SplatObject, columns: Mapping[str, NDArray[Any]]
+    checked: SplatObject,
+    replaced: Collection[str] = (),
+    columns: Callable[[], Mapping[str, NDArray[Any]]] = dict,
 ) -> Callable[[], SplatFile]:
     """Read a splat object; return what makes the file that it would be of that, on any thread.
 
     Parameters
     ----------
     checked : SplatObject
-    columns : mapping of str to (N,)
-        Properties to write with these values in place of the object's.
+    replaced : collection of str
+        Properties to write with other values than the object's.
+    columns : callable
+        Returns these, (N,) each, when the file is made.
     """
-    groups = deque(_groups_of(checked, columns))
+    groups = deque(_groups_of(checked, frozenset(replaced)))
     one_by_one = (groups.popleft() for _ in range(len(groups)))  # to be forgotten when written
-    return partial(_file, checked.obj.name, checked.layout, len(checked), one_by_one)
+    return partial(_file, checked.obj.name, checked.layout, len(checked), one_by_one, columns)
 
 
 def _file(
-    name: str, layout: Layout, count: int, groups: Iterable[tuple[list[str], Sequence[Any]]]
+    name: str,
+    layout: Layout,
+    count: int,
+    groups: Iterable[tuple[list[str], Sequence[Any]]],
+    columns: Callable[[], Mapping[str, NDArray[Any]]],
 ) -> SplatFile:
     """Return a file of so many splats, from columns that are transposed together."""
-    rows = np.empty(count, layout.row_dtype)
+    rows, made = np.empty(count, layout.row_dtype), columns()
     for names, planes in groups:
-        _interleave(rows, names, planes)
+        given = made.keys() & set(names)
+        pairs = zip(names, planes, strict=True)
+        _interleave(
+            rows, names, [made.get(name, plane) for name, plane in pairs] if given else planes
+        )
     no_elements = np.empty(0, np.uint8)
     return SplatFile(Path(name), rows, layout.header, no_elements, no_elements)
 
 
 def _groups_of(
-    checked: SplatObject, columns: Mapping[str, NDArray[Any]]
-) -> Iterator[tuple[list[str], Sequence[NDArray[Any]]]]:
-    """Yield names and values of columns that are transposed together; some are given."""
+    checked: SplatObject, replaced: AbstractSet[str]
+) -> Iterator[tuple[list[str], Sequence[NDArray[Any] | None]]]:
+    """Yield names and values of columns that are transposed together; None for those replaced."""
     read, dtype = _Reader(checked), checked.layout.row_dtype
     for names in _groups([column.name for column in checked.layout.columns], dtype):
-        if dtype[names[0]].str == "<f4" and not columns.keys() & set(names):
+        if dtype[names[0]].str == "<f4" and not replaced & set(names):
             yield names, read.planes(names)  # as one array, which Linux gives large pages
         else:
-            yield names, [columns[name] if name in columns else read[name] for name in names]
+            yield names, [None if name in replaced else read[name] for name in names]
 
 
 def stored_columns(checked: SplatObject) -> Columns:

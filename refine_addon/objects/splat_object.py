@@ -16,7 +16,7 @@ import bpy
 import numpy as np
 
 from ..cameras.objects import world_matrix
-from ..core.affine import baked, is_uniform, transformed
+from ..core.affine import baked, check_affine, is_uniform, transformed
 from ..core.errors import RefineError
 from ..core.formats.ply_columns import values_by_name
 from ..core.moves import Move
@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from ..core.views import ViewSet
     from ..mesh.layout import SplatObject
 
+
+_NORMALS = ("nx", "ny", "nz")
 
 _ROWS = 1 << 14
 """Splats that are moved at a time, on one thread."""
@@ -351,12 +353,14 @@ def read_for_export(
     RefineError
         If the transform is to be applied and cannot be, being flat.
     """
-    columns = {}
     if apply_transform:
         matrix = world_matrix(checked.obj, bpy.context.evaluated_depsgraph_get())
         if not np.array_equal(matrix, np.eye(4)):
-            columns = moved_columns(checked, [Move(np.arange(len(checked)), matrix)])
-    return mesh_attributes.read_for_file(checked, columns)
+            check_affine(matrix)
+            move, names = _read_to_move(checked)
+            everything = [Move(np.arange(len(checked)), matrix)]
+            return mesh_attributes.read_for_file(checked, names, partial(move, everything))
+    return mesh_attributes.read_for_file(checked)
 
 
 def export_notes(checked: SplatObject, *, apply_transform: bool = False) -> list[str]:
@@ -408,9 +412,18 @@ def moved_columns(checked: SplatObject, moves: Sequence[Move]) -> dict[str, NDAr
 
 def read_to_move(checked: SplatObject) -> Callable[[Sequence[Move]], dict[str, NDArray[Any]]]:
     """Read a splat object; return what does as `moved_columns` on any thread, given the moves."""
+    return _read_to_move(checked)[0]
+
+
+def _read_to_move(
+    checked: SplatObject,
+) -> tuple[Callable[[Sequence[Move]], dict[str, NDArray[Any]]], set[str]]:
+    """Return that, and the properties that it returns."""
     splats = mesh_attributes.splats_from_object(checked)
-    with_normals = {"nx", "ny", "nz"} <= {column.name for column in checked.layout.columns}
-    return partial(_moved, splats, mesh_attributes.normals(checked) if with_normals else None)
+    with_normals = set(_NORMALS) <= {column.name for column in checked.layout.columns}
+    names = {*values_by_name(splats), *(_NORMALS if with_normals else ())} - {"opacity"}
+    normals = mesh_attributes.normals(checked) if with_normals else None
+    return partial(_moved, splats, normals), names
 
 
 def _moved(
@@ -424,7 +437,7 @@ def _moved(
     if normals is not None:
         for move in moves:
             normals[move.rows] = _turned_normals(normals[move.rows], move.matrix)
-        columns.update(zip(("nx", "ny", "nz"), normals.T, strict=True))
+        columns.update(zip(_NORMALS, normals.T, strict=True))
     return columns
 
 
