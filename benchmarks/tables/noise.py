@@ -1,0 +1,123 @@
+"""By how much cells of the quality tables vary when nothing that matters changes.
+
+::
+
+    python -m benchmarks.tables.noise SCENE_DIR ... --ratios .5 .7 .9 --turns 4
+
+For a scene's folder see `evaluate`. Splats are absorbed by the views that score; each turn takes
+other pixels for the rays, and cells of the image that are up to 3 % larger, neither of which makes
+results better. PSNR is by 65,536 rays of the held-out views, always the same ones: what is left is
+how much the result itself varies. "Other rays" is what other rays of the held-out views say of the
+first turn.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+from unittest import mock
+
+import numpy as np
+
+from refine_addon.core import Settings
+from refine_addon.core.estimate.psnr import psnr_against
+from refine_addon.core.pipeline.absorb_splats import absorb_removed
+from refine_addon.core.pipeline.score_splats import score_once
+from refine_addon.core.seeing import cast, points, projection, ray_sample
+from refine_addon.core.seeing.ray_sample import RaySample
+from refine_addon.core.work import silent
+
+from .evaluate import read_scene
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from contextlib import AbstractContextManager
+    from typing import Any
+
+    from numpy.typing import NDArray
+
+    from refine_addon.core.splats import Splats
+    from refine_addon.core.views import View, ViewSet
+
+RAYS = 1 << 16
+"""Rays of the held-out views."""
+
+WIDER = 0.01
+"""By which share of their side cells are larger in each turn than in the one before."""
+
+
+def other_pixels(turn: int) -> AbstractContextManager[Any]:
+    """Let rays go through other pixels, those of turn 0 as always."""
+
+    def pixels(
+        view: View, number: float, count: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        return cast.pixels(view, number + 1000.25 * turn, count)
+
+    return mock.patch.object(ray_sample, "pixels", pixels)
+
+
+def other_cells(turn: int) -> AbstractContextManager[Any]:
+    """Let cells be larger, those of turn 0 as always."""
+    sides = points.cell_size
+    factor = 1.0 + WIDER * turn
+    return mock.patch(
+        "refine_addon.core.seeing.measuring.cell_size",
+        lambda *arguments: factor * sides(*arguments),
+    )
+
+
+def held_out(splats: Splats, views: ViewSet, turn: int) -> RaySample:
+    """Return rays of the held-out views."""
+    gaussians, scene, _ = projection.prepare(splats, views)
+    sample = RaySample(views.by_distance(), gaussians, splats)
+    sample.share = RAYS / ray_sample.VALIDATION_RAYS
+    with other_pixels(turn):
+        sample.cast_all(gaussians, scene, silent, None)
+    return sample
+
+
+def measure(folder: Path, ratios: Sequence[float], turns: int) -> None:
+    """Print the PSNR of each ratio and turn of a scene, mean and standard deviation."""
+    scene = read_scene(folder)
+    settings = Settings()
+    used = scene.train.spread(settings.views)
+    samples = [held_out(scene.splats, scene.test, turn) for turn in range(2)]
+    found = np.zeros((turns, len(ratios)))
+    others = np.zeros(len(ratios))
+    for turn in range(turns):
+        with other_pixels(turn), other_cells(turn):
+            known = score_once(scene.splats, used, settings, silent, 1)
+            for place, ratio in enumerate(ratios):
+                left = len(scene.splats) - int(ratio * len(scene.splats))
+                made = absorb_removed(
+                    scene.splats, used, left, settings, known=known, threads=1
+                ).splats
+                found[turn, place] = psnr_against(samples[0], made, scene.test)
+                if turn == 0:
+                    others[place] = psnr_against(samples[1], made, scene.test)
+        print(f"{folder.name} turn {turn}:", *(f"{x:.2f}" for x in found[turn]), flush=True)
+    print(f"{folder.name} {'removed':>10} {'mean':>6} {'sd':>6} {'range':>6} {'other rays':>10}")
+    for ratio, column, other in zip(ratios, found.T, others, strict=True):
+        off = other - column[0]
+        print(
+            f"{folder.name} {ratio:10.0%} {column.mean():6.2f} {column.std(ddof=1):6.2f} "
+            f"{np.ptp(column):6.2f} {off:+10.2f}",
+            flush=True,
+        )
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description="How much cells of the quality tables vary.")
+    parser.add_argument("scenes", nargs="+", type=Path, help="folders, see evaluate.py")
+    parser.add_argument("--ratios", nargs="+", type=float, default=[0.5, 0.7, 0.9])
+    parser.add_argument("--turns", type=int, default=4)
+    options = parser.parse_args(arguments)
+    for folder in options.scenes:
+        measure(folder, options.ratios, options.turns)
+
+
+if __name__ == "__main__":
+    main()
