@@ -26,6 +26,9 @@ _RENDERED = {
     *("GPENCIL", "EMPTY"),  # an empty may stand for a collection
 }
 
+_TILE = 128
+"""Pixels along each side of a tile that the processor renders, at most."""
+
 _WORLD_SAMPLES = 16
 """Rays a pixel of the world alone, at most."""
 
@@ -166,6 +169,7 @@ class Meshes:
             copy.render.engine = "CYCLES"
             copy.cycles.samples = copy.eevee.taa_render_samples
             copy.cycles.use_denoising = False
+        _small_tiles(copy)
         copies.write_exr(copy, self._folder / f"{name.rsplit(maxsplit=1)[-1]}_######")
         return copy
 
@@ -211,6 +215,14 @@ class Meshes:
             bpy.data.images.remove(shown)
             path.unlink()
         return np.moveaxis(pixels[..., :3], -1, 0)
+
+
+def _small_tiles(scene: bpy.types.Scene) -> None:
+    """Have Cycles look for Esc often where the processor renders: it does so between tiles."""
+    cycles = getattr(scene, "cycles", None)
+    if cycles is not None and cycles.device == "CPU":
+        cycles.tile_size = min(cycles.tile_size, _TILE) if cycles.use_auto_tile else _TILE
+        cycles.use_auto_tile = True
 
 
 def _limit_samples(scene: bpy.types.Scene) -> None:

@@ -356,6 +356,32 @@ def test_a_movie_is_written_as_one_file(shot, tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("asked", "used"),
+    [
+        (("CPU", True, 2048), 128),
+        (("CPU", True, 64), 64),
+        (("CPU", False, 64), 128),
+        (("GPU", True, 2048), 2048),
+    ],
+)
+def test_the_processor_renders_small_tiles_between_which_esc_is_heard(
+    addon, shot, tmp_path, asked, used
+):
+    """Smaller ones that were asked for stay, and so does the scene."""
+    shot.render.engine = "CYCLES"
+    bpy.ops.mesh.primitive_cube_add()
+    cycles = shot.cycles
+    cycles.device, cycles.use_auto_tile, cycles.tile_size = asked
+
+    addon.render.meshes.Meshes(shot, tmp_path)
+
+    copy = bpy.data.scenes["REFINE meshes"].cycles
+    assert (copy.use_auto_tile, copy.tile_size) == (True, used)
+    assert (cycles.device, cycles.use_auto_tile, cycles.tile_size) == asked
+    addon.render.copies.remove_all()
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         (lambda scene: setattr(scene, "camera", None), "has no camera"),
