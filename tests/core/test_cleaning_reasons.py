@@ -184,6 +184,33 @@ def test_what_is_only_isolated_must_have_little_near(monkeypatch, near, expected
     assert (told["isolated"], told["front"]) == (expected, 0)
 
 
+@pytest.mark.parametrize("denied", [(), (0,), (3,)])
+def test_a_clump_goes_as_one_unless_a_group_of_views_denies_it(monkeypatch, denied):
+    """Of ten splats, the last has .051 of the light near it, and goes only with its clump.
+
+    The six views are in four groups by turns: two views each in the first two, one in the others.
+    """
+    seen_as(monkeypatch, 0.051, 0.949, 0.8, 6, 6)
+    suspected = search.Search._suspects
+    looked = []
+
+    def find(self, progress):
+        suspects = suspected(self, progress)
+        looked.append(self.past_by[:, -1].tolist())
+        self.past_by[list(denied)] = 0.0
+        return suspects
+
+    monkeypatch.setattr(search.Search, "_suspects", find)
+    places = np.random.default_rng(1).normal((0.0, 0.0, 2.0), 0.05, (10, 3))
+    inmost_last = np.argsort(-np.linalg.norm(places - places.mean(axis=0), axis=1))
+
+    cleaned = clean(joined(wall(), made(places[inmost_last], 0.06, 0.95, 0.1)), cameras(), ALL)
+
+    assert looked == [[2.0, 2.0, 1.0, 1.0]]
+    assert cleaned.keep[-10:].tolist() == [False] * 9 + [bool(denied)]
+    assert cleaned.keep[: SIDE**2].all()
+
+
 def test_rays_are_aimed_at_small_suspects(monkeypatch):
     """All six views hit a splat 1 px wide, though each has some 100 rays in 4,800 px."""
     monkeypatch.setattr(support, "RAYS", 100)
