@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import pickle
 from dataclasses import replace
 from types import SimpleNamespace
@@ -9,7 +10,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from benchmarks.speed import capture
 from refine_addon import core
 from refine_addon.core import ViewSet, processes, spherical_harmonics
 from refine_addon.core.refitting import linear, refit, round_rays, stored
@@ -347,6 +347,8 @@ def test_among_splats_that_nearly_touch_all_parameters_gain_more_than_colours_al
     With means that move however little it is worth, all parameters gained .7 dB less.
     """
     monkeypatch.setattr(round_rays, "MIN_RAYS", 1 << 15)
+    pytest.importorskip("numba", reason="what benchmarks need, which make the scene")
+    capture = importlib.import_module("benchmarks.speed.capture")
     splats, views = capture.make(4_000), capture.cameras(8, 160)
     survivors = core.prune(
         splats, views, core.Budget(ratio=0.5), core.Settings(views=0), survivors="absorb"
