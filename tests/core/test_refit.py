@@ -18,7 +18,7 @@ from refine_addon.core.seeing import cast as casting
 from refine_addon.core.seeing import projection
 from refine_addon.core.seeing.cast import cast, cast_visible, pixels
 from refine_addon.core.seeing.ray_sample import colors_from
-from refine_addon.core.splats import SH_C0, rotation_matrices, with_model
+from refine_addon.core.splats import rotation_matrices, with_model
 from refine_addon.core.work import Cancelled, silent
 from tests.core.test_invariance import moved, rotation
 from tests.core.test_occlusion import cloud, ring
@@ -37,8 +37,15 @@ def few():
         quaternions=random.normal(size=(12, 4)),
         opacity_logits=random.uniform(-1.0, 1.5, 12),
         sh_dc=random.uniform(-1.0, 1.0, (12, 3)),
-        sh_rest=np.zeros((12, 0, 3)),
+        sh_rest=random.uniform(-0.2, 0.2, (12, 3, 3)),
     )
+
+
+def colored(splats, k, view, fixed):
+    """Return the colour of a splat, (3,), in the direction of its mean in `fixed`."""
+    direction = fixed.means[k] - view.center
+    direction = (direction / np.linalg.norm(direction))[None]
+    return spherical_harmonics.colors(direction, splats.sh_dc[[k]], splats.sh_rest[[k]])[0].clip(0)
 
 
 def drawn(splats, view, fixed):
@@ -67,7 +74,7 @@ def drawn(splats, view, fixed):
         d = np.stack([across, down]) - center[:, None]
         squared = np.einsum("ip,ij,jp->p", d, np.linalg.inv(shape), d)
         alpha = np.exp(-squared / 2.0) / (1.0 + np.exp(-splats.opacity_logits[k]))
-        color = np.maximum(0.5 + SH_C0 * splats.sh_dc[k], 0.0)
+        color = colored(splats, k, view, fixed)
         image += color[:, None] * left * alpha
         left *= 1.0 - alpha
     return image
@@ -100,7 +107,7 @@ def drawn_discs(splats, view, fixed, pixels):
         blob = np.square(np.stack([across, down], 1) - center).sum(axis=1) / DISC_LOW_PASS
         squared = np.minimum(u * u + v * v, blob)
         alpha = np.exp(-squared / 2.0) / (1.0 + np.exp(-splats.opacity_logits[k]))
-        color = np.maximum(0.5 + SH_C0 * splats.sh_dc[k], 0.0)
+        color = colored(splats, k, view, fixed)
         image += color[:, None] * left * alpha
         left *= 1.0 - alpha
     return image
@@ -162,7 +169,9 @@ def test_derivatives_are_those_of_differences_in_float64(monkeypatch, parameter)
 
 
 @pytest.mark.usefixtures("squares")
-@pytest.mark.parametrize("parameter", [*range(9), 10, 11, 12])
+@pytest.mark.parametrize(
+    "parameter", [k for k in range(linear.COUNT) if k != linear.SCALE.stop - 1]
+)
 def test_derivatives_of_discs_are_those_of_differences_in_float64(parameter):
     """As above, of every parameter but the third scale, which is none.
 
@@ -212,20 +221,25 @@ def test_backward_is_the_transpose_of_forward(model):
 
 @pytest.mark.parametrize("parameter", range(linear.COUNT))
 def test_the_diagonal_is_the_squared_length_of_each_column(parameter):
+    """Of the three harmonics of a channel the mean of theirs."""
     found = linear_of(few(), ring()[0])
-    unit = np.zeros((linear.COUNT, 12), np.float32)
-    unit[parameter, 3] = 1.0
+    rows, begin, end = [parameter], linear.DEGREE_1.start, linear.DEGREE_1.stop
+    if begin <= parameter < end:
+        rows = [*range(begin + (parameter - begin) % 3, end, 3)]
+    squared = []
+    for row in rows:
+        unit = np.zeros((linear.COUNT, 12), np.float32)
+        unit[row, 3] = 1.0
+        squared.append(float((forward(found, unit) ** 2).sum()))
 
-    assert found.diagonal[parameter, 3] == pytest.approx(
-        float((forward(found, unit) ** 2).sum()), rel=1e-3
-    )
+    assert found.diagonal[parameter, 3] == pytest.approx(np.mean(squared), rel=1e-3)
 
 
 def test_colours_and_opacities_alone_have_the_derivatives_that_they_have_among_all():
     every, alone = (linear_of(few(), ring()[0], geometry=geometry) for geometry in (True, False))
     random = np.random.default_rng(1)
     change = np.zeros((linear.COUNT, 12), np.float32)
-    change[: linear.MEAN.start] = random.normal(size=(4, 12))
+    change[: linear.MEAN.start] = random.normal(size=(linear.MEAN.start, 12))
     errors = random.normal(size=every.views[0].errors.shape).astype(np.float32)
 
     np.testing.assert_allclose(forward(alone, change), forward(every, change), atol=1e-6)
@@ -317,6 +331,8 @@ def test_no_parameter_moves_farther_in_a_round_than_it_may():
     np.testing.assert_allclose(moved.log_scales - splats.log_scales, 0.3)
     np.testing.assert_allclose(moved.opacity_logits - splats.opacity_logits, 1.0)
     np.testing.assert_allclose(moved.sh_dc - splats.sh_dc, 0.5)
+    harmonics = np.linalg.norm(moved.sh_rest - splats.sh_rest, axis=1)  # of each channel
+    np.testing.assert_allclose(harmonics, 0.5)
     turns = np.einsum(
         "nij,nkj->nik", rotation_matrices(moved.quaternions), rotation_matrices(splats.quaternions)
     )
@@ -341,10 +357,10 @@ def test_means_move_where_that_is_worth_a_change_of_order():
     assert not refit._worthwhile(np.zeros_like(change)).any()
 
 
-def test_among_splats_that_nearly_touch_all_parameters_gain_more_than_colours_alone(monkeypatch):
+def test_among_splats_that_nearly_touch_all_parameters_gain_as_much_as_colours_alone(monkeypatch):
     """Thin ones on a floor and on objects, where any move changes which of them is in front.
 
-    With means that move however little it is worth, all parameters gained .7 dB less.
+    With means that move however little it is worth, all parameters gained .8 dB less.
     """
     monkeypatch.setattr(round_rays, "MIN_RAYS", 1 << 15)
     pytest.importorskip("numba", reason="what benchmarks need, which make the scene")
@@ -357,7 +373,7 @@ def test_among_splats_that_nearly_touch_all_parameters_gain_more_than_colours_al
     colors = refit.refit(survivors, splats, views, refit.Refit(1, geometry=False))
     every = refit.refit(survivors, splats, views, refit.Refit(1))
 
-    assert every.psnr > colors.psnr + 0.1 > colors.psnr_before + 1.0
+    assert every.psnr > colors.psnr - 0.2 > colors.psnr_before + 2.0
 
 
 @pytest.mark.slow
@@ -373,7 +389,39 @@ def test_refitted_survivors_are_nearer_to_what_the_views_see():
     assert every.psnr > colors.psnr + 1.0
     assert every.psnr_before == colors.psnr_before
     np.testing.assert_array_equal(colors.splats.means, survivors.means)
-    assert every.splats.sh_rest is survivors.sh_rest
+    assert not np.array_equal(every.splats.sh_rest, survivors.sh_rest)
+
+
+@pytest.mark.parametrize("geometry", [True, False])
+def test_harmonics_of_the_first_degree_are_learned_and_those_above_stay(geometry):
+    """Splats without view-dependent colour learn that of the unpruned ones; 1 dB more by it."""
+    splats, rest = cloud(200), np.random.default_rng(3).normal(scale=0.2, size=(200, 8, 3))
+    rest[:, 3:] *= 0.01
+    splats = replace(splats, sh_rest=rest)
+    flat = replace(splats, sh_rest=np.concatenate([np.zeros((200, 3, 3)), rest[:, 3:]], axis=1))
+    settings = refit.Refit(1, geometry=geometry)
+
+    found = refit.refit(flat, splats, ring(), settings).splats
+    constant = refit.refit(flat.up_to_degree(0), splats, ring(), settings)
+
+    np.testing.assert_array_equal(found.sh_rest[:, 3:], rest[:, 3:])
+    learned = np.corrcoef(found.sh_rest[:, :3].ravel(), rest[:, :3].ravel())[0, 1]
+    assert learned > 0.7
+    assert constant.splats.sh_rest.shape == (200, 0, 3)
+    assert refit.refit(flat, splats, ring(), settings).psnr > constant.psnr + 1.0
+
+
+@pytest.mark.filterwarnings("error")
+def test_harmonics_of_any_size_are_refitted_without_a_warning():
+    """Doubles beyond what float32 holds, of either sign, and the largest float32."""
+    splats, rest = cloud(60), np.random.default_rng(3).normal(scale=0.2, size=(60, 8, 3))
+    rest[::2, 0, 0], rest[::4, 1, 1], rest[1::2, 2, 2] = 1e300, -1e300, np.finfo(np.float32).max
+    splats = replace(splats, sh_rest=rest)
+
+    found = refit.refit(splats.take(np.arange(0, 60, 3)), splats, ring(), refit.Refit(1))
+
+    assert found.psnr >= found.psnr_before
+    assert np.isfinite(found.splats.sh_rest).all()
 
 
 @pytest.mark.slow

@@ -5,6 +5,9 @@ behind it, the colour C of its ray changes by::
 
     dC / dc = T a,    dC / da = T (c - B)
 
+The colour changes with the constant of the harmonics and with their first degree, by the values
+that these have in the direction of view. Those of higher degrees stay.
+
 Alpha is ``o exp(-d' A d / 2)`` at the distance d, in pixels, from the footprint's centre, with
 ``A = (J W S W' J' + .3 I)^-1`` (`seeing.projection`). With ``g = W' J' A d``, and h_j its component
 along the splat's axis j, whose scale is s_j and the longest of which is s::
@@ -36,6 +39,7 @@ from ..rendering import ALPHA_CUT, ALPHA_MAX, DISC_LOW_PASS
 from ..seeing import projection
 from ..seeing.cast import BEHIND
 from ..seeing.rays import LEAST_LEFT
+from ..spherical_harmonics import basis
 from ..splats import SH_C0, rotation_matrices
 from ..work import Progress, each_chunk
 from .stored import Stored
@@ -51,13 +55,14 @@ if TYPE_CHECKING:
     from ..splats import Splats
     from ..views import View
 
-COLOR, OPACITY, MEAN, SCALE, TURN = (
-    slice(0, 3), slice(3, 4), slice(4, 7), slice(7, 10), slice(10, 13)
+COLOR, DEGREE_1, OPACITY, MEAN, SCALE, TURN = (
+    slice(0, 3), slice(3, 12), slice(12, 13), slice(13, 16), slice(16, 19), slice(19, 22)
 )  # fmt: skip
-"""Rows of the 13 parameters of a splat: the constant of the harmonics, the logit of the opacity,
-the mean, the logarithms of the scales and a turn, the last three by its own axes."""
+"""Rows of the 22 parameters of a splat: the constant of the harmonics, their first degree (three
+coefficients of three channels each), the logit of the opacity, the mean, the logarithms of the
+scales and a turn, the last three by its own axes."""
 
-COUNT = 13
+COUNT = 22
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Rows and columns of the six numbers of a symmetric matrix."""
@@ -123,16 +128,17 @@ class Shapes:
         return Shapes(self.gaussians.take(hit), self.scene, axes, scales, self.geometry)
 
     def in_scene(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return changed parameters, (13, M), as changes in the frame of the scene.
+        """Return changed parameters, (22, M), as changes in the frame of the scene.
 
         Returns
         -------
-        (13, M) float32
-            Of the colour, of the logarithm of the opacity, m, and the six numbers of S (`PAIRS`);
-            without geometry the first four alone.
+        (22, M) float32
+            Of the colour, of the first degree of the harmonics as it is, of the logarithm of the
+            opacity, m, and the six numbers of S (`PAIRS`); without geometry the first 13 alone.
         """
         result = np.zeros((COUNT if self.geometry else MEAN.start, len(self)), np.float32)
         result[COLOR] = np.float32(SH_C0) * change[COLOR]
+        result[DEGREE_1] = change[DEGREE_1]
         result[OPACITY] = (np.float32(1.0) - self.gaussians.alphas) * change[OPACITY]
         if self.geometry:
             moved = self.scales.max(axis=0) * change[MEAN]
@@ -144,9 +150,10 @@ class Shapes:
         return result
 
     def by_parameter(self, sums: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the transpose of `in_scene`: of such sums, see `LinearView.backward`, (13, M)."""
+        """Return the transpose of `in_scene`: of such sums, see `LinearView.backward`, (22, M)."""
         result = np.zeros((COUNT, len(self)), np.float32)
         result[COLOR] = np.float32(SH_C0) * sums[COLOR]
+        result[DEGREE_1] = sums[DEGREE_1]
         result[OPACITY] = (np.float32(1.0) - self.gaussians.alphas) * sums[OPACITY]
         if self.geometry:
             np.einsum("kin,in->kn", self.axes, sums[MEAN], out=result[MEAN])
@@ -209,6 +216,8 @@ class LinearView:
         Where the colour changes with the harmonics.
     jacobian : (2, 3, u) float32
         Rows of J W: pixels for a step of one scene size; none if geometry does not change.
+    basis : (3, u) float32
+        Values of the harmonics of the first degree in the direction of view.
     """
 
     hit: NDArray[np.int64]
@@ -221,13 +230,14 @@ class LinearView:
     steepness: NDArray[np.uint16]
     unclipped: NDArray[np.bool_]
     jacobian: NDArray[np.float32]
+    basis: NDArray[np.float32]
 
     def forward(self, change: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return by how much the colours change, (3, P), to first order.
 
         Parameters
         ----------
-        change : (13, M) or (4, M) float32
+        change : (22, M) or (13, M) float32
             Of all Gaussians, in the frame of the scene: see `Shapes.in_scene`.
         """
         return self._forward(change, self._hits())
@@ -241,7 +251,7 @@ class LinearView:
 
         Returns
         -------
-        (13, u) or (4, u) float32
+        (22, u) or (13, u) float32
             Off the diagonal of S, half of it.
         """
         return self._backward(errors, self._hits())
@@ -280,10 +290,11 @@ class LinearView:
         if not len(self.counts):
             return result
         first = np.cumsum(self.counts) - self.counts
-        for row, unclipped, seen, slope in zip(
-            result, self.unclipped, mine[COLOR], hits.by_log_alpha, strict=True
+        for channel, (row, unclipped, seen, slope) in enumerate(
+            zip(result, self.unclipped, mine[COLOR], hits.by_log_alpha, strict=True)
         ):
-            light = (seen * unclipped).take(hits.owner)
+            turning = _dot([*self.basis], mine[_of_channel(channel)])
+            light = ((seen + turning) * unclipped).take(hits.owner)
             light *= hits.weight
             light += slope * log_alpha
             row[self.hitting] = np.add.reduceat(light, first)
@@ -298,6 +309,8 @@ class LinearView:
             error *= hits.weight
             result[channel] = self._sum(error, hits.owner)
         result[COLOR] *= self.unclipped
+        for channel, total in enumerate(result[COLOR]):
+            result[_of_channel(channel)] = self.basis * total
         result[OPACITY] = self._sum(value, hits.owner)
         if hits.steepness:
             across, down, *on_plane = hits.steepness
@@ -331,7 +344,9 @@ class LinearView:
         ]  # fmt: skip
 
     def diagonal(self, shapes: Shapes) -> NDArray[np.float32]:
-        """Return the squared length of each column, that is of each parameter, (13, u).
+        """Return the squared length of each column, that is of each parameter, (22, u).
+
+        Of the three harmonics of a degree the mean, which does not turn with the axes of the world.
 
         Parameters
         ----------
@@ -341,6 +356,9 @@ class LinearView:
         result, hits = np.zeros((COUNT, len(self.hit)), np.float32), self._hits()
         result[COLOR] = np.float32(SH_C0**2) * self._sum(np.square(hits.weight), hits.owner)
         result[COLOR] *= self.unclipped
+        for channel, squared in enumerate(result[COLOR]):
+            # Squared harmonics of a degree are on average those of the constant (Unsoeld 1927).
+            result[_of_channel(channel)] = squared
         value = np.square(hits.by_log_alpha[0])
         for slope in hits.by_log_alpha[1:]:
             value += np.square(slope)
@@ -377,6 +395,21 @@ class LinearView:
         return np.asarray(np.bincount(owner, values, len(self.hit)), np.float64)
 
 
+def _of_channel(channel: int) -> slice:
+    """Return the rows of the parameters that are harmonics of the first degree of a channel."""
+    return slice(DEGREE_1.start + channel, DEGREE_1.stop, 3)
+
+
+def _basis(shapes: Shapes, view: View) -> NDArray[np.float32]:
+    """Return the values of the harmonics of the first degree in the direction of view, (3, u)."""
+    scene = shapes.scene
+    from_view = shapes.gaussians.means.astype(np.float64)
+    from_view -= scene.positions(view.center[None])[0][:, None]
+    from_view /= np.maximum(np.sqrt(np.square(from_view).sum(axis=0)), np.finfo(np.float32).tiny)
+    in_world = np.einsum("in,ij->nj", from_view, scene.axes)
+    return np.ascontiguousarray(basis(in_world, 1)[:, 1:].T, np.float32)
+
+
 def _dot(one: Sequence[NDArray[Any]], other: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Return the inner products of vectors, three components each, (u,)."""
     result = one[0] * other[0]
@@ -411,7 +444,7 @@ class LinearRays:
     ----------
     shapes : Shapes
     views : Stored of LinearView
-    residual, diagonal : (13, M) float32
+    residual, diagonal : (22, M) float32
         J'r and the diagonal of J'J, see `refit`.
     count : int
         How many rays there are.
@@ -439,7 +472,7 @@ class LinearRays:
     def normal(
         self, change: NDArray[np.float32], progress: Progress, threads: int | None
     ) -> NDArray[np.float32]:
-        """Return J'J times some change of the parameters, (13, M)."""
+        """Return J'J times some change of the parameters, (22, M)."""
         in_scene = self.shapes.in_scene(change)
         total = np.zeros_like(in_scene)
 
@@ -540,6 +573,7 @@ def _linear(
         owner.astype(np.uint16 if movable < 1 << 16 else np.int32),
         _halves(of_hits * weight[kept]), _halves(of_hits * by_log_alpha), _halves(steepness),
         ((colors > 0.0) & (colors < projection.BRIGHTEST))[:, :movable], jacobian,
+        _basis(shapes, view),
     )  # fmt: skip
     return linear, shapes
 

@@ -33,8 +33,8 @@ from ..errors import RefineError
 from ..pace import phases
 from ..splats import rotation_matrices, unit_quaternions
 from ..work import Progress, part, silent
-from .linear import COLOR, COUNT, MEAN, OPACITY, SCALE, TURN, LinearRays
-from .round_rays import RoundRays, limits
+from .linear import COLOR, COUNT, DEGREE_1, MEAN, OPACITY, SCALE, TURN, LinearRays
+from .round_rays import LARGEST, RoundRays, limits
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -62,8 +62,8 @@ MAX_ROUNDS, ENOUGH_RAYS = 4, (5, 400_000)
 survivor and so many in all: of large scenes each round takes as long as absorbing."""
 
 SIMPLER, ENOUGH_SIMPLER = 0.4, 0.25
-"""How many times as many rays a round has, and are enough, for colours and opacities alone: four of
-13 parameters, and colours change with most of these in straight lines."""
+"""How many times as many rays a round has, and are enough, for colours and opacities alone: 13 of
+22 parameters, and colours change with most of these in straight lines."""
 
 LEAST_GAIN = 0.05
 """Rounds end where the PSNR of the validation rays rises by less, dB."""
@@ -194,7 +194,7 @@ def refit(  # noqa: PLR0913 - all but three are optional
 
     Notes
     -----
-    Memory: about 700 bytes a survivor. 14 bytes for each hit of a round, see `round_rays.limits`,
+    Memory: about 900 bytes a survivor. 14 bytes for each hit of a round, see `round_rays.limits`,
     lie in a temporary file.
     """
     *_, last = refit_rounds(
@@ -243,6 +243,7 @@ def refit_on(
     """Yield what `refit_rounds` does, of some rays."""
     moving, geometry = np.zeros(COUNT, np.bool_), settings.geometry
     moving[: COUNT if geometry else MEAN.start] = True
+    moving[DEGREE_1] = survivors.sh_rest.shape[1] > 0
     moving[SCALE.stop - 1] &= survivors.model != "2dgs"  # discs have no third scale
     movable = moving[:, None] & ~(
         np.zeros(len(survivors), np.bool_) if protected is None else protected
@@ -303,9 +304,9 @@ class _Told(NamedTuple):
 
     Attributes
     ----------
-    diagonal : (13, N) float32
+    diagonal : (22, N) float32
         K; see the top of this file.
-    left : (13, N) float32
+    left : (22, N) float32
         What is left of J'r.
     """
 
@@ -322,12 +323,12 @@ def _solve(
     progress: Progress,
     threads: int | None,
 ) -> tuple[NDArray[np.float32], _Told]:
-    """Return by how much to change the parameters of N survivors, (13, N), and what rays told.
+    """Return by how much to change the parameters of N survivors, (22, N), and what rays told.
 
     Parameters
     ----------
     linear : LinearRays
-    movable : (13, N) bool
+    movable : (22, N) bool
         Which parameters may change.
     damping : float
         k; see the top of this file.
@@ -367,7 +368,7 @@ def _solve(
 
 
 def _medians(diagonal: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the median over splats of what rays tell, 1 where they tell nothing, (13,)."""
+    """Return the median over splats of what rays tell, 1 where they tell nothing, (22,)."""
     medians = [np.median(row[row > 0.0]) if row.any() else 1.0 for row in diagonal]
     return np.array(medians, np.float32)
 
@@ -385,7 +386,7 @@ def _conjugate_gradients(
     Parameters
     ----------
     product : callable
-    residual, inverse : (13, N) float32
+    residual, inverse : (22, N) float32
         The right side, and the preconditioner: 0 where x stays 0.
     steps : list of callable
         The progress of each step.
@@ -410,12 +411,12 @@ def _conjugate_gradients(
 
 
 def _dot(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
-    """Return the inner product of two arrays, (13, N), summed in float64."""
+    """Return the inner product of two arrays, (22, N), summed in float64."""
     return float(sum(np.sum(a * b, dtype=np.float64) for a, b in zip(one, other, strict=True)))
 
 
 def _worthwhile(change: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return a change in which means move only where that is worth it, (13, N).
+    """Return a change in which means move only where that is worth it, (22, N).
 
     Splats are drawn in the order of their means, and each move puts some behind others that were
     behind them, which no derivative tells of. The squared error that costs grows in proportion to
@@ -426,7 +427,7 @@ def _worthwhile(change: NDArray[np.float32]) -> NDArray[np.float32]:
 
     Parameters
     ----------
-    change : (13, N) float32
+    change : (22, N) float32
     """
     means = change[MEAN]
     squared = np.maximum(np.square(means).sum(axis=0), np.float32(_NOTHING))
@@ -442,7 +443,7 @@ def _moved(splats: Splats, change: NDArray[np.floating[Any]]) -> Splats:
     Parameters
     ----------
     splats : Splats
-    change : (13, N) floating
+    change : (22, N) floating
     """
     rows = np.flatnonzero(change.any(axis=0))
     some, change = splats.take(rows), change[:, rows].astype(np.float64)
@@ -459,6 +460,13 @@ def _moved(splats: Splats, change: NDArray[np.floating[Any]]) -> Splats:
         + change[OPACITY][0].clip(-MAX_STEP["opacity"], MAX_STEP["opacity"]),
         "sh_dc": some.sh_dc + change[COLOR].T.clip(-limit, limit),
     }
+    if splats.sh_rest.shape[1]:
+        by_channel = change[DEGREE_1].reshape(3, 3, -1).swapaxes(0, 1)
+        steps = [_limited(each, limit).T for each in by_channel]  # (n, 3) each
+        values["sh_rest"] = some.sh_rest.copy()
+        # In float32, since that is what blended harmonics are in memory, but not in tiles.
+        learned = some.sh_rest[:, :3].clip(-LARGEST, LARGEST).astype(np.float32)
+        values["sh_rest"][:, :3] = (learned + np.stack(steps, axis=2)).astype(np.float32)
     arrays = {}
     for name, new in values.items():
         arrays[name] = getattr(splats, name).copy()
@@ -507,4 +515,4 @@ def _same(one: Splats, other: Splats) -> NDArray[np.bool_]:
     same = one.opacity_logits == other.opacity_logits
     for name in ("means", "log_scales", "quaternions", "sh_dc"):
         same &= (getattr(one, name) == getattr(other, name)).all(axis=1)
-    return np.asarray(same)
+    return np.asarray(same & (one.sh_rest[:, :3] == other.sh_rest[:, :3]).all(axis=(1, 2)))

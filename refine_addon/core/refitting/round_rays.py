@@ -57,6 +57,9 @@ SHIFT, MAX_SHIFT = 0.7, 0.1
 """About how far a view is moved in a round: so many times as far as the view next to it is, at most
 so many scene sizes."""
 
+LARGEST = np.float32(1e36)
+"""Coefficients of harmonics count as no larger: 25 of them add up to a float32."""
+
 SECONDS, SECONDS_OF_RAY = 2.5e-7, 4e-6
 """About how long one core takes to project a splat into a view, and to cast a ray, to tell what is
 worth a process."""
@@ -218,8 +221,10 @@ def colors_of(splats: _Colored, rows: NDArray[np.int64], view: View) -> NDArray[
     for piece in chunks(len(rows), _CHUNK):
         chosen = rows[piece]
         harmonics = np.empty((len(chosen), 3, 1 + splats.sh_rest.shape[1]), np.float32)
-        harmonics[:, :, 0] = splats.sh_dc[chosen]
-        harmonics[:, :, 1:] = splats.sh_rest[chosen].transpose(0, 2, 1)
+        with np.errstate(over="ignore"):
+            harmonics[:, :, 0] = splats.sh_dc[chosen]
+            harmonics[:, :, 1:] = splats.sh_rest[chosen].transpose(0, 2, 1)
+        np.clip(harmonics, -LARGEST, LARGEST, out=harmonics)
         from_view = splats.means[chosen].astype(np.float64) - view.center
         direction = np.ascontiguousarray(from_view.T, np.float32)
         length = np.sqrt(np.square(direction).sum(axis=0))
