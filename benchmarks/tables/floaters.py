@@ -2,7 +2,7 @@
 
 ::
 
-    python -m benchmarks.tables.floaters SCENE_DIR ... --recipe volume --seed 7
+    python -m benchmarks.tables.floaters SCENE_DIR ... --recipe volume --seed 7 [--sure]
 
 The recipes of `benchmarks.floaters` put in 1,000 floaters: 45 % single ones, 25 % in dense
 clusters, 26 % needles and 4 % giant veils. Nothing of the cleaner was chosen by them, nor were they
@@ -275,11 +275,47 @@ def main() -> int:
         "--recipe", choices=(*RECIPES, "copies", "chosen", "mixed", "none"), default="volume"
     )
     parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--sure", action="store_true", help="compare `sure`, and clean again")
     options = parser.parse_args()
     print("scene: found (by kind), true splats taken, seconds, PSNR: before, dirty, cleaned")
     for folder in options.scenes:
-        print(_line(folder, options.recipe, options.seed), flush=True)
+        line = _sure if options.sure else _line
+        print(line(folder, options.recipe, options.seed), flush=True)
     return 0
+
+
+def _sure(folder: Path, recipe: str, seed: int) -> str:
+    """Say how sure cleaning was, beside what test views say, and what a second run takes.
+
+    Giants and needles have no place here: of them `sure` counts light, not views.
+    """
+    scene = read_scene(folder)
+    dirty, kinds, _ = dirtied(folder, scene.splats, scene.train, recipe, seed)
+    found, held_out = clean(dirty, scene.train), clean(dirty, scene.test)
+    small = found.by_reason["front"] | found.by_reason["isolated"]
+    seen = np.rint((held_out.past + 1.0) / np.maximum(held_out.sure, 1e-9) - 2.0)
+    other = held_out.by_reason["giant"] | held_out.by_reason["needle"]
+    judged = small & (seen > 0.0) & ~other & (held_out.past <= seen)
+    real = np.arange(len(dirty)) < len(scene.splats)
+    cells = []
+    for low, high in ((0.0, 0.7), (0.7, 0.8), (0.8, 0.9), (0.9, 0.95), (0.95, 1.0)):
+        inside = small & (found.sure > low) & (found.sure <= high)
+        both = inside & judged
+        if not both.any():
+            continue
+        cells.append(
+            f"said {found.sure[both].mean():.0%} of {inside.sum()}: "
+            f"{held_out.past[both].sum() / seen[both].sum():.0%} of test views see past "
+            f"{both.sum()} of them, {np.mean(~real[inside]):.0%} put in"
+        )
+    rest = dirty.take(found.keep)
+    again, left = clean(rest, scene.train), real[found.keep]
+    added = np.count_nonzero(~left)
+    return (
+        f"{folder.name}, {recipe}: {'; '.join(cells)}; again: "
+        f"{np.count_nonzero(~again.keep & ~left)} of {added} floaters left of {len(kinds)}, "
+        f"{np.count_nonzero(~again.keep & left)} of {np.count_nonzero(left)} true splats"
+    )
 
 
 def _line(folder: Path, recipe: str, seed: int) -> str:
