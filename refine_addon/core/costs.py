@@ -13,8 +13,8 @@ if TYPE_CHECKING:
     from .views import View
 
 SECONDS = {
-    "activating": (0.0, 1.4e-6, 0.0, 0.3),
-    "prior": (0.0006, 0.9e-6, 0.0, 0.3),
+    "activating": (0.0, 1.4e-6, 0.0, 1.0),
+    "prior": (0.0006, 0.9e-6, 0.0, 1.0),
     "closed form": (0.0003, 0.5e-6, 5e-9, 0.3),
     "measuring": (0.0, 0.0, 0.36e-6, 0.0),
     "casting": (0.0025, 0.0, 0.08e-6, 0.0),
@@ -25,11 +25,11 @@ SECONDS = {
     "aligning": (0.08, 0.0, 0.0, 1.0),
     "estimating": (0.0065, 0.0, 0.13e-6, 0.0),
     "selecting": (0.25, 1.1e-6, 0.0, 0.8),
-    "comparing": (0.004, 0.0, 0.15e-6, 0.0),
+    "comparing": (0.004, 0.0, 0.15e-6, 0.5),
     "picturing": (0.02, 0.0, 0.5e-6, 0.1),
     "merging": (0.0, 11e-6, 0.0, 0.5),
-    "refit casting": (0.0, 0.0, 0.62e-6, 0.0),
-    "refit solving": (0.0, 8.6e-6, 0.0, 0.3),
+    "refit casting": (0.0, 0.0, 0.72e-6, 0.0),
+    "refit solving": (0.0, 12.7e-6, 0.0, 0.9),
     "refit checking": (0.0, 0.0, 0.14e-6, 0.0),
     "writing": (0.0, 0.7e-9, 0.0, 1.0),
     "rewriting": (0.0, 5e-9, 0.0, 1.0),
