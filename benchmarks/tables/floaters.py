@@ -2,7 +2,7 @@
 
 ::
 
-    python -m benchmarks.tables.floaters SCENE_DIR ... --recipe volume --seed 7 [--sure]
+    python -m benchmarks.tables.floaters SCENE_DIR ... --recipe volume --seed 7 [--sure | --why]
 
 The recipes of `benchmarks.floaters` put in 1,000 floaters: 45 % single ones, 25 % in dense
 clusters, 26 % needles and 4 % giant veils. Nothing of the cleaner was chosen by them, nor were they
@@ -27,17 +27,29 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from refine_addon.core.cleaning.clean import clean
+from refine_addon.core.cleaning.clean import Cleaning, clean
+from refine_addon.core.cleaning.clusters import touching
+from refine_addon.core.cleaning.search import (
+    AGREE,
+    FAINT,
+    FEW,
+    HAZE_HELD,
+    ISOLATED_SUPPORT,
+    SUPPORT,
+    Search,
+)
 from refine_addon.core.formats.ply import read_ply
 from refine_addon.core.seeing import projection
 from refine_addon.core.seeing.ray_sample import validation_rays
 from refine_addon.core.splats import SH_C0, Splats, joined, opacity
+from refine_addon.core.work import silent
 
 from .evaluate import Evaluator, read_scene
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from refine_addon.core.cleaning.search import _Suspects
     from refine_addon.core.views import View, ViewSet
 
 COUNTS = {"front": 1100, "blob": 800, "veil": 100}
@@ -276,10 +288,12 @@ def main() -> int:
     )
     parser.add_argument("--seed", type=int, default=7)
     parser.add_argument("--sure", action="store_true", help="compare `sure`, and clean again")
+    parser.add_argument("--why", action="store_true", help="say why the others stay")
     options = parser.parse_args()
-    print("scene: found (by kind), true splats taken, seconds, PSNR: before, dirty, cleaned")
+    line = _sure if options.sure else _why if options.why else _line
+    if line is _line:
+        print("scene: found (by kind), true splats taken, seconds, PSNR: before, dirty, cleaned")
     for folder in options.scenes:
-        line = _sure if options.sure else _line
         print(line(folder, options.recipe, options.seed), flush=True)
     return 0
 
@@ -316,6 +330,65 @@ def _sure(folder: Path, recipe: str, seed: int) -> str:
         f"{np.count_nonzero(~again.keep & ~left)} of {added} floaters left of {len(kinds)}, "
         f"{np.count_nonzero(~again.keep & left)} of {np.count_nonzero(left)} true splats"
     )
+
+
+class _Asked(Search):
+    """A search that keeps why splats stay.
+
+    Attributes
+    ----------
+    why : dict of str to (M,) bool
+        Of the Gaussians that stay, the first of these that is true of each.
+    """
+
+    def _floats(self, suspects: _Suspects) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        shows, faint = super()._floats(suspects)
+        large = suspects.giant | suspects.needle
+        seen, past, support = self.evidence.views, self.evidence.past, self.evidence.support()
+        passed = np.where(large, np.maximum(past, seen * (1.0 - support)), past)
+        most = np.where(large | suspects.doubted, SUPPORT, ISOLATED_SUPPORT)
+        change, needed = self._change(suspects.giant), self._needed(suspects, passed, support)
+        hazy = (self.gaussians.alphas < FAINT) & ~suspects.giant
+        rows = np.flatnonzero(suspects.mask & hazy)
+        near, touch = touching(self.gaussians, rows)
+        in_haze = np.zeros(len(seen))
+        in_haze[rows] = np.count_nonzero(touch & (self.gaussians.alphas < FAINT)[near], axis=1)
+        told = {
+            "not drawn": ~self.shown,
+            "no suspect": ~suspects.mask,
+            "no ray": seen == 0.0,
+            "near": support >= most,
+            "few agree": ~large & (past < AGREE * seen),
+            "one view": (past < FEW) & ~(suspects.giant & (passed >= FEW)),
+            "small change": change < needed,
+            "haze": change < needed * HAZE_HELD**in_haze,
+            "held": np.ones(len(seen), np.bool_),
+        }
+        self.why, left = {}, ~shows
+        for name, true in told.items():
+            self.why[name] = left & true
+            left = left & ~true
+        return shows, faint
+
+
+def _why(folder: Path, recipe: str, seed: int) -> str:
+    """Say of each kind of floaters how many are found, and why the others stay, per cent."""
+    scene = read_scene(folder)
+    dirty, kinds, names = dirtied(folder, scene.splats, scene.train, recipe, seed)
+    gaussians, size, _ = projection.prepare(dirty, scene.train)
+    used = scene.train.spread(Cleaning().views)
+    search = _Asked(gaussians, size, dirty, (used, ()), None)
+    search.reasons(silent)
+    rows = np.arange(len(kinds)) + len(scene.splats)
+    why = {name: search.of_all(mask)[rows] for name, mask in search.why.items()}
+    why["not drawn"] |= ~np.isin(rows, gaussians.index)
+    found = ~np.any(list(why.values()), axis=0)
+    cells = []
+    for kind, name in enumerate(names):
+        of_kind = kinds == kind
+        rest = ", ".join(f"{text} {mask[of_kind].mean():.1%}" for text, mask in why.items())
+        cells.append(f"{name} ({of_kind.sum()}): found {found[of_kind].mean():.1%}, {rest}")
+    return f"{folder.name}, {recipe}: {'; '.join(cells)}"
 
 
 def _line(folder: Path, recipe: str, seed: int) -> str:

@@ -51,10 +51,10 @@ class Layout:
         assert name in data.bl_rna.properties
         self.drawn.append(name)
 
-    def prop_enum(self, data, name, value, **_options):
-        """Note one value of a property; it must exist."""
+    def prop_enum(self, data, name, value, *, text="", **_options):
+        """Note one value of a property, and its text; it must exist."""
         assert value in data.bl_rna.properties[name].enum_items
-        self.drawn.append(name)
+        self.drawn += [name, text]
 
     def label(self, *, text="", **_options):
         """Note a text."""
@@ -124,6 +124,24 @@ def test_each_step_shows_what_came_of_it(draw, room, room_cameras):  # noqa: ARG
     assert "chart" in scored
     assert "room: 19,878 splats, SH degree 3" in " ".join(applied)
     assert not [text for text in applied if text.startswith(("Keeps", "chart", "Scored"))]
+
+
+def test_each_reason_of_floaters_is_told_with_how_sure_it_is(draw, addon, room, room_cameras):  # noqa: ARG001
+    """Per cent are the mean over what goes for the reason; where nothing goes there are none."""
+    splats = addon.objects.splat_object.gather(addon.mesh.layout.check(room))
+    views = addon.ui.operators.chosen_views(bpy.context)
+    expected = addon.core.clean(splats, views, addon.core.Cleaning())
+
+    bpy.ops.refine.find_floaters()
+    drawn = draw()
+
+    counts, sure = expected.counts(), expected.surety()
+    assert counts["front"]
+    assert f"In Front: {counts['front']:,} ({100.0 * sure['front']:.0f} %)" in drawn
+    none = [name for name, count in counts.items() if not count]
+    texts = {name: text for name, text, _ in addon.ui.properties.FLOATERS}
+    for name in none:
+        assert f"{texts[name]}: 0" in drawn
 
 
 def test_after_deletion_by_hand_the_panel_asks_for_scores_and_says_why(

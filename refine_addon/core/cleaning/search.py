@@ -343,8 +343,7 @@ class Search:
         in_clumps = self._clumps(np.flatnonzero(~large[rows]), rows, near, touch)
         near, touch, rows = near[may[rows]], touch[may[rows]], rows[may[rows]]
         needed = self._needed(suspects, passed, support)[rows]
-        wide = np.where(giant[rows], np.maximum(self.width[rows], WIDE) / WIDE, 1.0)
-        change = np.minimum(self._effect()[rows], GLARING) * wide
+        change = self._change(giant)[rows]
         hazy = self.gaussians.alphas < FAINT
         in_haze = np.count_nonzero(touch & hazy[near], axis=1) * (hazy & ~giant)[rows]
 
@@ -406,6 +405,11 @@ class Search:
         behind = self.evidence.behind
         contrast = self.evidence.contrast / np.where(behind > 0.0, behind, 1.0)
         return np.asarray(self.gaussians.alphas * contrast, np.float64)
+
+    def _change(self, giant: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Return how much that counts as evidence, (M,), where `giant`, (M,), are."""
+        wide = np.where(giant, np.maximum(self.width, WIDE) / WIDE, 1.0)
+        return np.asarray(np.minimum(self._effect(), GLARING) * wide)
 
     def _near_cameras(self, chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return which of some Gaussians, (M,) bool, are near a camera, (M,)."""
