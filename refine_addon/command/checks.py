@@ -102,6 +102,9 @@ def _check_settings(options: argparse.Namespace) -> None:
         levels(options)
         check_goal(options.distance_psnr)
     scoring = settings(options)
+    if scoring.refit.rounds is not None and options.survivors != "refit":
+        msg = f"rounds is {scoring.refit.rounds}, expected only with --survivors refit"
+        raise RefineError(msg)
     if options.command == "prune":
         budget(options).refuse_meaningless(scoring.method, frustum=scoring.frustum)
 

@@ -23,6 +23,7 @@ from ..core import (
 from ..core.errors import printable
 from ..core.formats.registry import READ_SUFFIXES, SUFFIXES
 from ..core.levels.files import GOAL
+from ..core.refitting.refit import Refit
 from ..core.rendering import MODELS
 from ..core.urls import Url, is_url, refuse_url
 from ..core.whole_file import expanded
@@ -178,6 +179,7 @@ def _add_prune(commands: Any) -> None:  # noqa: ANN401 - argparse does not name 
         "default (no way to score, as --method auto is): absorb, but unchanged where that is as "
         "good, and with --method, --threshold, --min-seen or --together",
     )
+    _add_rounds(prune)
     becoming.add_argument(
         "--absorb",
         dest="survivors",
@@ -291,6 +293,7 @@ def _add_lod(commands: Any) -> None:  # noqa: ANN401 - argparse does not name th
         "level is made from the one before, or all are parts of one another); --method only "
         "matters where they stay unchanged",
     )
+    _add_rounds(making)
     becoming.add_argument(
         "--nested",
         dest="survivors",
@@ -467,6 +470,16 @@ def _add_scoring(parser: argparse.ArgumentParser) -> None:
     _add_views(parser)
 
 
+def _add_rounds(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--rounds",
+        type=int,
+        metavar="N",
+        help="with --survivors refit: fit them up to N times, each time to other rays (default: "
+        "as often as is worth the time, 2 to 4; more where much time is no matter)",
+    )
+
+
 def _add_model(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model",
@@ -577,9 +590,9 @@ def _path(text: str) -> Path:
 
 
 def settings(options: argparse.Namespace) -> Settings:
-    """Return how to score, or raise `RefineError` where a value cannot be."""
-    method = options.method or Settings.method
-    return Settings(method, most_views(options), tolerance=options.tolerance)
+    """Return how to score and to refit, or raise `RefineError` where a value cannot be."""
+    method, refit = options.method or Settings.method, Refit(getattr(options, "rounds", None))
+    return Settings(method, most_views(options), tolerance=options.tolerance, refit=refit)
 
 
 def most_views(options: argparse.Namespace) -> int:

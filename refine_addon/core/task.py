@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from .errors import RefineError
+from .refitting.refit import Refit
 from .scoring.closed_form_settings import ClosedForm
 from .scoring.occlusion import Occlusion
 from .splats import among_all
@@ -34,7 +35,7 @@ METHODS = ("auto", "occlusion", "closed-form")
 
 @dataclass(frozen=True)
 class Settings:
-    """How to score.
+    """How to score, and to refit.
 
     Attributes
     ----------
@@ -48,6 +49,8 @@ class Settings:
         Settings of these methods.
     tolerance : float
         For "auto": by how much the PSNR of the pictures may be lower than by all views, dB.
+    refit : Refit
+        Settings of refitting.
     """
 
     method: Literal["auto", "occlusion", "closed-form"] = "auto"
@@ -55,6 +58,7 @@ class Settings:
     closed_form: ClosedForm = field(default_factory=ClosedForm)
     occlusion: Occlusion = field(default_factory=Occlusion)
     tolerance: float = 0.5
+    refit: Refit = field(default_factory=Refit)
 
     def __post_init__(self) -> None:
         """Check the values.

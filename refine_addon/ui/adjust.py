@@ -31,6 +31,7 @@ class Adjustable:
     min_seen: FloatProperty(**AMOUNTS["min_seen"], options={"SKIP_SAVE"})
     psnr: FloatProperty(**AMOUNTS["psnr"], options={"SKIP_SAVE"})
     survivors: EnumProperty(**AMOUNTS["survivors"], options={"SKIP_SAVE"})
+    rounds: IntProperty(**AMOUNTS["rounds"], options={"SKIP_SAVE"})
 
     if TYPE_CHECKING:  # of every operator
         properties: Any
@@ -71,3 +72,5 @@ class Adjustable:
         layout.prop(self, "budget")
         layout.prop(self, "percent" if self.budget == "ratio" else self.budget)
         layout.prop(self, "survivors")
+        if self.survivors == "refit":
+            layout.prop(self, "rounds")

@@ -268,6 +268,8 @@ class REFINE_PT_apply(_InSidebar, bpy.types.Panel):
         column.prop(settings, "budget")
         column.prop(settings, "percent" if settings.budget == "ratio" else settings.budget)
         column.prop(settings, "survivors")
+        if settings.survivors == "refit":
+            column.prop(settings, "rounds")
         obj = context.object
         record = _record(obj)
         if record:
@@ -297,6 +299,8 @@ class REFINE_PT_export(_InSidebar, bpy.types.Panel):
         column = _named_column(layout)
         column.prop(settings, "levels")
         column.prop(settings, "level_survivors")
+        if settings.level_survivors == "refit":
+            column.prop(settings, "rounds")
         column.operator("refine.levels", icon="MOD_DECIM")
         if level_objects.has_levels(obj):
             column.operator("refine.export_levels", icon="EXPORT")

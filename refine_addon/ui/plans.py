@@ -118,7 +118,7 @@ def unregister() -> None:
 def key(settings: Any) -> str:  # noqa: ANN401 - RefineSettings, which imports this module
     """Return what a plan depends on; a stored plan of another key is out of date."""
     budget = f"{settings.budget} {getattr(settings, settings.budget)!r} {_demanded(settings)!r}"
-    return f"{budget} {settings.survivors} {settings.method}"
+    return f"{budget} {settings.survivors} {settings.rounds} {settings.method}"
 
 
 def changed(context: bpy.types.Context) -> None:

@@ -23,6 +23,7 @@ from ..core.cleaning.clean import DEFAULT_REASONS
 from ..core.errors import RefineError
 from ..core.formats.ply import REQUIRED
 from ..core.levels.lod import Levels
+from ..core.refitting.refit import Refit
 from ..core.rendering import MODELS
 from ..core.selection import Budget
 from ..core.task import Settings
@@ -144,6 +145,14 @@ AMOUNTS: dict[str, dict[str, Any]] = {
         "name": "Survivors",
         "description": "What the splats that stay may become",
         "items": SURVIVORS,
+    },
+    "rounds": {
+        "name": "Rounds",
+        "description": "Refit so many times at most, each time to other rays; 0: as many as are "
+        "worth their time, usually 2 to 4",
+        "default": 0,
+        "min": 0,
+        "max": 100,
     },
 }
 """How much is removed, and how: properties of the panel and of *Apply*."""
@@ -330,6 +339,7 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
     min_seen: FloatProperty(**AMOUNTS["min_seen"], update=_plan_again)
     psnr: FloatProperty(**AMOUNTS["psnr"], update=_plan_again)
     survivors: EnumProperty(**AMOUNTS["survivors"], update=_plan_again)
+    rounds: IntProperty(**AMOUNTS["rounds"], update=_plan_again)
     absorb: BoolProperty(name="Absorb", description=OLDER, options={"HIDDEN"})
     nested: BoolProperty(name="Nested", description=OLDER, options={"HIDDEN"})
     protect: StringProperty(
@@ -363,7 +373,8 @@ class RefineSettings(SelectSettings, bpy.types.PropertyGroup):
         RefineError
             If they cannot be.
         """
-        return Settings(self.method, self.views, tolerance=decimal(self.tolerance))
+        refit = Refit(self.rounds or None)
+        return Settings(self.method, self.views, tolerance=decimal(self.tolerance), refit=refit)
 
     def to_budget(self) -> Budget:
         """Return the budget of core.

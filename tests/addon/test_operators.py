@@ -104,7 +104,10 @@ def test_settings_reach_core_as_they_were_typed(addon):
     assert settings.to_budget() == core.Budget(ratio=0.5)
 
     settings.method, settings.views, settings.tolerance = "auto", 7, 0.3
-    assert settings.to_settings() == core.Settings("auto", views=7, tolerance=0.3)
+    settings.rounds = 3
+    assert settings.to_settings() == core.Settings(
+        "auto", views=7, tolerance=0.3, refit=core.Refit(rounds=3)
+    )
 
 
 def test_scoring_writes_scores_ranks_views_and_colours(addon, room, room_cameras):  # noqa: ARG001

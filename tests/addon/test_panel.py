@@ -326,6 +326,16 @@ def test_one_bar_is_drawn_in_the_box_of_the_button_that_was_clicked(draw, at_wor
     assert f"refine.{name}" in buttons <= set(drawn)
 
 
+@pytest.mark.parametrize("name", ["survivors", "level_survivors"])
+def test_rounds_are_drawn_where_survivors_are_refitted(draw, name):
+    """In the boxes of *Apply* and of levels."""
+    setattr(bpy.context.scene.refine, name, "absorb")
+    without = draw().count("rounds")
+    setattr(bpy.context.scene.refine, name, "refit")
+
+    assert (without, draw().count("rounds")) == (0, 1)
+
+
 @pytest.mark.parametrize(
     ("method", "expected"),
     [("closed-form", {"views"}), ("occlusion", {"views"}), ("auto", {"views", "tolerance"})],

@@ -568,6 +568,8 @@ USAGE = {
     "seen by too many": [*PRUNE, "-o", "out.ply", "--min-seen", "101"],
     "a score of any method": [*PRUNE, "-o", "out.ply", "--threshold", "1"],
     "views below 0": [*PRUNE, "-o", "out.ply", "--views", "-1"],
+    "rounds of nothing": [*PRUNE, "-o", "out.ply", "--rounds", "2"],
+    "no rounds": [*PRUNE, "-o", "out.ply", "--survivors", "refit", "--rounds", "0"],
     "unknown method": [*PRUNE, "-o", "out.ply", "--method", "guess"],
     "object without Blender": ["prune", "--object", "Splats", "-o", "out.ply", *PRUNE[2:]],
     "save without object": [*PRUNE, "-o", "out.ply", "--save"],

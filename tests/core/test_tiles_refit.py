@@ -21,6 +21,7 @@ from refine_addon.core import (
 )
 from refine_addon.core.estimate.psnr import psnr_against
 from refine_addon.core.refitting import round_rays
+from refine_addon.core.refitting.refit import Refit
 from refine_addon.core.refitting.round_rays import Window
 from refine_addon.core.scoring import closed_form
 from refine_addon.core.seeing import projection
@@ -70,9 +71,9 @@ def request(views, budget=HALF, settings=OCCLUSION):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ratio", [0.1, 0.5])
+@pytest.mark.parametrize(("ratio", "rounds"), [(0.1, None), (0.5, None), (0.5, 1)])
 def test_refitting_a_single_region_is_refitting_one_file(
-    tmp_path, tiles, views, monkeypatch, ratio
+    tmp_path, tiles, views, monkeypatch, ratio, rounds
 ):
     """Where one region holds all splats, every row is the same to the byte; also if none merged.
 
@@ -80,7 +81,7 @@ def test_refitting_a_single_region_is_refitting_one_file(
     """
     monkeypatch.setattr(absorbing, "REGION", COUNT)
     monkeypatch.setattr(gaussians, "CHUNK", 1 << 16)
-    asked = request(views, Budget(ratio=ratio))
+    asked = request(views, Budget(ratio=ratio), replace(OCCLUSION, refit=Refit(rounds)))
 
     told = prune_tiles(tiles, tmp_path / "out", asked)
     whole = prune_file(tmp_path / "whole.ply", tmp_path / "pruned.ply", asked)
@@ -88,6 +89,7 @@ def test_refitting_a_single_region_is_refitting_one_file(
     facts, expected = told["refitted"], whole.report["refitted"]
     assert {**facts, "seconds": 0.0} == {**expected, "seconds": 0.0}
     assert facts["psnr"] >= facts["psnr_before"]
+    assert rounds is None or facts["rounds"] == rounds
     assert told["absorbed"] == whole.report["absorbed"]
     assert (
         read(tmp_path / "out", tiles).tobytes() == read_ply(tmp_path / "pruned.ply").rows.tobytes()

@@ -15,7 +15,6 @@ from ..absorbing.merge_field import ViewSums
 from ..estimate.psnr import psnr_against
 from ..estimate.quality import left_to_lose
 from ..pace import phases
-from ..refitting.refit import expected_rounds
 from ..refitting.round_rays import limits
 from ..scoring import occlusion
 from ..seeing.ray_sample import VALIDATION_VIEWS
@@ -128,7 +127,8 @@ def _to_count(task: Task, left: int) -> list[Plan]:
     absorbed = _stages(count, left, costs.Images.of(used))
     if task.survivors != "refit":
         return [absorbed, compared, [], []]
-    refitted = costs.refitting(count, left, len(used), limits(left)[0], expected_rounds(left))
+    rounds = task.settings.refit.expected_rounds(left)
+    refitted = costs.refitting(count, left, len(used), limits(left)[0], rounds)
     return [absorbed, 2 * compared, costs.joined(refitted), compared]
 
 

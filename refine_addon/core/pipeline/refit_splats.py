@@ -137,7 +137,7 @@ def refit_made(task: Task, made: Made, progress: Progress, threads: int | None) 
     return_freed()
     try:
         for reached in refit_rounds(
-            absorbed.splats, original, views.spread(task.settings.views),
+            absorbed.splats, original, views.spread(task.settings.views), task.settings.refit,
             protected=None if task.protected is None else task.protected[absorbed.keep],
             progress=named(progress, DOING), threads=threads,
         ):  # fmt: skip

@@ -85,7 +85,7 @@ class Refit:
     Attributes
     ----------
     rounds : int, optional
-        At most so many; by default see `MAX_ROUNDS`.
+        At most so many; by default see `MAX_ROUNDS`. They end before where little is gained.
     geometry : bool
         Whether means, scales and rotations are refitted too, or colours and opacities alone.
     """
@@ -104,6 +104,11 @@ class Refit:
         if self.rounds is not None and self.rounds < 1:
             msg = f"rounds is {self.rounds}, expected 1 or more"
             raise RefineError(msg)
+
+    def expected_rounds(self, count: int) -> int:
+        """Return how many rounds it takes to refit so many survivors, if all of them gain."""
+        enough = max(ENOUGH_RAYS[0] * count, ENOUGH_RAYS[1])
+        return self.rounds or min(math.ceil(enough / limits(count)[0]), MAX_ROUNDS)
 
 
 class Gains:
@@ -220,7 +225,7 @@ def refit_rounds(  # noqa: PLR0913 - as `refit`
     """
     share = 1.0 if settings.geometry else SIMPLER
     count = round(share * len(survivors))
-    rounds = settings.rounds or expected_rounds(len(survivors))
+    rounds = settings.expected_rounds(len(survivors))
     most = limits(count)[0]
     preparing, *plans = costs.refitting(len(original), len(survivors), len(views), most, rounds)
     prepared, refitting = phases(progress, preparing, costs.joined(plans), threads=threads)
@@ -249,7 +254,7 @@ def refit_on(
         np.zeros(len(survivors), np.bool_) if protected is None else protected
     )
     rounds, cast = settings.rounds or MAX_ROUNDS, 0
-    ahead = settings.rounds or expected_rounds(len(survivors))
+    ahead = settings.expected_rounds(len(survivors))
     checked, one_round = rays.costs(len(survivors))
     validating, later = phases(progress, checked, ahead * costs.joined(one_round))
     psnr = rays.psnr(survivors, validating)
@@ -291,12 +296,6 @@ def refit_on(
             return
         else:
             more, undone = more * MORE_DAMPING, True
-
-
-def expected_rounds(count: int) -> int:
-    """Return how many rounds it takes to refit so many survivors, if all of them gain."""
-    enough = max(ENOUGH_RAYS[0] * count, ENOUGH_RAYS[1])
-    return min(math.ceil(enough / limits(count)[0]), MAX_ROUNDS)
 
 
 class _Told(NamedTuple):

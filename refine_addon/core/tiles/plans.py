@@ -9,13 +9,13 @@ from .. import costs
 from ..absorbing.absorb import ALONE, stages
 from ..costs import Cost
 from ..pipeline.absorb_splats import FIRST
-from ..refitting.refit import expected_rounds
 from ..refitting.round_rays import limits
 from ..scoring.occlusion import survivors_of_rounds
 from . import absorbing
 
 if TYPE_CHECKING:
     from ..costs import Images, Plan
+    from ..refitting.refit import Refit
     from ..task import Settings
 
 
@@ -47,7 +47,7 @@ def scoring(
     return [ready, costs.joined(scored), curve]
 
 
-def making(count: int, left: int, images: Images, *, refits: bool) -> list[Plan]:
+def making(count: int, left: int, images: Images, refit: Refit | None) -> list[Plan]:
     """Return the costs of absorbing, of refitting if asked, and of estimating what is left.
 
     Parameters
@@ -55,14 +55,15 @@ def making(count: int, left: int, images: Images, *, refits: bool) -> list[Plan]
     count, left : int
         Splats before and after.
     images : Images
-    refits : bool
+    refit : Refit or None
+        How to refit; None where survivors are not refitted.
     """
     begin = max(count - math.floor(FIRST * count), left)
     alone = absorbing.ALONE if begin > absorbing.REGION else ALONE
     after = stages(begin, left, alone)
     absorbed = costs.joined(costs.absorbing(begin, after, images))
     refitted: Plan = []
-    if refits:
-        rays, rounds = limits(left)[0], expected_rounds(left)
+    if refit is not None:
+        rays, rounds = limits(left)[0], refit.expected_rounds(left)
         refitted = costs.joined(costs.refitting(count, left, images.views, rays, rounds))
     return [absorbed, refitted, costs.comparing(left, images.views)]

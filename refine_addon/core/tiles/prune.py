@@ -20,7 +20,6 @@ from ..estimate.psnr import psnr_kept
 from ..estimate.quality import needed
 from ..formats.ply_header import with_count
 from ..operation.run import Request, Written, run
-from ..refitting.refit import Refit
 from ..report import (
     MEASURES,
     conclude,
@@ -56,7 +55,7 @@ if TYPE_CHECKING:
     from ..formats.format import Format
     from ..operation.requests import PruneRequest
     from ..operation.run import Runtime
-    from ..refitting.refit import Gains
+    from ..refitting.refit import Gains, Refit
     from ..scores import Scores
     from ..selection import Budget
     from ..survivor_choice import Became
@@ -262,7 +261,7 @@ class TilesRequest(Request[TileScene, TileDecision]):
         if not asked.absorb:
             return [*plans, []]
         left = count - removed.amount if removed is not None and known else count // 2
-        made = plan_making(count, left, images, refits=asked.survivors == "refit")
+        made = plan_making(count, left, images, _refit(asked))
         return [*plans, joined(made)]
 
     def decide(self, scene: TileScene, runtime: Runtime) -> TileDecision:
@@ -342,21 +341,26 @@ class TilesRequest(Request[TileScene, TileDecision]):
 
     def _made(self, measured: MeasuredTiles, kept: int, runner: Runner) -> _Made:
         """Return what so many survivors become."""
-        settings, refits = self.prune.settings, self.prune.survivors == "refit"
+        settings, refit = self.prune.settings, _refit(self.prune)
         count, images = len(measured.measured.seen), Images.of(measured.context.views)
-        plans = plan_making(count, kept, images, refits=refits)
+        plans = plan_making(count, kept, images, refit)
         absorbing_runner, refitting, estimating = runner.phases(*plans)
         absorbed = absorbing.absorb(measured, kept, settings, absorbing_runner)
         made = _Made(absorbed, absorbed)
-        if refits and kept < count:
+        if refit is not None and kept < count:
             start = time.perf_counter()
-            done = refit_survivors(measured, absorbed, Refit(), refitting)
+            done = refit_survivors(measured, absorbed, refit, refitting)
             if done is not None:
                 made = _Made(absorbed, done.survivors, done, time.perf_counter() - start)
         if not made.survivors.regions:
             return made
         _, psnr = absorbing.estimated(measured, made.survivors.regions, estimating)
         return replace(made, psnr=psnr)
+
+
+def _refit(request: PruneRequest) -> Refit | None:
+    """Return how survivors are refitted; None if they are not."""
+    return request.settings.refit if request.survivors == "refit" else None
 
 
 def _select(scene: TileScene, budget: Budget, scores: Scores, runner: Runner) -> NDArray[np.int64]:

@@ -87,6 +87,7 @@ class AtOnceContext:
     folder: Folder
     views: ViewSet
     units: Sequence[Unit]  # the unpruned splats
+    settings: Refit
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class RefitAtOnce:
     def _refitted(self, context: AtOnceContext, runtime: Runtime) -> NDArray[np.float64]:
         original = joined([unit.splats() for unit in context.units])
         done = refit(
-            self._survivors(original), original, context.views,
+            self._survivors(original), original, context.views, context.settings,
             progress=runtime.progress, threads=runtime.threads,
         )  # fmt: skip
         context.folder.save(0, {"splats": packed(done.splats), "changed": done.changed})
@@ -181,7 +182,7 @@ def refit_survivors(
     500 a survivor.
     """
     if len(tiles.measured.seen) <= absorbing.REGION:
-        return _at_once(tiles, survivors, runner)
+        return _at_once(tiles, survivors, settings, runner)
     folder = tiles.context.folder.inner("refitting")
     if not survivors.regions:
         kept = _saved(tiles.units, folder.inner("kept"), runner, survivors.origin)
@@ -200,10 +201,12 @@ def refit_survivors(
     return replace(refitted, psnr=psnr)
 
 
-def _at_once(tiles: MeasuredTiles, survivors: Survivors, runner: Runner) -> Refitting:
+def _at_once(
+    tiles: MeasuredTiles, survivors: Survivors, settings: Refit, runner: Runner
+) -> Refitting:
     """Refit all survivors in one step."""
     folder = tiles.context.folder.inner("refitted")
-    context = AtOnceContext(folder, tiles.context.views, tiles.units)
+    context = AtOnceContext(folder, tiles.context.views, tiles.units, settings)
     step = RefitAtOnce(survivors.regions, survivors.origin)
     ((rounds, psnr_before, psnr),) = runner.run(context, [step], "refitting")
     changed = folder.load(0, ["changed"])["changed"]
